@@ -1,0 +1,184 @@
+"""Rotations and small vector algebra in numpy, batched over leading dimensions.
+
+R_ij takes the coordinates of a vector in frame j to those in frame i. Angles in rad.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# Below this sine the two z-turns of a z-x-z triple can't be told apart; one of them is set to 0.
+EULER_SINGULAR_SINE = 1e-12
+
+
+def skew(vector: ArrayLike) -> Array:
+    """The matrix [x ×] of (..., 3) vectors, (..., 3, 3): skew(a) @ b = a × b."""
+    v = np.asarray(vector, dtype=np.float64)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def _turn(angle: ArrayLike, fixed: int) -> Array:
+    """Rotation about the coordinate axis number `fixed`, (..., 3, 3)."""
+    a = np.asarray(angle, dtype=np.float64)
+    i, j = (fixed + 1) % 3, (fixed + 2) % 3
+    out = np.zeros((*a.shape, 3, 3))
+    out[..., fixed, fixed] = 1.0
+    out[..., i, i] = out[..., j, j] = np.cos(a)
+    out[..., j, i] = np.sin(a)
+    out[..., i, j] = -out[..., j, i]
+    return out
+
+
+def rot_x(angle: ArrayLike) -> Array:
+    """Rotation about x by (...) angles, (..., 3, 3)."""
+    return _turn(angle, 0)
+
+
+def rot_y(angle: ArrayLike) -> Array:
+    """Rotation about y by (...) angles, (..., 3, 3)."""
+    return _turn(angle, 1)
+
+
+def rot_z(angle: ArrayLike) -> Array:
+    """Rotation about z by (...) angles, (..., 3, 3)."""
+    return _turn(angle, 2)
+
+
+def matrix_from_zxz(angles: ArrayLike) -> Array:
+    """Rz(α) Rx(β) Rz(γ) of (..., 3) angles [α β γ] (paper, eq. 9 at q = 0), (..., 3, 3)."""
+    e = np.asarray(angles, dtype=np.float64)
+    product: Array = rot_z(e[..., 0]) @ rot_x(e[..., 1]) @ rot_z(e[..., 2])
+    return product
+
+
+def zxz_from_matrix(rotation: ArrayLike) -> Array:
+    """Canonical angles [α β γ] of (..., 3, 3) rotations: β in [0, π]; γ = 0 where β is 0 or π.
+
+    γ is read from what Rz(α) Rx(β) leaves over, so the rotation is met to rounding error even
+    close to the singularity, where α alone is poorly determined.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    sine = np.hypot(r[..., 0, 2], r[..., 1, 2])
+    singular = sine < EULER_SINGULAR_SINE
+    beta = np.arctan2(np.where(singular, 0.0, sine), r[..., 2, 2])
+    alpha = np.where(
+        singular,
+        np.arctan2(r[..., 1, 0], r[..., 0, 0]),
+        np.arctan2(r[..., 0, 2], -r[..., 1, 2]),
+    )
+    rest = np.swapaxes(rot_z(alpha) @ rot_x(beta), -1, -2) @ r
+    gamma = np.where(singular, 0.0, np.arctan2(rest[..., 1, 0], rest[..., 0, 0]))
+    return np.stack([alpha, beta, gamma], axis=-1)
+
+
+def exp_rotation(vector: ArrayLike) -> Array:
+    """Rotation matrices of (..., 3) rotation vectors (axis times angle), (..., 3, 3)."""
+    v = np.asarray(vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    k = skew(v)
+    # sinc keeps both series factors exact at zero: sin(x)/x and (1 - cos x)/x² = ½ sinc²(x/2).
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    out: Array = np.eye(3) + first * k + second * (k @ k)
+    return out
+
+
+def log_rotation(rotation: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) of (..., 3, 3) rotations, angle in [0, π]."""
+    r = np.asarray(rotation, dtype=np.float64)
+    quaternion = _quaternion(r)
+    vector, scalar = quaternion[..., 1:], quaternion[..., :1]
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(length, scalar)
+    scale = np.where(length > 0, angle / np.where(length > 0, length, 1.0), 2.0)
+    out: Array = vector * scale
+    return out
+
+
+def _quaternion(r: Array) -> Array:
+    """Unit quaternions [w x y z] with w >= 0 of (..., 3, 3) rotations, from the largest part."""
+    d = [r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]]
+    trace = d[0] + d[1] + d[2]
+    a = r[..., 2, 1] - r[..., 1, 2]
+    b = r[..., 0, 2] - r[..., 2, 0]
+    c = r[..., 1, 0] - r[..., 0, 1]
+    xy, xz, yz = (r[..., i, j] + r[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    # Four proportional copies of the quaternion; the longest is the best conditioned.
+    copies = np.stack(
+        [
+            np.stack([1 + trace, a, b, c], axis=-1),
+            np.stack([a, 1 + 2 * d[0] - trace, xy, xz], axis=-1),
+            np.stack([b, xy, 1 + 2 * d[1] - trace, yz], axis=-1),
+            np.stack([c, xz, yz, 1 + 2 * d[2] - trace], axis=-1),
+        ],
+        axis=-2,
+    )
+    longest = np.argmax(np.linalg.norm(copies, axis=-1), axis=-1)
+    best = np.take_along_axis(copies, longest[..., None, None], axis=-2)[..., 0, :]
+    unit = best / np.linalg.norm(best, axis=-1, keepdims=True)
+    out: Array = np.where(unit[..., :1] < 0, -unit, unit)
+    return out
+
+
+def rotation_angle(first: ArrayLike, second: ArrayLike) -> Array:
+    """Angle (...) between two sets of (..., 3, 3) rotations, rad."""
+    relative = np.swapaxes(np.asarray(first, dtype=np.float64), -1, -2) @ np.asarray(second)
+    angle: Array = np.linalg.norm(log_rotation(relative), axis=-1)
+    return angle
+
+
+def z_to_axis(axis: ArrayLike) -> Array:
+    """The smallest rotation Q (3, 3) that turns z to `axis`: Q z = axis / |axis|.
+
+    For axis = -z it is not unique; the turn by π about x is taken. This is the rule by which
+    joint frames of any axis become frames turning about z, and back.
+
+    >>> z_to_axis([0, 0, -1]).diagonal().tolist()
+    [1.0, -1.0, -1.0]
+    """
+    u = np.asarray(axis, dtype=np.float64)
+    u = u / np.linalg.norm(u)
+    sine = float(np.hypot(u[0], u[1]))
+    if sine == 0.0:
+        return np.eye(3) if u[2] > 0 else np.diag([1.0, -1.0, -1.0])
+    k = skew([-u[1] / sine, u[0] / sine, 0.0])
+    out: Array = np.eye(3) + sine * k + (1.0 - u[2]) * (k @ k)
+    return out
+
+
+def matrix_from_rpy(rpy: ArrayLike) -> Array:
+    """URDF's fixed-axis roll, pitch, yaw (..., 3) as Rz(yaw) Ry(pitch) Rx(roll), (..., 3, 3)."""
+    a = np.asarray(rpy, dtype=np.float64)
+    product: Array = rot_z(a[..., 2]) @ rot_y(a[..., 1]) @ rot_x(a[..., 0])
+    return product
+
+
+def rpy_from_matrix(rotation: ArrayLike) -> Array:
+    """Roll, pitch in [-π/2, π/2] and yaw (..., 3) of (..., 3, 3) rotations.
+
+    Roll is read from what Rz(yaw) Ry(pitch) leaves over, which stays exact at pitch = ±π/2.
+    """
+    r = np.asarray(rotation, dtype=np.float64)
+    cosine = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    singular = cosine < EULER_SINGULAR_SINE
+    yaw = np.where(singular, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    pitch = np.arctan2(-r[..., 2, 0], np.where(singular, 0.0, cosine))
+    rest = np.swapaxes(rot_z(yaw) @ rot_y(pitch), -1, -2) @ r
+    roll = np.arctan2(rest[..., 2, 1], rest[..., 1, 1])
+    return np.stack([roll, pitch, yaw], axis=-1)
+
+
+def vector3(value: Any) -> Array:
+    """A (3,) float64 vector from anything array-like. Raises ValueError on another shape."""
+    v = np.asarray(value, dtype=np.float64)
+    if v.shape != (3,) or not np.all(np.isfinite(v)):
+        raise ValueError(f"expected 3 finite numbers, got {value!r}")
+    return v

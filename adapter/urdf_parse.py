@@ -1,0 +1,181 @@
+"""URDF text into links and joints as they are written, checked one by one.
+
+Read with xml.etree: the standard library is enough for the few elements that matter here.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.inertia import move_theta, tensor_from_six, theta_from_body
+from adapter.spatial import Array, matrix_from_rpy
+
+TURNING = ("revolute", "continuous")
+JOINT_TYPES = (*TURNING, "fixed", "prismatic", "planar", "floating")
+_SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """A joint as written: placement in the parent link's frame, axis in its own.
+
+    `limits` are [lower upper velocity effort], NaN where not given.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    rotation: Array
+    position: Array
+    axis: Array
+    limits: Array
+    mimic: bool
+
+
+@dataclass(frozen=True)
+class UrdfRobot:
+    """A file's content: θ (10,) of each link in its own frame, and the joints, as written."""
+
+    file: str
+    name: str
+    links: dict[str, Array]
+    joints: dict[str, UrdfJoint]
+
+
+def parse_urdf(text: str, file: str) -> UrdfRobot:
+    """Links and joints of a URDF; `file` is what errors call it.
+
+    Raises:
+        ModelError: naming the file, the element and what is wrong with it.
+    """
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise ModelError(f"{file}: not XML ({error})") from None
+    if root.tag != "robot":
+        raise ModelError(f"{file}: top element is <{root.tag}>, a URDF has <robot>")
+    links: dict[str, Array] = {}
+    for element in root.findall("link"):
+        name = _attribute(element, "name", file, "a <link>")
+        if name in links:
+            raise ModelError(f"{file}: link '{name}' appears twice")
+        links[name] = _link_theta(element, f"{file}: link '{name}'")
+    joints: dict[str, UrdfJoint] = {}
+    for element in root.findall("joint"):
+        joint = _joint(element, links, file)
+        if joint.name in joints:
+            raise ModelError(f"{file}: joint '{joint.name}' appears twice")
+        joints[joint.name] = joint
+    if not links:
+        raise ModelError(f"{file}: no <link> in it")
+    return UrdfRobot(file, root.get("name", "robot"), links, joints)
+
+
+def _attribute(element: ET.Element, key: str, file: str, what: str) -> str:
+    value = element.get(key)
+    if not value:
+        raise ModelError(f"{file}: {what} has no '{key}' attribute")
+    return value
+
+
+def _numbers(text: str, count: int, where: str) -> Array:
+    try:
+        values = np.array([float(part) for part in text.split()])
+    except ValueError:
+        raise ModelError(f"{where} must hold numbers, got '{text}'") from None
+    if len(values) != count or not np.all(np.isfinite(values)):
+        raise ModelError(f"{where} must hold {count} finite number(s), got '{text}'")
+    return values
+
+
+def _number(element: ET.Element, key: str, where: str) -> float:
+    value = element.get(key)
+    if value is None:
+        raise ModelError(f"{where} has no '{key}' in its <{element.tag}>")
+    return float(_numbers(value, 1, f"{where}, <{element.tag} {key}>")[0])
+
+
+def _origin(element: ET.Element, where: str) -> tuple[Array, Array]:
+    """Rotation (3, 3) and position (3,) of an <origin>; the identity where there is none."""
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    position = _numbers(origin.get("xyz", "0 0 0"), 3, f"{where}, <origin xyz>")
+    rpy = _numbers(origin.get("rpy", "0 0 0"), 3, f"{where}, <origin rpy>")
+    return matrix_from_rpy(rpy), position
+
+
+def _link_theta(element: ET.Element, where: str) -> Array:
+    """θ (10,) of a link about its own frame; zeros without <inertial>."""
+    inertial = element.find("inertial")
+    if inertial is None:
+        return np.zeros(10)
+    mass, tensor = inertial.find("mass"), inertial.find("inertia")
+    if mass is None or tensor is None:
+        missing = "mass" if mass is None else "inertia"
+        raise ModelError(f"{where} has an <inertial> without <{missing}>")
+    kilograms = _number(mass, "value", where)
+    if kilograms < 0:
+        raise ModelError(f"{where} has a negative mass of {kilograms} kg")
+    about_com = tensor_from_six([_number(tensor, key, where) for key in _SIX])
+    rotation, com = _origin(inertial, where)
+    return move_theta(theta_from_body(kilograms, np.zeros(3), about_com), rotation, com)
+
+
+def _joint(element: ET.Element, links: dict[str, Array], file: str) -> UrdfJoint:
+    name = _attribute(element, "name", file, "a <joint>")
+    where = f"{file}: joint '{name}'"
+    kind = _attribute(element, "type", file, f"joint '{name}'")
+    if kind not in JOINT_TYPES:
+        raise ModelError(f"{where} is of type '{kind}'; have: {', '.join(JOINT_TYPES)}")
+    ends = {}
+    for end in ("parent", "child"):
+        found = element.find(end)
+        link = None if found is None else found.get("link")
+        if not link:
+            raise ModelError(f"{where} has no <{end} link=...>")
+        if link not in links:
+            raise ModelError(f"{where} names {end} '{link}'; have links: {', '.join(links)}")
+        ends[end] = link
+    rotation, position = _origin(element, where)
+    axis = _axis(element, where) if kind in TURNING else np.array([1.0, 0.0, 0.0])
+    return UrdfJoint(
+        name, kind, ends["parent"], ends["child"], rotation, position, axis,
+        _limits(element, kind, where), element.find("mimic") is not None,
+    )  # fmt: skip
+
+
+def _axis(element: ET.Element, where: str) -> Array:
+    """The unit axis (3,); URDF's default is x."""
+    found = element.find("axis")
+    if found is None:
+        return np.array([1.0, 0.0, 0.0])
+    value = _attribute(found, "xyz", where, "its <axis>")
+    axis = _numbers(value, 3, f"{where}, <axis xyz>")
+    length = float(np.linalg.norm(axis))
+    if length == 0.0:
+        raise ModelError(f"{where} has an axis of length zero")
+    # An axis that is a unit vector already keeps its digits.
+    return axis if abs(length - 1.0) < 1e-15 else axis / length
+
+
+def _limits(element: ET.Element, kind: str, where: str) -> Array:
+    found = element.find("limit")
+    out = np.full(4, math.nan)
+    if found is None:
+        return out
+    # A continuous joint has no position limits, whatever its file says.
+    keys = (
+        ("velocity", "effort") if kind == "continuous" else ("lower", "upper", "velocity", "effort")
+    )
+    for key in keys:
+        if found.get(key) is not None:
+            place = ("lower", "upper", "velocity", "effort").index(key)
+            out[place] = _number(found, key, where)
+    return out
