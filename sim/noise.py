@@ -1,0 +1,209 @@
+"""What the sensors add: noise like that of a real Panda's log, quantisation, lost samples.
+
+The noise of sample k depends on the seed and on k alone: each signal has its own stream of
+random numbers, drawn ahead in blocks of fixed length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import butter, sosfilt, sosfreqz
+
+from drivers.interface import JointSample, LinkMotion
+from sim.truth import Array, facts_of
+
+RATE_HZ = 1000.0
+HIGH_HZ = 50.0  # "above 50 Hz"
+BAND_HZ = (10.0, 40.0)
+BLOCK = 16  # samples drawn at once: dear enough one by one, a hitch in the loop if many
+TAPS = 256  # samples after which the band filter has forgotten an input but for 2e-4
+MAX_JITTER = 0.45  # of a period: stamps stay in order
+
+Draw = Callable[[np.random.Generator], Array]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseLevels:
+    """Sizes of what the sensors add; scalars or one value per joint.
+
+    Attributes:
+        tau_above_50hz: torque noise above 50 Hz, N m rms; white over all frequencies.
+        tau_10_to_40hz: torque noise between 10 and 40 Hz, share of the white noise included.
+        tau_step: quantisation of the torque, N m; 0 for none.
+        dq_above_50hz: velocity noise above 50 Hz, rad/s rms; white.
+        q_above_50hz: position noise above 50 Hz, rad rms; white.
+        link_twist: white noise on link twists, m/s and rad/s rms.
+        link_accel: white noise on link accelerations, m/s² and rad/s² rms.
+        dropouts: share of samples that never arrive.
+        repeats: share of samples that carry the values of the one before.
+        stamp_jitter_s: error of the stamp (not of the instant), s rms, cut at 0.45 periods.
+    """
+
+    tau_above_50hz: float | list[float] = 0.0
+    tau_10_to_40hz: float | list[float] = 0.0
+    tau_step: float | list[float] = 0.0
+    dq_above_50hz: float | list[float] = 0.0
+    q_above_50hz: float | list[float] = 0.0
+    link_twist: float = 0.0
+    link_accel: float = 0.0
+    dropouts: float = 0.0
+    repeats: float = 0.0
+    stamp_jitter_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            if not np.all(np.asarray(getattr(self, item.name)) >= 0.0):
+                raise ValueError(f"noise {item.name!r} is negative or not a number")
+        if self.dropouts >= 1.0:
+            raise ValueError(f"noise 'dropouts' is {self.dropouts}; have: below 1")
+
+    @property
+    def twist_and_accel(self) -> Array:
+        """(2, 1): the link noise as it scales rows of twist and acceleration."""
+        return np.array([[self.link_twist], [self.link_accel]])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers for a truth file."""
+        return asdict(self)
+
+
+def levels_of(name: str, **changes: float) -> NoiseLevels:
+    """Noise levels by name: `real` (a Panda's log) or `none`, with some of them changed.
+
+    Raises:
+        ValueError: unknown name or unknown level; the message has the choices.
+    """
+    if name not in ("real", "none"):
+        raise ValueError(f"no noise {name!r}; have: real, none")
+    known = {item.name for item in fields(NoiseLevels)}
+    for key in changes.keys() - known:
+        raise ValueError(f"no noise level {key!r}; have: {', '.join(sorted(known))}")
+    base = NoiseLevels() if name == "none" else NoiseLevels(**facts_of("panda")["noise"])
+    return replace(base, **changes)
+
+
+class SensorNoise:
+    """Turns the clean sample number k = 0, 1, 2, ... into what arrives of it."""
+
+    def __init__(self, levels: NoiseLevels, n: int, seed: int) -> None:
+        self._levels = levels
+        sizes = levels.twist_and_accel
+        draws: list[Draw] = [
+            _JointNoise(levels, n),
+            lambda rng: sizes * rng.standard_normal((BLOCK, n, 2, 6)),
+            lambda rng: rng.random((BLOCK, 2)),
+            lambda rng: levels.stamp_jitter_s * rng.standard_normal(BLOCK),
+        ]
+        streams = [_Stream(draw, np.random.default_rng([seed, i])) for i, draw in enumerate(draws)]
+        self._joints, self._links, self._fate, self._jitter = streams
+        self._step = np.broadcast_to(np.asarray(levels.tau_step, dtype=float), n)
+        self._quantised = self._step > 0
+        self._last: JointSample | None = None
+
+    def measure(self, k: int, clean: JointSample) -> JointSample | None:
+        """Sample k as it arrives, None where it is lost. To be called for every k in order."""
+        sample = self._noisy(k, clean)
+        if self._levels.repeats or self._levels.dropouts:
+            lost, repeated = self._fate.at(k)
+            if self._last is not None and repeated < self._levels.repeats:
+                sample = replace(self._last, stamp_ns=sample.stamp_ns)
+            self._last = sample
+            return None if lost < self._levels.dropouts else sample
+        return sample
+
+    def _noisy(self, k: int, clean: JointSample) -> JointSample:
+        tau, dq, q = self._joints.at(k)
+        tau = clean.tau + tau
+        on = self._quantised
+        tau[on] = np.round(tau[on] / self._step[on]) * self._step[on]
+        links = clean.links
+        if links is not None:
+            extra = self._links.at(k)
+            links = LinkMotion(links.twist + extra[:, 0], links.accel + extra[:, 1])
+        stamp_ns = clean.stamp_ns
+        if self._levels.stamp_jitter_s:
+            edge = MAX_JITTER / RATE_HZ
+            stamp_ns += round(min(max(float(self._jitter.at(k)), -edge), edge) * 1e9)
+        return JointSample(stamp_ns, clean.q + q, clean.dq + dq, tau, links)
+
+
+class _Stream:
+    """One source of noise, row k for sample k, drawn in blocks."""
+
+    def __init__(self, draw: Draw, rng: np.random.Generator) -> None:
+        self._draw, self._rng = draw, rng
+        self._block, self._number = np.empty(0), -1
+
+    def at(self, k: int) -> Any:
+        while self._number < k // BLOCK:
+            self._block, self._number = self._draw(self._rng), self._number + 1
+        return self._block[k % BLOCK]
+
+
+class _JointNoise:
+    """Draws (BLOCK, 3, n) noise of tau, dq and q."""
+
+    def __init__(self, levels: NoiseLevels, n: int) -> None:
+        white, band = _torque_parts(levels)
+        whole = 1 / np.sqrt(_share_above())
+        dq, q = (whole * np.asarray(x) for x in (levels.dq_above_50hz, levels.q_above_50hz))
+        self._white = np.stack([np.broadcast_to(x, n) for x in (white, dq, q)])
+        self._band = _Band(np.broadcast_to(band, n))
+
+    def __call__(self, rng: np.random.Generator) -> Array:
+        block = self._white * rng.standard_normal((BLOCK, *self._white.shape))
+        block[:, 0] += self._band(rng)
+        return block
+
+
+class _Band:
+    """Gaussian noise between 10 and 40 Hz: white noise times a gain (n,), band-passed.
+
+    The filter is applied as a product of a block's inputs and their past with the shifted
+    impulse responses, which takes a tenth of the time of a recursive filter's call.
+    """
+
+    def __init__(self, gain: Array) -> None:
+        self._gain = gain
+        pulse = np.zeros(TAPS)
+        pulse[0] = 1.0
+        response = sosfilt(_band_filter(), pulse)[::-1]
+        self._rows = np.zeros((BLOCK, TAPS - 1 + BLOCK))
+        for i, row in enumerate(self._rows):
+            row[i : i + TAPS] = response
+        self._past: Array | None = None
+
+    def __call__(self, rng: np.random.Generator) -> Array:
+        if self._past is None:
+            self._past = rng.standard_normal((TAPS - 1, len(self._gain)))
+        inputs = np.concatenate((self._past, rng.standard_normal((BLOCK, len(self._gain)))))
+        self._past = inputs[BLOCK:]
+        return self._gain * (self._rows @ inputs)
+
+
+def _band_filter() -> Array:
+    return butter(2, BAND_HZ, btype="bandpass", fs=RATE_HZ, output="sos")
+
+
+def _share_above() -> float:
+    """Share of white noise's power above 50 Hz: 0.9."""
+    return 1.0 - HIGH_HZ / (RATE_HZ / 2)
+
+
+def _torque_parts(levels: NoiseLevels) -> tuple[Array, Array]:
+    """Rms of the white noise and gain of the band noise that add up to the levels.
+
+    Both parts have power in both bands: the white one between 10 and 40 Hz, the band one in its
+    skirts above 50 Hz. Two linear equations in the two powers.
+    """
+    f, response = sosfreqz(_band_filter(), worN=1 << 14, fs=RATE_HZ)
+    power = np.abs(response) ** 2 / len(f)
+    high, inside = f >= HIGH_HZ, (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
+    shares = np.array([[high.mean(), power[high].sum()], [inside.mean(), power[inside].sum()]])
+    wanted = np.square(np.broadcast_arrays(levels.tau_above_50hz, levels.tau_10_to_40hz))
+    white, band = np.linalg.solve(shares, wanted.reshape(2, -1))
+    return np.sqrt(np.maximum(white, 0.0)), np.sqrt(np.maximum(band, 0.0))

@@ -1,0 +1,195 @@
+"""A simulated arm: torques in, samples of a sensor-bearing arm out, 1 ms apart."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from drivers.interface import DriverError, JointSample
+from sim.engine import PERIOD_S, Engine
+from sim.links import link_motion
+from sim.noise import NoiseLevels, SensorNoise, levels_of
+from sim.truth import Array, Truth
+
+PERIOD_NS = round(PERIOD_S * 1e9)
+REFRESH_TICKS = 20  # a command counts for 20 ms of plant time, then the brakes close
+BRAKE_TIME_S = 0.02  # below the full deceleration, speed dies away with this time constant
+LOCK_BELOW = 0.01  # rad/s, a slower joint is held where it is
+LOCK_RATE = 60.0  # 1/s, the critically damped hold
+
+
+class Plant:
+    """A simulated arm with sensors, brakes and a limit on its torques.
+
+    The driving torque goes linearly from one command to the next over a tick, so that it is
+    continuous and equals the command at the end of the tick. A sample holds q, dq, the driving
+    torque plus sensor offset, and link motion of one and the same instant.
+
+    Until the first command, after `stop`, 20 ms after the last command and after a fault the
+    brakes act: full deceleration, then a hold. A brake is part of the drive, so its torque is
+    what the sensor reads; it is not bound by the effort limits. A command opens the brakes
+    unless there is a fault: a joint that left its range or exceeded its speed limit.
+
+    Attributes:
+        saturated: the last command asked for more than an effort limit and was cut.
+        braked: the brakes act.
+        fault: why the arm refuses commands, or None.
+        compute_ns: time the last `read` took here; on a real arm it would pass in hardware.
+    """
+
+    def __init__(
+        self,
+        truth: Truth,
+        seed: int = 0,
+        noise: NoiseLevels | None = None,
+        links: bool = False,
+        q0: Array | None = None,
+    ) -> None:
+        """Set up the arm at rest at t = 0.
+
+        Args:
+            truth: the arm.
+            seed: of the noise.
+            noise: what the sensors add; a real Panda's by default.
+            links: whether the links' motion is measured.
+            q0: (n,) posture at the start, rad; the truth's by default.
+        """
+        order = sorted(truth.events, key=lambda event: event.t_s)
+        self.truth = truth = truth.with_changes(events=tuple(order))
+        self.saturated, self.braked = False, True
+        self.fault: str | None = None
+        self.compute_ns = 0
+        self._links = links
+        self._engine = Engine(truth)
+        self._noise = SensorNoise(noise or levels_of("real"), truth.n, seed)
+        self._carried = 0
+        self._q = np.array(truth.ready if q0 is None else q0, dtype=float)
+        self._dq = np.zeros(truth.n)
+        self._engine.place(self._q, self._dq)
+        self._drive = self._engine.drive_for(self._q, self._dq, np.zeros(truth.n))
+        self._wanted = self._drive
+        self._age = 0
+        self._lock, self._moving = self._q.copy(), np.zeros(truth.n, dtype=bool)
+        self._k = -1
+        self._clean: JointSample | None = None
+        self._observe()  # what is compiled on first use is compiled before the clock runs
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of every array."""
+        return self.truth.joint_names
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of the moving links, in the order of every array."""
+        return self.truth.link_names
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two samples, ns."""
+        return PERIOD_NS
+
+    def read(self) -> JointSample:
+        """Move on by one period and say what arrives; the first call is t = 0, before any motion.
+
+        Where samples get lost the arm has moved on by more than a period.
+        """
+        begun = time.perf_counter_ns()
+        sample = None
+        while sample is None:
+            self._advance()
+            self._clean = self._observe()
+            sample = self._noise.measure(self._k, self._clean)
+        self.compute_ns = time.perf_counter_ns() - begun
+        return sample
+
+    def clean(self) -> JointSample:
+        """What the last `read` would have said with perfect sensors and a perfect clock."""
+        return self._observe() if self._clean is None else self._clean
+
+    def ddq(self) -> Array:
+        """True joint acceleration (n,) at the last sample, rad/s²."""
+        return self._engine.acceleration(self._q, self._dq, self._drive)
+
+    def command(self, tau: Array) -> None:
+        """Drive with these torques (n,) N m from here on, reached at the end of the next period.
+
+        Raises:
+            DriverError: not n finite numbers, or the arm has a fault.
+        """
+        wanted = np.asarray(tau, dtype=float)
+        if wanted.shape != (self.truth.n,) or not np.isfinite(wanted).all():
+            raise DriverError(f"command {tau!r}: have to be {self.truth.n} finite torques in N m")
+        if self.fault is not None:
+            raise DriverError(f"the arm is braked: {self.fault}")
+        effort = self.truth.limits.effort
+        self._wanted = np.minimum(np.maximum(wanted, -effort), effort)
+        self.saturated = bool((np.abs(wanted) > effort).any())
+        self.braked, self._age = False, 0
+
+    def stop(self) -> None:
+        """Close the brakes."""
+        if not self.braked:
+            self.braked, self._moving = True, np.ones(self.truth.n, dtype=bool)
+
+    def close(self) -> None:
+        """Free the simulator; may be called more than once."""
+        self._engine.close()
+
+    def _advance(self) -> None:
+        """One tick, but for the first sample, which is the start itself."""
+        self._k += 1
+        if self._k == 0:
+            return
+        self._handle_events()
+        self._age += 1
+        if self._age > REFRESH_TICKS:
+            self.stop()
+        end = self._brake() if self.braked else self._wanted
+        self._engine.tick(self._drive, end)
+        self._drive = end
+        self._q, self._dq = self._engine.state()
+        self._watch()
+
+    def _handle_events(self) -> None:
+        """Payloads whose time the last sample has reached act from here on."""
+        if self._carried == len(self.truth.events):
+            return
+        now_s = (self._k - 1) * PERIOD_S
+        due = sum(event.t_s <= now_s + PERIOD_S / 2 for event in self.truth.events)
+        if due > self._carried:
+            self._engine.carry(due)
+            self._carried = due
+
+    def _brake(self) -> Array:
+        """Driving torque (n,) at the end of the next tick that slows down and then holds."""
+        stopped = self._moving & (np.abs(self._dq) < LOCK_BELOW)
+        self._lock[stopped] = self._q[stopped]
+        self._moving &= ~stopped
+        most = self.truth.limits.acceleration
+        slow = np.clip(-self._dq / BRAKE_TIME_S, -most, most)
+        hold = LOCK_RATE**2 * (self._lock - self._q) - 2 * LOCK_RATE * self._dq
+        return self._engine.drive_for(self._q, self._dq, np.where(self._moving, slow, hold))
+
+    def _watch(self) -> None:
+        """Brake for good when a joint leaves its range or is too fast."""
+        limits, q, dq = self.truth.limits, self._q, self._dq
+        outside = (q < limits.lower) | (q > limits.upper)
+        wrong = outside | (np.abs(dq) > limits.velocity)
+        if self.fault is None and wrong.any():
+            j = int(np.argmax(wrong))
+            what = "left its range" if outside[j] else "exceeded its speed limit"
+            at = f"q {q[j]:.3f} rad, dq {dq[j]:.3f} rad/s"
+            self.fault = f"{self.joint_names[j]} {what} ({at})"
+            self.stop()
+
+    def _observe(self) -> JointSample:
+        """The present instant, without noise."""
+        return JointSample(
+            stamp_ns=max(self._k, 0) * PERIOD_NS,
+            q=self._q,
+            dq=self._dq,
+            tau=self._drive + self.truth.torque_offset,
+            links=link_motion(self.truth, self._q, self._dq, self.ddq()) if self._links else None,
+        )

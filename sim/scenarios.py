@@ -1,0 +1,163 @@
+"""Scenarios: a truth, what the sensors add and what they measure, by name and seed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.noise import NoiseLevels, levels_of
+from sim.plant import Plant
+from sim.truth import Array, Payload, Truth, facts_of, panda, turn
+
+FORMAT, VERSION = "panda-adapter/truth", 1
+TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
+FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
+BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
+STAND_OFF_M = 0.05  # m, its centre is so far off the flange ...
+SIDE_STEP_M = 0.02  # m, ... and so far from the axis of joint 7
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """A simulated arm as it is started.
+
+    Attributes:
+        name: of the scenario.
+        seed: decides truth and noise.
+        truth: the arm.
+        noise: what the sensors add.
+        links: whether link motion is measured.
+    """
+
+    name: str
+    seed: int
+    truth: Truth
+    noise: NoiseLevels
+    links: bool
+
+    def plant(self, q0: Array | None = None) -> Plant:
+        """A fresh arm at t = 0, at rest at q0 (n,) rad or at the truth's own posture."""
+        return Plant(self.truth, self.seed, self.noise, self.links, q0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a truth file holds."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "scenario": self.name,
+            "seed": self.seed,
+            **self.truth.as_dict(),
+            "links_measured": self.links,
+            "noise": self.noise.as_dict(),
+        }
+
+    def write_truth(self, path: Path | str) -> None:
+        """Write the truth as JSON."""
+        Path(path).write_text(json.dumps(self.as_dict(), indent=1) + "\n", "utf-8")
+
+
+def nominal(rng: np.random.Generator) -> Truth:
+    """The documented arm."""
+    return panda()
+
+
+def bent_link(rng: np.random.Generator, angle_deg: float = 5.0, offset_m: float = 0.02) -> Truth:
+    """Every joint frame turned by up to `angle_deg` and shifted by up to `offset_m`."""
+    arm = panda()
+    angles = np.radians(angle_deg) * rng.random(arm.n)
+    lengths = offset_m * rng.random(arm.n)
+    turns = np.array([_turn_about(_direction(rng), angle) for angle in angles])
+    shifts = np.array([length * _direction(rng) for length in lengths])
+    return arm.with_changes(R=arm.R @ turns, p=arm.p + shifts)
+
+
+def payload_at_20s(rng: np.random.Generator, mass: float = 1.0, t_s: float = 20.0) -> Truth:
+    """A ball of `mass` kg at the flange after `t_s`."""
+    com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
+    ball = Payload(t_s, mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3))
+    return panda().with_changes(events=(ball,))
+
+
+def friction(rng: np.random.Generator) -> Truth:
+    """The documented arm with the friction published for it."""
+    losses = facts_of("panda")["friction"]
+    return panda().with_changes(Fv=np.array(losses["Fv"]), Fc=np.array(losses["Fc"]))
+
+
+def wall_mounted(rng: np.random.Generator) -> Truth:
+    """The documented arm on a wall: the base's z axis is level, its x axis points down."""
+    arm = panda()
+    return arm.with_changes(gravity=turn(1, np.pi / 2).T @ arm.gravity)
+
+
+# Name -> how its truth is drawn, whether link motion is measured.
+SCENARIOS: dict[str, tuple[Callable[..., Truth], bool]] = {
+    "nominal": (nominal, False),
+    "bent_link": (bent_link, True),
+    "payload_at_20s": (payload_at_20s, False),
+    "friction": (friction, False),
+    "wall_mounted": (wall_mounted, False),
+}
+OPTIONS = {"bent_link": ("angle_deg", "offset_m"), "payload_at_20s": ("mass", "t_s")}
+COMMON_OPTIONS = ("noise", "links", "levels")
+
+
+def build(name: str, seed: int = 0, **options: Any) -> Scenario:
+    """A scenario by name.
+
+    Args:
+        name: one of `SCENARIOS`.
+        seed: decides truth and noise.
+        options: `noise` ("real" or "none"), `links` (bool: measure link motion or not), `levels`
+            (a mapping of single noise levels to change, see `NoiseLevels`), and those of the
+            scenario: `angle_deg`, `offset_m` of bent_link, `mass` (kg), `t_s` of payload_at_20s.
+
+    Raises:
+        ValueError: unknown name, option or level, or a value out of range; with the choices.
+    """
+    if name not in SCENARIOS:
+        raise ValueError(f"no scenario {name!r}; have: {', '.join(SCENARIOS)}")
+    own = OPTIONS.get(name, ())
+    for key in options.keys() - {*own, *COMMON_OPTIONS}:
+        raise ValueError(f"{name} has no option {key!r}; have: {', '.join(own + COMMON_OPTIONS)}")
+    numbers = {key: _size(name, key, options[key]) for key in own if key in options}
+    draw, measured = SCENARIOS[name]
+    links = options.get("links", measured)
+    if not isinstance(links, bool):
+        raise ValueError(f"{name}: links is {links!r}; have: True, False")
+    return Scenario(
+        name,
+        seed,
+        draw(np.random.default_rng([seed, TRUTH_STREAM]), **numbers),
+        levels_of(options.get("noise", "real"), **options.get("levels", {})),
+        links,
+    )
+
+
+def _size(name: str, key: str, value: Any) -> float:
+    """An option's value as a number from 0 up. Raises ValueError for anything else."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = -1.0
+    if not 0.0 <= number < np.inf:
+        raise ValueError(f"{name}: {key} is {value!r}; have: numbers from 0 up")
+    return number
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    """A unit vector, all directions alike."""
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def _turn_about(axis: Array, angle: float) -> Array:
+    """Rotation matrix by `angle` (rad) about a unit vector (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K

@@ -1,0 +1,209 @@
+"""What is true of a simulated arm: the numbers that a learner is to find, and their file."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Joint limits, (n,) each: rad, rad, rad/s, N m, rad/s²."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    effort: Array
+    acceleration: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """A rigid body that the last link carries in every instant after `t_s`.
+
+    It is taken over in motion: the joint velocities do not jump and the body arrives with the
+    velocity of the link, so that from then on only more force is needed to move it.
+
+    Attributes:
+        t_s: when, seconds of plant time.
+        m: mass, kg.
+        com: (3,) centre of mass in the frame of the last link, m.
+        inertia: (3, 3) about the centre of mass, axes of the last link, kg m².
+    """
+
+    t_s: float
+    m: float
+    com: Array
+    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The event as it stands in a truth file (keys: effect catalogue, `payload`)."""
+        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia.tolist()
+        cx, cy, cz = self.com.tolist()
+        return {
+            "t_s": self.t_s,
+            "effect": "payload",
+            "m": self.m,
+            "cx": cx,
+            "cy": cy,
+            "cz": cz,
+            "inertia": [xx, xy, xz, yy, yz, zz],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Everything that decides how a simulated serial arm moves.
+
+    The torque of a sample is that of the driving side, friction and offset included:
+    `tau = tau_rigid + motor_inertia ddq + Fv dq + Fc tanh(dq / 0.01 rad/s) + torque_offset`.
+
+    Attributes:
+        joint_names: n names.
+        link_names: n names, link j moves with joint j.
+        R: (n, 3, 3) orientation of joint frame j in the frame of joint j - 1 at q_j = 0; axis z.
+        p: (n, 3) its position there, m.
+        theta: (n, 10) [m mX mY mZ XX XY XZ YY YZ ZZ] about the link-frame origin, SI.
+        limits: of the joints.
+        gravity: (3,) acceleration of gravity in the base frame, m/s².
+        ready: (n,) posture at the start, rad.
+        Fv: (n,) viscous friction, N m s/rad.
+        Fc: (n,) Coulomb friction, N m.
+        torque_offset: (n,) what the torque sensor adds, N m.
+        motor_inertia: (n,) reflected inertia of the drive, kg m².
+        events: what changes while the arm runs.
+    """
+
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    R: Array
+    p: Array
+    theta: Array
+    limits: Limits
+    gravity: Array
+    ready: Array
+    Fv: Array
+    Fc: Array
+    torque_offset: Array
+    motor_inertia: Array
+    events: tuple[Payload, ...] = ()
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joint_names)
+
+    @property
+    def lam(self) -> Array:
+        """λ (n, 6): [α β γ p], R = Rz(α) Rx(β) Rz(γ), rad and m."""
+        return np.array([[*zxz_angles(R), *p] for R, p in zip(self.R, self.p, strict=True)])
+
+    def with_changes(self, **changes: Any) -> Truth:
+        """A copy with some attributes replaced."""
+        return replace(self, **changes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The truth as plain numbers, keys as in a truth file."""
+        return {
+            "joints": list(self.joint_names),
+            "links": list(self.link_names),
+            "lambda": self.lam.tolist(),
+            "theta": self.theta.tolist(),
+            "gravity": self.gravity.tolist(),
+            "friction": {"Fv": self.Fv.tolist(), "Fc": self.Fc.tolist()},
+            "torque_offset": self.torque_offset.tolist(),
+            "motor_inertia": self.motor_inertia.tolist(),
+            "events": [event.as_dict() for event in self.events],
+        }
+
+
+def panda() -> Truth:
+    """The Panda as documented, with the inertias of Gaz et al. 2019 and without friction."""
+    facts = facts_of("panda")
+    joints = facts["joint"]
+    zero = np.zeros(len(joints))
+    return Truth(
+        joint_names=tuple(j["name"] for j in joints),
+        link_names=tuple(j["link"] for j in joints),
+        R=np.array([from_rpy(j["rpy"]) for j in joints]),
+        p=np.array([j["xyz"] for j in joints]),
+        theta=np.array([_theta(j["mass"], j["com"], j["inertia"]) for j in joints]),
+        limits=Limits(*(np.array([j[k] for j in joints]) for k in Limits.__slots__)),
+        gravity=np.array(facts["robot"]["gravity"]),
+        ready=np.array(facts["robot"]["ready"]),
+        Fv=zero,
+        Fc=zero,
+        torque_offset=zero,
+        motor_inertia=zero,
+    )
+
+
+def facts_of(robot: str) -> dict[str, Any]:
+    """The data file of a robot in `sim/models`."""
+    return tomllib.loads((resources.files("sim") / "models" / f"{robot}.toml").read_text("utf-8"))
+
+
+def body_of(theta: Array) -> tuple[float, Array, Array]:
+    """Mass, centre (3,) and inertia (3, 3) about the centre, from (10,) about the origin."""
+    m, *first, xx, xy, xz, yy, yz, zz = theta.tolist()
+    c = np.array(first) / m
+    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return m, c, about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))
+
+
+def _theta(m: float, com: list[float], inertia: list[float]) -> Array:
+    """(10,) about the frame's origin, from mass, centre and inertia about the centre."""
+    c = np.array(com)
+    shift = m * (c @ c * np.eye(3) - np.outer(c, c))
+    return np.array([m, *(m * c), *(np.array(inertia) + shift[np.triu_indices(3)])])
+
+
+def turn(axis: int, angle: float) -> Array:
+    """Rotation by `angle` (rad) about coordinate axis 0, 1 or 2."""
+    R = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[i, i] = R[j, j] = np.cos(angle)
+    R[j, i] = np.sin(angle)
+    R[i, j] = -R[j, i]
+    return R
+
+
+def from_rpy(rpy: list[float]) -> Array:
+    """Rotation matrix of URDF's roll, pitch, yaw (rad): turns about fixed x, then y, then z."""
+    return turn(2, rpy[2]) @ turn(1, rpy[1]) @ turn(0, rpy[0])
+
+
+def to_rpy(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw (rad) of a rotation matrix; yaw is 0 where pitch is ±90°."""
+    flat = np.hypot(R[0, 0], R[1, 0])
+    pitch = float(np.arctan2(-R[2, 0], flat))
+    if flat < BETA_IS_ZERO:
+        return float(np.arctan2(-R[1, 2], R[1, 1])), pitch, 0.0
+    roll, yaw = np.arctan2(R[2, 1], R[2, 2]), np.arctan2(R[1, 0], R[0, 0])
+    return float(roll), pitch, float(yaw)
+
+
+def zxz_angles(R: Array) -> tuple[float, float, float]:
+    """Angles α, β, γ (rad) of R = Rz(α) Rx(β) Rz(γ).
+
+    Of the two triples that exist the one with the smaller |α| + |γ| is taken; at β = 0 or π,
+    where only α + γ or α - γ exists, γ = 0.
+    """
+    sin_beta = float(np.hypot(R[0, 2], R[1, 2]))
+    beta = float(np.arctan2(sin_beta, R[2, 2]))
+    if sin_beta < BETA_IS_ZERO:
+        return float(np.arctan2(R[1, 0], R[0, 0])), beta, 0.0
+    first = np.array([np.arctan2(R[0, 2], -R[1, 2]), np.arctan2(R[2, 0], R[2, 1])])
+    second = first - np.pi * np.where(first > 0, 1.0, -1.0)
+    if np.abs(second).sum() < np.abs(first).sum():
+        return float(second[0]), -beta, float(second[1])
+    return float(first[0]), beta, float(first[1])

@@ -1,0 +1,76 @@
+"""A truth written as URDF text, in the form that PyBullet reads without loss.
+
+PyBullet keeps only the diagonal of an inertia tensor, so every inertial frame is turned into
+the principal axes of its body. Joints are `continuous`: PyBullet's own joint stops would push
+through its constraint solver; the plant watches the ranges itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sim.truth import Array, Payload, Truth, body_of, to_rpy
+
+
+def urdf(truth: Truth, carried: int = 0) -> str:
+    """URDF of the arm with a fixed link for each payload.
+
+    Args:
+        truth: the arm.
+        carried: how many of its payload events are in force; the others' links weigh nothing.
+    """
+    parts = ['<robot name="arm">', _link("base", 1.0, np.zeros(3), np.eye(3))]
+    parent = "base"
+    for j, name in enumerate(truth.link_names):
+        parts.append(_link(name, *body_of(truth.theta[j])))
+        parts.append(_joint(truth.joint_names[j], parent, name, truth.p[j], truth.R[j]))
+        parent = name
+    for k, event in enumerate(truth.events):
+        moments, axes = principal(event.inertia)
+        weighs = float(k < carried)
+        body = weighs * event.m, np.zeros(3), weighs * np.diag(moments)
+        parts.append(_link(payload_link(k), *body))
+        parts.append(_joint(f"hold_{k}", parent, payload_link(k), event.com, axes, "fixed"))
+    return "\n".join([*parts, "</robot>"])
+
+
+def payload_link(k: int) -> str:
+    """Name of the link that stands for payload event k."""
+    return f"payload_{k}"
+
+
+def payload_moments(event: Payload) -> list[float]:
+    """Principal moments of a payload in the axes that `urdf` gave its link, kg m²."""
+    return principal(event.inertia)[0].tolist()
+
+
+def principal(inertia: Array) -> tuple[Array, Array]:
+    """Principal moments (3,) and the right-handed axes (3, 3), one per column."""
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 2] *= -1
+    return moments, axes
+
+
+def _numbers(values: Array | tuple[float, ...]) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _origin(p: Array, R: Array) -> str:
+    return f'<origin xyz="{_numbers(p)}" rpy="{_numbers(to_rpy(R))}"/>'
+
+
+def _link(name: str, m: float, com: Array, inertia: Array) -> str:
+    (xx, yy, zz), axes = principal(inertia)
+    return (
+        f'<link name="{name}"><inertial>{_origin(com, axes)}<mass value="{m!r}"/>'
+        f'<inertia ixx="{float(xx)!r}" iyy="{float(yy)!r}" izz="{float(zz)!r}"'
+        ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    )
+
+
+def _joint(name: str, parent: str, child: str, p: Array, R: Array, kind: str = "continuous") -> str:
+    return (
+        f'<joint name="{name}" type="{kind}">{_origin(p, R)}<parent link="{parent}"/>'
+        f'<child link="{child}"/><axis xyz="0 0 1"/></joint>'
+    )
