@@ -1,0 +1,18 @@
+"""Reflected rotor inertia ("armature"): tau = B ddq."""
+
+from __future__ import annotations
+
+from adapter.effects.base import Array
+
+
+class MotorInertia:
+    """Torque that speeds the joint's own rotor up, seen at the joint."""
+
+    name = "motor_inertia"
+    key = "B"
+    unit = "kg m2"
+    prior_std = 0.5
+
+    def column(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """ddq."""
+        return ddq

@@ -1,0 +1,205 @@
+"""The joint filter: q, dq, tau in; q, dq, ddq, tau of one and the same earlier instant out.
+
+Every signal x is modelled as [x, dx/dt] with white noise on the second derivative (filterpy's
+`Q_continuous_white_noise`); filterpy's KalmanFilter is run once to its steady state, and what
+is kept are the observer's poles. In steady state the estimated rate is s L(s) x with
+
+    L(s) = k2 / (s² + k1 s + k2),
+
+and the estimated level stepped back by d = k1 / k2 along that rate is exactly L(s) x. So q, dq
+and tau leave through L, and ddq as s L(s) dq: one transfer, one instant, d before the sample.
+
+The tick integrates L exactly between stamps (the signal taken as straight between two samples),
+so jitter, missing and dropped samples need no grid. All joints go through one call.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
+
+from adapter.errors import SettingsError
+from adapter.fast import jit
+
+Array = NDArray[np.float64]
+
+# Third differences of white noise have 1 + 9 + 9 + 1 times its variance; of arm motion, almost none.
+THIRD_DIFFERENCE_GAIN = 20.0
+
+SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """How the filter weighs noise against change.
+
+    Attributes:
+        bandwidth_hz: corner of L; used where `dq_drive` is not given. Real Pandas show a torque
+            oscillation of 10 to 40 Hz that no rigid model explains, so the default stays below.
+        dq_noise: standard deviation of one dq sample, rad/s; only the ratio to `dq_drive` matters.
+        dq_drive: white-noise intensity of dq's second derivative, rad/s³/√Hz; sets the gains
+            together with `dq_noise` instead of `bandwidth_hz`.
+        period_s: nominal sample period, s.
+    """
+
+    bandwidth_hz: float = 8.0
+    dq_noise: float = 5e-3
+    dq_drive: float | None = None
+    period_s: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("bandwidth_hz", "dq_noise", "period_s"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"filter.{name} must be above zero, got {getattr(self, name)}")
+        if self.dq_drive is not None and not self.dq_drive > 0.0:
+            raise SettingsError(f"filter.dq_drive must be above zero, got {self.dq_drive}")
+        if self.dq_drive is None and self.bandwidth_hz > 0.1 / self.period_s:
+            raise SettingsError(
+                f"filter.bandwidth_hz {self.bandwidth_hz} is above a tenth of the sample rate "
+                f"({0.1 / self.period_s:.0f} Hz)"
+            )
+
+
+def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
+    """(k1, k2) of L from filterpy's Kalman filter in its steady state, 1/s and 1/s²."""
+    period = settings.period_s
+    drive = settings.dq_drive
+    if drive is None:
+        # Kalman-Bucy: corner^4 = drive² / (noise² period)
+        drive = (2 * math.pi * settings.bandwidth_hz) ** 2 * settings.dq_noise * math.sqrt(period)
+    kalman = KalmanFilter(dim_x=2, dim_z=1)
+    kalman.F = np.array([[1.0, period], [0.0, 1.0]])
+    kalman.H = np.array([[1.0, 0.0]])
+    kalman.R = np.array([[settings.dq_noise**2]])
+    kalman.Q = Q_continuous_white_noise(2, dt=period, spectral_density=drive**2)
+    kalman.P = np.diag([settings.dq_noise**2, drive**2])
+    gain = np.full((2, 1), np.inf)
+    while not np.allclose(kalman.K, gain, rtol=1e-12, atol=0.0):
+        gain = kalman.K.copy()
+        kalman.predict()
+        kalman.update(np.zeros(1))
+    closed_loop = (np.eye(2) - kalman.K @ kalman.H) @ kalman.F
+    poles = np.log(np.linalg.eigvals(closed_loop).astype(complex)) / period
+    return float(-(poles[0] + poles[1]).real), float((poles[0] * poles[1]).real)
+
+
+@jit
+def advance(dt, k1, k2, u0, u1, y, dy):
+    """Advance y = L u and its rate dy over dt seconds while u goes straight from u0 to u1.
+
+    Written for L with complex poles (steady-state Kalman poles of this model always are).
+    """
+    decay = 0.5 * k1
+    omega = math.sqrt(k2 - decay * decay)
+    e = math.exp(-decay * dt)
+    c, s = math.cos(omega * dt), math.sin(omega * dt) / omega
+    f00, f01 = e * (c + decay * s), e * s
+    f10, f11 = -e * k2 * s, e * (c - decay * s)
+    lag = k1 / k2
+    for i in range(u0.shape[0]):
+        slope = (u1[i] - u0[i]) / dt
+        e0 = y[i] - (u0[i] - slope * lag)
+        e1 = dy[i] - slope
+        y[i] = u1[i] - slope * lag + f00 * e0 + f01 * e1
+        dy[i] = slope + f10 * e0 + f11 * e1
+
+
+NEVER = -(2**62)  # a stamp before all others
+
+
+@jit
+def filter_step(stamp_ns, signals, k1, k2, settle_ns, times, old, y, dy):
+    """Take one sample; whether the filter has settled since its last start.
+
+    Args:
+        signals: (c,) the sample; old: (c,) the one before, overwritten.
+        times: (2,) int64 stamps of the last sample (NEVER: start anew) and of the last start.
+        y, dy: (c,) L of the signals and its rate, at stamp - delay.
+    """
+    if times[0] == NEVER:
+        y[:] = signals
+        dy[:] = 0.0
+        times[1] = stamp_ns
+    else:
+        advance(1e-9 * (stamp_ns - times[0]), k1, k2, old, signals, y, dy)
+    old[:] = signals
+    times[0] = stamp_ns
+    return stamp_ns - times[1] >= settle_ns
+
+
+class JointFilter:
+    """All joints in one filter; see the module.
+
+    Attributes:
+        delay_s: age of the filtered instant against the sample, s, constant.
+        y, dy: (3 n,) filtered q, dq, tau and their rates.
+    """
+
+    def __init__(self, n: int, settings: FilterSettings | None = None) -> None:
+        self.n = n
+        self.settings = settings or FilterSettings()
+        self.k1, self.k2 = steady_state_poles(self.settings)
+        self.delay_s = self.k1 / self.k2
+        self.delay_ns = round(1e9 * self.delay_s)
+        self.settle_ns = SETTLING_DELAYS * self.delay_ns
+        self.old, self.y, self.dy = np.zeros(3 * n), np.zeros(3 * n), np.zeros(3 * n)
+        self.times = np.array([NEVER, NEVER])
+
+    @property
+    def noise_gain(self) -> float:
+        """Samples of white noise that one independent filtered sample is worth (ENBW)."""
+        bandwidth_hz = self.k2 / (4.0 * self.k1)  # equivalent noise bandwidth of L, one-sided
+        return 1.0 / (2.0 * bandwidth_hz * self.settings.period_s)
+
+    def reset(self) -> None:
+        """Forget everything; the next sample starts the filter anew, at rest on that sample."""
+        self.times[0] = NEVER
+
+    def step(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bool:
+        """Take one sample; returns whether the filter has settled since its last start.
+
+        The outputs are read from `q`, `dq`, `ddq`, `tau` and belong to stamp - delay_ns.
+        Stamps must increase; the caller has refused what does not.
+        """
+        u = np.concatenate([q, dq, tau])
+        return bool(
+            filter_step(
+                stamp_ns, u, self.k1, self.k2, self.settle_ns, self.times, self.old, self.y, self.dy
+            )
+        )
+
+    @property
+    def q(self) -> Array:
+        """(n,) rad."""
+        return self.y[: self.n]
+
+    @property
+    def dq(self) -> Array:
+        """(n,) rad/s."""
+        return self.y[self.n : 2 * self.n]
+
+    @property
+    def ddq(self) -> Array:
+        """(n,) rad/s²."""
+        return self.dy[self.n : 2 * self.n]
+
+    @property
+    def tau(self) -> Array:
+        """(n,) N m."""
+        return self.y[2 * self.n :]
+
+
+def noise_from_samples(x: Array) -> Array:
+    """White-noise level of each column of x (m, c), from its third differences.
+
+    Works in motion: what an arm does within three samples is far below its sensors' noise.
+    Raises SettingsError for fewer than eight samples.
+    """
+    if len(x) < 8:
+        raise SettingsError(f"a noise level needs at least 8 samples, got {len(x)}")
+    return np.sqrt(np.mean(np.diff(x, n=3, axis=0) ** 2, axis=0) / THIRD_DIFFERENCE_GAIN)

@@ -1,0 +1,276 @@
+"""Tables of joint signals from other tools, turned into a recording."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.import_spec import ALL, SIGNALS, UNITS, ImportSpec
+from adapter.tables import Table, read_npz, read_table
+from drivers.interface import Array, DriverError
+from drivers.mcap_file import McapWriter, derive_velocity, looks_like_degrees
+
+__all__ = ["ImportReport", "ImportSpec", "import_table"]
+
+_USUAL = {  # what signals are called where the user doesn't say
+    "time": ("time", "times", "t", "stamp", "timestamp"),
+    "q": ("q", "positions", "position", "q[0-9]*", "q_*", "position*"),
+    "dq": ("dq", "velocities", "velocity", "dq[0-9]*", "dq_*", "velocity*"),
+    "tau": ("tau", "torques", "efforts", "effort", "tau[0-9]*", "tau_*", "torque*", "effort*"),
+}
+_STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
+_MOVING = 1e-2  # rad/s, a median slope below it says nothing
+_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What was written."""
+
+    out: Path
+    samples: int
+    joint_names: tuple[str, ...]
+    duration_s: float
+    rate_hz: float
+    warnings: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"out": str(self.out)}
+
+
+def import_table(spec: ImportSpec, out: Path) -> ImportReport:
+    """Write a recording from tables; it appears under its name only when it is complete.
+
+    Raises:
+        DriverError: a file, column, signal or unit is missing or unreadable; the sentence names
+            file, line or column, and the choices.
+    """
+    warnings: list[str] = []
+    reader = _Reader(spec)
+    stamp_ns, q, dq, tau = _signals(reader, spec)
+    names = spec.joint_names or tuple(f"joint{i + 1}" for i in range(q.shape[1]))
+    if not spec.joint_names:
+        warnings.append(f"{out}: no joint names given; they are called {names[0]} to {names[-1]}")
+    where = str(reader.source("q"))
+    if dq is None:
+        dq = derive_velocity(stamp_ns, q)
+        warnings.append(f"{where}: no velocities; derived from the positions")
+    else:
+        warnings += _velocity_doubts(where, stamp_ns, q, dq)
+    warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
+    if out.exists() and not spec.overwrite:
+        raise DriverError(f"{out}: exists; choose another name or delete it")
+    _write(spec, out, names, (stamp_ns, q, dq, tau))
+    duration_s = float(np.ptp(stamp_ns)) * 1e-9
+    rate_hz = (len(q) - 1) / duration_s if duration_s > 0 else 0.0
+    return ImportReport(out, len(q), names, duration_s, rate_hz, warnings)
+
+
+def _write(
+    spec: ImportSpec,
+    out: Path,
+    names: tuple[str, ...],
+    signals: tuple[NDArray[np.int64], Array, Array, Array],
+) -> None:
+    try:
+        version = importlib.metadata.version("panda-adapter")
+    except importlib.metadata.PackageNotFoundError:
+        version = "unknown"
+    source = {
+        "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},
+        "columns": spec.columns,
+        "units": spec.units,
+    }
+    part = out.with_name(out.name + ".part")
+    try:
+        metadata = {"version": version, "imported": source}
+        with McapWriter(part, names, metadata=metadata, overwrite=True) as writer:
+            for stamp_ns, q, dq, tau in zip(*signals, strict=True):
+                writer.write_joint_state(int(stamp_ns), q, dq, tau)
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class _Reader:
+    """Finds signals in files; each file is read once."""
+
+    def __init__(self, spec: ImportSpec) -> None:
+        asked = (*spec.sources, *spec.columns, *spec.units)
+        unknown = [s for s in asked if s not in SIGNALS and s != ALL]
+        if unknown:
+            raise DriverError(f"no signal '{unknown[0]}'; have: {', '.join(SIGNALS)}")
+        self._spec = spec
+        self._tables: dict[Path, Table] = {}
+        self._arrays: dict[Path, dict[str, Array]] = {}
+
+    def source(self, signal: str) -> Path | None:
+        """The file of a signal."""
+        path = self._spec.sources.get(signal, self._spec.sources.get(ALL))
+        return None if path is None else Path(path)
+
+    def read(self, signal: str) -> Array | None:
+        """(m, k) values in SI units; None where the signal isn't there and wasn't asked for."""
+        path = self.source(signal)
+        factor = self._factor(signal)
+        if path is None:
+            return None
+        values = self._npz(path, signal) if path.suffix == ".npz" else self._text(path, signal)
+        return None if values is None else values * factor
+
+    def need(self, signal: str) -> Array:
+        """Like `read`. Raises DriverError where the signal isn't there."""
+        values = self.read(signal)
+        if values is not None:
+            return values
+        path = self.source(signal)
+        if path is None:
+            have = ", ".join(f"{s}={p}" for s, p in self._spec.sources.items())
+            raise DriverError(f"no file for {signal} (have: {have or 'none'}); add {signal}=FILE")
+        if path in self._arrays:
+            having = f"its arrays: {', '.join(self._arrays[path])}"
+        else:
+            table = self._tables[path]
+            having = f"its columns: {', '.join(table.names) or f'0 to {len(table) - 1}'}"
+        raise DriverError(f"{path}: which column is {signal}? Name it, {signal}=...; {having}")
+
+    def _factor(self, signal: str) -> float:
+        units = self._spec.units
+        usual = units.get("q", "rad") if signal == "dq" else next(iter(UNITS[signal]))
+        unit = units.get(signal, usual)
+        if unit not in UNITS[signal]:
+            raise DriverError(f"no unit '{unit}' for {signal}; have: {', '.join(UNITS[signal])}")
+        return UNITS[signal][unit]
+
+    def _text(self, path: Path, signal: str) -> Array | None:
+        if path not in self._tables:
+            self._tables[path] = read_table(path)
+        table = self._tables[path]
+        if signal in self._spec.columns:
+            return table.columns(self._spec.columns[signal], signal)
+        if signal in self._spec.sources:
+            return table.values
+        return next((table.columns([u], signal) for u in _USUAL[signal] if table.has(u)), None)
+
+    def _npz(self, path: Path, signal: str) -> Array | None:
+        if path not in self._arrays:
+            self._arrays[path] = read_npz(path)
+        arrays = self._arrays[path]
+        keys = self._spec.columns.get(signal)
+        if keys is None:
+            keys = tuple(u for u in _USUAL[signal] if u in arrays)[:1]
+        elif len(keys) != 1 or keys[0] not in arrays:
+            raise DriverError(
+                f"{path}: no array '{','.join(keys)}' for {signal}; have: {', '.join(arrays)}"
+            )
+        if not keys:
+            return None
+        values = arrays[keys[0]]
+        if values.ndim > 2:
+            raise DriverError(f"{path}: {keys[0]} has {values.ndim} dimensions, need 1 or 2")
+        return values.reshape(len(values), -1)
+
+
+def _signals(
+    reader: _Reader, spec: ImportSpec
+) -> tuple[NDArray[np.int64], Array, Array | None, Array]:
+    """Stamps (m,) and q, dq, tau (m, n), checked against one another."""
+    times = reader.read("time")
+    if times is None and spec.period_s is None:
+        reader.need("time")
+    q, dq, tau = reader.need("q"), reader.read("dq"), reader.need("tau")
+    if times is not None and times.shape[1] != 1:
+        raise DriverError(f"{reader.source('time')}: time has {times.shape[1]} columns, need 1")
+    samples = _sample_count(reader, spec, times, q)
+    q, tau = _shape(reader, "q", q, samples), _shape(reader, "tau", tau, samples)
+    dq = None if dq is None else _shape(reader, "dq", dq, samples)
+    count = len(spec.joint_names) or q.shape[1]
+    for signal, values in (("q", q), ("dq", dq), ("tau", tau)):
+        if values is not None and values.shape[1] != count:
+            raise DriverError(
+                f"{reader.source(signal)}: {signal} has {values.shape[1]} columns for {count} "
+                f"joints ({', '.join(spec.joint_names) or 'as many as q has columns'})"
+            )
+    seconds = np.arange(samples) * (spec.period_s or 0.0) if times is None else times[:, 0]
+    bad = np.flatnonzero(~np.isfinite(seconds))
+    if bad.size:
+        raise DriverError(f"{reader.source('time')}: the time of sample {bad[0]} is not a number")
+    return np.round(seconds * 1e9).astype(np.int64), q, dq, tau
+
+
+def _sample_count(reader: _Reader, spec: ImportSpec, times: Array | None, q: Array) -> int:
+    if times is not None:
+        return len(times)
+    if not spec.flat:
+        return len(q)
+    if not spec.joint_names:
+        raise DriverError(
+            f"{reader.source('q')}: how many values make a sample? Name the joints, or a time file"
+        )
+    return q.size // len(spec.joint_names)
+
+
+def _shape(reader: _Reader, signal: str, values: Array, samples: int) -> Array:
+    """(samples, n); a single column of n values a sample is cut into rows."""
+    if len(values) == samples:
+        return values
+    if values.shape[1] == 1 and samples and values.size % samples == 0:
+        return values.reshape(samples, -1)
+    raise DriverError(
+        f"{reader.source(signal)}: {signal} has {len(values)} lines of {values.shape[1]} values "
+        f"for {samples} samples; need as many lines, or one value a line and a whole number a "
+        "sample"
+    )
+
+
+def _doubts(
+    spec: ImportSpec, where: str, stamp_ns: NDArray[np.int64], signals: dict[str, Array]
+) -> list[str]:
+    """Sentences on what looks wrong but can be recorded."""
+    found = []
+    steps = np.diff(stamp_ns)
+    if np.any(steps < 0):
+        first = int(np.flatnonzero(steps < 0)[0]) + 1
+        found.append(
+            f"{where}: time runs backwards {int((steps < 0).sum())} times, first at sample {first}"
+        )
+    step_s = float(np.median(steps)) * 1e-9 if steps.size else _STEP_S[0]
+    if not _STEP_S[0] <= step_s <= _STEP_S[1]:
+        unit = spec.units.get("time", "s")
+        found.append(
+            f"{where}: samples are {step_s:.3g} s apart; is the time in {unit}? "
+            f"(units: {', '.join(UNITS['time'])})"
+        )
+    for name, values in signals.items():
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            found.append(
+                f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
+            )
+    if looks_like_degrees(signals["q"]):
+        found.append(
+            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they "
+            "degrees? Say q=deg"
+        )
+    return found
+
+
+def _velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array) -> list[str]:
+    """Whether the velocities are the positions' slope in the same unit."""
+    with np.errstate(invalid="ignore"):
+        slope = np.nanmedian(np.abs(derive_velocity(stamp_ns, q)))
+        said = np.nanmedian(np.abs(dq))
+    ratio = said / slope if slope > _MOVING and said > 0 else 1.0
+    if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
+        return []
+    return [
+        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
+        "of q, dq and time right?"
+    ]

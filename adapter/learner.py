@@ -1,0 +1,236 @@
+"""λ first, then θ: one ADAM update per filtered state, from the moments of all states so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from adapter.change import ChangeDetector, ChangeSettings
+from adapter.effects import effects_by_name
+from adapter.errors import SettingsError
+from adapter.records import Array, StateLayout, stamp_of
+from adapter.schema_learner import SchemaLearner, SchemaSettings
+from adapter.spatial import log_rotation
+from adapter.theta_learner import ThetaLearner, ThetaSettings
+from adapter.trace import Trace
+from adapter.tree import Tree
+from adapter.twist import base_motion
+
+MODES = ("moments", "sample")
+ADAM_EPS = 1e-12  # gradients come in units of information per sample; far below any that matters
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """How the self is learned.
+
+    Attributes:
+        mode: "moments" (all samples at every step) or "sample" (the paper's stochastic step).
+        effects: names from the catalogue, learned beside θ.
+        seed: of the random start of λ.
+        wait_for_schema: whether θ waits until λ has converged.
+        held_samples: newest states kept to rebuild θ's moments from when λ has moved.
+        rebuild_rows: how many of them each update redoes.
+        schema, theta, change: of the parts.
+    """
+
+    mode: str = "moments"
+    effects: tuple[str, ...] = ()
+    seed: int = 0
+    wait_for_schema: bool = True
+    held_samples: int = 60_000
+    rebuild_rows: int = 20
+    schema: SchemaSettings = field(default_factory=SchemaSettings)
+    theta: ThetaSettings = field(default_factory=ThetaSettings)
+    change: ChangeSettings = field(default_factory=ChangeSettings)
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise SettingsError(f"no learner mode '{self.mode}'; have: {', '.join(MODES)}")
+        if self.held_samples < 1000:
+            raise SettingsError(f"held_samples must be at least 1000, got {self.held_samples}")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change at the hand: when it was seen (stamp of the filtered state, ns)."""
+
+    stamp_ns: int
+
+
+class Learner:
+    """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
+
+    Args:
+        tree: N and A of the arm; the networks are built from them alone.
+        gravity: (3,) acceleration of gravity in base axes, m/s².
+        settings: of the learner.
+        noise_gain: of the filter (`JointFilter.noise_gain`).
+        tool_theta: (10,) of a known tool on the last link, kept out of θ.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        gravity: Array,
+        settings: LearnerSettings | None = None,
+        *,
+        noise_gain: float = 1.0,
+        tool_theta: Array | None = None,
+    ) -> None:
+        self.settings = s = settings or LearnerSettings()
+        self.tree, self.layout = tree, StateLayout(tree.n)
+        base = base_motion(gravity)
+        self.schema = SchemaLearner(
+            tree, base, s.schema, mode=s.mode, noise_gain=noise_gain, seed=s.seed
+        )
+        self.theta = ThetaLearner(
+            tree,
+            base,
+            effects_by_name(s.effects),
+            s.theta,
+            mode=s.mode,
+            noise_gain=noise_gain,
+            tool_theta=tool_theta,
+        )
+        self.change = ChangeDetector(tree.n, s.change)
+        # one flat parameter, so that one fused step serves λ and θ
+        flat = torch.zeros(6 * tree.n + self.theta.P, dtype=torch.float64)
+        flat.grad = torch.zeros_like(flat)
+        self._bind(flat.numpy(), flat.grad.numpy())
+        self._rate = s.theta.sample_rate if s.mode == "sample" else s.theta.rate
+        self.adam = torch.optim.Adam(
+            [flat], lr=self._rate, betas=s.theta.betas, eps=ADAM_EPS, fused=True
+        )
+        n = tree.n
+        self.learned = 0
+        self.theta_started_ns: int | None = None
+        self.changes: list[Change] = []
+        self.rebuilds = 0
+        self._held = np.zeros((s.held_samples, 4 * n))
+        self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
+        self._R0, self._p = self.schema.R0.copy(), self.schema.p.copy()
+        self._shadow: Array | None = None
+        self._shadow_at = 0
+        self.schema_trace = Trace(1 + 6 * n)
+        self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
+        self.score_trace = Trace(1 + 5 * n, capacity=12_000)
+
+    def _bind(self, parameters: Array, gradient: Array) -> None:
+        """Let λ's tangent, θ's parameters and their gradients be views of the flat arrays."""
+        n = self.tree.n
+        parameters[6 * n :] = self.theta.x
+        self.schema.tangent = parameters[: 6 * n].reshape(n, 6)
+        self.schema.gradient = gradient[: 6 * n].reshape(n, 6)
+        self.theta.x, self.theta.gradient = parameters[6 * n :], gradient[6 * n :]
+
+    def step(self, state: Array) -> None:
+        """Learn from one filtered state (a record of `StateLayout`): one update of λ and θ."""
+        self.step_table(state[None])
+
+    def step_table(self, table: Array) -> None:
+        """Add a table (m, size) of filtered states, then make one update of λ and θ."""
+        self.learned += len(table)
+        self.schema.absorb(table)
+        self.schema.compute_gradient()
+        self._adam_step(self._theta_turn(table))
+        self._trace(table)
+
+    def _adam_step(self, theta_too: bool) -> None:
+        if not theta_too:
+            self.theta.gradient[:] = 0.0
+        self.adam.step()
+        self.schema.apply_step(self._rate)
+        if theta_too:
+            self.theta.after_step()
+
+    def _theta_turn(self, table: Array) -> bool:
+        """θ's share of an update; whether it has a gradient to step on."""
+        if self.theta_started_ns is None:
+            if self.settings.wait_for_schema and not self.schema.converged:
+                return False
+            self.theta_started_ns = stamp_of(table[0])
+            self._R0[:], self._p[:] = self.schema.R0, self.schema.p
+        if self.schema.updates % self.settings.schema.judge_every == 0:
+            self._follow_schema()
+        at = self.layout
+        q, dq, ddq, tau = table[:, at.q], table[:, at.dq], table[:, at.ddq], table[:, at.tau]
+        if self.change.waiting(len(table)):
+            return False
+        error = self.theta.absorb(self._R0, self._p, q, dq, ddq, tau)
+        self._hold(np.concatenate([q, dq, ddq, tau], axis=1))
+        if self._shadow is not None:
+            self._rebuild_some(len(table))
+        if self.score_trace.wants():
+            self.score_trace.keep(stamp_of(table[-1]), q[-1], dq[-1], ddq[-1], tau[-1], error[-1])
+        if self.change.look(error):
+            self._start_change(stamp_of(table[-1]))
+            return False
+        if self.theta.restart_due(len(table)):
+            self.theta.restart_spare()
+            self._forget_momentum()
+        return self.theta.compute_gradient()
+
+    def _start_change(self, stamp_ns: int) -> None:
+        self.changes.append(Change(stamp_ns))
+        self.theta.start_change()
+        self._held_from = self._held_to
+        self._shadow = None
+        self._forget_momentum()
+
+    def _forget_momentum(self) -> None:
+        """ADAM's averages of θ's gradient are of no use after a jump."""
+        for state in self.adam.state.values():
+            for moment in (state["exp_avg"], state["exp_avg_sq"]):
+                moment[6 * self.tree.n :] = 0.0
+
+    def _hold(self, rows: Array) -> None:
+        size = len(self._held)
+        for row in rows:
+            self._held[self._held_to % size] = row
+            self._held_to += 1
+        self._held_from = max(self._held_from, self._held_to - size)
+
+    def _follow_schema(self) -> None:
+        """Rebuild θ's moments when λ has left them by more than its standard deviation."""
+        turned = log_rotation(np.swapaxes(self._R0, 1, 2) @ self.schema.R0)
+        moved = np.concatenate([turned, self.schema.p - self._p], axis=1)
+        std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
+        if (np.abs(moved) <= np.maximum(std, REBUILD_FLOOR)).all():
+            return
+        self._R0[:], self._p[:] = self.schema.R0, self.schema.p
+        self._shadow = np.zeros_like(self.theta.A)
+        self._shadow_at = self._held_from
+
+    def _rebuild_some(self, updates: int) -> None:
+        """Redo some of the samples still held with the present λ; swap when all are done."""
+        assert self._shadow is not None
+        size, n = len(self._held), self.tree.n
+        start = max(self._shadow_at, self._held_from)
+        stop = min(start + self.settings.rebuild_rows * updates, self._held_to)
+        rows = self._held[np.arange(start, stop) % size]
+        q, dq, ddq, tau = (np.ascontiguousarray(rows[:, k * n : (k + 1) * n]) for k in range(4))
+        self.theta.absorb(self._R0, self._p, q, dq, ddq, tau, into=self._shadow)
+        self._shadow_at = stop
+        if stop == self._held_to:
+            self.theta.replace_moments(self._shadow, float(stop - self._held_from))
+            self._shadow = None
+            self.rebuilds += 1
+
+    def _trace(self, table: Array) -> None:
+        if self.schema_trace.wants():
+            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+        if self.theta_started_ns is not None and self.theta_trace.wants():
+            self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
+
+    def settle(self, updates: int) -> None:
+        """Further updates on the same moments (batch mode: the data are all in, steps are not)."""
+        for _ in range(updates):
+            self.schema.compute_gradient()
+            started = self.theta_started_ns is not None
+            self._adam_step(started and self.theta.compute_gradient())
+
+
+REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show

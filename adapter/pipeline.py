@@ -1,0 +1,63 @@
+"""Front end and learner in one thread: what the live process does, without its clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from adapter.filters import FilterSettings
+from adapter.front_end import FrontEnd, FrontEndSettings
+from adapter.learner import Learner, LearnerSettings
+from adapter.model import SelfModel
+from drivers.interface import JointSample
+
+
+@dataclass(frozen=True)
+class PipelineSettings:
+    """Settings of the parts."""
+
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+
+
+class Pipeline:
+    """The two pure steps, composed.
+
+    Args:
+        documented: the arm as documented; the learner gets its topology, gravity and tool only.
+        settings: of the parts.
+
+    Attributes:
+        front_end, learner: the parts; estimates are read from the learner.
+    """
+
+    def __init__(self, documented: SelfModel, settings: PipelineSettings | None = None) -> None:
+        self.settings = settings or PipelineSettings()
+        self.front_end = make_front_end(documented, self.settings)
+        self.learner = make_learner(documented, self.settings)
+
+    def step(self, sample: JointSample) -> bool:
+        """Take one sample; whether it was learned from."""
+        state = self.front_end.step(sample)
+        if state is None:
+            return False
+        self.learner.step(state)
+        return True
+
+
+def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:
+    """The front end of a pipeline with these settings."""
+    return FrontEnd(documented, settings.filter, settings.front_end)
+
+
+def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
+    """The learner of a pipeline with these settings."""
+    front_end = make_front_end(documented, settings)
+    tool = documented.tool
+    return Learner(
+        documented.tree,
+        documented.gravity,
+        settings.learner,
+        noise_gain=front_end.filter.noise_gain,
+        tool_theta=None if tool is None else tool.theta(),
+    )

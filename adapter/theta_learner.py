@@ -1,0 +1,425 @@
+"""Learning θ and the effects beside it: ADAM on the moments of eq. 19, physically consistent.
+
+Bodies live in log-Cholesky coordinates, so every step of ADAM is a possible body. What the data
+do not show is held by a broad prior around a neutral body. The noise level of each joint is
+profiled from its own residual. The value in use is a short running mean of ADAM's iterates.
+
+A change at the hand (a payload) gets a body of its own, in the last link's place: what was
+known of the other links stays known, and the payload is the difference to the link before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.effects.base import JointEffect
+from adapter.errors import SettingsError
+from adapter.fast import jit
+from adapter.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
+from adapter.records import Array
+from adapter.theta_kernels import (
+    accumulate,
+    forget_along,
+    gradient,
+    joint_costs,
+    model_rows,
+    predict,
+    values,
+)
+from adapter.tree import Tree
+
+# Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
+NEUTRAL_MASS = 1.0  # kg
+NEUTRAL_INERTIA = 0.02  # kg m², about every axis
+PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
+
+SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
+LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
+
+
+@dataclass(frozen=True)
+class ThetaSettings:
+    """How θ is learned.
+
+    Attributes:
+        rate: ADAM's rate per sample on the log-Cholesky parameters.
+        betas: ADAM's averaging constants.
+        average: samples that the reported running mean spans.
+        restarts: samples after a change at which the spare body is put to the point mass that
+            fits best so far; ADAM refines it from there.
+        warm_up: samples in the moments before the first step.
+        forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
+        noise_floor: torque noise that no weight looks below, N m.
+        sample_rate: ADAM's rate in mode `sample`.
+    """
+
+    rate: float = 3e-3
+    betas: tuple[float, float] = (0.97, 0.99)
+    average: int = 300
+    restarts: tuple[int, ...] = (50, 100, 200, 400)
+    warm_up: int = 50
+    forget_s: float | None = None
+    noise_floor: float = 1e-3
+    sample_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "average", "noise_floor", "sample_rate"):
+            if not getattr(self, name) > 0:
+                raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
+        if self.forget_s is not None and self.forget_s < 0.5:
+            raise SettingsError(f"theta.forget_s must be at least 0.5 s, got {self.forget_s}")
+
+
+@jit
+def absorb(
+    parent,
+    R0,
+    p,
+    base,
+    q,
+    dq,
+    ddq,
+    tau,
+    columns,
+    tool,
+    support,
+    sizes,
+    place,
+    th,
+    rate,
+    A,
+    newest,
+    error,
+):
+    """Predict every sample with th, then add it to the moments A (n, S+1, S+1).
+
+    Args:
+        q, dq, ddq, tau: (m, n); columns: (m, e, n) of the effects; error: (m, n), filled with
+            measured minus predicted torque.
+        tool: (10,) of a known tool on the last link; its torque is taken off first.
+        rate: of directional forgetting per sample, 0 for none.
+        newest: (n, S+1, S+1) moments of the last sample alone.
+    """
+    n = parent.shape[0]
+    motion, Y = np.empty((n, 12)), np.empty((n, 10 * n))
+    rows, expected, own = np.zeros((n, support.shape[1])), np.empty(n), np.empty(n)
+    for m in range(q.shape[0]):
+        model_rows(
+            parent, R0, p, q[m], dq[m], ddq[m], base, columns[m], motion, Y, support, sizes, rows
+        )
+        for j in range(n):
+            own[j] = tau[m, j]
+            for k in range(10):
+                own[j] -= Y[j, 10 * (n - 1) + k] * tool[k]
+        predict(th, place, sizes, rows, expected)
+        error[m] = own - expected
+        if rate > 0.0:
+            forget_along(rows, own, sizes, rate, A)
+        accumulate(rows, own, sizes, A)
+    if newest.shape[0] > 0 and q.shape[0] > 0:
+        newest[:] = 0.0
+        accumulate(rows, own, sizes, newest)
+
+
+class ThetaLearner:
+    """θ and the effects' parameters, their uncertainty, and a spare body for a change.
+
+    Args:
+        tree: of a fixed-base arm.
+        base: (12,) motion of the base.
+        effects: learned beside θ.
+        noise_gain: correlated samples that one independent sample is worth.
+        tool_theta: (10,) of a known tool on the last link, kept out of θ.
+
+    Attributes:
+        x: (P,) what ADAM steps on: log-Cholesky of the links and of the spare body, then effects.
+        mean: (P,) the running mean of x that is in use; `th` its values (θ, effects).
+        A: (n, S+1, S+1) moments since the last change; `count` samples in them.
+        prior, prior_rhs: information (P, P) and (P,) from before: the prior and, after a change,
+            all that was known then.
+        spare_in_use: whether the spare body stands in for the last link.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        base: Array,
+        effects: Sequence[JointEffect] = (),
+        settings: ThetaSettings | None = None,
+        *,
+        mode: str = "moments",
+        noise_gain: float = 1.0,
+        tool_theta: Array | None = None,
+    ) -> None:
+        if tree.floating:
+            raise SettingsError("the online learner of θ needs a fixed base; this tree floats")
+        self.tree, self.effects, self.mode = tree, tuple(effects), mode
+        self.settings = settings or ThetaSettings()
+        self.noise_gain = noise_gain
+        self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
+        n = tree.n
+        self.bodies = n + 1
+        self.P = 10 * self.bodies + n * len(self.effects)
+        self._parent, self._base = np.array(tree.parent, dtype=np.int64), base
+        self._support, self._sizes = self._columns()
+        # effects come after the spare body in the flat parameters
+        self.place = self._support + 10 * (self._support >= 10 * n)
+        width = int(self._sizes[:, 1].max()) + 1
+        self.A = np.zeros((n, width, width))
+        self.newest = np.zeros((n, width, width) if mode == "sample" else (0, width, width))
+        self.count = 0.0
+        self.prior, self.prior_rhs = self._neutral_prior()
+        self.x, self.gradient = self._neutral(), np.zeros(self.P)
+        self.mean, self.th = self.x.copy(), np.zeros(self.P)
+        values(self.mean, self.bodies, self.th)
+        self._th, self._g = np.zeros(self.P), np.zeros(self.P)
+        self.updates = 0
+        self.floor = np.full(n, self.settings.noise_floor**2)
+        self.floor_count = 1.0
+        self.spare_in_use = False
+
+    def _columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """Which columns each joint's torque depends on: links beyond it, then its effects."""
+        n, e = self.tree.n, len(self.effects)
+        beyond = [[k for k in range(n) if j in self.tree.path_to(k)] for j in range(n)]
+        sizes = np.array([[10 * len(b), 10 * len(b) + e] for b in beyond], dtype=np.int64)
+        support = np.zeros((n, int(sizes[:, 1].max())), dtype=np.int64)
+        for j, links in enumerate(beyond):
+            columns = [10 * k + i for k in links for i in range(10)]
+            columns += [10 * n + k * n + j for k in range(e)]
+            support[j, : len(columns)] = columns
+        return support, sizes
+
+    def _neutral(self) -> Array:
+        body = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+        x = np.zeros(self.P)
+        x[: 10 * self.bodies] = np.tile(log_cholesky_from_theta(body), self.bodies)
+        return x
+
+    def _neutral_prior(self) -> tuple[Array, Array]:
+        """Information of the prior: links and effects; the spare body waits without one."""
+        n = self.tree.n
+        std = np.full(self.P, np.inf)
+        std[: 10 * n] = np.tile(PRIOR_STD, n)
+        for k, effect in enumerate(self.effects):
+            start = 10 * self.bodies + k * n
+            std[start : start + n] = effect.prior_std
+        mean = np.zeros(self.P)
+        neutral = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+        mean[: 10 * n] = np.tile(neutral, n)
+        information = 1.0 / std**2
+        return np.diag(information), information * mean
+
+    def effect_columns(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """(m, e, n) columns of the effects for tables (m, n)."""
+        out = np.empty((len(q), len(self.effects), self.tree.n))
+        for k, effect in enumerate(self.effects):
+            out[:, k] = effect.column(q, dq, ddq)
+        return out
+
+    def absorb(
+        self,
+        R0: Array,
+        p: Array,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        tau: Array,
+        into: Array | None = None,
+    ) -> Array:
+        """Add samples (m, n) to the moments (or to `into`); returns the errors (m, n) before."""
+        target = self.A if into is None else into
+        error = np.empty_like(tau)
+        forget = self.settings.forget_s
+        absorb(
+            self._parent,
+            R0,
+            p,
+            self._base,
+            q,
+            dq,
+            ddq,
+            tau,
+            self.effect_columns(q, dq, ddq),
+            self._tool,
+            self._support,
+            self._sizes,
+            self.place,
+            self.th,
+            0.0 if forget is None else 1e-3 / forget,
+            target,
+            self.newest if into is None else self.newest[:0],
+            error,
+        )
+        if into is None:
+            self.count += len(q)
+        return error
+
+    def replace_moments(self, A: Array, count: float) -> None:
+        """Put moments rebuilt with a better λ in place of the old ones.
+
+        What was folded into the prior at a change cannot be rebuilt; it counts half from here on.
+        """
+        self.A, self.count = A, count
+        if self.spare_in_use:
+            neutral, neutral_rhs = self._neutral_prior()
+            self.prior = 0.5 * (self.prior + neutral)
+            self.prior_rhs = 0.5 * (self.prior_rhs + neutral_rhs)
+
+    def compute_gradient(self) -> bool:
+        """Fill the gradient of one ADAM step; False while there is too little to step on."""
+        if self.count < self.settings.warm_up and not self.spare_in_use:
+            self.gradient[:] = 0.0
+            return False
+        sample = self.mode == "sample"
+        gradient(
+            self.x,
+            self.bodies,
+            self.newest if sample else self.A,
+            self._sizes,
+            self.place,
+            1.0 if sample else self.count,
+            self.noise_gain,
+            np.ones_like(self.floor) if sample else self.floor,
+            1e9 if sample else self.floor_count,
+            self.prior * (1e-6 if sample else 1.0),
+            self.prior_rhs * (1e-6 if sample else 1.0),
+            self._th,
+            self._g,
+            self.gradient,
+        )
+        return True
+
+    def restart_due(self, added: int) -> bool:
+        """Whether the newest samples reached a restart of the spare body."""
+        before = self.count - added
+        return self.spare_in_use and any(before < k <= self.count for k in self.settings.restarts)
+
+    def restart_spare(self) -> None:
+        """Put the spare body to the last link plus the point mass that fits the data best.
+
+        Nothing happens where that is no possible body (a load was taken away, say).
+        """
+        n = self.tree.n
+        spare = slice(10 * n, 10 * n + 10)
+        link = self.th[10 * n - 10 : 10 * n]
+        H, rhs = self.information()
+        th = self.th.copy()
+        th[spare] = link
+        at = np.arange(10 * n, 10 * n + 4)
+        mass, *moment = np.linalg.solve(H[np.ix_(at, at)], rhs[at] - H[at] @ th)
+        if mass < SMALLEST_LOAD:
+            return
+        centre = np.array(moment) / mass
+        load = theta_from_body(mass, centre, mass * LOAD_RADIUS**2 * np.eye(3))
+        if min_eigenvalue(link + load) <= 0.0:
+            return
+        self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
+        values(self.mean, self.bodies, self.th)
+        self.updates = 0
+
+    def after_step(self) -> None:
+        """Carry the running mean along after ADAM has moved x."""
+        self.updates += 1
+        self.mean += (self.x - self.mean) / min(self.updates, self.settings.average)
+        values(self.mean, self.bodies, self.th)
+
+    def variance(self) -> Array:
+        """(n,) profiled variance of each joint's residual torque, (N m)²."""
+        cost = np.empty(self.tree.n)
+        joint_costs(self.th, self.A, self._sizes, self.place, cost)
+        return (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
+
+    def information(self) -> tuple[Array, Array]:
+        """All that is known of (θ, effects): information matrix (P, P) and right side (P,)."""
+        H, rhs = self.prior.copy(), self.prior_rhs.copy()
+        for j, weight in enumerate(1.0 / (self.noise_gain * self.variance())):
+            s = self._sizes[j, 1]
+            at = self.place[j, :s]
+            H[np.ix_(at, at)] += weight * self.A[j, :s, :s]
+            rhs[at] += weight * self.A[j, :s, s]
+        return H, rhs
+
+    def known(self) -> np.ndarray:
+        """Indices of the parameters that have any information (the idle spare body has none)."""
+        idle = np.zeros(self.P, dtype=bool)
+        if not self.spare_in_use:
+            idle[10 * self.tree.n : 10 * self.bodies] = True
+        return np.flatnonzero(~idle)
+
+    def least_squares(self) -> Array:
+        """(P,) the batch solution on all samples so far, with the same prior, unconstrained."""
+        H, rhs = self.information()
+        at = self.known()
+        out = self.th.copy()
+        out[at] = np.linalg.solve(H[np.ix_(at, at)], rhs[at])
+        return out
+
+    def covariance(self) -> Array:
+        """(P, P) covariance of (θ, effects); zero for the idle spare body."""
+        H, _ = self.information()
+        at = self.known()
+        out = np.zeros((self.P, self.P))
+        out[np.ix_(at, at)] = np.linalg.inv(H[np.ix_(at, at)])
+        return out
+
+    @property
+    def theta(self) -> Array:
+        """(n, 10) inertial parameters in use; the last link's with whatever it carries."""
+        th = self.th[: 10 * self.bodies].reshape(-1, 10)
+        out = th[:-1].copy()
+        if self.spare_in_use:
+            out[-1] = th[-1]
+        return out
+
+    @property
+    def payload(self) -> tuple[Array, Array] | None:
+        """What the last link carries more than before the change: θ (10,), covariance (10, 10)."""
+        if not self.spare_in_use:
+            return None
+        n = self.tree.n
+        th = self.th[: 10 * self.bodies].reshape(-1, 10)
+        cov = self.covariance()[10 * (n - 1) : 10 * self.bodies, 10 * (n - 1) : 10 * self.bodies]
+        J = np.hstack([-np.eye(10), np.eye(10)])
+        return th[-1] - th[-2], J @ cov @ J.T
+
+    @property
+    def effect_values(self) -> Array:
+        """(e, n) parameters of the effects."""
+        return self.th[10 * self.bodies :].reshape(len(self.effects), self.tree.n)
+
+    def start_change(self) -> None:
+        """Something at the hand changed: keep what is known, open the spare body for the rest."""
+        n = self.tree.n
+        last, spare = slice(10 * (n - 1), 10 * n), slice(10 * n, 10 * self.bodies)
+        H, rhs = self.information()
+        if self.spare_in_use:
+            H, rhs = _marginalise(H, rhs, spare)
+        link = 1.0 / PRIOR_STD**2
+        rows = np.arange(10)
+        H[last, last][rows, rows] += link
+        H[spare, spare][rows, rows] += link
+        H[last, spare][rows, rows] -= link
+        H[spare, last][rows, rows] -= link
+        self.floor, self.floor_count = self.variance(), 500.0
+        self.prior, self.prior_rhs = H, rhs
+        self.A[:], self.count = 0.0, 0.0
+        self.x[spare] = self.mean[spare] = self.mean[last]
+        values(self.mean, self.bodies, self.th)
+        moved = self._support >= 10 * (n - 1)  # the last link's columns, and the effects' as ever
+        self.place = self._support + 10 * moved
+        self.spare_in_use = True
+        self.updates = 0
+
+
+def _marginalise(H: Array, rhs: Array, block: slice) -> tuple[Array, Array]:
+    """Information about the rest when `block` is integrated out; zero rows in its place."""
+    rest = np.setdiff1d(np.arange(len(H)), np.arange(block.start, block.stop))
+    gain = np.linalg.solve(H[block, block], np.c_[H[block, rest], rhs[block]]).T
+    out, out_rhs = np.zeros_like(H), np.zeros_like(rhs)
+    out[np.ix_(rest, rest)] = H[np.ix_(rest, rest)] - H[rest, block] @ gain[:-1].T
+    out_rhs[rest] = rhs[rest] - H[rest, block] @ gain[-1]
+    return out, out_rhs

@@ -1,0 +1,88 @@
+"""Twist synthesis: the links' motion from the documented kinematics, or as it was measured.
+
+The paper's Panda has no sensors on its links; it computes their motion from the joint signals
+and the documented λ. What is learned from that can only reproduce the documentation, and is
+labelled so. Synthesized motion uses the same q and dq that the learner sees, so their noise
+cancels. Measured motion is handed on unfiltered beside the q and dq of its own stamp: the
+body-schema moments average its noise, and a low-pass would shift products of fast signals.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adapter.fast import jit, link_motion
+from adapter.model import SelfModel
+from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, MOTION_NONE, Array, StateLayout
+from adapter.spatial import matrix_from_zxz
+from drivers.interface import JointSample
+
+
+class TwistSynthesis:
+    """Fills the link-motion part of a filtered state.
+
+    Args:
+        documented: whose λ and gravity the synthesized motion follows.
+    """
+
+    def __init__(self, documented: SelfModel) -> None:
+        self.layout = StateLayout(documented.tree.n)
+        self._parent = np.array(documented.tree.parent, dtype=np.int64)
+        self._R0 = np.ascontiguousarray(matrix_from_zxz(documented.lam[:, :3]))
+        self._p = np.ascontiguousarray(documented.lam[:, 3:])
+        self._base = base_motion(documented.gravity)
+
+    def fill(self, record: Array, sample: JointSample) -> None:
+        """Complete a record whose q, dq, ddq are filled, for the sample that led to it."""
+        links = sample.links
+        if links is None:
+            synthesize(self._parent, self._R0, self._p, self._base, record[None])
+        else:
+            self._measured(
+                record[None], sample.q[None], sample.dq[None], links.twist[None], links.accel[None]
+            )
+
+    def fill_table(
+        self, records: Array, q: Array, dq: Array, twists: Array | None, accels: Array | None
+    ) -> None:
+        """Complete records (m, size); raw q, dq (m, n) and link motion (m, n, 6) beside them."""
+        if twists is None or accels is None:
+            synthesize(self._parent, self._R0, self._p, self._base, records)
+            return
+        heard = ~np.isnan(twists).all(axis=(1, 2)) | ~np.isnan(accels).all(axis=(1, 2))
+        part = records[heard]
+        self._measured(part, q[heard], dq[heard], twists[heard], accels[heard])
+        records[heard] = part
+        part = records[~heard]
+        synthesize(self._parent, self._R0, self._p, self._base, part)
+        records[~heard] = part
+
+    def _measured(self, records: Array, q: Array, dq: Array, twists: Array, accels: Array) -> None:
+        at = self.layout
+        records[:, at.motion_q], records[:, at.motion_dq] = q, dq
+        motion = records[:, at.motion].reshape(len(records), -1, 12)
+        motion[..., :6], motion[..., 6:] = twists, accels
+        records[:, at.motion] = motion.reshape(len(records), -1)
+        # a link that was not heard of at this stamp leaves the body schema a sample short
+        whole = np.isfinite(motion).all(axis=(1, 2))
+        records[:, 1] = np.where(whole, MOTION_MEASURED, MOTION_NONE)
+
+
+@jit
+def synthesize(parent, R0, p, base, records):
+    """Fill the link motion of records (m, size) from their filtered q, dq, ddq."""
+    n = parent.shape[0]
+    o = 2 + 6 * n
+    for i in range(records.shape[0]):
+        row = records[i]
+        row[1] = MOTION_DOCUMENTED
+        row[2 + 4 * n : o] = row[2 : 2 + 2 * n]
+        q, dq, ddq = row[2 : 2 + n], row[2 + n : 2 + 2 * n], row[2 + 2 * n : 2 + 3 * n]
+        link_motion(parent, R0, p, q, dq, ddq, base, row[o:].reshape((n, 12)))
+
+
+def base_motion(gravity: Array) -> Array:
+    """Motion row (12,) of a base at rest: nothing but a = -gravity (base axes, m/s²)."""
+    base = np.zeros(12)
+    base[6:9] = -np.asarray(gravity)
+    return base
