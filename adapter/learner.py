@@ -100,9 +100,9 @@ class Learner:
         flat = torch.zeros(6 * tree.n + self.theta.P, dtype=torch.float64)
         flat.grad = torch.zeros_like(flat)
         self._bind(flat.numpy(), flat.grad.numpy())
-        self._rate = s.theta.sample_rate if s.mode == "sample" else s.theta.rate
+        self.rate = s.theta.sample_rate if s.mode == "sample" else s.theta.rate
         self.adam = torch.optim.Adam(
-            [flat], lr=self._rate, betas=s.theta.betas, eps=ADAM_EPS, fused=True
+            [flat], lr=self.rate, betas=s.theta.betas, eps=ADAM_EPS, fused=True
         )
         n = tree.n
         self.learned = 0
@@ -112,6 +112,7 @@ class Learner:
         self._held = np.zeros((s.held_samples, 4 * n))
         self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
         self._R0, self._p = self.schema.R0.copy(), self.schema.p.copy()
+        self._alarm_ns = 0
         self._shadow: Array | None = None
         self._shadow_at = 0
         self.schema_trace = Trace(1 + 6 * n)
@@ -135,43 +136,88 @@ class Learner:
         self.learned += len(table)
         self.schema.absorb(table)
         self.schema.compute_gradient()
-        self._adam_step(self._theta_turn(table))
-        self._trace(table)
+        self._adam_step(self._theta_is_due(table) and self._take_torque(table))
+        if self.schema_trace.wants():
+            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+
+    def learn_schema(self, table: Array) -> None:
+        """λ's half of `step_table`; an empty table makes one more update on the same moments."""
+        self.learned += len(table)
+        if len(table):
+            self.schema.absorb(table)
+        self.schema.compute_gradient()
+        self._adam_step(theta_too=False)
+        if len(table) and self.schema_trace.wants():
+            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+
+    def learn_theta(self, table: Array) -> None:
+        """θ's half of `step_table`, λ standing still; an empty table as in `learn_schema`."""
+        self.schema.gradient[:] = 0.0
+        ready = self._take_torque(table) if len(table) else self.theta.compute_gradient()
+        self._adam_step(ready)
+
+    def set_rate(self, rate: float) -> None:
+        """Let ADAM go on at this rate per update."""
+        self.rate = self.adam.param_groups[0]["lr"] = rate
 
     def _adam_step(self, theta_too: bool) -> None:
+        """One ADAM step on the gradients as they stand; θ's counts only if asked for."""
         if not theta_too:
             self.theta.gradient[:] = 0.0
         self.adam.step()
-        self.schema.apply_step(self._rate)
+        self.schema.apply_step(self.rate)
         if theta_too:
             self.theta.after_step()
 
-    def _theta_turn(self, table: Array) -> bool:
-        """θ's share of an update; whether it has a gradient to step on."""
+    def _theta_is_due(self, table: Array) -> bool:
+        """Whether θ is being learned; sees to it that its moments follow λ."""
         if self.theta_started_ns is None:
             if self.settings.wait_for_schema and not self.schema.converged:
+                self._hold(table[:, self.layout.q.start : self.layout.tau.stop])
                 return False
-            self.theta_started_ns = stamp_of(table[0])
-            self._R0[:], self._p[:] = self.schema.R0, self.schema.p
-        if self.schema.updates % self.settings.schema.judge_every == 0:
+            self.start_theta(stamp_of(table[0]))
+        elif self.schema.updates % self.settings.schema.judge_every == 0:
             self._follow_schema()
+        return True
+
+    def start_theta(self, stamp_ns: int) -> None:
+        """Begin to learn θ, with the frames as they are now; states held so far count too."""
+        self.theta_started_ns = stamp_ns
+        if self._held_to > self._held_from:
+            self._begin_rebuild()
+        else:
+            self._R0[:], self._p[:] = self.schema.R0, self.schema.p
+
+    def _take_torque(self, table: Array) -> bool:
+        """Add states to θ's moments; whether there is a gradient to step on."""
         at = self.layout
         q, dq, ddq, tau = table[:, at.q], table[:, at.dq], table[:, at.ddq], table[:, at.tau]
-        if self.change.waiting(len(table)):
+        if self.change.waiting:
+            self._look_on(table, self.theta.errors(self._R0, self._p, q, dq, ddq, tau))
             return False
         error = self.theta.absorb(self._R0, self._p, q, dq, ddq, tau)
-        self._hold(np.concatenate([q, dq, ddq, tau], axis=1))
+        self._hold(table[:, at.q.start : at.tau.stop])
         if self._shadow is not None:
             self._rebuild_some(len(table))
-        if self.score_trace.wants():
-            self.score_trace.keep(stamp_of(table[-1]), q[-1], dq[-1], ddq[-1], tau[-1], error[-1])
-        if self.change.look(error):
-            self._start_change(stamp_of(table[-1]))
-            return False
+        self._look_on(table, error)
         if self.theta.restart_due(len(table)):
             self.theta.restart_spare()
             self._forget_momentum()
         return self.theta.compute_gradient()
+
+    def _look_on(self, table: Array, error: Array) -> None:
+        """Keep the scores, and notice a change."""
+        state, at = table[-1], self.layout
+        if self.score_trace.wants():
+            signals = state[at.q.start : at.tau.stop]
+            self.score_trace.keep(stamp_of(state), signals, error[-1])
+        if self.theta_trace.wants():
+            self.theta_trace.keep(stamp_of(state), self.theta.th)
+        alarmed_before = self.change.waiting
+        if self.change.look(error):
+            self._start_change(self._alarm_ns)
+        elif self.change.waiting and not alarmed_before:
+            self._alarm_ns = stamp_of(state)
 
     def _start_change(self, stamp_ns: int) -> None:
         self.changes.append(Change(stamp_ns))
@@ -200,6 +246,9 @@ class Learner:
         std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
         if (np.abs(moved) <= np.maximum(std, REBUILD_FLOOR)).all():
             return
+        self._begin_rebuild()
+
+    def _begin_rebuild(self) -> None:
         self._R0[:], self._p[:] = self.schema.R0, self.schema.p
         self._shadow = np.zeros_like(self.theta.A)
         self._shadow_at = self._held_from
@@ -218,19 +267,6 @@ class Learner:
             self.theta.replace_moments(self._shadow, float(stop - self._held_from))
             self._shadow = None
             self.rebuilds += 1
-
-    def _trace(self, table: Array) -> None:
-        if self.schema_trace.wants():
-            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
-        if self.theta_started_ns is not None and self.theta_trace.wants():
-            self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
-
-    def settle(self, updates: int) -> None:
-        """Further updates on the same moments (batch mode: the data are all in, steps are not)."""
-        for _ in range(updates):
-            self.schema.compute_gradient()
-            started = self.theta_started_ns is not None
-            self._adam_step(started and self.theta.compute_gradient())
 
 
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show

@@ -164,13 +164,13 @@ def joint_costs(th, A, sizes, place, cost):
 
 @jit
 def gradient(
-    x, bodies, A, sizes, place, count, noise_gain, floor, floor_count, prior, prior_rhs, th, g, gx
+    x, bodies, A, sizes, place, count, noise_gain, floor, floor_count, error, prior, prior_rhs, th, g, gx
 ):
     """Gradient gx (P,) of half the weighted cost by the flat parameters, over the sample count.
 
     Each joint is weighted by 1 / (noise_gain * variance), the variance being its own residual
-    one (`cost / count`, with `floor_count` samples of variance `floor` (n,) as a prior): the
-    noise level is profiled, not assumed. th and g are filled with the values and the gradient
+    one (`cost / count`, with `floor_count` samples of variance `floor` (n,) as a prior) plus
+    `error`: the noise level is profiled, not assumed. th and g are filled with the values and the gradient
     by them.
     """
     values(x, bodies, th)
@@ -195,7 +195,7 @@ def gradient(
             d[a] = v - A[j, a, s]
             cost += t[a] * (v - 2.0 * A[j, a, s])
         variance = (max(cost, 0.0) + floor_count * floor[j]) / (count + floor_count)
-        weight = 1.0 / (noise_gain * variance)
+        weight = 1.0 / (noise_gain * (variance + error))
         for a in range(s):
             g[place[j, a]] += weight * d[a]
     U = np.empty((4, 4))

@@ -36,6 +36,8 @@ NEUTRAL_MASS = 1.0  # kg
 NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 
+REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.03, 0.001  # N m
+
 SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
 LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
 
@@ -52,7 +54,9 @@ class ThetaSettings:
             fits best so far; ADAM refines it from there.
         warm_up: samples in the moments before the first step.
         forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
-        noise_floor: torque noise that no weight looks below, N m.
+        model_error: torque that the model is not trusted to explain, N m; no weight looks below
+            it. None: 0.03 where effects are learned (a real arm, whose friction no such model
+            explains better), 0.001 else.
         sample_rate: ADAM's rate in mode `sample`.
     """
 
@@ -62,11 +66,11 @@ class ThetaSettings:
     restarts: tuple[int, ...] = (50, 100, 200, 400)
     warm_up: int = 50
     forget_s: float | None = None
-    noise_floor: float = 1e-3
+    model_error: float | None = None
     sample_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("rate", "average", "noise_floor", "sample_rate"):
+        for name in ("rate", "average", "sample_rate"):
             if not getattr(self, name) > 0:
                 raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
         if self.forget_s is not None and self.forget_s < 0.5:
@@ -177,8 +181,11 @@ class ThetaLearner:
         values(self.mean, self.bodies, self.th)
         self._th, self._g = np.zeros(self.P), np.zeros(self.P)
         self.updates = 0
-        self.floor = np.full(n, self.settings.noise_floor**2)
-        self.floor_count = 1.0
+        error = self.settings.model_error
+        if error is None:
+            error = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
+        self.model_variance = error**2
+        self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
 
     def _columns(self) -> tuple[np.ndarray, np.ndarray]:
@@ -258,6 +265,10 @@ class ThetaLearner:
             self.count += len(q)
         return error
 
+    def errors(self, R0: Array, p: Array, q: Array, dq: Array, ddq: Array, tau: Array) -> Array:
+        """Torque errors (m, n) of the parameters in use; nothing is learned."""
+        return self.absorb(R0, p, q, dq, ddq, tau, into=np.zeros_like(self.A))
+
     def replace_moments(self, A: Array, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.
 
@@ -285,6 +296,7 @@ class ThetaLearner:
             self.noise_gain,
             np.ones_like(self.floor) if sample else self.floor,
             1e9 if sample else self.floor_count,
+            self.model_variance,
             self.prior * (1e-6 if sample else 1.0),
             self.prior_rhs * (1e-6 if sample else 1.0),
             self._th,
@@ -328,10 +340,11 @@ class ThetaLearner:
         values(self.mean, self.bodies, self.th)
 
     def variance(self) -> Array:
-        """(n,) profiled variance of each joint's residual torque, (N m)²."""
+        """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)²."""
         cost = np.empty(self.tree.n)
         joint_costs(self.th, self.A, self._sizes, self.place, cost)
-        return (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
+        own = (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
+        return own + self.model_variance
 
     def information(self) -> tuple[Array, Array]:
         """All that is known of (θ, effects): information matrix (P, P) and right side (P,)."""
@@ -404,7 +417,7 @@ class ThetaLearner:
         H[spare, spare][rows, rows] += link
         H[last, spare][rows, rows] -= link
         H[spare, last][rows, rows] -= link
-        self.floor, self.floor_count = self.variance(), 500.0
+        self.floor, self.floor_count = self.variance() - self.model_variance, 500.0
         self.prior, self.prior_rhs = H, rhs
         self.A[:], self.count = 0.0, 0.0
         self.x[spare] = self.mean[spare] = self.mean[last]

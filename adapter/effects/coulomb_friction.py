@@ -1,4 +1,4 @@
-"""Coulomb friction: tau = Fc sign(dq), the sign smoothed around rest. Positive Fc opposes motion."""
+"""Coulomb friction: tau = Fc sign(dq), smoothed around rest. Positive Fc opposes motion."""
 
 from __future__ import annotations
 

@@ -1,0 +1,174 @@
+"""Learning from a recording: sample by sample as live, or in batches with the same moments."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.batch import learn_batch
+from adapter.errors import SettingsError
+from adapter.model import SelfModel
+from adapter.outcome import Outcome, collect
+from adapter.pipeline import Pipeline, PipelineSettings
+from adapter.records import Array
+from drivers.interface import DriverError, JointSample, LinkMotion
+from drivers.mcap_file import Log
+
+MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a replay found.
+
+    Attributes:
+        outcome: of the learner.
+        pipeline: its front end has the counts of refused samples.
+        samples: read from the recording.
+        tick_ns: compute time of the front end by sample (exact mode only).
+        wall_s: time spent on learning, without reading the file.
+        span_s: time that the samples span in the recording.
+    """
+
+    outcome: Outcome
+    pipeline: Pipeline
+    samples: int
+    tick_ns: NDArray[np.int64]
+    wall_s: float
+    span_s: float
+
+
+def matching(log: Log, documented: SelfModel) -> Log:
+    """The recording with the robot's joints in the robot's order, and its links' motion.
+
+    Names that differ in nothing but what stands before their number (fer_joint3 for
+    panda_joint3) are taken to mean the same joint, with a warning.
+
+    Raises:
+        DriverError: a joint of the robot is not in the recording; names both lists.
+    """
+    tree = documented.tree
+    joints, warnings = _corresponding(tree.joint_names, log.joint_names, "joint")
+    missing = [name for name, found in zip(tree.joint_names, joints, strict=True) if found is None]
+    if missing:
+        raise DriverError(
+            f"{log.path}: has no joint {', '.join(missing)}; it has {', '.join(log.joint_names)}; "
+            f"{documented.name} has {', '.join(tree.joint_names)}"
+        )
+    links, more = _corresponding(tree.link_names, log.link_names, "link")
+    heard = all(links) and log.twists is not None and log.accels is not None
+    if log.link_names and not heard:
+        more.append(
+            f"{log.path}: motion of not all links was recorded (twists and accelerations of "
+            f"{', '.join(tree.link_names)}); link motion is synthesized instead"
+        )
+    log = log.select([name for name in joints if name], [name for name in links if name and heard])
+    log.warnings.extend(warnings + more)
+    return log
+
+
+def _corresponding(
+    want: tuple[str, ...], have: tuple[str, ...], what: str
+) -> tuple[list[str | None], list[str]]:
+    """For each wanted name the one in `have` (None: not there), and warnings."""
+    if all(name in have for name in want) or len(have) != len(want):
+        return [name if name in have else None for name in want], []
+    number = {_number(name): name for name in have}
+    found = [number.get(_number(name)) for name in want]
+    if len(number) < len(have) or None in found or "" in number:
+        return [name if name in have else None for name in want], []
+    pairs = ", ".join(f"{a} = {b}" for a, b in zip(have, want, strict=False))
+    return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
+
+
+def _number(name: str) -> str:
+    return name[len(name.rstrip("0123456789")) :]
+
+
+def replay(
+    log: Log,
+    documented: SelfModel,
+    settings: PipelineSettings,
+    *,
+    every: int = 1,
+    until_s: float | None = None,
+    progress: Progress | None = None,
+) -> Replay:
+    """Learn from a recording (as `matching` returns it).
+
+    Args:
+        every: samples per update; 1 is the exact mode, which equals the live estimates.
+        until_s: learn only from samples before this time after the first stamp.
+        progress: called with the number of samples taken so far.
+
+    Raises:
+        SettingsError: `every` out of range. DriverError: no samples.
+    """
+    if not 1 <= every <= MOST_PER_UPDATE:
+        raise SettingsError(f"--every takes 1 to {MOST_PER_UPDATE} samples, got {every}")
+    stop = len(log)
+    if until_s is not None:
+        stop = int(np.sum(log.stamp_ns < log.stamp_ns[0] + round(1e9 * until_s)))
+    if stop == 0:
+        raise DriverError(f"{log.path}: no samples to learn from")
+    pipeline = Pipeline(documented, settings)
+    started = time.perf_counter()
+    run = _exact if every == 1 else _batch
+    tick_ns = run(log, stop, pipeline, every, progress or (lambda done: None))
+    wall_s = time.perf_counter() - started
+    span_s = 1e-9 * float(log.stamp_ns[stop - 1] - log.stamp_ns[0])
+    return Replay(collect(pipeline.learner), pipeline, stop, tick_ns, wall_s, span_s)
+
+
+def _exact(
+    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
+) -> NDArray[np.int64]:
+    tick_ns = np.zeros(stop, dtype=np.int64)
+    front_end, learner = pipeline.front_end, pipeline.learner
+    heard = _heard(log)
+    for i in range(stop):
+        links = None
+        if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
+            links = LinkMotion(log.twists[i], log.accels[i])
+        sample = JointSample(int(log.stamp_ns[i]), log.q[i], log.dq[i], log.tau[i], links)
+        before = time.perf_counter_ns()
+        state = front_end.step(sample)
+        tick_ns[i] = time.perf_counter_ns() - before
+        if state is not None:
+            learner.step(state)
+        if i % 500 == 0:
+            progress(i)
+    return tick_ns
+
+
+def _heard(log: Log) -> NDArray[np.bool_] | None:
+    if log.twists is None or log.accels is None:
+        return None
+    return ~(np.isnan(log.twists).all(axis=(1, 2)) & np.isnan(log.accels).all(axis=(1, 2)))
+
+
+def _batch(
+    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
+) -> NDArray[np.int64]:
+    upto = slice(0, stop)
+    states = pipeline.front_end.step_table(
+        log.stamp_ns[upto],
+        log.q[upto],
+        log.dq[upto],
+        log.tau[upto],
+        None if log.twists is None else log.twists[upto],
+        None if log.accels is None else log.accels[upto],
+    )
+    learn_batch(pipeline.learner, states, every, progress)
+    return np.zeros(0, dtype=np.int64)
+
+
+def seconds(log: Log) -> Array:
+    """(m,) seconds since the first stamp."""
+    return 1e-9 * (log.stamp_ns - log.stamp_ns[0])
