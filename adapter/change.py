@@ -10,7 +10,6 @@ from adapter.errors import SettingsError
 from adapter.fast import jit
 from adapter.records import Array
 
-
 BURST_BLOCK = 500  # samples
 
 
@@ -96,13 +95,11 @@ class ChangeDetector:
     def look(self, error: Array) -> bool:
         """Take torque errors (m, n); True when they say, for good, that something changed."""
         s = self.settings
-        if not s.enabled:
-            return False
         if self.waiting:
             return self._confirm(error)
         self.samples += len(error)
         most, mean = compare(error, s.fast, s.slow, self.samples, self.recent, self.level)
-        if self.samples >= self._armed_at and self._alarming(most, mean):
+        if s.enabled and self.samples >= self._armed_at and self._alarming(most, mean):
             self._wait = s.wait
         else:
             self._remember_burst(len(error), most, mean)

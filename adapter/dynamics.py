@@ -142,3 +142,18 @@ class DynamicsNetwork(nn.Module):
     def forward(self, lam: Tensor, q: Tensor, k: Motion) -> Tensor:
         """τ (m, rows) from λ (n, 6), joint angles (m, n) and the kinematics network's output."""
         return torques(self.tree, self.wrenches(lam, q, k))
+
+
+def theta_from_log_cholesky_torch(x: Tensor) -> Tensor:
+    """As `inertia.theta_from_log_cholesky`, differentiable; (..., 10) in and out."""
+    a, d1, d2, d3 = (torch.exp(x[..., k]) for k in range(4))
+    s12, s23, s13, t1, t2, t3 = (x[..., k] for k in range(4, 10))
+    # Second moments ∫ r rᵀ dm over e^{2α}: the upper left block of U Uᵀ.
+    xx = d1 * d1 + s12 * s12 + s13 * s13 + t1 * t1
+    yy = d2 * d2 + s23 * s23 + t2 * t2
+    zz = d3 * d3 + t3 * t3
+    xy = s12 * d2 + s13 * s23 + t1 * t2
+    xz = s13 * d3 + t1 * t3
+    yz = s23 * d3 + t2 * t3
+    parts = [torch.ones_like(a), t1, t2, t3, yy + zz, -xy, -xz, xx + zz, -yz, xx + yy]
+    return torch.stack(parts, dim=-1) * (a * a)[..., None]

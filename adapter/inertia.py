@@ -10,9 +10,7 @@ All functions take leading batch dimensions.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from adapter.spatial import Array, skew
 
@@ -131,18 +129,3 @@ def log_cholesky_from_theta(theta: ArrayLike) -> Array:
     diagonal = np.log(unit[..., (0, 1, 2), (0, 1, 2)])
     sides = unit[..., (0, 1, 0), (1, 2, 2)]
     return np.concatenate([np.log(scale)[..., None], diagonal, sides, unit[..., :3, 3]], axis=-1)
-
-
-def theta_from_log_cholesky_torch(x: Tensor) -> Tensor:
-    """As `theta_from_log_cholesky`, differentiable; (..., 10) in and out."""
-    a, d1, d2, d3 = (torch.exp(x[..., k]) for k in range(4))
-    s12, s23, s13, t1, t2, t3 = (x[..., k] for k in range(4, 10))
-    # Second moments ∫ r rᵀ dm over e^{2α}: the upper left block of U Uᵀ.
-    xx = d1 * d1 + s12 * s12 + s13 * s13 + t1 * t1
-    yy = d2 * d2 + s23 * s23 + t2 * t2
-    zz = d3 * d3 + t3 * t3
-    xy = s12 * d2 + s13 * s23 + t1 * t2
-    xz = s13 * d3 + t1 * t3
-    yz = s23 * d3 + t2 * t3
-    parts = [torch.ones_like(a), t1, t2, t3, yy + zz, -xy, -xz, xx + zz, -yz, xx + yy]
-    return torch.stack(parts, dim=-1) * (a * a)[..., None]

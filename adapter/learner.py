@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 
 from adapter.change import ChangeDetector, ChangeSettings
 from adapter.effects import effects_by_name
@@ -41,7 +40,7 @@ class LearnerSettings:
     seed: int = 0
     wait_for_schema: bool = True
     held_samples: int = 60_000
-    rebuild_rows: int = 20
+    rebuild_rows: int = 10
     schema: SchemaSettings = field(default_factory=SchemaSettings)
     theta: ThetaSettings = field(default_factory=ThetaSettings)
     change: ChangeSettings = field(default_factory=ChangeSettings)
@@ -96,6 +95,8 @@ class Learner:
             tool_theta=tool_theta,
         )
         self.change = ChangeDetector(tree.n, s.change)
+        import torch  # here: the loop process reads settings from this module, and needs none of it
+
         # one flat parameter, so that one fused step serves λ and θ
         flat = torch.zeros(6 * tree.n + self.theta.P, dtype=torch.float64)
         flat.grad = torch.zeros_like(flat)
@@ -106,7 +107,9 @@ class Learner:
         )
         n = tree.n
         self.learned = 0
+        self.stamp_ns = 0
         self.theta_started_ns: int | None = None
+        self.theta_converged = False
         self.changes: list[Change] = []
         self.rebuilds = 0
         self._held = np.zeros((s.held_samples, 4 * n))
@@ -134,6 +137,7 @@ class Learner:
     def step_table(self, table: Array) -> None:
         """Add a table (m, size) of filtered states, then make one update of λ and θ."""
         self.learned += len(table)
+        self.stamp_ns = stamp_of(table[-1])
         self.schema.absorb(table)
         self.schema.compute_gradient()
         self._adam_step(self._theta_is_due(table) and self._take_torque(table))
@@ -203,7 +207,15 @@ class Learner:
         if self.theta.restart_due(len(table)):
             self.theta.restart_spare()
             self._forget_momentum()
+        if self.theta.updates % JUDGE_THETA_EVERY == 0:
+            self._judge_theta()
         return self.theta.compute_gradient()
+
+    def _judge_theta(self) -> None:
+        """θ has converged when it predicts the last seconds as well as it fits all samples."""
+        excess = float(np.mean(self.change.level / self.theta.variance()))
+        limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
+        self.theta_converged = self.change.samples >= self.change.settings.slow and excess < limit
 
     def _look_on(self, table: Array, error: Array) -> None:
         """Keep the scores, and notice a change."""
@@ -269,4 +281,6 @@ class Learner:
             self.rebuilds += 1
 
 
+JUDGE_THETA_EVERY = 100  # updates
+CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import effects_by_name
-from adapter.identifiability import base_parameters
 from adapter.inertia import body_from_theta, min_eigenvalue
 from adapter.learner import Learner, LearnerSettings
 from adapter.model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -102,6 +101,8 @@ def collect(learner: Learner) -> Outcome:
 
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
     """The self model a run ends with: what was learned in, what was not shown held and said so."""
+    from adapter.identifiability import base_parameters  # brings torch; not for the loop
+
     n = documented.tree.n
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE

@@ -5,11 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.batch import learn_batch
+from adapter.checkpoint import load_checkpoint
 from adapter.errors import SettingsError
 from adapter.model import SelfModel
 from adapter.outcome import Outcome, collect
@@ -99,6 +101,7 @@ def replay(
     every: int = 1,
     until_s: float | None = None,
     progress: Progress | None = None,
+    resume: Path | None = None,
 ) -> Replay:
     """Learn from a recording (as `matching` returns it).
 
@@ -106,9 +109,11 @@ def replay(
         every: samples per update; 1 is the exact mode, which equals the live estimates.
         until_s: learn only from samples before this time after the first stamp.
         progress: called with the number of samples taken so far.
+        resume: a checkpoint to go on from.
 
     Raises:
-        SettingsError: `every` out of range. DriverError: no samples.
+        SettingsError: `every` out of range, or a checkpoint that does not fit.
+        DriverError: no samples.
     """
     if not 1 <= every <= MOST_PER_UPDATE:
         raise SettingsError(f"--every takes 1 to {MOST_PER_UPDATE} samples, got {every}")
@@ -118,6 +123,8 @@ def replay(
     if stop == 0:
         raise DriverError(f"{log.path}: no samples to learn from")
     pipeline = Pipeline(documented, settings)
+    if resume is not None:
+        load_checkpoint(pipeline.learner, resume)
     started = time.perf_counter()
     run = _exact if every == 1 else _batch
     tick_ns = run(log, stop, pipeline, every, progress or (lambda done: None))
@@ -150,7 +157,8 @@ def _exact(
 def _heard(log: Log) -> NDArray[np.bool_] | None:
     if log.twists is None or log.accels is None:
         return None
-    return ~(np.isnan(log.twists).all(axis=(1, 2)) & np.isnan(log.accels).all(axis=(1, 2)))
+    silent = np.isnan(log.twists).all(axis=(1, 2)) & np.isnan(log.accels).all(axis=(1, 2))
+    return np.asarray(~silent)
 
 
 def _batch(

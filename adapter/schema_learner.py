@@ -4,9 +4,9 @@ Each joint frame moves in its own tangent (turn phi about its axes, shift d), so
 has a singular place to start from or pass through; λ is read off the frame. Three cares beside
 plain ADAM, each a consequence of the moments being there:
 
-- each channel's noise level is profiled (weight = 1 / its own residual variance), and the noise
-  of measured parent motion, told from third differences, is taken out of the moments, where it
-  would pass for excitation;
+- each channel's noise level is profiled (weight = 1 / its own residual variance);
+- when it is judged what the data show, the noise of measured parent motion is taken out of the
+  moments, where it would pass for excitation;
 - a step is kept out of directions the data do not show: those stay where they started;
 - a step is at most as long as a share of the distance to the optimum, which the curvature
   tells: full speed at first, no spikes later.
@@ -73,7 +73,7 @@ def absorb(
         kinds: (m,) kind of link motion of each sample; only `kind` is taken.
         q, dq: (m, n); motion: (m, n, 12); base: (12,).
         M: (n, 3, 15, 15) moments; newest: (n, 3, 15, 15) those of the last sample alone.
-        noise_power: (n, 4) sum of squared third differences of v, w, a, dw of each link.
+        noise_power: (n, 3) sum of squared third differences of v, w, a of each link.
         last_motion: (3, n, 12) the three motions before.
         counts: (2,) samples taken, third differences taken.
     """
@@ -90,7 +90,7 @@ def absorb(
         counts[0] = keep * counts[0] + 1.0
         if counts[1] >= 0.0:
             for j in range(n):
-                for k in range(12):
+                for k in range(9):
                     d = motion[m, j, k] - last_motion[0, j, k]
                     d -= 3.0 * (last_motion[2, j, k] - last_motion[1, j, k])
                     noise_power[j, k // 3] += d * d / 3.0
@@ -102,7 +102,11 @@ def absorb(
 
 @jit
 def without_noise(parent, M, count, variance, out):
-    """out = M with the parents' noise variance (n, 4; order v, w, a, dw) taken out."""
+    """out = M with the parents' noise variance (n, 3; order v, w, a) taken out.
+
+    Angular accelerations and products of angular velocities leave altogether: what they show of
+    a frame's place, the twists show as well, and their noise cannot be told from jerky motion.
+    """
     for j in range(parent.shape[0]):
         out[j] = M[j]
         i = parent[j]
@@ -113,26 +117,41 @@ def without_noise(parent, M, count, variance, out):
             out[j, 1, 3 + a, 3 + a] -= count * variance[i, 0]
             out[j, 1, 6 + a, 6 + a] -= count * variance[i, 1]
             out[j, 2, 3 + a, 3 + a] -= count * variance[i, 2]
-            out[j, 2, 6 + a, 6 + a] -= count * variance[i, 3]
+        out[j, 2, 6:, :] = 0.0
+        out[j, 2, :, 6:] = 0.0
 
 
 @jit
-def profiled(M, count, D, R0, p, floor, misfit, curved, g, H):
-    """Gradient g (n, 6), every channel weighted by its own residual; if `curved`, curvature too."""
-    gc, Hc = np.zeros(6), np.zeros((6, 6))
+def profiled(M, clean, count, D, R0, p, floor, misfit, curved, g, H):
+    """Gradient g (n, 6), every channel weighted by its own residual.
+
+    If `curved`, also the curvature H (n, 6, 6) that the moments `clean` have with these weights.
+    """
+    gc, Hc, unused = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
     for j in range(R0.shape[0]):
         g[j] = 0.0
         if curved:
             H[j] = 0.0
         for ch in range(3):
             gc[:], Hc[:] = 0.0, 0.0
-            cost = max(channel_cost(M[j], D, ch, R0[j], p[j], curved, gc, Hc), 0.0)
+            cost = max(channel_cost(M[j], D, ch, R0[j], p[j], False, gc, Hc), 0.0)
             power = M[j, ch, 0, 0] + M[j, ch, 1, 1] + M[j, ch, 2, 2]
             weight = 3.0 * count / (cost + 3.0 * count * floor * floor + misfit * power + 1e-300)
             for a in range(6):
                 g[j, a] += weight * gc[a]
             if curved:
+                channel_cost(clean[j], D, ch, R0[j], p[j], True, unused, Hc)
                 H[j] += weight * Hc
+
+
+@jit
+def residual_variance(M, count, D, R0, p, out):
+    """out (n, 3): mean square of what each channel's fit leaves, per component."""
+    g, H = np.zeros(6), np.zeros((6, 6))
+    for j in range(R0.shape[0]):
+        for ch in range(3):
+            cost = channel_cost(M[j], D, ch, R0[j], p[j], False, g, H)
+            out[j, ch] = max(cost, 0.0) / (3.0 * max(count, 1.0))
 
 
 @jit
@@ -216,7 +235,7 @@ class SchemaLearner:
         self.kind = 0  # of link motion, taken from the first sample that has one
         self.M = np.zeros((n, 3, 15, 15))
         self._clean, self._newest = np.zeros_like(self.M), np.zeros_like(self.M)
-        self.noise_power, self.last_motion = np.zeros((n, 4)), np.zeros((3, n, 12))
+        self.noise_power, self.last_motion = np.zeros((n, 3)), np.zeros((3, n, 12))
         self.counts = np.array([0.0, -3.0])
         self.updates = 0
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
@@ -280,10 +299,20 @@ class SchemaLearner:
         return bool((fresh >= 1e-2 * held).all())
 
     def noise_variance(self) -> Array:
-        """(n, 4) noise variance of measured v, w, a, dw of each link; zero where synthesized."""
+        """(n, 3) noise variance of measured v, w, a of each link; zero where synthesized.
+
+        From third differences, which jerky motion can exceed; so at most half of what the fit
+        leaves of v, w and a, the other half being the child's own noise.
+        """
         if self.kind != MOTION_MEASURED or self.counts[1] < 50:
             return np.zeros_like(self.noise_power)
-        return self.noise_power / (THIRD_DIFFERENCE_GAIN * self.counts[1])
+        found = self.noise_power / (THIRD_DIFFERENCE_GAIN * self.counts[1])
+        left = np.empty((len(found), 3))
+        residual_variance(self.M, self.count, DERIVATIVES, self.R0, self.p, left)
+        for j, i in enumerate(self._parent):
+            if i >= 0:
+                found[i] = np.minimum(found[i], 0.5 * left[j, [1, 0, 2]])
+        return found
 
     def compute_gradient(self) -> None:
         """Fill `gradient` for one ADAM step; looks at the curvature now and then."""
@@ -311,13 +340,15 @@ class SchemaLearner:
         self.tangent[:] = 0.0
 
     def _profile(self, curved: bool) -> None:
-        M = self.M
-        if self.kind == MOTION_MEASURED:
-            variance = self.noise_variance()
-            without_noise(self._parent, self.M, self.count, variance, self._clean)
-            M = self._clean
+        """Fill the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
+        size), and the curvature from what of them is motion."""
+        clean = self.M
+        if curved and self.kind == MOTION_MEASURED:
+            clean = self._clean
+            without_noise(self._parent, self.M, self.count, self.noise_variance(), clean)
         profiled(
-            M,
+            self.M,
+            clean,
             self.count,
             DERIVATIVES,
             self.R0,

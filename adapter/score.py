@@ -9,11 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adapter.effects import effects_by_name
 from adapter.errors import ModelError
-from adapter.identifiability import base_parameters, frame_observability
 from adapter.model import SelfModel
 from adapter.outcome import Outcome, changes, frame_errors
 from adapter.records import Array
@@ -71,7 +69,7 @@ def stamps_s(rows: Array) -> Array:
     return 1e-9 * rows[:, 0]
 
 
-def settled_at(times: Array, good: NDArray[np.bool_]) -> float | None:
+def settled_at(times: Array, good: Any) -> float | None:
     """The time after which `good` always holds; None where it does not hold at the end."""
     if not len(times) or not good[-1]:
         return None
@@ -83,6 +81,8 @@ def schema_score(
     outcome: Outcome, documented: SelfModel, reference: Reference, start_s: float | None
 ) -> dict[str, Any]:
     """The `lambda` part of the figures; errors per joint in the observable directions."""
+    from adapter.identifiability import frame_observability  # brings torch; not for the loop
+
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
     lam = outcome.schema_trace[:, 1:].reshape(-1, documented.tree.n, 6)
     turn, shift = frame_errors(lam, reference.lam, seen.projectors)
@@ -163,6 +163,8 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     Convergence is judged up to the first change at the hand: prequential torque error against
     the batch solution's on the same samples, joints in units of their noise.
     """
+    from adapter.identifiability import base_parameters  # brings torch; not for the loop
+
     n = documented.tree.n
     base = base_parameters(documented.tree, outcome.lam, documented.gravity)
     score: dict[str, Any] = {

@@ -16,6 +16,10 @@ import numpy as np
 
 from adapter.fast import jit, link_motion, regressor
 
+# Prior on the second-moment radii of a body, exp(d): log-normal around 0.1 m. Without it a body
+# that the data hardly show would run to the edge of what is possible and take long to come back.
+LOG_RADIUS, LOG_RADIUS_STD = math.log(0.1), 2.0
+
 
 @jit
 def body_from_log_cholesky(x, U, th):
@@ -164,14 +168,28 @@ def joint_costs(th, A, sizes, place, cost):
 
 @jit
 def gradient(
-    x, bodies, A, sizes, place, count, noise_gain, floor, floor_count, error, prior, prior_rhs, th, g, gx
+    x,
+    bodies,
+    A,
+    sizes,
+    place,
+    count,
+    noise_gain,
+    floor,
+    floor_count,
+    error,
+    prior,
+    prior_rhs,
+    th,
+    g,
+    gx,
 ):
     """Gradient gx (P,) of half the weighted cost by the flat parameters, over the sample count.
 
     Each joint is weighted by 1 / (noise_gain * variance), the variance being its own residual
     one (`cost / count`, with `floor_count` samples of variance `floor` (n,) as a prior) plus
-    `error`: the noise level is profiled, not assumed. th and g are filled with the values and the gradient
-    by them.
+    `error`: the noise level is profiled, not assumed. th and g are filled with the values and
+    the gradient by them.
     """
     values(x, bodies, th)
     P = th.shape[0]
@@ -204,5 +222,7 @@ def gradient(
     for b in range(bodies):
         body_from_log_cholesky(x[10 * b : 10 * b + 10], U, out)
         pull_back(U, g[10 * b : 10 * b + 10], gx[10 * b : 10 * b + 10])
+        for i in range(1, 4):
+            gx[10 * b + i] += (x[10 * b + i] - LOG_RADIUS) / LOG_RADIUS_STD**2
     gx[10 * bodies :] = g[10 * bodies :]
     gx *= scale

@@ -52,15 +52,9 @@ class ModelTorque:
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """tau (m, n), N m, for q, dq, ddq (m, n) rad, rad/s, rad/s²."""
         tau = np.empty_like(q)
-        rigid_torque(
-            self._parent,
-            self._R0,
-            self._p,
-            self._base,
-            self._theta,
-            *(np.ascontiguousarray(x) for x in (q, dq, ddq)),
-            tau,
-        )
+        q, dq, ddq = (np.ascontiguousarray(x) for x in (q, dq, ddq))
+        frames = self._parent, self._R0, self._p, self._base
+        rigid_torque(*frames, self._theta, q, dq, ddq, tau)
         for effect, gain in self._effects:
             tau += gain * effect.column(q, dq, ddq)
         return tau

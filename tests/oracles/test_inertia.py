@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 import torch
 
+from adapter.dynamics import theta_from_log_cholesky_torch
 from adapter.inertia import (
     body_from_theta,
     is_consistent,
@@ -16,7 +17,6 @@ from adapter.inertia import (
     pseudo_inertia,
     theta_from_body,
     theta_from_log_cholesky,
-    theta_from_log_cholesky_torch,
     theta_from_pseudo_inertia,
 )
 from adapter.spatial import exp_rotation

@@ -1,0 +1,118 @@
+"""A learner's whole state in a file, so that a run can go on where another ended."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import SettingsError
+from adapter.learner import Change, Learner
+
+VERSION = 1
+
+# What each part would not be the same learner without. Everything else follows from the settings.
+_STATE = {
+    "": (
+        *("learned", "stamp_ns", "theta_started_ns", "theta_converged", "rebuilds"),
+        *("_held_from", "_held_to", "_R0", "_p", "_alarm_ns", "_shadow", "_shadow_at"),
+    ),
+    "schema": (
+        *("R0", "p", "start_lam", "kind", "M", "_newest", "noise_power", "last_motion", "counts"),
+        *("updates", "information", "identifiable", "_inverse", "_distance", "rank", "_calm"),
+        "converged",
+    ),
+    "theta": (
+        *("x", "mean", "th", "A", "newest", "count", "prior", "prior_rhs", "place", "floor"),
+        *("floor_count", "spare_in_use", "updates"),
+    ),
+    "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),
+    "schema_trace": ("_rows", "_used", "_offers", "stride"),
+    "theta_trace": ("_rows", "_used", "_offers", "stride"),
+    "score_trace": ("_rows", "_used", "_offers", "stride"),
+}
+
+
+def save_checkpoint(learner: Learner, path: str | Path) -> None:
+    """Write a learner's state; an existing file is replaced in one go, or not at all."""
+    path = Path(path)
+    arrays: dict[str, Any] = {"version": VERSION, "about": _about(learner)}
+    for part, names in _STATE.items():
+        owner = getattr(learner, part) if part else learner
+        for name in names:
+            value = getattr(owner, name)
+            if value is not None:
+                arrays[f"{part}.{name}"] = value
+    size = len(learner._held)
+    rows = np.arange(learner._held_from, learner._held_to) % size
+    arrays[".held"] = learner._held[rows]
+    arrays[".changes"] = np.array([change.stamp_ns for change in learner.changes], dtype=np.int64)
+    for state in learner.adam.state.values():
+        for key in ("step", "exp_avg", "exp_avg_sq"):
+            arrays[f"adam.{key}"] = state[key].numpy()
+    part_file = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with part_file.open("wb") as file:
+        np.savez(file, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    part_file.replace(path)
+
+
+def load_checkpoint(learner: Learner, path: str | Path) -> None:
+    """Put a fresh learner into the state of a file.
+
+    Raises:
+        SettingsError: not a checkpoint, or one of another tree or other settings.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SettingsError(f"{path}: cannot be read as a checkpoint: {error}") from error
+    if int(arrays.get("version", -1)) != VERSION:
+        raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")
+    if str(arrays["about"]) != _about(learner):
+        raise SettingsError(
+            f"{path}: is of another robot or other learner settings: {arrays['about']}; "
+            f"here: {_about(learner)}"
+        )
+    for part, names in _STATE.items():
+        owner = getattr(learner, part) if part else learner
+        for name in names:
+            _put(owner, name, arrays.get(f"{part}.{name}"))
+    size = len(learner._held)
+    learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
+    learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
+    _load_adam(learner, arrays)
+
+
+def _put(owner: object, name: str, value: np.ndarray | None) -> None:
+    """Set an attribute; arrays in place, since ADAM and the parts share their memory."""
+    if value is None:
+        setattr(owner, name, None)
+    elif value.ndim and isinstance(getattr(owner, name), np.ndarray):
+        getattr(owner, name)[...] = value
+    else:
+        setattr(owner, name, value if value.ndim else value.item())
+
+
+def _load_adam(learner: Learner, arrays: dict[str, Any]) -> None:
+    if "adam.step" not in arrays:
+        return
+    learner.adam.step()  # makes ADAM's buffers; what it does to the parameters is undone below
+    for state in learner.adam.state.values():
+        for key in ("step", "exp_avg", "exp_avg_sq"):
+            state[key].numpy()[...] = arrays[f"adam.{key}"]
+    learner.schema.tangent[:] = 0.0
+    learner.theta.x[:] = arrays["theta.x"]
+
+
+def _about(learner: Learner) -> str:
+    tree = learner.tree
+    about = {"parent": tree.parent, "settings": dataclasses.asdict(learner.settings)}
+    return json.dumps(about, sort_keys=True)

@@ -1,0 +1,213 @@
+"""`adapter run`: learn live, at the arm's own rate."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from adapter.cli.common import (
+    UsageError,
+    add_learning_options,
+    configure,
+    console,
+    program_version,
+    recording_metadata,
+    robot_of,
+    warn,
+)
+from adapter.cli.display import make_display
+from adapter.cli.results import conclude, results_folder
+from adapter.cli.simulated import Simulation, simulation
+from adapter.config import REAL_ARM_EFFECTS, Config
+from adapter.controller import ExcitationController
+from adapter.excitation import MotionLimits
+from adapter.feedforward import Feedforward, ModelFeedforward
+from adapter.front_end import FrontEnd
+from adapter.live import describe_estimate, learner_job
+from adapter.model import SelfModel
+from adapter.model_file import dumps
+from adapter.pipeline import make_front_end
+from adapter.realtime.jobs import RecordingJob, WatchJob
+from adapter.realtime.learned import LearnedFeedforward
+from adapter.realtime.loop import LiveOptions, LiveResult, run_live
+from adapter.score import figures, reference_from
+from drivers.interface import Driver
+from drivers.registry import open_driver, split_address
+
+FEEDFORWARD = ("none", "documented", "learned")
+EXIT_ARM, EXIT_LEARNER = 3, 4
+
+
+def add_parser(commands: Any) -> None:
+    """Declare the subcommand."""
+    parser = commands.add_parser(
+        "run",
+        help="learn live",
+        description="Move an arm on smooth random trajectories (or only listen) and learn λ and "
+        "θ at its rate, in real time. Exit codes: 0 done, 2 wrong use, 3 the arm failed, "
+        "4 the learner failed.",
+    )
+    parser.add_argument(
+        "--driver", default="pybullet:panda", metavar="ADDRESS", help="pybullet:panda, log:FILE"
+    )
+    parser.add_argument("--duration", type=float, default=30.0, metavar="S", help="default 30")
+    parser.add_argument(
+        "--scenario",
+        metavar="NAME",
+        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, wall_mounted",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of the scenario, as in --set mass=0.3 --set noise=none",
+    )
+    parser.add_argument("--passive", action="store_true", help="only listen; do not move the arm")
+    parser.add_argument(
+        "--feedforward",
+        choices=FEEDFORWARD,
+        default="none",
+        help="model that helps the controller; its worth is told as tracking error",
+    )
+    parser.add_argument("--record", type=Path, metavar="FILE", help="default: in the results")
+    parser.add_argument("--no-record", action="store_true", help="keep no recording")
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
+    add_learning_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    if not args.duration > 0.0:
+        raise UsageError(f"--duration must be above zero, got {args.duration}")
+    robot = robot_of(args.robot)
+    scheme, _ = split_address(args.driver)
+    world = simulation(args.driver, args.scenario, args.set, args.seed or 0)
+    default_effects = REAL_ARM_EFFECTS if world is None else world.effects
+    config = configure(args, None, default_effects)
+    if world is not None and config.gravity is None:
+        robot = world.mounted(robot)
+    robot = config.apply(robot)
+    folder = results_folder(args, "run")
+    truth = args.truth or _write_truth(world, folder)
+    reference = reference_from(truth, robot)
+    builders = {} if world is None else {scheme: world.driver}
+    driver = open_driver(args.driver, builders, robot.tree.joint_names)
+    front_end = make_front_end(robot, config.pipeline)
+    result = _go(args, config, robot, driver, front_end, folder, truth)
+    for line in result.timing.lines():
+        console.print(line)
+    warn(([result.fault] if result.fault else []) + result.troubles)
+    if result.collected is None:
+        console.print("[red]error:[/] the learner ended early; the recording is complete")
+        return EXIT_LEARNER
+    _conclude(args, folder, robot, reference, front_end, result)
+    return EXIT_ARM if result.fault else 0
+
+
+def _write_truth(world: Simulation | None, folder: Path) -> Path | None:
+    """Write the scenario's truth; errors are against it where a scenario was asked for."""
+    if world is None:
+        return None
+    path = folder / "truth.json"
+    world.scenario.write_truth(path)
+    return path if world.asked_for else None
+
+
+def _controller(
+    args: argparse.Namespace, config: Config, robot: SelfModel, driver: Driver
+) -> ExcitationController | None:
+    if args.passive or not driver.can_move:
+        return None
+    forward: Feedforward | None = None
+    tool = None if robot.tool is None else robot.tool.theta()
+    if args.feedforward == "documented":
+        forward = ModelFeedforward.of(robot)
+    elif args.feedforward == "learned":
+        effects = config.pipeline.learner.effects
+        forward = LearnedFeedforward(robot.tree, robot.gravity, effects, tool)
+    return ExcitationController(MotionLimits.of(robot), config.excitation, feedforward=forward)
+
+
+def _go(
+    args: argparse.Namespace,
+    config: Config,
+    robot: SelfModel,
+    driver: Driver,
+    front_end: FrontEnd,
+    folder: Path,
+    truth: Path | None,
+) -> LiveResult:
+    """The live run itself."""
+    recording = None
+    if not args.no_record:
+        metadata = recording_metadata(
+            config, robot, shlex.join(sys.argv[1:]), driver=args.driver, scenario=args.scenario
+        )
+        attachments = {"documented.json": dumps(robot).encode()}
+        if truth is not None:
+            attachments["truth.json"] = truth.read_bytes()
+        path = args.record or folder / "recording.mcap"
+        recording = RecordingJob(
+            path,
+            metadata,
+            attachments,
+            overwrite=args.record is None,
+            describe=describe_estimate,
+        )
+    watch = None if args.quiet else WatchJob(partial(make_display, args.duration))
+    return run_live(
+        driver,
+        front_end,
+        controller=_controller(args, config, robot, driver),
+        learner=learner_job(robot, config.pipeline, args.checkpoint, args.resume),
+        recording=recording,
+        watch=watch,
+        options=LiveOptions(duration_s=args.duration),
+        say=lambda line: console.print(line, soft_wrap=True),
+    )
+
+
+def _conclude(
+    args: argparse.Namespace,
+    folder: Path,
+    robot: SelfModel,
+    reference: Any,
+    front_end: FrontEnd,
+    result: LiveResult,
+) -> None:
+    outcome = result.collected
+    refused = dict(front_end.refused)
+    lost = result.unlearned + result.passed_on - outcome.learned
+    if lost:
+        refused["not_reached_learner"] = lost
+    numbers = figures(
+        outcome,
+        robot,
+        reference,
+        samples=result.samples,
+        refused=refused,
+        first_moving_ns=front_end.first_moving_ns,
+        tick_us=result.timing.tick_us,
+        missed_deadlines=result.timing.missed_deadlines,
+        delay_s=front_end.delay_s,
+        warnings=[*front_end.messages, *result.troubles],
+        robot=robot.name,
+        driver=args.driver,
+        scenario=args.scenario,
+        program=f"panda-adapter {program_version()}",
+        timing=result.timing.as_dict(),
+        granted=[grant.line for grant in result.grants],
+        ended=result.ended,
+        fault=result.fault,
+        recorded=result.recorded,
+        unrecorded=result.unrecorded,
+        tracking=result.tracking,
+        feedforward=args.feedforward,
+    )
+    conclude(args, folder, outcome, robot, reference, numbers, front_end, args.driver)

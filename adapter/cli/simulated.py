@@ -1,0 +1,89 @@
+"""Simulated arms for `run`: the only place where adapter and sim meet."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adapter.cli.common import UsageError
+from adapter.model import SelfModel
+from drivers.interface import Driver
+from drivers.pybullet_arm import PyBulletArm
+from drivers.registry import split_address
+
+if TYPE_CHECKING:
+    from sim.scenarios import Scenario
+
+ARMS = ("panda",)
+DEFAULT_SCENARIO = "nominal"
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulation:
+    """A simulated arm that was asked for.
+
+    Attributes:
+        scenario: what is hidden in it.
+        asked_for: the scenario was named on the command line.
+    """
+
+    scenario: Scenario
+    asked_for: bool
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Effects worth learning: those of a real arm where the simulated one has friction."""
+        truth = self.scenario.truth
+        found = []
+        if np.any(truth.Fv):
+            found.append("viscous_friction")
+        if np.any(truth.Fc):
+            found.append("coulomb_friction")
+        if np.any(truth.torque_offset):
+            found.append("torque_offset")
+        if np.any(truth.motor_inertia):
+            found.append("motor_inertia")
+        return tuple(found)
+
+    def mounted(self, robot: SelfModel) -> SelfModel:
+        """The documented robot mounted as the simulated one is: that much is known of it."""
+        return dataclasses.replace(robot, gravity=np.array(self.scenario.truth.gravity))
+
+    def driver(self, arm: str) -> Driver:
+        """The driver, with its plant."""
+        return PyBulletArm(self.scenario.plant())
+
+
+def simulation(
+    address: str, scenario: str | None, options: list[str], seed: int
+) -> Simulation | None:
+    """The simulated arm of an address; None where the address names no simulation.
+
+    Raises:
+        UsageError: no such arm, a scenario for a real arm, an option that is no KEY=VALUE.
+        ValueError: no such scenario or option (names the choices).
+    """
+    scheme, arm = split_address(address)
+    if scheme != "pybullet":
+        if scenario or options:
+            raise UsageError(f"--scenario and --set need --driver pybullet:..., not {address}")
+        return None
+    if arm not in ARMS:
+        raise UsageError(f"no simulated arm '{arm}'; have: {', '.join(ARMS)}")
+    from sim.scenarios import build  # brings PyBullet, which the workers have no use for
+
+    chosen = dict(_option(text) for text in options)
+    return Simulation(build(scenario or DEFAULT_SCENARIO, seed, **chosen), scenario is not None)
+
+
+def _option(text: str) -> tuple[str, Any]:
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise UsageError(f"--set takes KEY=VALUE, got '{text}'")
+    try:
+        return key, json.loads(value)
+    except json.JSONDecodeError:
+        return key, value

@@ -1,0 +1,284 @@
+"""Smooth random motion that shows an arm its body: inside all limits, never repeating.
+
+Each joint follows q(s) = centre + sum_i a_i sin(w_i s + phi_i) along a path time s whose rate
+ds/dt = r goes from 0 to 1 at the start and back to 0 at a stop (quintic steps), so
+
+    dq = r q'(s),   ddq = r² q''(s) + r' q'(s),   and r <= 1.
+
+The limits hold for all time because they hold for the sums of |a_i| w_i^k.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import SettingsError
+from adapter.fast import jit
+from adapter.model import SelfModel
+from adapter.records import Array
+
+# Franka Emika Panda, vendor documentation (limits for planning motion): rad/s², rad/s³, N m/s.
+PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+PANDA_JERK = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
+PANDA_TORQUE_RATE = 1000.0
+# Of an arm whose documentation is silent; modest.
+UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK, UNKNOWN_RANGE = 1.0, 5.0, 1000.0, 0.5
+
+# Largest slope and second derivative of the quintic step over one second, and of the product of
+# two that overlap (a stop during the stop before a rest).
+RAMP_SLOPE, RAMP_BEND = 2.4, 12.4
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """What a motion has to keep, (n,) each: rad, rad/s, rad/s², rad/s³, N m, N m/s.
+
+    Attributes:
+        is_panda: whether the arm is known as one.
+    """
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+    effort: Array
+    torque_rate: Array
+    is_panda: bool = False
+
+    @classmethod
+    def of(cls, model: SelfModel) -> MotionLimits:
+        """Limits of a documented arm; modest ones where its documentation is silent."""
+        n, known = model.tree.n, model.limits
+        panda = n == len(PANDA_JERK) and model.name.startswith(("panda", "fer"))
+        velocity = np.where(np.isfinite(known.velocity), known.velocity, UNKNOWN_VELOCITY)
+        return cls(
+            known.lower,
+            known.upper,
+            velocity,
+            np.array(PANDA_ACCELERATION) if panda else np.full(n, UNKNOWN_ACCELERATION),
+            np.array(PANDA_JERK) if panda else np.full(n, UNKNOWN_JERK),
+            np.where(np.isfinite(known.effort), known.effort, np.inf),
+            np.full(n, PANDA_TORQUE_RATE),
+            panda,
+        )
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """How the arm moves.
+
+    Attributes:
+        seed: of the random motion.
+        sines: in each joint's motion.
+        low_hz, high_hz: between these frequencies.
+        share: of the velocity, acceleration and jerk limits that is never exceeded.
+        range_share: of a joint's range that is used at most.
+        margin: kept from the position limits, rad.
+        start_s, stop_s: length of the soft start and of the safe stop.
+        rests: (from, to) seconds of motion time in which the arm rests; the stop before and the
+            start after each lie behind its first and its second instant.
+    """
+
+    seed: int = 0
+    sines: int = 5
+    low_hz: float = 0.1
+    high_hz: float = 1.0
+    share: float = 0.9
+    range_share: float = 0.8
+    margin: float = 0.15
+    start_s: float = 1.0
+    stop_s: float = 1.0
+    rests: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.sines < 1:
+            raise SettingsError(f"excitation.sines must be at least 1, got {self.sines}")
+        if not 0.0 < self.low_hz < self.high_hz:
+            raise SettingsError(
+                f"excitation: frequencies must be 0 < low_hz < high_hz, got {self.low_hz}, "
+                f"{self.high_hz}"
+            )
+        for name in ("share", "range_share"):
+            if not 0.0 < getattr(self, name) <= 0.95:
+                raise SettingsError(f"excitation.{name} must be above 0 and at most 0.95")
+        for name in ("margin", "start_s", "stop_s"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"excitation.{name} must be above zero")
+        for begin, end in self.rests:
+            if end - begin < self.stop_s:
+                raise SettingsError(f"excitation.rests: {begin} to {end} s is shorter than a stop")
+
+
+@jit
+def smooth_step(x):
+    """Quintic step (value, slope) at x: 0 up to 0, 1 from 1 on."""
+    if x <= 0.0:
+        return 0.0, 0.0
+    if x >= 1.0:
+        return 1.0, 0.0
+    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x)
+
+
+@jit
+def sums_of_sines(s, centre, amplitude, omega, phase, out):
+    """q, q', q'' (3, n) of the path at path time s."""
+    for j in range(centre.shape[0]):
+        q, v, a = centre[j], 0.0, 0.0
+        for i in range(omega.shape[1]):
+            w = omega[j, i]
+            angle = w * s + phase[j, i]
+            x = amplitude[j, i] * math.sin(angle)
+            q += x
+            v += amplitude[j, i] * w * math.cos(angle)
+            a -= w * w * x
+        out[0, j], out[1, j], out[2, j] = q, v, a
+
+
+class RandomMotion:
+    """A random motion that starts at rest at q0.
+
+    Args:
+        limits: to keep.
+        q0: (n,) where the arm is, rad.
+        settings: of the motion.
+
+    Attributes:
+        q, dq, ddq: (n,) reference of the last `advance`.
+
+    Raises:
+        SettingsError: the arm stands outside its position limits.
+    """
+
+    def __init__(
+        self, limits: MotionLimits, q0: Array, settings: ExcitationSettings | None = None
+    ) -> None:
+        self.settings = s = settings or ExcitationSettings()
+        q0 = np.array(q0, dtype=np.float64)
+        rng = np.random.default_rng(s.seed)
+        lower, upper = _usable_range(limits, q0, s)
+        edges = np.geomspace(s.low_hz, s.high_hz, s.sines + 1)
+        shape = (len(q0), s.sines)
+        low, high = np.log(edges[:-1]), np.log(edges[1:])
+        self.omega = 2.0 * np.pi * np.exp(low + (high - low) * rng.random(shape))
+        relative = (0.5 + rng.random(shape)) / self.omega  # alike in speed, not in position
+        self.amplitude = relative * _scale(relative, self.omega, limits, lower, upper, s)[:, None]
+        reach = self.amplitude.sum(axis=1)
+        self.centre = np.minimum(np.maximum(q0, lower + reach), upper - reach)
+        phase = rng.uniform(-np.pi, np.pi, shape)
+        self.phase = _phases_through(phase, self.amplitude, q0 - self.centre)
+        self._path = np.zeros((3, len(q0)))
+        self._s = self._t = 0.0
+        self._rate = 0.0
+        self._stop_at: float | None = None
+        self.q, self.dq, self.ddq = q0, np.zeros(len(q0)), np.zeros(len(q0))
+
+    def advance(self, dt_s: float) -> None:
+        """Go on by dt_s seconds; the reference is in `q`, `dq`, `ddq`."""
+        self._t += dt_s
+        rate, slope = self._rate_at(self._t)
+        self._s += 0.5 * (self._rate + rate) * dt_s
+        self._rate = rate
+        sums_of_sines(self._s, self.centre, self.amplitude, self.omega, self.phase, self._path)
+        position, velocity, acceleration = self._path
+        self.q = position.copy()
+        self.dq = rate * velocity
+        self.ddq = rate * rate * acceleration + slope * velocity
+
+    def begin_stop(self) -> None:
+        """Come to rest within `stop_s` from now on, along the path."""
+        if self._stop_at is None:
+            self._stop_at = self._t
+
+    @property
+    def time_s(self) -> float:
+        """Motion time, s."""
+        return self._t
+
+    @property
+    def at_rest(self) -> bool:
+        """A stop was asked for and is done."""
+        return self._stop_at is not None and self._t >= self._stop_at + self.settings.stop_s
+
+    def _rate_at(self, t: float) -> tuple[float, float]:
+        """Rate of the path time and its slope: a product of steps up and down."""
+        s = self.settings
+        rate, slope = smooth_step(t / s.start_s)
+        slope /= s.start_s
+        for begin, end in s.rests:
+            down, down_slope = smooth_step((t - begin) / s.stop_s)
+            up, up_slope = smooth_step((t - end) / s.start_s)
+            part, part_slope = 1.0 - down + up, up_slope / s.start_s - down_slope / s.stop_s
+            rate, slope = rate * part, slope * part + rate * part_slope
+        if self._stop_at is not None:
+            down, down_slope = smooth_step((t - self._stop_at) / s.stop_s)
+            slope = slope * (1.0 - down) - rate * down_slope / s.stop_s
+            rate *= 1.0 - down
+        return rate, slope
+
+
+def _usable_range(
+    limits: MotionLimits, q0: Array, settings: ExcitationSettings
+) -> tuple[Array, Array]:
+    """Range (n,), (n,) the motion may use; q0 lies in it."""
+    lower = np.where(np.isfinite(limits.lower), limits.lower, q0 - UNKNOWN_RANGE)
+    upper = np.where(np.isfinite(limits.upper), limits.upper, q0 + UNKNOWN_RANGE)
+    outside = (q0 < lower) | (q0 > upper)
+    if outside.any():
+        j = int(np.argmax(outside))
+        raise SettingsError(
+            f"joint {j + 1} stands at {q0[j]:.3f} rad, outside its range [{lower[j]:.3f}, "
+            f"{upper[j]:.3f}]; move it by hand before the start"
+        )
+    return np.minimum(lower + settings.margin, q0), np.maximum(upper - settings.margin, q0)
+
+
+def _scale(
+    relative: Array,
+    omega: Array,
+    limits: MotionLimits,
+    lower: Array,
+    upper: Array,
+    settings: ExcitationSettings,
+) -> Array:
+    """Factor (n,) on the amplitudes with which every limit holds for all time.
+
+    With ramps of T seconds |ddq| <= A + V c1 / T and |jerk| <= J + 3 A c1 / T + V c2 / T², where
+    V, A, J are the sums of |a_i| w_i^k and c1, c2 those of the ramps.
+    """
+    ramp = min(settings.start_s, settings.stop_s)
+    c1, c2 = RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+    reach, speed, acceleration, jerk = ((relative * omega**k).sum(axis=1) for k in range(4))
+    room = settings.range_share * 0.5 * (upper - lower)
+    wanted = settings.share * np.array(
+        [
+            limits.velocity / speed,
+            limits.acceleration / (acceleration + c1 * speed),
+            limits.jerk / (jerk + 3.0 * c1 * acceleration + c2 * speed),
+        ]
+    )
+    factor: Array = np.minimum(room / reach, wanted.min(axis=0))
+    return factor
+
+
+def _phases_through(phase: Array, amplitude: Array, start: Array) -> Array:
+    """Phases as near to the given ones as makes sum_i a_i sin(phi_i) = start (n,).
+
+    All phases turn towards +-pi/2, where the sum is +-sum a_i, until it is right: it changes
+    continuously on the way, and |start| is not larger than that.
+    """
+    goal = np.where(start[:, None] >= (amplitude * np.sin(phase)).sum(axis=1)[:, None], 1.0, -1.0)
+    goal = goal * np.pi / 2
+    turn = np.mod(goal - phase + np.pi, 2.0 * np.pi) - np.pi
+    low, high = np.zeros(len(start)), np.ones(len(start))
+    rising = goal[:, 0] > 0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        value = (amplitude * np.sin(phase + middle[:, None] * turn)).sum(axis=1)
+        short = np.where(rising, value < start, value > start)
+        low, high = np.where(short, middle, low), np.where(short, high, middle)
+    found: Array = phase + high[:, None] * turn
+    return found

@@ -1,0 +1,111 @@
+"""What the learner process and the recorder process are asked to do in a live run."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.learner import Learner
+from adapter.model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
+from adapter.outcome import collect
+from adapter.pipeline import PipelineSettings, make_learner
+from adapter.realtime.jobs import LearnerJob
+from adapter.realtime.snapshot import Snapshot
+from adapter.records import MOTION_MEASURED
+
+STD_EVERY = 50  # publications; the covariance behind the standard deviations takes a millisecond
+
+
+def single_thread_learner(
+    documented: SelfModel, settings: PipelineSettings, resume: Path | None
+) -> Learner:
+    """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit."""
+    import torch
+
+    from adapter.checkpoint import load_checkpoint
+
+    torch.set_num_threads(1)
+    learner = make_learner(documented, settings)
+    if resume is not None:
+        load_checkpoint(learner, resume)
+    return learner
+
+
+def learner_job(
+    documented: SelfModel,
+    settings: PipelineSettings,
+    checkpoint: Path | None = None,
+    resume: Path | None = None,
+) -> LearnerJob:
+    """The learner process of a live run; everything in it can be pickled."""
+    from adapter.checkpoint import save_checkpoint
+
+    return LearnerJob(
+        make=partial(single_thread_learner, documented, settings, resume),
+        collect=collect,
+        publish=Publisher(),
+        save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
+        effect_names=settings.learner.effects,
+    )
+
+
+class Publisher:
+    """Makes the snapshot that other processes read; standard deviations now and then."""
+
+    def __init__(self) -> None:
+        self._calls = 0
+        self._std: tuple[Any, Any, Any] | None = None
+
+    def __call__(self, learner: Learner) -> Snapshot:
+        """The estimate as it stands."""
+        if self._std is None or self._calls % STD_EVERY == 0:
+            self._std = self._deviations(learner)
+        self._calls += 1
+        measured = learner.schema.kind == MOTION_MEASURED
+        return Snapshot(
+            lam=learner.schema.lam,
+            lam_std=self._std[0],
+            theta=learner.theta.theta,
+            theta_std=self._std[1],
+            effects=learner.theta.effect_values,
+            effects_std=self._std[2],
+            lam_converged=learner.schema.converged,
+            theta_converged=learner.theta_converged,
+            stamp_ns=learner.stamp_ns,
+            learned=learner.learned,
+            lambda_source=LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED,
+        )
+
+    @staticmethod
+    def _deviations(learner: Learner) -> tuple[Any, Any, Any]:
+        n, schema, theta = learner.tree.n, learner.schema, learner.theta
+        covariance = schema.covariance()
+        turned = schema.R0 @ covariance[:, :3, :3] @ np.swapaxes(schema.R0, 1, 2)
+        variance = np.concatenate(
+            [np.einsum("jaa->ja", turned), np.einsum("jaa->ja", covariance[:, 3:, 3:])], axis=1
+        )
+        std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
+        bodies = std[: 10 * (n + 1)].reshape(-1, 10)
+        rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)
+        return (
+            np.sqrt(np.maximum(variance, 0.0)),
+            bodies[rows],
+            std[10 * (n + 1) :].reshape(-1, n),
+        )
+
+
+def describe_estimate(snapshot: Snapshot) -> dict[str, Any]:
+    """What of an estimate goes into the recording."""
+    return {
+        "stamp_ns": snapshot.stamp_ns,
+        "learned": snapshot.learned,
+        "lambda_source": snapshot.lambda_source,
+        "lambda_converged": snapshot.lam_converged,
+        "theta_converged": snapshot.theta_converged,
+        "lambda": snapshot.lam.tolist(),
+        "theta": snapshot.theta.tolist(),
+        "effects": snapshot.effects.tolist(),
+    }

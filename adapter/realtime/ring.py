@@ -1,0 +1,174 @@
+"""A ring of fixed-size records between one producer and one consumer, in shared memory.
+
+The producer never waits and takes no lock. `head` counts records ever written and belongs to
+the producer, `tail` counts records ever released and belongs to the consumer. A full ring
+refuses the new record and counts it in `overruns`: what is unread is never overwritten.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.fast import jit
+from adapter.realtime.shared import SharedBlock, fence, free_bytes
+from adapter.records import Array
+
+# Places in the header; what different processes write lies in different cache lines.
+HEAD, TAIL, OVERRUNS, FINISHED, ROWS, SIZE = 0, 8, 16, 17, 24, 25
+HEADER_WORDS = 32
+HEADER_BYTES = 8 * HEADER_WORDS
+
+
+@jit
+def put(header, table, record):
+    """Copy a record (size,) into the ring; False where it is full."""
+    head, rows = header[HEAD], table.shape[0]
+    if head - header[TAIL] >= rows:
+        header[OVERRUNS] += 1
+        return False
+    place = head % rows
+    for i in range(table.shape[1]):
+        table[place, i] = record[i]
+    fence()
+    header[HEAD] = head + 1
+    return True
+
+
+@jit
+def unread_rows(header):
+    """How many records wait; what the producer wrote of them is visible after this call."""
+    waiting = header[HEAD] - header[TAIL]
+    fence()
+    return waiting
+
+
+@jit
+def set_after(header, place, value):
+    """Write a header word after everything before it was done."""
+    fence()
+    header[place] = value
+
+
+def _compile(size: int) -> None:
+    """Compile (or load) the kernels before the clock runs."""
+    header = np.zeros(HEADER_WORDS, np.int64)
+    put(header, np.zeros((1, size)), np.zeros(size))
+    unread_rows(header)
+    set_after(header, TAIL, 1)
+
+
+def ring_bytes(size: int, rows: int) -> int:
+    """Shared memory of a ring, bytes."""
+    return HEADER_BYTES + 8 * size * rows
+
+
+def affordable_rows(sizes: tuple[int, ...], rows: int) -> int:
+    """Rows that rings of these record sizes can have in the shared memory that is free."""
+    free = free_bytes()
+    if free is None or not sizes:
+        return rows
+    spare = free - len(sizes) * HEADER_BYTES
+    return min(rows, max(int(0.9 * spare / (8 * sum(sizes))), 0))
+
+
+class Ring:
+    """See the module. One process pushes, one other process peeks and releases.
+
+    Attributes:
+        name: of the shared block, for `attach`.
+        size: float64 values in a record.
+        rows: capacity.
+    """
+
+    def __init__(self, block: SharedBlock, size: int, rows: int) -> None:
+        self.name, self.size, self.rows = block.name, size, rows
+        self._block = block
+        self._header: NDArray[np.int64] = block.array((HEADER_WORDS,), np.int64, 0)
+        self._table: Array = block.array((rows, size), np.float64, HEADER_BYTES)
+
+    @classmethod
+    def create(cls, size: int, rows: int) -> Ring:
+        """An empty ring of `rows` records of `size` float64. Raises SharedMemoryError."""
+        if size < 1 or rows < 1:
+            raise ValueError(f"a ring needs records and rows of at least 1, got {size}, {rows}")
+        ring = cls(SharedBlock.create(ring_bytes(size, rows)), size, rows)
+        ring._header[ROWS], ring._header[SIZE] = rows, size
+        _compile(size)
+        return ring
+
+    @classmethod
+    def attach(cls, name: str, touch: bool = True) -> Ring:
+        """The same ring in a worker process. Raises FileNotFoundError.
+
+        With `touch` every page is brought into this process now and not one by one later.
+        """
+        block = SharedBlock.attach(name, own=True)
+        header = block.array((HEADER_WORDS,), np.int64, 0)
+        rows, size = int(header[ROWS]), int(header[SIZE])
+        del header
+        ring = cls(block, size, rows)
+        if touch:
+            ring._table[:, 0].sum()
+        return ring
+
+    def push(self, record: Array) -> bool:
+        """Producer: add a record (size,), C order; False where the ring is full (counted)."""
+        return bool(put(self._header, self._table, record))
+
+    def finish(self) -> None:
+        """Producer: nothing comes any more."""
+        set_after(self._header, FINISHED, 1)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the producer is done; look before `peek` to know that a ring is drained."""
+        done = bool(self._header[FINISHED])
+        unread_rows(self._header)
+        return done
+
+    def peek(self, limit: int | None = None) -> Array:
+        """Consumer: the oldest unread records (m, size), as far as they lie in one piece.
+
+        A view of the ring, valid until `release`.
+        """
+        waiting = int(unread_rows(self._header))
+        start = int(self._header[TAIL]) % self.rows
+        count = min(waiting, self.rows - start)
+        if limit is not None:
+            count = min(count, limit)
+        return self._table[start : start + count]
+
+    def release(self, count: int) -> None:
+        """Consumer: give back the `count` oldest records."""
+        set_after(self._header, TAIL, self._header[TAIL] + count)
+
+    @property
+    def pushed(self) -> int:
+        """Records ever written."""
+        return int(self._header[HEAD])
+
+    @property
+    def released(self) -> int:
+        """Records ever given back."""
+        return int(self._header[TAIL])
+
+    @property
+    def unread(self) -> int:
+        """Records that wait."""
+        return self.pushed - self.released
+
+    @property
+    def overruns(self) -> int:
+        """Records refused because the ring was full."""
+        return int(self._header[OVERRUNS])
+
+    def close(self) -> None:
+        """Let go of the ring in this process; may be called more than once."""
+        self._header = self._header.copy()  # the counts stay readable
+        self._table = np.zeros((0, self.size))
+        self._block.close()
+
+    def unlink(self) -> None:
+        """Creator: remove the ring's name."""
+        self._block.unlink()

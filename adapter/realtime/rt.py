@@ -1,0 +1,152 @@
+"""What a loop asks of the operating system: priority, locked memory, its own core, no collector.
+
+Nothing is demanded: each request says in one line whether it was granted, and why not.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+
+MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
+DEFAULT_PRIORITY = 70  # above the kernel's interrupt threads (50), below its watchdogs (99)
+
+
+@dataclass(frozen=True)
+class Grant:
+    """Answer to a request.
+
+    Attributes:
+        what: "priority", "memory", "core" or "collector".
+        granted: whether it was.
+        line: one clear sentence.
+    """
+
+    what: str
+    granted: bool
+    line: str
+
+
+def split_cores(allowed: Sequence[int] | None = None) -> tuple[set[int], set[int]]:
+    """Cores of the loop (the last one allowed) and of the workers (the others, if any)."""
+    cores = sorted(os.sched_getaffinity(0) if allowed is None else allowed)
+    return {cores[-1]}, set(cores[:-1]) or {cores[-1]}
+
+
+class RealTime:
+    """Asks on entry, gives everything back on exit. For the thread that runs the loop.
+
+    Args:
+        core: the loop's core; None leaves the scheduler its choice.
+        priority: of SCHED_FIFO, 1 to 99; None does not ask.
+        lock: whether to lock memory.
+        quiet: whether to stop the garbage collector.
+
+    Attributes:
+        grants: the answers, in order.
+    """
+
+    def __init__(
+        self,
+        core: int | None = None,
+        priority: int | None = DEFAULT_PRIORITY,
+        lock: bool = True,
+        quiet: bool = True,
+    ) -> None:
+        self._core, self._priority, self._lock, self._quiet = core, priority, lock, quiet
+        self._undo = ExitStack()
+        self.grants: list[Grant] = []
+
+    def __enter__(self) -> RealTime:
+        if self._quiet:
+            self._ask(quiet_collector())
+        if self._lock:
+            self._ask(lock_memory())
+        if self._core is not None:
+            self._ask(pin({self._core}))
+        if self._priority is not None:
+            self._ask(request_fifo(self._priority))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._undo.close()
+
+    def _ask(self, answer: tuple[Grant, Callable[[], None] | None]) -> None:
+        grant, undo = answer
+        self.grants.append(grant)
+        if undo is not None:
+            self._undo.callback(undo)
+
+
+def request_fifo(priority: int) -> tuple[Grant, Callable[[], None] | None]:
+    """SCHED_FIFO for the calling thread; its children start ordinary."""
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
+    except (OSError, ValueError) as error:
+        why = "needs root, CAP_SYS_NICE or an rtprio limit (ulimit -r)"
+        return Grant(
+            "priority", False, f"priority: SCHED_FIFO {priority} refused ({error}); {why}"
+        ), None
+    line = f"priority: SCHED_FIFO {priority} granted"
+    return Grant("priority", True, line), lambda: os.sched_setscheduler(0, *before)
+
+
+def lock_memory() -> tuple[Grant, Callable[[], None] | None]:
+    """mlockall: present pages, and future ones where no limit could make an allocation fail."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    unlimited = os.geteuid() == 0 or (
+        resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+    )
+    flags = MCL_CURRENT | (MCL_FUTURE if unlimited else 0)
+    if libc.mlockall(flags) != 0:
+        reason = os.strerror(ctypes.get_errno())
+        why = "needs root, CAP_IPC_LOCK or a memlock limit (ulimit -l)"
+        return Grant("memory", False, f"memory: lock refused ({reason}); {why}"), None
+    what = "present and future pages" if unlimited else "present pages only (ulimit -l)"
+
+    def undo() -> None:
+        libc.munlockall()
+
+    return Grant("memory", True, f"memory: locked, {what}"), undo
+
+
+def pin(cores: set[int]) -> tuple[Grant, Callable[[], None] | None]:
+    """Keep the calling thread on these cores."""
+    before = os.sched_getaffinity(0)
+    names = ", ".join(map(str, sorted(cores)))
+    try:
+        os.sched_setaffinity(0, cores)
+    except (OSError, ValueError) as error:
+        have = ", ".join(map(str, sorted(before)))
+        return Grant("core", False, f"core: {names} refused ({error}); have: {have}"), None
+    shared = " (the only one: the workers share it)" if before <= cores else ""
+    line = f"core: the loop runs on core {names}{shared}"
+    return Grant("core", True, line), lambda: os.sched_setaffinity(0, before)
+
+
+def quiet_collector() -> tuple[Grant, Callable[[], None] | None]:
+    """Collect once, then leave everything that lives alone and collect no more."""
+    enabled = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+    def undo() -> None:
+        gc.unfreeze()
+        if enabled:
+            gc.enable()
+
+    return Grant("collector", True, "collector: frozen and off"), undo

@@ -1,0 +1,248 @@
+"""The present estimate in shared memory: one writer, any number of readers, never torn.
+
+Two slots, each with a sequence number: the writer fills the slot that is not the newest, then
+names it the newest. A reader that was overtaken sees the number change and reads again; a
+writer that dies half-way leaves the other slot whole.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import TracebackType
+
+import numpy as np
+
+from adapter.model import LAMBDA_SOURCES
+from adapter.realtime.shared import SharedBlock
+from adapter.realtime.snapshot_board import (
+    BODIES,
+    EFFECTS,
+    FLAGS,
+    HEADER_WORDS,
+    KIND,
+    LAM_CONVERGED,
+    LEARNED,
+    MAGIC,
+    PID,
+    PUBLISHED,
+    SEQUENCE,
+    SLOT_WORDS,
+    SOURCE,
+    STAMP,
+    TEXT,
+    TEXT_BYTES,
+    THETA_CONVERGED,
+    Board,
+    N,
+    SnapshotError,
+    allocate,
+    put,
+    take,
+    value_count,
+)
+from adapter.records import Array
+
+DEFAULT_NAME = "panda_adapter"
+READ_TIMEOUT_S = 0.2
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """An estimate at one instant; n joints, b bodies, e effects.
+
+    Attributes:
+        lam: (n, 6) λ, rad and m (eq. 3b).
+        lam_std: (n, 6) its standard deviations as in `SelfModel.lam_std`.
+        theta: (b, 10) θ in the link frames (eq. 4b).
+        theta_std: (b, 10) its standard deviations.
+        effects: (e, n) parameters of the effects, in the order of `effect_names`.
+        effects_std: (e, n) their standard deviations.
+        lam_converged: λ is valid to work with.
+        theta_converged: θ and the effects are valid to work with.
+        stamp_ns: of the newest filtered state learned from, on the arm's clock.
+        learned: states learned from so far.
+        lambda_source: one of `model.LAMBDA_SOURCES`; says whether λ was measured.
+        version: counts publications; 0 where nothing was published yet (all values NaN).
+        published_ns: when, on this machine's CLOCK_MONOTONIC (`time.monotonic_ns`).
+    """
+
+    lam: Array
+    lam_std: Array
+    theta: Array
+    theta_std: Array
+    effects: Array
+    effects_std: Array
+    lam_converged: bool = False
+    theta_converged: bool = False
+    stamp_ns: int = 0
+    learned: int = 0
+    lambda_source: str = LAMBDA_SOURCES[0]
+    version: int = 0
+    published_ns: int = 0
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since this was published, on the machine that publishes."""
+        return 1e-9 * (time.monotonic_ns() - self.published_ns)
+
+
+class SnapshotWriter(Board):
+    """Publishes. Built by `create` in the process that owns the memory, `attach` in a worker."""
+
+    @classmethod
+    def create(
+        cls,
+        joint_names: Sequence[str],
+        effect_names: Sequence[str] = (),
+        bodies: int | None = None,
+        name: str | None = DEFAULT_NAME,
+    ) -> SnapshotWriter:
+        """A board with nothing on it.
+
+        Args:
+            joint_names: of the arm.
+            effect_names: of the effects learned beside θ.
+            bodies: rows of θ; one for each joint where None.
+            name: for readers; any free one where None. A leftover of a dead process is replaced.
+
+        Raises:
+            SnapshotError: the name is in use, or too many names.
+        """
+        n, e = len(joint_names), len(effect_names)
+        b = n if bodies is None else bodies
+        text = json.dumps({"joints": list(joint_names), "effects": list(effect_names)}).encode()
+        if len(text) > TEXT_BYTES:
+            raise SnapshotError(f"the joint names take {len(text)} bytes; at most {TEXT_BYTES}")
+        size = 8 * (HEADER_WORDS + 2 * SLOT_WORDS + 2 * value_count(n, b, e)) + TEXT_BYTES
+        board = cls(allocate(size, name))
+        h = board._header
+        h[[N, BODIES, EFFECTS, PID, TEXT]] = n, b, e, os.getpid(), len(text)
+        board._block.array((len(text),), np.uint8, 8 * HEADER_WORDS)[:] = list(text)
+        board._map()
+        board._values[:] = np.nan
+        h[KIND] = MAGIC
+        return board
+
+    @classmethod
+    def attach(cls, name: str) -> SnapshotWriter:
+        """The writer's end in a worker process of the creator. Raises FileNotFoundError."""
+        board = cls(SharedBlock.attach(name, own=True))
+        board._map()
+        return board
+
+    def publish(self, snapshot: Snapshot) -> int:
+        """Publish; `version` and `published_ns` are set here. Returns the version.
+
+        Raises ValueError for a shape that doesn't fit the board or an unknown λ source.
+        """
+        start = 0
+        for key, shape in self.shapes.items():
+            value = np.asarray(getattr(snapshot, key))
+            if value.shape != shape:
+                raise ValueError(f"{key} must have shape {shape}, got {value.shape}")
+            self._some_values[start : start + value.size] = value.reshape(-1)
+            start += value.size
+        if snapshot.lambda_source not in LAMBDA_SOURCES:
+            choices = ", ".join(LAMBDA_SOURCES)
+            raise ValueError(f"no lambda_source '{snapshot.lambda_source}'; have: {choices}")
+        words = self._some_words
+        words[STAMP], words[LEARNED] = snapshot.stamp_ns, snapshot.learned
+        words[PUBLISHED] = time.monotonic_ns()
+        words[FLAGS] = LAM_CONVERGED * bool(snapshot.lam_converged)
+        words[FLAGS] += THETA_CONVERGED * bool(snapshot.theta_converged)
+        words[SOURCE] = LAMBDA_SOURCES.index(snapshot.lambda_source)
+        return int(put(self._header, self._words, self._values, words, self._some_values))
+
+    def unlink(self) -> None:
+        """Creator: remove the name."""
+        self._block.unlink()
+
+
+class SnapshotReader(Board):
+    """Reads the estimate of a running adapter from another process.
+
+    `read` takes some 10 µs, never waits for the writer and returns values of one and the same
+    estimate. Use as a context manager, or call `close`.
+
+    Args:
+        name: as given to `adapter run`.
+
+    Attributes:
+        joint_names: order of the rows of λ (and of θ, on a fixed base).
+        effect_names: order of the rows of `effects`.
+
+    Raises:
+        SnapshotError: nobody publishes under this name.
+    """
+
+    def __init__(self, name: str = DEFAULT_NAME) -> None:
+        try:
+            block = SharedBlock.attach(name)
+        except FileNotFoundError:
+            raise SnapshotError(
+                f"no estimate is published as '{name}'; is `adapter run` running, with this "
+                "snapshot name?"
+            ) from None
+        super().__init__(block)
+        if int(self._header[KIND]) != MAGIC:
+            self._words, self._values = np.zeros((0, 0), np.int64), np.zeros((0, 0))
+            self.close()
+            raise SnapshotError(f"shared memory '{name}' is no estimate of this version")
+        self._map()
+
+    def read(self, timeout_s: float = READ_TIMEOUT_S) -> Snapshot:
+        """The newest estimate; of `version` 0 and NaN where nothing was published yet.
+
+        Raises SnapshotError where no whole one could be read in `timeout_s`, or after `close`.
+        """
+        if not self._header.size:
+            raise SnapshotError(f"the reader of '{self.name}' was closed")
+        words, values = self._some_words, self._some_values
+        deadline = None
+        while not take(self._header, self._words, self._values, words, values):
+            now = time.monotonic()
+            deadline = deadline or now + timeout_s
+            if now > deadline:
+                raise SnapshotError(f"'{self.name}': no whole estimate in {timeout_s} s")
+        parts, start = {}, 0
+        for key, shape in self.shapes.items():
+            size = shape[0] * shape[1]
+            parts[key] = values[start : start + size].reshape(shape).copy()
+            start += size
+        flags = int(words[FLAGS])
+        return Snapshot(
+            **parts,
+            lam_converged=bool(flags & LAM_CONVERGED),
+            theta_converged=bool(flags & THETA_CONVERGED),
+            stamp_ns=int(words[STAMP]),
+            learned=int(words[LEARNED]),
+            lambda_source=LAMBDA_SOURCES[int(words[SOURCE])],
+            version=int(words[SEQUENCE]),
+            published_ns=int(words[PUBLISHED]),
+        )
+
+    def __enter__(self) -> SnapshotReader:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        if hasattr(self, "_words"):
+            self.close()
+
+
+def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
+    """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
+    per_joint, per_body = np.full((n, 6), np.nan), np.full((bodies, 10), np.nan)
+    per_effect = np.full((effects, n), np.nan)
+    return Snapshot(per_joint, per_joint, per_body, per_body, per_effect, per_effect)

@@ -1,0 +1,134 @@
+"""What the loop's timing was: counted while it runs in memory that does not grow."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+SHARES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
+BITS = 9  # a bin is narrower than 1/512 of its value
+OCTAVES = 40  # up to 2^47 ns, a day and a half
+
+
+class Histogram:
+    """Durations in bins of equal relative width; the largest and the sum exactly."""
+
+    def __init__(self) -> None:
+        self._bins = np.zeros((OCTAVES + 2) << BITS, np.int64)
+        self.count = 0
+        self.total_ns = 0
+        self.max_ns = 0
+
+    def add(self, ns: int) -> None:
+        """Count one duration; a negative one counts as zero."""
+        if ns < 0:
+            ns = 0
+        shift = ns.bit_length() - BITS - 1
+        self._bins[ns if shift <= 0 else (shift << BITS) + (ns >> shift)] += 1
+        self.count += 1
+        self.total_ns += ns
+        if ns > self.max_ns:
+            self.max_ns = ns
+
+    def percentile_us(self, share: float) -> float | None:
+        """The duration that `share` percent do not exceed, µs, to within 0.1 %; None if empty."""
+        if not self.count:
+            return None
+        upto = np.cumsum(self._bins)
+        index = int(np.searchsorted(upto, max(share / 100 * self.count, 1.0)))
+        shift = max((index >> BITS) - 1, 0)
+        lower_ns = (index - (shift << BITS)) << shift
+        return min(lower_ns + 0.5 * ((1 << shift) - 1), self.max_ns) * 1e-3
+
+    def summary_us(self) -> dict[str, float | None]:
+        """p50, p99, p99.9 and max, µs; None where nothing was counted."""
+        out = {name: self.percentile_us(share) for name, share in SHARES.items()}
+        out["max"] = self.max_ns * 1e-3 if self.count else None
+        return out
+
+    @property
+    def mean_us(self) -> float | None:
+        """The mean, µs; None if empty."""
+        return 1e-3 * self.total_ns / self.count if self.count else None
+
+
+@dataclass(frozen=True)
+class TimingReport:
+    """Timing of a live run; the `_us` mappings hold p50, p99, p99.9, max in µs.
+
+    Attributes:
+        ticks: how many.
+        missed_deadlines: deadlines that went by unused.
+        tick_us: compute of driver, filter and synthesis.
+        loop_us: all compute of a tick, controller and hand-over to the workers included.
+        plant_us: what a simulated arm took for its physics, in neither of the two above.
+        lateness_us: begin of the tick after its deadline; empty where the source sets the pace.
+        period_us: between the begins of two ticks, with mean.
+    """
+
+    ticks: int
+    missed_deadlines: int
+    tick_us: dict[str, float | None]
+    loop_us: dict[str, float | None]
+    plant_us: dict[str, float | None]
+    lateness_us: dict[str, float | None]
+    period_us: dict[str, float | None]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """For people."""
+        rows = {
+            "compute (driver, filter, synthesis)": self.tick_us,
+            "compute of the whole tick": self.loop_us,
+            "physics of the simulated arm": self.plant_us,
+            "lateness": self.lateness_us,
+            "period": self.period_us,
+        }
+        out = [f"{self.ticks} ticks, {self.missed_deadlines} deadlines missed"]
+        for name, values in rows.items():
+            if values["p50"] is not None:
+                shown = "  ".join(f"{k} {v:.1f}" for k, v in values.items() if v is not None)
+                out.append(f"{name}, µs: {shown}")
+        return out
+
+
+class Timing:
+    """Collects while the loop runs; a tick costs some 2 µs."""
+
+    def __init__(self) -> None:
+        self._tick, self._loop, self._plant = Histogram(), Histogram(), Histogram()
+        self._late, self._period = Histogram(), Histogram()
+        self._began: int | None = None
+
+    def add(self, began: int, stepped: int, ended: int, plant_ns: int) -> None:
+        """One tick: instants (ns) of its begin, of the filtered state, of its end; physics time."""
+        if self._began is not None:
+            self._period.add(began - self._began)
+        self._began = began
+        self._tick.add(stepped - began - plant_ns)
+        self._loop.add(ended - began - plant_ns)
+        if plant_ns:
+            self._plant.add(plant_ns)
+
+    def late(self, ns: int) -> None:
+        """A tick began this long after its deadline."""
+        self._late.add(ns)
+
+    def report(self, missed: int = 0) -> TimingReport:
+        """What was collected so far."""
+        period = self._period.summary_us()
+        period["mean"] = self._period.mean_us
+        return TimingReport(
+            self._loop.count,
+            missed,
+            self._tick.summary_us(),
+            self._loop.summary_us(),
+            self._plant.summary_us(),
+            self._late.summary_us(),
+            period,
+        )

@@ -1,0 +1,156 @@
+"""The arm as a skeleton: where initial, learned and documented λ put the joints in one posture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from adapter.records import Array
+from adapter.report.schema_panels import observable
+from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
+from adapter.run_folder import RunData
+from adapter.spatial import exp_rotation, log_rotation, matrix_from_zxz, rot_z
+from adapter.tree import BASE, Tree
+
+Projection = Callable[[Array], Array]  # points (..., 3) to the drawing plane (..., 2)
+STYLES: dict[str, dict[str, Any]] = {
+    "documented": {"color": MUTED, "linewidth": 8.0, "alpha": 0.3},
+    "learned": {"color": ACCENT, "linewidth": 2.4},
+    "reference": {"color": GOAL, "linewidth": 1.0, "linestyle": (0, (4, 2))},
+    "initial": {"color": INK, "linewidth": 1.2, "linestyle": (0, (1, 1.2))},
+}
+AXIS_SHARE = 0.06  # half length of a joint axis, of the arm's size
+SCALE_M = 0.2
+POSTURES = 60  # of the run that are looked at
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """Joint origins p (n, 3), joint axes (n, 3), and tips of the outermost links by link."""
+
+    p: Array
+    axis: Array
+    tips: dict[int, Array]
+
+    def bones(self, tree: Tree) -> list[Array]:
+        """Lines (2, 3) from each joint's parent to the joint, and on to the tips."""
+        starts = [np.zeros(3) if i == BASE else self.p[i] for i in tree.parent]
+        lines = [np.stack(ends) for ends in zip(starts, self.p, strict=True)]
+        return lines + [np.stack([self.p[j], tip]) for j, tip in self.tips.items()]
+
+
+def skeleton_panels(data: RunData) -> list[Panel]:
+    """The arm as initial, learned, documented (and true) λ have it, from three sides."""
+    q = posture(data)
+    reference = data.documented.lam if data.reference is None else data.reference
+    arms = {
+        "documented": _arm(data, data.documented.lam, q),
+        "initial": replace(_arm(data, data.start_lam, q), tips={}),  # all in one place
+        "learned": _skeleton(data, *completed(data, data.model.lam, reference), q),
+    }
+    if has_reference(data):
+        arms["reference"] = _arm(data, reference, q)
+    views: tuple[tuple[str, Projection, str], ...] = (
+        ("Seen from a corner", _corner, "short ticks are the joint axes"),
+        ("Seen from the side", _side, "x to the right, z up"),
+        ("Seen from the front", _front, "y to the right, z up"),
+    )
+    tree = data.documented.tree
+    return [_view(tree, arms, project, title, note) for title, project, note in views]
+
+
+def has_reference(data: RunData) -> bool:
+    """Whether errors are against something else than the documentation, so that it is drawn."""
+    reference = data.reference
+    return reference is not None and not np.allclose(reference, data.documented.lam, atol=1e-9)
+
+
+def posture(data: RunData) -> Array:
+    """(n,) rad: of the run's postures the one that spreads widest in all directions of a plane;
+    the middle of the joints' ranges where there are none."""
+    if not len(data.score_trace):
+        limits = data.documented.limits
+        return np.nan_to_num(0.5 * (limits.lower + limits.upper), posinf=0.0, neginf=0.0)
+    q = data.score_signals()[0]
+    some = q[np.linspace(0, len(q) - 1, min(len(q), POSTURES)).astype(int)]
+    points = [_arm(data, data.documented.lam, row).p for row in some]
+    spread = [np.linalg.svd(p - p.mean(axis=0), compute_uv=False) for p in points]
+    return np.asarray(some[int(np.argmax([s[min(1, len(s) - 1)] for s in spread]))])
+
+
+def completed(data: RunData, lam: Array, reference: Array) -> tuple[Array, Array]:
+    """Learned frames (R0, p), in the directions that nothing shows as the reference has them."""
+    turn = log_rotation(
+        matrix_from_zxz(lam[:, :3]) @ np.swapaxes(matrix_from_zxz(reference[:, :3]), 1, 2)
+    )
+    error = np.concatenate([turn, lam[:, 3:] - reference[:, 3:]], axis=1)
+    seen = np.einsum("jab,jb->ja", observable(data, reference).projectors, error)
+    turned = np.stack([exp_rotation(phi) for phi in seen[:, :3]])
+    return turned @ matrix_from_zxz(reference[:, :3]), reference[:, 3:] + seen[:, 3:]
+
+
+def _arm(data: RunData, lam: Array, q: Array) -> Skeleton:
+    return _skeleton(data, matrix_from_zxz(lam[:, :3]), lam[:, 3:], q)
+
+
+def _skeleton(data: RunData, rotations: Array, shifts: Array, q: Array) -> Skeleton:
+    tree = data.documented.tree
+    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
+    for j, i in enumerate(tree.parent):
+        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
+        R[j] = R_i @ rotations[j] @ rot_z(q[j])
+        p[j] = p_i + R_i @ shifts[j]
+    tips = {}
+    for j in set(range(tree.n)) - set(tree.parent):
+        riding = [f.position for f in data.documented.frames if f.parent == tree.link_names[j]]
+        if riding:
+            tips[j] = p[j] + R[j] @ max(riding, key=lambda x: float(np.linalg.norm(x)))
+    return Skeleton(p, R[:, :, 2], tips)
+
+
+def _corner(points: Array) -> Array:
+    """Parallel projection, seen from the right in front and from above."""
+    turn, lift = np.radians(-55.0), np.radians(18.0)
+    right = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    towards = np.array([np.cos(turn), np.sin(turn), 0.0])
+    up = np.array([0.0, 0.0, np.cos(lift)]) - np.sin(lift) * towards
+    return np.stack([points @ right, points @ up], axis=-1)
+
+
+def _side(points: Array) -> Array:
+    return points[..., [0, 2]]
+
+
+def _front(points: Array) -> Array:
+    return points[..., [1, 2]]
+
+
+def _view(
+    tree: Tree, arms: dict[str, Skeleton], project: Projection, title: str, note: str
+) -> Panel:
+    drawing = Drawing("third", bare=True, stretch=1.3)
+    ax = drawing.axes[0]
+    for name, style in STYLES.items():
+        for line in arms[name].bones(tree) if name in arms else ():
+            ax.plot(*project(line).T, solid_capstyle="round", **style)
+    learned = arms["learned"]
+    size = float(np.ptp(np.vstack([arm.p for arm in arms.values()]), axis=0).max())
+    for j, (p, axis) in enumerate(zip(learned.p, learned.axis, strict=True)):
+        tick = AXIS_SHARE * size * axis
+        ax.plot(*project(np.stack([p - tick, p + tick])).T, color=joint_color(j), linewidth=1.3)
+        ax.plot(*project(p), color=joint_color(j), marker="o", markersize=3.6)
+    _ground(ax, project, size)
+    return drawing.panel(title, "", note)
+
+
+def _ground(ax: Axes, project: Projection, size: float) -> None:
+    """A square on the ground around the base, and a scale."""
+    square = 0.15 * size * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+    ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
+    left, foot = ax.get_xlim()[0], ax.get_ylim()[0]
+    ax.plot([left, left + SCALE_M], [foot, foot], color=MUTED, linewidth=1.2)
+    ax.text(left + 1.1 * SCALE_M, foot, f"{SCALE_M:g} m", color=MUTED, va="center", fontsize=7.6)

@@ -1,0 +1,250 @@
+"""How figures look: small SVG panels whose colours are the page's, light or dark.
+
+A panel is drawn with stand-in colours; on the way out each becomes a CSS variable, text stays
+text, coordinates are rounded, and nothing that refers to the outside is left in.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+
+from adapter.records import Array
+
+JOINT_COLORS = 8  # the page defines --j1 to --j8; more joints go round again
+_NAMES = ("ink", "muted", "grid", "accent", "goal", *(f"j{k + 1}" for k in range(JOINT_COLORS)))
+STAND_IN = {name: f"#0a0b{k + 16:02x}" for k, name in enumerate(_NAMES)}
+INK, MUTED, GRID = STAND_IN["ink"], STAND_IN["muted"], STAND_IN["grid"]
+ACCENT, GOAL = STAND_IN["accent"], STAND_IN["goal"]
+
+# width, height in inches and text in points: two, three or four panels side by side
+SIZES = {"half": (5.4, 2.55, 7.8), "third": (3.7, 2.35, 7.6), "quarter": (2.9, 2.0, 7.8)}
+MOST_POINTS = 500  # along one line; a panel has no more pixels
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A figure of the page: title and unit above, a note below."""
+
+    title: str
+    unit: str
+    svg: Markup
+    size: str
+    note: str = ""
+
+
+def joint_color(j: int) -> str:
+    """Stand-in of the colour of joint j (from 0)."""
+    return STAND_IN[f"j{j % JOINT_COLORS + 1}"]
+
+
+class Drawing:
+    """A panel being drawn.
+
+    Args:
+        size: one of `SIZES`.
+        rows: relative heights of axes above each other, sharing their x.
+        bare: without axes' frame, ticks and grid, and with equal scales.
+        stretch: times the usual height.
+    """
+
+    _numbers = itertools.count(1)
+
+    def __init__(
+        self, size: str, rows: Sequence[float] = (1.0,), bare: bool = False, stretch: float = 1.0
+    ) -> None:
+        width, height, text = SIZES[size]
+        self.size = size
+        self.figure = Figure(figsize=(width, height * stretch))
+        FigureCanvasSVG(self.figure)
+        with mpl.rc_context({"font.size": text, "axes.linewidth": 0.6}):
+            self.axes: list[Axes] = list(
+                np.ravel(
+                    self.figure.subplots(
+                        len(rows), 1, sharex=True, gridspec_kw={"height_ratios": rows}
+                    )
+                )
+            )
+        left, foot = 3.4 * text / 72 / width, 3.1 * text / 72 / (height * stretch)
+        if bare:
+            self.figure.subplots_adjust(0.02, 0.02, 0.98, 0.98)
+        else:
+            top = 1.0 - 0.06 / stretch
+            self.figure.subplots_adjust(left + 0.02, foot, 0.985, top, hspace=0.14)
+        for ax in self.axes:
+            _dress(ax, text, bare)
+
+    def panel(self, title: str, unit: str = "", note: str = "") -> Panel:
+        """Done: the SVG and its words."""
+        label = f"{title}, {unit}" if unit else title
+        return Panel(title, unit, _svg(self.figure, label, self.size), self.size, note)
+
+
+def _dress(ax: Axes, text: float, bare: bool) -> None:
+    ax.set_facecolor("none")
+    if bare:
+        ax.set_axis_off()
+        ax.set_aspect("equal", adjustable="datalim")
+        return
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(MUTED)
+        ax.spines[side].set_linewidth(0.6)
+    ax.tick_params(colors=MUTED, length=2.5, width=0.6, labelsize=text, pad=2)
+    ax.grid(True, color=GRID, linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.margins(x=0.01)
+    ax.yaxis.set_major_locator(MaxNLocator(5))
+    ax.xaxis.set_major_locator(MaxNLocator(6))
+
+
+def time_axis(drawing: Drawing, label: str = "time after the first motion, s") -> None:
+    """Name the x axis of the lowest axes."""
+    ax = drawing.axes[-1]
+    ax.set_xlabel(label, color=MUTED, labelpad=1.5, fontsize=SIZES[drawing.size][2])
+
+
+def log_axis(ax: Axes, low: float, high: float) -> None:
+    """A logarithmic y axis with powers of ten written out."""
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    ax.yaxis.set_major_locator(LogLocator(10, numticks=7))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+
+
+def log_time(ax: Axes, first_s: float, last_s: float) -> None:
+    """A logarithmic time axis from `first_s` to `last_s`."""
+    ax.set_xscale("log")
+    ax.set_xlim(first_s, max(last_s, 2 * first_s))
+    ax.xaxis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def power_of_ten(value: float) -> str:
+    """10⁻³ below 0.001 and from 10 000 up, the plain number between."""
+    if 0.99e-3 <= value < 1e4:
+        return f"{value:g}"
+    return "10" + str(round(float(np.log10(value)))).translate(SUPERSCRIPTS)
+
+
+def mark(ax: Axes, x: float, text: str, top: float = 0.98) -> None:
+    """A vertical line in time with words at its top, or lower (as a share of the height)."""
+    low, high = ax.get_xlim()
+    if not low <= x <= high:
+        return
+    ax.axvline(x, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)))
+    share = ax.transAxes.inverted().transform(ax.transData.transform((x, ax.get_ylim()[1])))[0]
+    left = share > 0.7
+    ax.annotate(
+        text,
+        (x, top),
+        xycoords=("data", "axes fraction"),
+        xytext=(-3 if left else 3, 0),
+        textcoords="offset points",
+        ha="right" if left else "left",
+        va="top",
+        color=MUTED,
+        fontsize=SIZES["third"][2],
+    )
+
+
+def level(ax: Axes, y: float, text: str) -> None:
+    """A horizontal goal line with its words at the right end."""
+    ax.axhline(y, color=GOAL, linewidth=0.9, linestyle=(0, (4, 2)))
+    ax.annotate(
+        text,
+        (1.0, y),
+        xycoords=("axes fraction", "data"),
+        xytext=(-2, 2),
+        textcoords="offset points",
+        ha="right",
+        va="bottom",
+        color=GOAL,
+        fontsize=SIZES["third"][2],
+    )
+
+
+def thin(t: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
+    """A line with at most about `most` points that keeps every peak: lowest and highest of each
+    stretch, in their order."""
+    if len(t) <= most:
+        return t, y
+    edges = np.linspace(0, len(t), most // 2 + 1).astype(int)
+    keep: list[int] = []
+    for start, stop in itertools.pairwise(edges):
+        part = y[start:stop]
+        if np.isfinite(part).any():
+            keep.extend(sorted({start + int(np.nanargmin(part)), start + int(np.nanargmax(part))}))
+    return t[keep], y[keep]
+
+
+def thin_rows(t: Array, rows: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
+    """Rows (k, ...) over time with at most about `most` of them, the last one kept."""
+    if len(t) <= most:
+        return t, rows
+    keep = np.linspace(0, len(t) - 1, most).astype(int)
+    return t[keep], rows[keep]
+
+
+def _svg(figure: Figure, label: str, size: str) -> Markup:
+    """The figure as inline SVG in the page's colours, without any reference to the outside."""
+    buffer = io.StringIO()
+    names = ("Date", "Creator", "Format", "Type")
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "panda-adapter"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata=dict.fromkeys(names))
+    text = buffer.getvalue()
+    box = re.search(r'viewBox="([^"]+)"', text)
+    assert box is not None
+    body = text[text.index(">", text.index("<svg")) + 1 : text.rindex("</svg>")]
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.S)
+    body = re.sub(r"<style.*?</style>", "", body, flags=re.S)
+    body = body.replace("xlink:href", "href")
+    body = _own_ids(body, f"f{next(Drawing._numbers)}-")
+    body = re.sub(r'\bd="[^"]*"', lambda found: _rounded(found.group(0), 1), body)
+    body = re.sub(r"<[^>]*>", lambda found: _rounded(found.group(0), 2), body)  # not the text
+    body = re.sub(r"\s*\n\s*", "\n", body)
+    for name, color in STAND_IN.items():
+        body = body.replace(color, f"var(--{name})")
+    head = f'<svg class="{size}" viewBox="{box.group(1)}" role="img" aria-label="{escape(label)}">'
+    return Markup(f"{head}{body}</svg>")
+
+
+def _own_ids(body: str, prefix: str) -> str:
+    """Ids that are referred to get a prefix, so that they are the page's only ones; the rest go."""
+    used = set(re.findall(r"[\"(]#([\w.-]+)", body))
+    for name in used:
+        body = body.replace(f'id="{name}"', f"\0{prefix}{name}\0")
+        body = re.sub(rf'(["(])#{re.escape(name)}(?=[")])', rf"\1#{prefix}{name}", body)
+    body = re.sub(r' id="[^"]*"', "", body)
+    return re.sub("\0([^\0]*)\0", r'id="\1"', body)
+
+
+def _rounded(text: str, digits: int) -> str:
+    """All numbers with more decimals than that rounded."""
+
+    def short(found: re.Match[str]) -> str:
+        shown = f"{float(found.group(0)):.{digits}f}".rstrip("0").rstrip(".")
+        return "0" if shown == "-0" else shown
+
+    return re.sub(rf"-?\d+\.\d{{{digits + 1},}}", short, text)
+
+
+def lines_by_joint(ax: Axes, t: Array, values: Array, joints: Iterable[int] | None = None) -> None:
+    """One line per joint, values (k, n), in the joints' colours."""
+    for j in range(values.shape[1]) if joints is None else joints:
+        ax.plot(*thin(t, values[:, j]), color=joint_color(j), linewidth=1.1)

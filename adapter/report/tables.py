@@ -1,0 +1,231 @@
+"""Tables of the report as plain rows of text: joints, identifiability, timing, what was refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from adapter.report.torque_panels import EFFECT_UNITS, SHARE_ALONE, theta_started
+from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
+from adapter.run_folder import RunData
+
+THETA_NAMES = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
+LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
+LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
+THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
+HIDDEN = 1e-6  # a share below it is none
+
+TIMES = {
+    "tick_us": "Compute: driver, filter, synthesis",
+    "loop_us": "Compute of the whole tick",
+    "plant_us": "Physics of the simulated arm",
+    "lateness_us": "Begin of the tick after its deadline",
+    "period_us": "Period",
+    "learner_us": "Update of the learner",
+}
+PERCENTILES = ("p50", "p99", "p99.9", "max")
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under column heads; `units` stand under the heads where given."""
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    units: Sequence[str] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of an identifiability matrix: "alone", "mixed" or "hidden", and its words."""
+
+    kind: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """Which parameters the data show: one row of cells per joint or link."""
+
+    title: str
+    summary: str
+    heads: Sequence[str]
+    rows: Sequence[tuple[str, Sequence[Cell]]] = field(default_factory=list)
+
+
+def joint_table(data: RunData) -> Table:
+    """One row per joint: errors, standard deviations, torque, effects."""
+    schema, theta = data.figures["lambda"], data.figures["theta"]
+    std = schema.get("std") or {}
+    columns: list[tuple[str, str, list[str]]] = [
+        ("Joint", "", list(data.documented.tree.joint_names))
+    ]
+    for head, unit, key, std_key in (
+        ("Turn error", "mrad", "rotation_error_rad", "rotation_rad"),
+        ("Shift error", "mm", "position_error_m", "position_m"),
+    ):
+        if schema.get(key):
+            columns.append((head, unit, _column(schema[key], 1e3)))
+        if std.get(std_key):
+            columns.append((f"± {head.split()[0].lower()}", unit, _column(std[std_key], 1e3)))
+    if theta_started(data):
+        measured = np.sqrt(np.mean(data.score_signals()[3] ** 2, axis=0))
+        columns.append(("Torque, rms", "N m", _column(measured)))
+    if theta.get("torque_rmse_nm"):
+        columns.append(("Not explained", "N m rms", _column(theta["torque_rmse_nm"])))
+    if theta.get("validation_torque_rmse_nm"):
+        columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
+    columns += _effect_columns(data)
+    heads, units, cells = zip(*columns, strict=True)
+    return Table(heads, list(zip(*cells, strict=True)), units)
+
+
+def _column(values: Sequence[Any], scale: float = 1.0) -> list[str]:
+    out = []
+    for value in values:
+        scaled = None if value is None else scale * value
+        tiny = scaled is not None and 0.0 <= abs(scaled) < 1e-3
+        out.append("< 0.001" if tiny else number(scaled))
+    return out
+
+
+def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
+    """The effects of the model file: value ± standard deviation by joint."""
+    columns: dict[tuple[str, str], list[str]] = {}
+    for entry in data.model.effects:
+        for key, value in entry.get("parameters", {}).items():
+            unit = entry.get("units", {}).get(key, "")
+            column = columns.setdefault(
+                (
+                    entry["effect"].replace("_", " ").capitalize(),
+                    f"{key}, {EFFECT_UNITS.get(unit, unit)}",
+                ),
+                [NOTHING] * data.n,
+            )
+            for j in entry.get("joints", ()):
+                column[j - 1] = plus_minus(value, entry.get("std", {}).get(key))
+    return [(head, unit, cells) for (head, unit), cells in columns.items()]
+
+
+def schema_matrix(data: RunData) -> Matrix:
+    """Which turns and shifts of the frames the run's motion showed."""
+    std, names = data.model.lam_std, data.documented.tree.joint_names
+    rank = data.figures["lambda"].get("identifiable_rank")
+    rows = [
+        (name, [_cell(data.lam_shown[j, k], std[j, k], LAMBDA_UNITS[k], "start") for k in range(6)])
+        for j, name in enumerate(names)
+    ]
+    summary = f"{rank} of {6 * data.n} directions"
+    return Matrix("Body schema λ", summary, LAMBDA_NAMES, rows)
+
+
+def theta_matrix(data: RunData) -> Matrix:
+    """Which inertial parameters torques can show."""
+    std, names = data.model.theta_std[-data.n :], data.documented.tree.link_names
+    rank = data.figures["theta"].get("base_parameters")
+    started = theta_started(data)
+    rows = []
+    for j, name in enumerate(names):
+        shares = data.theta_shown[j] if started else np.zeros(10)
+        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], "prior") for k in range(10)]
+        rows.append((name, cells))
+    summary = f"{rank} combinations of {10 * data.n} parameters"
+    if not started:
+        summary = f"none of {10 * data.n} parameters: θ was not learned"
+    return Matrix("Dynamics θ", summary, THETA_NAMES, rows)
+
+
+def _cell(share: float, std: float, unit: str, held_at: str) -> Cell:
+    if share > SHARE_ALONE:
+        return Cell("alone", f"identifiable, standard deviation {number(std, 2)} {unit}")
+    if share > HIDDEN:
+        return Cell("mixed", "identifiable only in combination with others")
+    return Cell("hidden", f"not identifiable, held at its {held_at}")
+
+
+def timing_table(figures: Mapping[str, Any]) -> Table | None:
+    """Percentiles of whatever was timed, µs; None where nothing was."""
+    timing = figures.get("timing") or {}
+    timed = {key: timing.get(key) or figures.get(key) for key in (*TIMES, *timing, *figures)}
+    rows = []
+    for key, values in timed.items():
+        if not (key.endswith("_us") and isinstance(values, Mapping)):
+            continue
+        if any(values.get(name) is not None for name in PERCENTILES):
+            name = TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
+            rows.append([name, *(number(values.get(share)) for share in PERCENTILES)])
+    if not rows:
+        return None
+    return Table(["", *PERCENTILES], rows, ["", *["µs"] * len(PERCENTILES)])
+
+
+def refused_table(figures: Mapping[str, Any]) -> Table | None:
+    """Samples that were not learned from, by reason; None where there were none."""
+    refused = {key: value for key, value in (figures.get("refused") or {}).items() if value}
+    if not refused:
+        return None
+    rows = [
+        [key.replace("_", " "), count(value), REFUSALS.get(key, "")]
+        for key, value in sorted(refused.items(), key=lambda item: -item[1])
+    ]
+    return Table(["Reason", "Samples", "Meaning"], rows)
+
+
+def changes_table(data: RunData) -> Table | None:
+    """Changes at the hand with what they brought; None where there were none."""
+    rows = []
+    for change in data.figures["theta"].get("changes") or []:
+        load = change.get("payload") or {}
+        centre = [load.get(key) for key in ("cx", "cy", "cz")]
+        rows.append(
+            [
+                number(change["stamp_s"] - data.start_s, 4),
+                plus_minus(load["m"], load.get("m_std")) if load else NOTHING,
+                ", ".join(number(1e3 * x) for x in centre if x is not None) or NOTHING,
+            ]
+        )
+    units = ["s after the first motion", "kg", "mm, in the last link's frame"]
+    return Table(["Seen at", "Load", "Centre of mass"], rows, units) if rows else None
+
+
+def theta_table(data: RunData) -> Table:
+    """θ in full, ± standard deviation where a parameter means something on its own."""
+    rows = []
+    for j, name in enumerate(data.documented.tree.link_names):
+        theta, std = data.model.theta[-data.n :][j], data.model.theta_std[-data.n :][j]
+        alone = data.theta_shown[j] > SHARE_ALONE
+        pairs = zip(theta, std, alone, strict=True)
+        rows.append([name, *(plus_minus(x, s) if a else f"({number(x)})" for x, s, a in pairs)])
+    note = "In brackets: the value of a possible body, not identifiable on its own."
+    return Table(["Link", *THETA_NAMES], rows, ["", *THETA_UNITS], note)
+
+
+def schema_table(data: RunData) -> Table:
+    """λ in full, learned and documented."""
+    rows = []
+    for j, name in enumerate(data.documented.tree.joint_names):
+        for what, lam in (("learned", data.model.lam), ("documented", data.documented.lam)):
+            rows.append([f"{name}, {what}", *(f"{x:.4f}".replace("-", "−") for x in lam[j])])
+    note = (
+        "R = Rz(α) Rx(β) Rz(γ). Angles of one frame may differ and mean the same frame; "
+        "directions that motion does not show keep their start."
+    )
+    units = ["", "rad", "rad", "rad", "m", "m", "m"]
+    return Table(["Joint", "α", "β", "γ", "pₓ", "p_y", "p_z"], rows, units, note)
+
+
+def provenance_rows(data: RunData) -> list[tuple[str, str, bool]]:
+    """(name, text, whether it is long) of everything known of where the model came from."""
+    rows = []
+    for key, value in data.model.provenance.items():
+        if key == "changes" or value is None:
+            continue
+        long = isinstance(value, Mapping | list)
+        text = json.dumps(value, indent=1, ensure_ascii=False, default=str) if long else str(value)
+        rows.append((key.replace("_", " ").capitalize(), text, long))
+    return rows

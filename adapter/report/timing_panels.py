@@ -1,0 +1,101 @@
+"""Panels of timing and of how well the arm followed its commands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from adapter.report.style import (
+    ACCENT,
+    JOINT_COLORS,
+    MUTED,
+    SIZES,
+    Drawing,
+    Panel,
+    joint_color,
+)
+from adapter.report.tables import TIMES, Table
+from adapter.report.words import count, number
+
+TRACKED = {
+    "feedback": "feedback alone",
+    "feedforward": "with feed-forward",
+    "documented": "feed-forward of the documented model",
+    "learned": "feed-forward of the learned model",
+}
+
+
+def histogram_panels(figures: Mapping[str, Any]) -> list[Panel]:
+    """Histograms, where the run kept them: counts over durations in µs."""
+    given = (figures.get("timing") or {}).get("histograms") or figures.get("histograms") or {}
+    panels = []
+    for key, bins in given.items():
+        edges, counts = np.array(bins["edges_us"], float), np.array(bins["counts"], float)
+        if not counts.any():
+            continue
+        drawing = Drawing("half")
+        ax = drawing.axes[0]
+        ax.stairs(counts, edges, color=ACCENT, fill=True, alpha=0.75)
+        if counts.max() > 100:
+            ax.set_yscale("symlog", linthresh=1.0)
+            ax.set_ylim(0.0, 2.0 * counts.max())
+        text = SIZES["half"][2]
+        ax.set_xlabel("duration, µs", color=MUTED, labelpad=1.5, fontsize=text)
+        name = TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
+        panels.append(drawing.panel(name, "ticks per bin"))
+    return panels
+
+
+def tracked(figures: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+    """The ways of control that were used and measured, by name."""
+    tracking = figures.get("tracking") or {}
+    names = dict(TRACKED)
+    if figures.get("feedforward"):
+        names["feedforward"] = f"with feed-forward of the {figures['feedforward']} model"
+    return {
+        names.get(name, name.replace("_", " ")): values
+        for name, values in tracking.items()
+        if isinstance(values, Mapping) and values.get("rms_rad")
+    }
+
+
+def tracking_table(figures: Mapping[str, Any]) -> Table | None:
+    """Tracking error by way of control; None where nothing was tracked."""
+    rows = []
+    for name, values in tracked(figures).items():
+        rms = 1e3 * np.array(values["rms_rad"], float)
+        most = values.get("max_rad")
+        rows.append(
+            [
+                name,
+                count(values.get("samples") or 0),
+                number(float(np.sqrt(np.mean(rms**2)))),
+                number(None if not most else 1e3 * max(most)),
+            ]
+        )
+    heads = ["Control", "Samples", "rms, all joints", "largest"]
+    return Table(heads, rows, ["", "", "mrad", "mrad"]) if rows else None
+
+
+def tracking_panel(figures: Mapping[str, Any]) -> Panel | None:
+    """Tracking error by joint as bars; None where nothing was tracked."""
+    ways = tracked(figures)
+    if not ways:
+        return None
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    width = 0.8 / len(ways)
+    n = 0
+    for k, (name, values) in enumerate(ways.items()):
+        rms = 1e3 * np.array(values["rms_rad"], float)
+        n = len(rms)
+        at = np.arange(1, n + 1) + (k - 0.5 * (len(ways) - 1)) * width
+        color = MUTED if k == 0 else ACCENT if k == 1 else joint_color((k + 1) % JOINT_COLORS)
+        ax.bar(at, rms, 0.92 * width, color=color, label=name)
+    ax.set_xticks(range(1, n + 1))
+    ax.grid(False, axis="x")
+    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="best")
+    ax.set_xlabel("joint", color=MUTED, labelpad=1.5, fontsize=SIZES["half"][2])
+    return drawing.panel("Tracking error", "mrad rms")

@@ -1,0 +1,191 @@
+"""Panels of torque: θ over time, the error before learning, and the fit joint by joint."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from adapter.effects import effects_by_name
+from adapter.records import Array
+from adapter.report.style import (
+    ACCENT,
+    GOAL,
+    INK,
+    MUTED,
+    Drawing,
+    Panel,
+    joint_color,
+    lines_by_joint,
+    mark,
+    thin,
+    thin_rows,
+    time_axis,
+)
+from adapter.run_folder import RunData
+from adapter.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
+
+SHOWN_FIT_S = 20.0  # of the end of the run
+SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
+SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
+FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
+GROUPS = (
+    ("Mass", "kg", slice(0, 1)),
+    ("First moments mX mY mZ", "kg m", slice(1, 4)),
+    ("Inertia XX to ZZ", "kg m²", slice(4, 10)),
+)
+EFFECT_UNITS = {"kg m2": "kg m²"}
+
+
+def change_times(data: RunData) -> list[float]:
+    """Times of the changes at the hand, s after the first motion."""
+    changes = data.figures["theta"].get("changes") or []
+    return [change["stamp_s"] - data.start_s for change in changes]
+
+
+def theta_started(data: RunData) -> bool:
+    """Whether θ was learned at all."""
+    return len(data.theta_trace) > 0 and len(data.score_trace) > 0
+
+
+def bodies_over_time(data: RunData, rows: Array) -> Array:
+    """θ (k, n, 10) in use; the spare body stands for the last link once it left its start."""
+    n = data.n
+    bodies = rows[:, 1 : 1 + 10 * (n + 1)].reshape(len(rows), n + 1, 10)
+    spare = data.theta_trace[:, 1 + 10 * n : 1 + 10 * (n + 1)]
+    left = np.flatnonzero((spare != spare[0]).any(axis=1))
+    theta = bodies[:, :n].copy()
+    if len(left):
+        after = rows[:, 0] >= data.theta_trace[left[0], 0]
+        theta[after, -1] = bodies[after, n]
+    return theta
+
+
+def theta_panels(data: RunData) -> list[Panel]:
+    """θ over time (the paper's Fig. 6b) by kind of parameter."""
+    t, rows = thin_rows(data.times(data.theta_trace), data.theta_trace)
+    theta = bodies_over_time(data, rows)
+    panels = []
+    for title, unit, part in GROUPS:
+        drawing = Drawing("third")
+        ax = drawing.axes[0]
+        for j in range(data.n):
+            for k in range(part.start, part.stop):
+                alone = data.theta_shown[j, k] > SHARE_ALONE
+                ax.plot(
+                    t,
+                    theta[:, j, k],
+                    color=joint_color(j),
+                    linewidth=1.3 if alone else 0.7,
+                    alpha=1.0 if alone else 0.6,
+                )
+        _finish(drawing, t, data)
+        panels.append(drawing.panel(title, unit))
+    return panels
+
+
+def effect_panels(data: RunData) -> list[Panel]:
+    """Friction and the other effects over time, one panel each."""
+    names = list(data.figures["theta"].get("effects") or {})
+    t, rows = thin_rows(data.times(data.theta_trace), data.theta_trace)
+    values = rows[:, 1 + 10 * (data.n + 1) :].reshape(len(rows), -1, data.n)
+    panels = []
+    for k, effect in enumerate(effects_by_name(names)):
+        drawing = Drawing("quarter")
+        lines_by_joint(drawing.axes[0], t, values[:, k])
+        _finish(drawing, t, data)
+        title = effect.name.replace("_", " ").capitalize()
+        unit = EFFECT_UNITS.get(effect.unit, effect.unit)
+        panels.append(drawing.panel(f"{title} {effect.key}", unit))
+    return panels
+
+
+def _finish(drawing: Drawing, t: Array, data: RunData) -> None:
+    ax = drawing.axes[0]
+    ax.set_xlim(min(0.0, t[0]), t[-1])
+    for at in change_times(data):
+        mark(ax, at, "change")
+    time_axis(drawing)
+
+
+def prequential_panels(data: RunData) -> list[Panel]:
+    """Torque error of each sample before it was learned from, against batch least squares."""
+    return [_against_batch(data), _by_joint(data)]
+
+
+def _against_batch(data: RunData) -> Panel:
+    """In units of each joint's noise, as convergence is judged; up to the first change."""
+    t = data.times(data.score_trace)
+    _, _, _, tau, error = data.score_signals()
+    changes = change_times(data)
+    early = t < changes[0] if changes else np.ones(len(t), dtype=bool)
+    scale = np.maximum(data.noise, 1e-12) * np.sqrt(data.n)
+    ours = trailing_rms(t, error / scale, TORQUE_WINDOW_S)
+    batch = trailing_rms(t[early], (tau - data.batch)[early] / scale, TORQUE_WINDOW_S)
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    shown, inside = t > t[0] + FIRST_SHOWN_S, t[early] > t[0] + FIRST_SHOWN_S
+    ax.plot(*thin(t[early][inside], batch[inside]), color=MUTED, linewidth=1.1)
+    goal = thin(t[early][inside], TORQUE_GOAL * batch[inside])
+    ax.plot(*goal, color=GOAL, linewidth=1.0, linestyle=(0, (4, 2)))
+    ax.plot(*thin(t[shown], ours[shown]), color=ACCENT, linewidth=1.5)
+    if inside.any():
+        ax.set_ylim(0.0, SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()))
+    _finish(drawing, t, data)
+    converged = data.figures["theta"].get("converged_s")
+    if converged is not None:
+        mark(ax, converged, f"inside {TORQUE_GOAL:g} × batch", top=0.88)
+    return drawing.panel(
+        "Prequential torque error",
+        "in units of the noise",
+        f"rms over {TORQUE_WINDOW_S:g} s and all joints; each sample is predicted first, "
+        "then learned from",
+    )
+
+
+def _by_joint(data: RunData) -> Panel:
+    t = data.times(data.score_trace)
+    error = data.score_signals()[4]
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    shown = t > t[0] + FIRST_SHOWN_S
+    rms = np.stack([trailing_rms(t, error[:, j : j + 1], TORQUE_WINDOW_S) for j in range(data.n)])
+    lines_by_joint(ax, t[shown], rms[:, shown].T)
+    late = shown & (t >= 0.5 * (t[0] + t[-1]))
+    if late.any():
+        ax.set_ylim(0.0, SHOWN_ERROR * float(rms[:, late].max()))
+    _finish(drawing, t, data)
+    note = f"rms over {TORQUE_WINDOW_S:g} s of the error before learning"
+    return drawing.panel("Prequential torque error by joint", "N m", note)
+
+
+def fit_window(data: RunData) -> Array:
+    """Which rows of the score (bool) the fit is shown for: after the last change, at the end."""
+    t = data.times(data.score_trace)
+    start = max([t[-1] - SHOWN_FIT_S, *change_times(data)])
+    return np.asarray(t >= start)
+
+
+def fit_panels(data: RunData) -> list[Panel]:
+    """Measured torque, the learned model's, and what is left, one panel per joint."""
+    rows = fit_window(data)
+    t = data.times(data.score_trace)[rows]
+    tau, fit = data.score_signals()[3][rows], data.fit[rows]
+    if len(t) < 2:
+        return []
+    panels = []
+    for j in range(data.n):
+        drawing = Drawing("quarter", rows=(2.3, 1.0), stretch=1.15)
+        above, below = drawing.axes
+        above.plot(*thin(t, tau[:, j]), color=INK, linewidth=2.2, alpha=0.3)
+        above.plot(*thin(t, fit[:, j]), color=joint_color(j), linewidth=1.0)
+        left = tau[:, j] - fit[:, j]
+        below.axhline(0.0, color=MUTED, linewidth=0.6)
+        below.plot(*thin(t, left), color=joint_color(j), linewidth=0.7)
+        widest = max(float(np.abs(left).max()), 1e-6)
+        below.set_ylim(-1.15 * widest, 1.15 * widest)
+        below.yaxis.set_major_locator(MaxNLocator(3))
+        below.set_xlim(t[0], t[-1])
+        time_axis(drawing)
+        rms = float(np.sqrt(np.mean(left**2)))
+        panels.append(drawing.panel(f"Joint {j + 1}", "N m", f"residual {rms:.3g} N m rms"))
+    return panels

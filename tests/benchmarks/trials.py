@@ -1,0 +1,302 @@
+"""Statistical trials over many seeds on the simulated arm, in lockstep: `make trials`.
+
+Prints one line a trial and a table at the end; the figures in the README come from here. Each
+trial learns exactly what a live run of that seed would learn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.controller import ExcitationController
+from adapter.excitation import ExcitationSettings, MotionLimits
+from adapter.learner import Learner, LearnerSettings
+from adapter.outcome import collect
+from adapter.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.realtime.lockstep import run_lockstep
+from adapter.records import stamp_of
+from adapter.robots import documented
+from adapter.score import reference_from, schema_score, theta_score
+from adapter.theta_learner import ThetaLearner
+from adapter.torque import ModelTorque
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+
+Row = dict[str, Any]
+LATE_S, END_S = 15.0, 30.0
+
+
+class Watched:
+    """A learner that calls `look` with itself before each state it learns from."""
+
+    def __init__(self, learner: Learner, look: Callable[[Learner, np.ndarray], None]) -> None:
+        self.learner, self._look = learner, look
+
+    def step(self, record: np.ndarray) -> None:
+        self._look(self.learner, record)
+        self.learner.step(record)
+
+
+def learn(
+    scenario: str,
+    seed: int,
+    duration_s: float,
+    look: Callable[[Learner, np.ndarray], None] = lambda learner, record: None,
+    motion: dict[str, Any] | None = None,
+    mode: str = "moments",
+    **options: Any,
+) -> tuple[Row, Learner, Any]:
+    """Run one seed; the figures of λ and θ, the learner, and the scenario's truth."""
+    import torch
+
+    torch.set_num_threads(1)
+    robot = documented("panda")
+    world = build(scenario, seed, **options)
+    settings = PipelineSettings(learner=LearnerSettings(seed=seed, mode=mode))
+    front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
+    excitation = ExcitationSettings(seed=seed, **(motion or {}))
+    controller = ExcitationController(MotionLimits.of(robot), excitation)
+    arm = PyBulletArm(world.plant())
+    result = run_lockstep(arm, front_end, Watched(learner, look), controller, duration_s)
+    arm.close()
+    assert result.fault is None, result.fault
+    with tempfile.TemporaryDirectory() as folder:
+        truth = Path(folder) / "truth.json"
+        world.write_truth(truth)
+        reference = reference_from(truth, robot)
+    outcome = collect(learner)
+    start_s = 1e-9 * (front_end.first_moving_ns or 0) - front_end.delay_s
+    figures = {
+        "seed": seed,
+        "lambda": schema_score(outcome, robot, reference, start_s),
+        "theta": theta_score(outcome, robot, start_s),
+    }
+    return figures, learner, world.truth
+
+
+def schema_trial(job: tuple[str, int, str]) -> Row:
+    """λ from synthesized or measured motion."""
+    scenario, seed, mode = job
+    figures, _, _ = learn(scenario, seed, 12.0 if mode == "sample" else 8.0, mode=mode)
+    lam = figures["lambda"]
+    return {
+        "seed": seed,
+        "converged_s": lam["converged_s"],
+        "rotation_rad": max(lam["rotation_error_rad"]),
+        "position_m": max(lam["position_error_m"]),
+        "rank": lam["identifiable_rank"],
+        "rebuilds": figures["theta"]["rebuilds"],
+    }
+
+
+def held_out(seed: int, theta: np.ndarray) -> tuple[np.ndarray, ...]:
+    """(q, dq, ddq, tau) of a motion that was never learned from, noiseless."""
+    from adapter.excitation import RandomMotion
+
+    robot = documented("panda")
+    motion = RandomMotion(
+        MotionLimits.of(robot),
+        np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4]),
+        ExcitationSettings(seed=10_000 + seed),
+    )
+    rows = []
+    for _ in range(1000):
+        motion.advance(0.02)
+        rows.append((motion.q.copy(), motion.dq.copy(), motion.ddq.copy()))
+    q, dq, ddq = (np.array(column) for column in zip(*rows, strict=True))
+    from dataclasses import replace
+
+    return q, dq, ddq, ModelTorque(replace(robot, theta=theta))(q, dq, ddq)
+
+
+def regressor_rows(theta: ThetaLearner, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> Any:
+    """Y (m, 7, 70) of the documented Panda."""
+    from dataclasses import replace
+
+    robot = documented("panda")
+    columns = []
+    for k in range(70):
+        unit = np.zeros(70)
+        unit[k] = 1.0
+        model = replace(robot, theta=unit.reshape(7, 10))
+        columns.append(ModelTorque(model)(q, dq, ddq))
+    return np.stack(columns, axis=-1)
+
+
+def theta_trial(job: tuple[int]) -> Row:
+    """θ against batch least squares on the same samples, by held-out noiseless torque."""
+    (seed,) = job
+    truth = build("nominal", seed).truth
+    q, dq, ddq, tau = held_out(seed, np.array(truth.theta))
+    Y: list[Any] = []
+    ratios: list[tuple[float, float, float]] = []
+    lowest = [np.inf]
+
+    def look(learner: Learner, record: np.ndarray) -> None:
+        theta = learner.theta
+        if theta.updates % 50 or not theta.updates:
+            return
+        if not Y:
+            Y.append(regressor_rows(theta, q, dq, ddq))
+        from adapter.inertia import min_eigenvalue
+
+        lowest[0] = min(lowest[0], float(np.min(min_eigenvalue(theta.theta))))
+        t = 1e-9 * stamp_of(record)
+        if t < LATE_S - 5.0:
+            return
+        noise = np.sqrt(theta.variance())
+        errors = [Y[0] @ th - tau for th in (theta.theta.ravel(), theta.least_squares()[:70])]
+        weighted = [float(np.sqrt(np.mean((e / noise) ** 2))) for e in errors]
+        plain = [float(np.sqrt(np.mean(e**2))) for e in errors]
+        ratios.append((t, weighted[0] / weighted[1], plain[0] / plain[1]))
+
+    figures, _, _ = learn("nominal", seed, END_S, look)
+    table = np.array(ratios)
+    late = table[table[:, 0] >= LATE_S]
+    lam, theta = figures["lambda"]["converged_s"], figures["theta"]["converged_s"]
+    return {
+        "seed": seed,
+        "worst_from_15_s": late[:, 1].max(),
+        "worst_from_15_s_unweighted": late[:, 2].max(),
+        "at_30_s": late[-1, 1],
+        "at_30_s_unweighted": late[-1, 2],
+        "lambda_converged_s": lam,
+        "theta_converged_s": theta,
+        "theta_after_lambda_s": None if theta is None or lam is None else theta - lam,
+        "min_eigenvalue": lowest[0],
+        "changes": len(figures["theta"]["changes"]),
+    }
+
+
+def payload_trial(job: tuple[int, float]) -> Row:
+    """A load picked up at 20 s: prequential torque error and its mass afterwards."""
+    seed, mass = job
+    errors: list[tuple[float, np.ndarray]] = []
+    marks: Row = {}
+
+    def look(learner: Learner, record: np.ndarray) -> None:
+        t = 1e-9 * stamp_of(record) + 0.0375  # the sample that completed the state
+        if t < 18.0:
+            return
+        at, theta = learner.layout, learner.theta
+        q, dq, ddq, tau = (record[None, s] for s in (at.q, at.dq, at.ddq, at.tau))
+        errors.append((t, theta.errors(learner._R0, learner._p, q, dq, ddq, tau)[0]))
+        if t < 20.0:
+            marks["before"] = (learner.schema.R0.copy(), learner.schema.p.copy())
+            marks["noise"] = np.sqrt(theta.variance())
+        payload = theta.payload
+        for after in (1.0, 5.0):
+            if payload is not None and t >= 20.0 + after and f"mass_{after:.0f}_s" not in marks:
+                marks[f"mass_{after:.0f}_s"] = float(payload[0][0])
+
+    figures, learner, _ = learn("payload_at_20s", seed, 26.0, look, mass=mass)
+    t = np.array([row[0] for row in errors])
+    e = np.array([row[1] for row in errors])
+
+    def rms(first: float, last: float, scale: np.ndarray | float) -> float:
+        inside = (t >= first) & (t < last)
+        return float(np.sqrt(np.mean((e[inside] / scale) ** 2)))
+
+    R0, p = marks["before"]
+    moved = max(np.abs(learner.schema.R0 - R0).max(), np.abs(learner.schema.p - p).max())
+    changes = figures["theta"]["changes"]
+    return {
+        "seed": seed,
+        "mass": mass,
+        "alarms": len(changes),
+        "seen_after_s": changes[0]["stamp_s"] + 0.0375 - 20.0 if changes else None,
+        "ratio_weighted": rms(20.8, 21.0, marks["noise"]) / rms(18.0, 20.0, marks["noise"]),
+        "ratio": rms(20.8, 21.0, 1.0) / rms(18.0, 20.0, 1.0),
+        "mass_1_s": marks.get("mass_1_s"),
+        "mass_5_s": marks.get("mass_5_s"),
+        "lambda_moved": float(moved),
+    }
+
+
+def null_trial(job: tuple[str, int]) -> Row:
+    """No change: how many alarms."""
+    scenario, seed = job
+    figures, _, _ = learn(scenario, seed, END_S)
+    return {"scenario": scenario, "seed": seed, "alarms": len(figures["theta"]["changes"])}
+
+
+def rest_trial(job: tuple[int]) -> Row:
+    """Rest for 60 s after 20 s of motion: nothing drifts, and learning goes on where it was."""
+    (seed,) = job
+    marks: Row = {}
+    errors: list[tuple[float, float]] = []
+
+    def look(learner: Learner, record: np.ndarray) -> None:
+        t = 1e-9 * stamp_of(record)
+        at, theta = learner.layout, learner.theta
+        if not theta.updates:
+            return
+        q, dq, ddq, tau = (record[None, s] for s in (at.q, at.dq, at.ddq, at.tau))
+        error = theta.errors(learner._R0, learner._p, q, dq, ddq, tau)[0]
+        errors.append((t, float(np.mean((error / np.sqrt(theta.variance())) ** 2))))
+        key = "before" if t < 50.0 else "after"
+        if key == "before" or "after" not in marks:
+            marks[key] = np.concatenate([theta.mean, learner.schema.lam.ravel()])
+
+    motion = {"rests": ((20.0, 80.0),)}
+    learn("nominal", seed, 84.0, look, motion=motion)
+    table = np.array(errors)
+    before = table[(table[:, 0] > 15.0) & (table[:, 0] < 19.0), 1].mean()
+    after = table[(table[:, 0] > 50.0), 1][:2000].mean()
+    drift = float(np.abs(marks["after"] - marks["before"]).max())
+    return {"seed": seed, "drift": drift, "error_after_over_before": float(np.sqrt(after / before))}
+
+
+TRIALS: dict[str, tuple[Callable[[Any], Row], list[Any]]] = {
+    "lambda_synthesized": (schema_trial, [("nominal", s, "moments") for s in range(10)]),
+    "lambda_measured": (schema_trial, [("bent_link", s, "moments") for s in range(10)]),
+    "lambda_sample_mode": (schema_trial, [("nominal", s, "sample") for s in range(3)]),
+    "theta": (theta_trial, [(s,) for s in range(10)]),
+    "payload": (payload_trial, [(s, m) for m in (0.1, 0.3, 1.0) for s in range(5)]),
+    "null": (null_trial, [(n, s) for n in ("nominal", "friction") for s in range(100, 110)]),
+    "rest": (rest_trial, [(s,) for s in range(3)]),
+}
+
+
+def main() -> None:
+    """Run the trials that were asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("trials", nargs="*", metavar="TRIAL", help=f"of {', '.join(TRIALS)}")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seeds", type=int, help="only so many jobs of each trial")
+    args = parser.parse_args()
+    chosen = args.trials or list(TRIALS)
+    for name in chosen:
+        if name not in TRIALS:
+            parser.error(f"no trial '{name}'; have: {', '.join(TRIALS)}")
+    found: dict[str, list[Row]] = {}
+    with ProcessPoolExecutor(args.workers) as pool:
+        for name in chosen:
+            trial, jobs = TRIALS[name]
+            began = time.monotonic()
+            found[name] = []
+            for row in pool.map(trial, jobs[: args.seeds]):
+                found[name].append(row)
+                shown = (
+                    f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items()
+                )
+                print(name, *shown, flush=True)
+            print(
+                f"{name}: {len(found[name])} trials in {time.monotonic() - began:.0f} s", flush=True
+            )
+    if args.json is not None:
+        args.json.write_text(json.dumps(found, indent=1, default=float) + "\n")
+
+
+if __name__ == "__main__":
+    main()

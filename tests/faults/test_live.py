@@ -1,0 +1,213 @@
+"""The live process: nothing gets lost, whatever fails."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import live_tools as tools
+import pytest
+
+from adapter.realtime.jobs import WatchJob
+from adapter.realtime.lockstep import run_lockstep
+from adapter.realtime.loop import run_live
+from adapter.realtime.worker import WorkerError
+from drivers.interface import DriverError
+from drivers.mcap_file import read_estimates, read_log
+
+SCRIPT = """
+import sys
+from pathlib import Path
+import live_tools as tools
+from adapter.realtime.loop import run_live
+
+if __name__ == "__main__":
+    front_end, controller = tools.parts()
+    result = run_live(
+        tools.simulated_arm(), front_end, controller=controller, learner=tools.learner_job(),
+        recording=tools.recording_job(Path(sys.argv[1])), options=tools.live_options(None),
+        say=lambda line: print(line, flush=True),
+    )
+    print("RESULT", result.ended, result.samples, result.recorded, result.passed_on,
+          result.collected[0], flush=True)
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_leftovers():
+    before = tools.shared_memory()
+    yield
+    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+
+
+def _save(learner) -> None:
+    Path(os.environ["TEST_CHECKPOINT"]).write_text(str(learner.count))
+
+
+def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setenv("TEST_CHECKPOINT", str(tmp_path / "checkpoint"))
+    front_end, controller = tools.parts()
+    path = tmp_path / "a.mcap"
+    result = run_live(
+        tools.simulated_arm(),
+        front_end,
+        controller=controller,
+        learner=tools.learner_job(save=_save),
+        recording=tools.recording_job(path),
+        options=tools.live_options(2.0),
+    )
+    print("\n".join(result.timing.lines()))
+    assert (result.ended, result.fault, result.troubles) == ("duration", None, [])
+    assert result.samples == result.recorded >= 3000
+    assert (result.unlearned, result.unrecorded) == (0, 0)
+    assert [g.what for g in result.grants] == ["collector", "memory", "core", "priority"]
+
+    again, learner = tools.simulated_arm(), tools.Digest()
+    front_end, controller = tools.parts()
+    lockstep = run_lockstep(again, front_end, learner, controller, 2.0)
+    assert result.collected == learner.summary()
+    assert result.collected[:2] == (result.passed_on, True)
+    assert (lockstep.samples, lockstep.ended) == (result.samples, "duration")
+    assert lockstep.tracking == result.tracking
+
+    log = read_log(path)
+    assert len(log) == result.samples and not log.truncated and log.metadata["note"] == "test"
+    assert log.commands is not None and len(log.commands.stamp_ns) == result.samples
+    estimates = list(read_estimates(path))
+    assert len(estimates) > 10 and estimates[-1]["learned"] == result.passed_on
+    assert (tmp_path / "checkpoint").read_text() == str(result.passed_on)
+
+
+@pytest.mark.parametrize("fault", [{"fail_read": 700}, {"fail_command": 700}])
+def test_a_driver_that_fails_is_stopped_and_all_is_kept(tmp_path, fault):
+    arm, path = tools.Swinging(**fault), tmp_path / "a.mcap"
+    front_end, controller = tools.parts()
+    result = run_live(
+        arm,
+        front_end,
+        controller=controller,
+        learner=tools.learner_job(),
+        recording=tools.recording_job(path),
+        options=tools.live_options(30.0),
+    )
+    assert result.ended == "driver_error"
+    assert result.fault in ("the cable came off", "the arm refused")
+    assert arm.stops == 1 and arm.closes == 1
+    assert result.samples == result.recorded == len(read_log(path)) == arm.reads
+    assert result.collected[:2] == (result.passed_on, True) and result.passed_on > 300
+
+
+@pytest.mark.parametrize("kind", [tools.Digest, tools.Dying])
+def test_a_display_sees_the_run_to_its_end(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
+    result = run_live(
+        tools.Swinging(),
+        tools.parts()[0],
+        learner=tools.learner_job(kind),
+        watch=WatchJob(tools.Diary, period_s=0.05),
+        options=tools.live_options(1.0),
+    )
+    lines = [line.split() for line in (tmp_path / "diary").read_text().splitlines()]
+    assert [line[3] for line in lines[:-1]] == ["False"] * (len(lines) - 1) and len(lines) > 5
+    assert lines[-1][1:] == ["0", lines[-1][2], "True"]
+    if kind is tools.Digest:
+        assert int(lines[-1][0]) == result.passed_on
+
+
+def test_passive_only_listens_and_needs_no_workers():
+    arm = tools.Swinging()
+    result = run_live(arm, tools.parts()[0], options=tools.live_options(0.3))
+    assert (result.ended, arm.commands, result.tracking) == ("duration", 0, None)
+    assert result.samples == 301 and result.recorded is None and result.collected is None
+
+
+@pytest.mark.parametrize(("kind", "said"), [(tools.Dying, "exit code 3"), (tools.Failing, "a bug")])
+def test_a_learner_that_dies_does_not_stop_the_arm(tmp_path, kind, said):
+    lines: list[str] = []
+    arm, path = tools.Swinging(), tmp_path / "a.mcap"
+    result = run_live(
+        arm,
+        tools.parts()[0],
+        learner=tools.learner_job(kind),
+        recording=tools.recording_job(path),
+        options=tools.live_options(2.0),
+        say=lines.append,
+    )
+    assert result.ended == "duration" and result.samples == 2001
+    assert result.collected is None and result.unlearned > 0
+    assert len(result.troubles) == 1 and said in result.troubles[0]
+    assert "the arm goes on" in result.troubles[0] and result.troubles[0] in lines
+    assert len(read_log(path)) == result.samples
+
+
+def _no_learner():
+    raise RuntimeError("no such model")
+
+
+def test_what_cannot_start_says_so_and_leaves_nothing(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    arm = tools.Swinging()
+    with pytest.raises(DriverError, match="exists"):
+        run_live(arm, tools.parts()[0], recording=tools.recording_job(path))
+    assert path.read_bytes() == b"precious"
+    job = tools.LearnerJob(_no_learner, tools.Digest.summary)
+    with pytest.raises(WorkerError, match="no such model"):
+        run_live(arm, tools.parts()[0], learner=job, options=tools.live_options(1.0))
+    arm.can_move = False
+    with pytest.raises(DriverError, match="passive"):
+        run_live(arm, tools.parts()[0], controller=tools.parts()[1])
+
+
+@pytest.fixture
+def running(tmp_path):
+    script, path = tmp_path / "live.py", tmp_path / "a.mcap"
+    script.write_text(SCRIPT)
+    folders = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders)}
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    assert tools.wait_for(lambda: path.exists() and path.stat().st_size > 60_000, 120.0)
+    yield process, path
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_brings_the_arm_to_rest_and_closes_everything(running, number):
+    process, path = running
+    os.killpg(process.pid, number)  # as Ctrl-C does: the whole group hears it
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    ended, *counts = out.splitlines()[-1].split()[1:]
+    samples, recorded, passed_on, learned = map(int, counts)
+    assert ended == "interrupted" and samples == recorded and passed_on == learned
+    log = read_log(path)
+    assert len(log) == samples and not log.truncated
+    assert abs(log.dq[-1]).max() < 0.1
+    assert "leaked" not in err and "Traceback" not in err
+
+
+def test_after_kill_9_the_workers_close_the_recording_and_go(running):
+    process, path = running
+    process.kill()
+    process.wait()
+    assert tools.wait_for(lambda: not _truncated(path))
+    assert len(read_log(path)) > 300
+
+
+def _truncated(path: Path) -> bool:
+    try:
+        return read_log(path).truncated
+    except DriverError:
+        return True

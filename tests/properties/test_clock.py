@@ -1,0 +1,82 @@
+"""Deadlines on a made-up clock; the figures of timing against numpy."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adapter.realtime.clock import Clock, sleep_until
+from adapter.realtime.timing import Histogram, Timing
+
+PERIOD = 1_000_000
+
+
+class FakeTime:
+    """A clock that jumps: to the asked instant when slept, a little with every look."""
+
+    def __init__(self) -> None:
+        self.ns = 12_345
+
+    def now(self) -> int:
+        self.ns += 50
+        return self.ns
+
+    def sleep(self, until: int) -> None:
+        self.ns = max(self.ns, until)
+
+
+@settings(max_examples=100, deadline=None)
+@given(work=st.lists(st.integers(0, 6 * PERIOD), min_size=1, max_size=40))
+def test_deadlines_stay_on_the_grid_and_are_missed_only_by_more_than_a_period(work):
+    fake = FakeTime()
+    clock = Clock(PERIOD, now=fake.now, sleep=fake.sleep)
+    clock.start()
+    t0 = clock._t0
+    for waits, busy in enumerate(work, start=1):
+        before, asked = clock.k, fake.ns
+        late = clock.wait()
+        deadline = t0 + clock.k * PERIOD
+        assert late >= 0 and fake.ns == deadline + late
+        assert clock.k + 1 == waits + clock.missed
+        skipped = clock.k - before - 1
+        behind = asked - (t0 + (before + 1) * PERIOD)
+        if skipped:
+            assert behind > PERIOD - 200 and late < 200  # waited for one in the future
+        else:
+            assert behind <= PERIOD
+        fake.ns += busy
+
+
+def test_sleeps_on_the_real_clock_until_the_absolute_instant():
+    at = time.monotonic_ns() + 5_000_000
+    sleep_until(at)
+    assert time.monotonic_ns() >= at
+    sleep_until(at - 1_000_000_000)  # gone by: returns at once
+
+
+@settings(max_examples=50, deadline=None)
+@given(values=st.lists(st.integers(0, 10**12), min_size=1, max_size=300))
+def test_percentiles_are_right_to_two_tenths_of_a_percent(values):
+    histogram = Histogram()
+    for value in values:
+        histogram.add(value)
+    for share in (50.0, 99.0, 99.9):
+        exact = 1e-3 * np.percentile(values, share, method="inverted_cdf")
+        assert abs(histogram.percentile_us(share) - exact) <= 2e-3 * exact + 1e-3
+    assert histogram.summary_us()["max"] == 1e-3 * max(values)
+
+
+def test_physics_time_is_told_apart_and_an_empty_report_says_none():
+    timing = Timing()
+    assert timing.report().tick_us["p50"] is None
+    for k in range(10):
+        timing.add(k * PERIOD, k * PERIOD + 300_000, k * PERIOD + 400_000, 200_000)
+        timing.late(1000)
+    report = timing.report(missed=3)
+    assert (report.ticks, report.missed_deadlines) == (10, 3)
+    assert abs(report.tick_us["p50"] - 100) < 0.2 and abs(report.loop_us["max"] - 200) < 0.2
+    assert abs(report.plant_us["p50"] - 200) < 0.4 and report.period_us["mean"] == 1000.0
+    assert any("3 deadlines missed" in line for line in report.lines())

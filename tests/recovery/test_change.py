@@ -1,0 +1,173 @@
+"""A load at the hand is noticed and weighed; without one, or at rest, nothing moves."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from arm_data import (
+    Motion,
+    arm,
+    learner_for,
+    model_torque,
+    panda_model,
+    record,
+    rms,
+    states_of,
+)
+
+from adapter.learner import Learner
+from adapter.outcome import changes, collect
+from adapter.records import stamps_of
+from adapter.theta_learner import ThetaSettings
+from sim.scenarios import build
+from sim.truth import Truth
+
+AT_S = 9.0
+MASSES = (0.1, 0.3, 1.0)
+
+
+@cache
+def loaded_arm(mass: float) -> Truth:
+    return build("payload_at_20s", mass=mass, t_s=AT_S).truth
+
+
+def held_out_error(learner: Learner, truth: Truth, seed: int = 101) -> np.ndarray:
+    q, dq, ddq, tau = record(truth, Motion(6.0, seed), noisy=False).true
+    theta = learner.theta.theta
+    return rms(tau - model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq))
+
+
+class WithLoad:
+    """A learner that gets a load on the way, and what it looked like at four instants."""
+
+    def __init__(self, mass: float, seed: int) -> None:
+        data = record(loaded_arm(mass), Motion(AT_S + 5.2, seed))
+        self.learner = learner = learner_for(seed=seed)
+        states = states_of(data)
+        stamps = 1e-9 * stamps_of(states)
+        split = int(np.searchsorted(stamps, AT_S - 0.05))
+        for state in states[:split]:
+            learner.step(state)
+        self.frames = learner.schema.R0.copy(), learner.schema.p.copy()
+        self.theta = learner.theta.theta.copy()
+        errors = []
+        for state in states[split:]:
+            learner.step(state)
+            rows = learner.score_trace.rows
+            errors.append((rows[-1, 0] * 1e-9, rows[-1, -7:]))
+        rows = learner.score_trace.rows
+        self.time_s, self.error = 1e-9 * rows[:, 0], rows[:, -7:]
+
+
+@cache
+def with_load(mass: float, seed: int = 1) -> WithLoad:
+    return WithLoad(mass, seed)
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_a_load_is_noticed_once_and_soon(mass: float) -> None:
+    run = with_load(mass)
+    seen = [1e-9 * change.stamp_ns for change in run.learner.changes]
+    assert len(seen) == 1
+    assert AT_S - 0.05 < seen[0] < AT_S + 0.3
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_load_is_weighed(mass: float) -> None:
+    """Within 5 % after 5 s for 0.3 and 1 kg; 0.1 kg within its std or a fifth."""
+    run = with_load(mass)
+    theta, covariance = run.learner.theta.payload
+    slack = 0.05 * mass if mass >= 0.3 else 0.2 * mass
+    assert theta[0] == pytest.approx(mass, abs=slack)
+    assert abs(theta[0] - mass) < 4.0 * np.sqrt(covariance[0, 0]) + 0.01 * mass
+    com = loaded_arm(mass).events[0].com
+    assert np.abs(theta[1:4] / theta[0] - com).max() < (0.02 if mass >= 0.3 else 0.06)
+    told = changes(collect(run.learner))
+    assert len(told) == 1 and told[0]["payload"]["m"] == theta[0]
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_torque_error_is_back_within_a_second(mass: float) -> None:
+    run = with_load(mass)
+    noise = np.sqrt(run.learner.theta.variance())
+    before = (run.time_s > AT_S - 2.0) & (run.time_s < AT_S - 0.1)
+    after = (run.time_s > AT_S + 0.8) & (run.time_s < AT_S + 1.0)
+    level, now = (np.sqrt(np.mean((run.error[k] / noise) ** 2)) for k in (before, after))
+    assert now < 1.5 * level
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_lambda_has_not_moved(mass: float) -> None:
+    run = with_load(mass)
+    R0, p = run.frames
+    assert np.abs(run.learner.schema.R0 - R0).max() < 1e-6
+    assert np.abs(run.learner.schema.p - p).max() < 1e-6
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_other_links_stay_what_they_were(mass: float) -> None:
+    """What was known of the arm is known still: the error with the load on is small."""
+    run = with_load(mass)
+    truth = arm()
+    event = loaded_arm(mass).events[0]
+    gone = Truth.with_changes(truth, events=(type(event)(-1.0, event.m, event.com, event.inertia),))
+    error = held_out_error(run.learner, gone)
+    before = held_out_error_of(run, truth)
+    assert (error < 2.0 * before + 0.02).all()
+
+
+def held_out_error_of(run: WithLoad, truth: Truth) -> np.ndarray:
+    """With the θ from before the load, on the bare arm."""
+    q, dq, ddq, tau = record(truth, Motion(6.0, 101), noisy=False).true
+    return rms(tau - model_torque(panda_model(), run.learner.schema.lam, run.theta, q, dq, ddq))
+
+
+@pytest.mark.parametrize("seed", range(11, 14))
+def test_no_false_alarm(seed: int) -> None:
+    learner = learner_for(seed=seed)
+    for state in states_of(record(arm(), Motion(14.0, seed))):
+        learner.step(state)
+        assert not learner.change.waiting
+    assert not learner.changes and learner.theta.payload is None
+
+
+@pytest.mark.parametrize("joint", [0, 6])
+def test_directional_forgetting_does_not_wind_up(joint: int) -> None:
+    """All joints for 8 s, then one alone for 12 s while 2 s are remembered."""
+    motion = Motion(20.0, 5, alone=(joint, 8.0))
+    states = states_of(record(arm(), motion))
+    learner = learner_for(theta=ThetaSettings(forget_s=2.0))
+    stamps = 1e-9 * stamps_of(states)
+    middle = None
+    for stamp, state in zip(stamps, states, strict=True):
+        if middle is None and stamp > 8.0:
+            middle = held_out_error(learner, arm())
+        learner.step(state)
+    noise = np.sqrt(learner.theta.variance())
+    end = held_out_error(learner, arm())
+    assert np.linalg.norm(end / noise) < 1.5 * np.linalg.norm(middle / noise)
+    assert not learner.changes
+    A = learner.theta.A
+    assert np.isfinite(A).all()
+    assert all(np.linalg.eigvalsh(a)[0] > -1e-6 * np.abs(a).max() for a in A)
+
+
+@pytest.mark.parametrize("forget_s", [None, 2.0])
+def test_at_rest_nothing_moves(forget_s: float | None) -> None:
+    """A minute at rest; then the next motion starts where the last ended."""
+    data = record(arm(), Motion(68.0, 6, rests=((5.0, 66.0),)))
+    states = states_of(data)
+    stamps = 1e-9 * stamps_of(states)
+    assert not ((stamps > 6.1) & (stamps < 65.9)).any()
+    learner = learner_for(theta=ThetaSettings(forget_s=forget_s))
+    split = int(np.searchsorted(stamps, 30.0))
+    for state in states[:split]:
+        learner.step(state)
+    before, lam = held_out_error(learner, arm()), learner.schema.lam
+    for state in states[split:]:
+        learner.step(state)
+    after = held_out_error(learner, arm())
+    noise = np.sqrt(learner.theta.variance())
+    assert np.linalg.norm(after / noise) < 1.2 * np.linalg.norm(before / noise)
+    assert np.abs(learner.schema.lam[1:, 3:] - lam[1:, 3:]).max() < 1e-4
+    assert not learner.changes
