@@ -38,7 +38,7 @@ def learn_batch(
     if learner.settings.wait_for_schema and not learner.schema.converged:
         return
     learner.start_theta(stamp_of(states[0]))
-    usual = learner.rate
+    usual = learner.adam.rate
     learner.set_rate(RATE_WHILE_READING * usual)
     for start in starts:
         learner.learn_theta(states[start : start + every])

@@ -31,6 +31,7 @@ _STATE = {
         *("x", "mean", "th", "A", "newest", "count", "prior", "prior_rhs", "place", "floor"),
         *("floor_count", "spare_in_use", "updates"),
     ),
+    "adam": ("first", "second", "rate"),
     "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),
     "schema_trace": ("_rows", "_used", "_offers", "stride"),
     "theta_trace": ("_rows", "_used", "_offers", "stride"),
@@ -52,9 +53,7 @@ def save_checkpoint(learner: Learner, path: str | Path) -> None:
     rows = np.arange(learner._held_from, learner._held_to) % size
     arrays[".held"] = learner._held[rows]
     arrays[".changes"] = np.array([change.stamp_ns for change in learner.changes], dtype=np.int64)
-    for state in learner.adam.state.values():
-        for key in ("step", "exp_avg", "exp_avg_sq"):
-            arrays[f"adam.{key}"] = state[key].numpy()
+    arrays["adam.steps"] = learner.adam.steps
     part_file = path.with_name(f"{path.name}.{os.getpid()}.part")
     with part_file.open("wb") as file:
         np.savez(file, **arrays)
@@ -88,7 +87,7 @@ def load_checkpoint(learner: Learner, path: str | Path) -> None:
     size = len(learner._held)
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
     learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
-    _load_adam(learner, arrays)
+    learner.adam.steps = int(arrays["adam.steps"])
 
 
 def _put(owner: object, name: str, value: np.ndarray | None) -> None:
@@ -99,17 +98,6 @@ def _put(owner: object, name: str, value: np.ndarray | None) -> None:
         getattr(owner, name)[...] = value
     else:
         setattr(owner, name, value if value.ndim else value.item())
-
-
-def _load_adam(learner: Learner, arrays: dict[str, Any]) -> None:
-    if "adam.step" not in arrays:
-        return
-    learner.adam.step()  # makes ADAM's buffers; what it does to the parameters is undone below
-    for state in learner.adam.state.values():
-        for key in ("step", "exp_avg", "exp_avg_sq"):
-            state[key].numpy()[...] = arrays[f"adam.{key}"]
-    learner.schema.tangent[:] = 0.0
-    learner.theta.x[:] = arrays["theta.x"]
 
 
 def _about(learner: Learner) -> str:

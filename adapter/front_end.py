@@ -20,6 +20,7 @@ from drivers.interface import JointSample
 NON_FINITE, OUT_OF_RANGE, REPEATED = "non_finite", "out_of_range", "repeated"
 TIME_BACKWARDS, SETTLING = "time_backwards", "filter_settling"
 AT_REST, SATURATED = "at_rest", "torque_saturated"
+NOTEWORTHY = (NON_FINITE, OUT_OF_RANGE, TIME_BACKWARDS, SATURATED)
 VERDICTS = (
     "",
     NON_FINITE,
@@ -154,7 +155,7 @@ class FrontEnd:
     Attributes:
         refused: how many samples were not passed on, by reason.
         gaps: (stamp_ns, seconds) of each hole that restarted the filter.
-        messages: one sentence for each kind of refusal, at its first occurrence.
+        messages: one sentence for each kind of trouble, at its first occurrence.
     """
 
     def __init__(
@@ -284,9 +285,15 @@ class FrontEnd:
 
     def _refuse(self, verdict: int, sample: JointSample, before_ns: int) -> None:
         if verdict < 0:
-            self.gaps.append((int(before_ns), 1e-9 * (sample.stamp_ns - int(before_ns))))
+            gap_s = 1e-9 * (sample.stamp_ns - int(before_ns))
+            if not self.gaps:
+                self.messages.append(
+                    f"at {1e-9 * before_ns:.3f} s: {gap_s:.3f} s without a sample; the filter "
+                    "starts anew"
+                )
+            self.gaps.append((int(before_ns), gap_s))
         reason = VERDICTS[abs(verdict)]
-        if not self.refused[reason]:
+        if reason in NOTEWORTHY and not self.refused[reason]:
             self.messages.append(self._sentence(reason, sample))
         self.refused[reason] += 1
 
@@ -307,6 +314,6 @@ class FrontEnd:
                     )
         if reason == NON_FINITE:
             return f"{at}: a reading is not a finite number; the sample was refused"
-        if reason == TIME_BACKWARDS:
-            return f"{at}: time does not increase; the sample was refused"
-        return f"{at}: first sample not learned from: {reason.replace('_', ' ')}"
+        if reason == SATURATED:
+            return f"{at}: a torque is at its limit; nothing is learned around it"
+        return f"{at}: time does not increase; the sample was refused"

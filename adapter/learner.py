@@ -18,7 +18,6 @@ from adapter.tree import Tree
 from adapter.twist import base_motion
 
 MODES = ("moments", "sample")
-ADAM_EPS = 1e-12  # gradients come in units of information per sample; far below any that matters
 
 
 @dataclass(frozen=True)
@@ -95,16 +94,12 @@ class Learner:
             tool_theta=tool_theta,
         )
         self.change = ChangeDetector(tree.n, s.change)
-        import torch  # here: the loop process reads settings from this module, and needs none of it
+        from adapter.adam import FlatAdam  # brings torch; the loop process needs only settings
 
-        # one flat parameter, so that one fused step serves λ and θ
-        flat = torch.zeros(6 * tree.n + self.theta.P, dtype=torch.float64)
-        flat.grad = torch.zeros_like(flat)
-        self._bind(flat.numpy(), flat.grad.numpy())
-        self.rate = s.theta.sample_rate if s.mode == "sample" else s.theta.rate
-        self.adam = torch.optim.Adam(
-            [flat], lr=self.rate, betas=s.theta.betas, eps=ADAM_EPS, fused=True
-        )
+        rate = s.theta.sample_rate if s.mode == "sample" else s.theta.rate
+        # one flat parameter, so that one step serves λ and θ
+        self.adam = FlatAdam(6 * tree.n + self.theta.P, rate, s.theta.betas)
+        self._bind(self.adam.parameters, self.adam.gradient)
         n = tree.n
         self.learned = 0
         self.stamp_ns = 0
@@ -162,14 +157,14 @@ class Learner:
 
     def set_rate(self, rate: float) -> None:
         """Let ADAM go on at this rate per update."""
-        self.rate = self.adam.param_groups[0]["lr"] = rate
+        self.adam.rate = rate
 
     def _adam_step(self, theta_too: bool) -> None:
         """One ADAM step on the gradients as they stand; θ's counts only if asked for."""
         if not theta_too:
             self.theta.gradient[:] = 0.0
         self.adam.step()
-        self.schema.apply_step(self.rate)
+        self.schema.apply_step(self.adam.rate)
         if theta_too:
             self.theta.after_step()
 
@@ -240,9 +235,7 @@ class Learner:
 
     def _forget_momentum(self) -> None:
         """ADAM's averages of θ's gradient are of no use after a jump."""
-        for state in self.adam.state.values():
-            for moment in (state["exp_avg"], state["exp_avg_sq"]):
-                moment[6 * self.tree.n :] = 0.0
+        self.adam.forget(slice(6 * self.tree.n, None))
 
     def _hold(self, rows: Array) -> None:
         size = len(self._held)

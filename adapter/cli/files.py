@@ -133,10 +133,7 @@ def run_recover(args: argparse.Namespace) -> int:
 
 def run_info(args: argparse.Namespace) -> int:
     """Carry `info` out."""
-    if args.file.suffix == ".json":
-        facts = _model_facts(args.file)
-    else:
-        facts = describe(args.file)
+    facts = _model_facts(args.file) if args.file.suffix == ".json" else describe(args.file)
     write_json(args.json, facts)
     for key, value in facts.items():
         console.print(f"{key}: {value}", soft_wrap=True)

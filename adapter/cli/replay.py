@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from adapter.config import REAL_ARM_EFFECTS, Config
 from adapter.errors import SettingsError
 from adapter.model import SelfModel
 from adapter.outcome import learned_model
-from adapter.replay import Replay, matching, replay, seconds
+from adapter.replay import Replay, matching, seconds
+from adapter.replay import replay as learn_from
 from adapter.score import figures, reference_from
 from adapter.torque import ModelTorque
 from adapter.validation import validation_torque_rmse
@@ -59,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(args.truth, robot)
     log = matching(whole, robot)
     warn(log.warnings)
+    config = at_rate_of(log, config)
     result = _learn(args, log, robot, config)
     front_end = result.pipeline.front_end
     numbers = figures(
@@ -91,6 +94,21 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def at_rate_of(log: Log, config: Config) -> Config:
+    """The settings for the rate of a recording, where it is not that of the settings."""
+    steps = np.diff(log.stamp_ns)
+    steps = steps[steps > 0]
+    settings = config.pipeline.filter
+    if not len(steps):
+        return config
+    period_s = 1e-9 * float(np.median(steps))
+    if 0.8 < period_s / settings.period_s < 1.25:
+        return config
+    warn([f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter is set for that rate"])
+    changed = replace(settings, period_s=period_s)
+    return replace(config, pipeline=replace(config.pipeline, filter=changed))
+
+
 def _robot(args: argparse.Namespace, log: Log) -> SelfModel:
     """The robot asked for, else the one that the recording carries, else the Panda."""
     carried = log.attachments.get("documented.json")
@@ -116,7 +134,7 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
             if bar is not None and task is not None:
                 bar.update(task, completed=done)
 
-        return replay(
+        return learn_from(
             log,
             robot,
             config.pipeline,

@@ -164,15 +164,15 @@ def mark(ax: Axes, x: float, text: str, top: float = 0.98) -> None:
 
 
 def level(ax: Axes, y: float, text: str) -> None:
-    """A horizontal goal line with its words at the right end."""
+    """A horizontal goal line with its words at the left end."""
     ax.axhline(y, color=GOAL, linewidth=0.9, linestyle=(0, (4, 2)))
     ax.annotate(
         text,
-        (1.0, y),
+        (0.0, y),
         xycoords=("axes fraction", "data"),
-        xytext=(-2, 2),
+        xytext=(3, 2),
         textcoords="offset points",
-        ha="right",
+        ha="left",
         va="bottom",
         color=GOAL,
         fontsize=SIZES["third"][2],

@@ -129,7 +129,8 @@ def _against_batch(data: RunData) -> Panel:
     ax.plot(*goal, color=GOAL, linewidth=1.0, linestyle=(0, (4, 2)))
     ax.plot(*thin(t[shown], ours[shown]), color=ACCENT, linewidth=1.5)
     if inside.any():
-        ax.set_ylim(0.0, SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()))
+        usual = float(np.median(ours[t >= 0.5 * (t[0] + t[-1])]))
+        ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
     _finish(drawing, t, data)
     converged = data.figures["theta"].get("converged_s")
     if converged is not None:

@@ -216,7 +216,9 @@ def test_a_known_tool_is_kept_apart() -> None:
     a = held_out_rms(bare, bare.theta.theta, fresh)
     b = held_out_rms(loaded, loaded.theta.theta, fresh)
     assert np.allclose(a, b, atol=0.02)
-    assert np.allclose(bare.theta.theta, loaded.theta.theta, atol=0.1)
+    difference = bare.theta.theta - loaded.theta.theta  # much of it no torque shows
+    shown = model_torque(panda_model(), bare.schema.lam, difference, *fresh.true[:3])
+    assert (rms(shown) < 0.02).all()
     saved = learned_model(collect(loaded), replace(panda_model(), tool=TOOL))
     tau = fresh.true[3] + tool_torque(fresh)
     assert np.allclose(rms(tau - ModelTorque(saved)(*fresh.true[:3])), b, atol=0.02)

@@ -1,0 +1,40 @@
+# Two commands do everything: `make run` and `make test`. Set-up happens by itself.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.ready
+
+.PHONY: run test setup lint trials soak bench clean
+
+run: $(STAMP)
+	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
+
+test: $(STAMP) lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version.split()[0])'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(BIN)/python -m adapter.cli.warm_up > /dev/null 2>&1
+	touch $@
+
+trials: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
+
+soak: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10
+
+bench: $(STAMP)
+	$(BIN)/adapter bench
+
+clean:
+	rm -rf $(VENV) build *.egg-info
