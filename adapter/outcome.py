@@ -30,8 +30,8 @@ class Outcome:
         theta_started_ns: stamp of the first state θ learned from, None before.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
         payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
-        schema_trace: rows [stamp bits, λ]; theta_trace: rows [stamp bits, θ and effects].
-        score_trace: rows [stamp bits, q, dq, ddq, tau, torque error before learning].
+        schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
+        score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
         frames: (R0, p) that θ's moments were taken with.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
     """

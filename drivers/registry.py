@@ -8,6 +8,7 @@ from drivers.interface import Driver, DriverError
 from drivers.log import LogArm
 
 Builder = Callable[[str], Driver]
+SCHEMES = ("log", "pybullet")
 
 
 def split_address(address: str) -> tuple[str, str]:
@@ -37,5 +38,5 @@ def open_driver(
     scheme, rest = split_address(address)
     known: dict[str, Builder] = {"log": lambda path: LogArm(path, joint_names), **builders}
     if scheme not in known:
-        raise DriverError(f"no driver '{scheme}'; have: {', '.join(sorted(known))}")
+        raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
     return known[scheme](rest)

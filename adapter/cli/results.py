@@ -40,6 +40,7 @@ def conclude(
     source: str,
 ) -> None:
     """Write model, figures and report; print the headline."""
+    warn(front_end.messages)
     figures["model"] = str(folder / "model.json")
     data = run_data(
         outcome,

@@ -107,7 +107,8 @@ def _errors(t: Array, error: Array, goal: float, unit: str, converged: float | N
     lines_by_joint(ax, t[shown], np.maximum(error[shown], 1e-3 * LOWEST[unit]))
     log_axis(ax, LOWEST[unit], 2 * top)
     log_time(ax, FIRST_S, t[-1])
-    level(ax, goal, f"goal {goal:g} {unit}")
+    late = converged is None or converged > 0.2 * t[-1]  # then lines cross the right end
+    level(ax, goal, f"goal {goal:g} {unit}", left=late)
     if converged is not None:
         mark(ax, converged, SETTLED)
     time_axis(drawing)

@@ -163,16 +163,16 @@ def mark(ax: Axes, x: float, text: str, top: float = 0.98) -> None:
     )
 
 
-def level(ax: Axes, y: float, text: str) -> None:
-    """A horizontal goal line with its words at the left end."""
+def level(ax: Axes, y: float, text: str, left: bool) -> None:
+    """A horizontal goal line with its words at the left or the right end."""
     ax.axhline(y, color=GOAL, linewidth=0.9, linestyle=(0, (4, 2)))
     ax.annotate(
         text,
-        (0.0, y),
+        (0.0 if left else 1.0, y),
         xycoords=("axes fraction", "data"),
-        xytext=(3, 2),
+        xytext=(3 if left else -2, 2),
         textcoords="offset points",
-        ha="left",
+        ha="left" if left else "right",
         va="bottom",
         color=GOAL,
         fontsize=SIZES["third"][2],

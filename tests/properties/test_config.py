@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from adapter.config import REAL_ARM_EFFECTS, Config, config_from, config_table, read_config
 from adapter.effects import effects_by_name
-from adapter.errors import SettingsError
+from adapter.errors import ModelError, SettingsError
+from adapter.pipeline import make_learner
 from adapter.robots import documented
 
 WHOLE = """
@@ -152,21 +153,28 @@ def test_what_does_not_fit_is_refused(tmp_path: Path, text: str, said: str) -> N
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[pipeline.learner]\neffects = ['stiction']", "no effect 'stiction'; have: viscous"),
-        ("gravity = [0.0, 0.0, nan]", "gravity"),
         ("[pipeline.learner.theta]\nbetas = [0.9]", "betas"),
         ("[excitation]\nrests = [[1.0]]", "rests"),
         ("[pipeline.learner.theta]\nbetas = [0.9, 1.5]", "betas"),
-        ("[pipeline.front_end]\nrest_dq = inf", "rest_dq"),
     ],
 )
-def test_values_that_would_fail_later_are_refused_at_once(tmp_path, text: str, said: str) -> None:
+def test_values_that_would_fail_without_a_word_are_refused_at_once(
+    tmp_path, text: str, said: str
+) -> None:
     assert said in refusal(tmp_path, text)
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"nowhere\.toml: cannot be read: No such file"):
         read_config(tmp_path / "nowhere.toml")
+
+
+def test_what_only_the_parts_know_is_refused_by_them() -> None:
+    config = config_from({"pipeline": {"learner": {"effects": ["stiction"]}}})
+    with pytest.raises(SettingsError, match="no effect 'stiction'; have: viscous_friction"):
+        make_learner(documented("panda"), config.pipeline)
+    with pytest.raises(ModelError, match="gravity holds a value that is not finite"):
+        config_from({"gravity": [0.0, 0.0, np.nan]}).apply(documented("panda"))
 
 
 def test_gravity_and_tool_reach_the_model() -> None:
@@ -192,7 +200,11 @@ NAMES = sorted({item.name for _, kind in sections(Config) for item in dataclasse
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
-@given(where=st.sampled_from([w for w, _ in sections(Config)]), key=st.sampled_from(NAMES), value=VALUES)
+@given(
+    where=st.sampled_from([w for w, _ in sections(Config)]),
+    key=st.sampled_from(NAMES),
+    value=VALUES,
+)
 def test_nonsense_is_refused_in_one_sentence_or_taken(where: str, key: str, value: object) -> None:
     table: dict = {}
     inner = table

@@ -5,7 +5,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
+from arm_data import (
+    LINK_TWIST_NOISE,
+    ArmData,
+    Motion,
+    arm,
+    learner_for,
+    panda_model,
+    record,
+    states_of,
+)
 
 from adapter.identifiability import FrameObservability, frame_observability
 from adapter.learner import Learner
@@ -149,9 +158,10 @@ def test_a_hole_in_the_data_is_not_taken_for_noise() -> None:
     names = ("stamp_ns", "q", "dq", "tau", "twists", "accels")
     holed = replace(data, **{name: getattr(data, name)[rows] for name in names})
     found = learn(holed)
-    noise = np.sqrt(found.learner.schema.noise_variance()[:-1]).max(axis=0)
-    assert (noise < 1.3 * np.array([2e-3, 2e-3, 2e-2, 2e-2])).all()
     assert found.learner.schema.rank == found.seen.rank
+    assert found.turn[-1].max() < ROTATION_RAD and found.shift[-1].max() < POSITION_M
+    w_noise = np.sqrt(found.learner.schema.noise_variance()[:-1, 1])
+    assert (w_noise < 1.3 * LINK_TWIST_NOISE).all()
 
 
 def test_measured_motion_counts_although_it_comes_late() -> None:

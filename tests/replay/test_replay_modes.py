@@ -93,7 +93,7 @@ def test_batches_repeat_bit_for_bit() -> None:
     assert state_bytes(one.pipeline.learner) == state_bytes(two.pipeline.learner)
 
 
-@pytest.mark.parametrize("every", [10, 50])
+@pytest.mark.parametrize("every", [10, 30])
 def test_batches_agree_within_the_std(every: int) -> None:
     ours, theirs = batch(every), exact(seconds=12.0)
     a, b = ours.outcome, theirs.outcome
@@ -179,11 +179,10 @@ def test_names_in_another_order_are_put_in_order() -> None:
 
 def test_another_prefix_means_the_same_joints_with_a_warning() -> None:
     log = data().log()
-    other = renamed(log, tuple(f"fer_joint{k + 1}" for k in range(N))[::-1], q=log.q[:, ::-1])
-    found = matching(other, panda_model())
+    names = tuple(f"fer_joint{k + 1}" for k in range(N))[::-1]
+    found = matching(renamed(log, names, q=log.q[:, ::-1]), panda_model())
     assert np.array_equal(found.q, log.q)
-    assert len(found.warnings) == 1 and "fer_joint7 = panda_joint" not in found.warnings[0]
-    assert "matched by their numbers" in found.warnings[0]
+    assert len(found.warnings) == 1 and "matched by their numbers" in found.warnings[0]
 
 
 def test_the_warning_pairs_the_names_that_were_matched() -> None:
@@ -210,7 +209,7 @@ def test_names_that_say_nothing_are_refused(names: tuple[str, ...]) -> None:
 def test_a_missing_joint_is_named() -> None:
     log = data().log()
     names = (*log.joint_names[:4], "gripper", *log.joint_names[5:])
-    with pytest.raises(DriverError, match="has no joint panda_joint5; it has .*gripper.*; panda"):
+    with pytest.raises(DriverError, match=r"has no joint panda_joint5; it has .*gripper.*; panda"):
         matching(renamed(log, names), panda_model())
 
 
@@ -224,7 +223,9 @@ def test_extra_joints_are_ignored_with_a_warning() -> None:
 
 def test_motion_of_some_links_is_not_enough() -> None:
     log = data(links=True).log()
-    part = replace(log, link_names=log.link_names[:5], twists=log.twists[:, :5], accels=log.accels[:, :5])
+    part = replace(
+        log, link_names=log.link_names[:5], twists=log.twists[:, :5], accels=log.accels[:, :5]
+    )
     found = matching(part, panda_model())
     assert any("motion of not all links" in w for w in found.warnings)
     assert not found.link_names and found.twists.shape[1] == 0
