@@ -24,6 +24,7 @@ _STATE = {
     ),
     "schema": (
         *("R0", "p", "start_lam", "kind", "M", "_newest", "noise_power", "last_motion", "counts"),
+        "last_stamps",
         *("updates", "information", "identifiable", "_inverse", "_distance", "rank", "_calm"),
         "converged",
     ),

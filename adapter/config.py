@@ -98,7 +98,7 @@ def config_table(config: Config) -> dict[str, Any]:
 def _drop_none(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _drop_none(part) for key, part in value.items() if part is not None}
-    return list(value) if isinstance(value, tuple) else value
+    return [_drop_none(part) for part in value] if isinstance(value, tuple) else value
 
 
 def _build(kind: Any, table: Any, where: str) -> Any:

@@ -108,6 +108,8 @@ class ExcitationSettings:
         for name in ("margin", "start_s", "stop_s"):
             if not getattr(self, name) > 0.0:
                 raise SettingsError(f"excitation.{name} must be above zero")
+        if any(len(rest) != 2 for rest in self.rests):
+            raise SettingsError("excitation.rests needs pairs of (from, to) seconds")
         for begin, end in self.rests:
             if end - begin < self.stop_s:
                 raise SettingsError(f"excitation.rests: {begin} to {end} s is shorter than a stop")

@@ -20,6 +20,9 @@ from drivers.interface import JointSample
 NON_FINITE, OUT_OF_RANGE, REPEATED = "non_finite", "out_of_range", "repeated"
 TIME_BACKWARDS, SETTLING = "time_backwards", "filter_settling"
 AT_REST, SATURATED = "at_rest", "torque_saturated"
+# What no joint of an arm does, where its documentation is silent: rad, rad/s, N m.
+Q_CAP, DQ_CAP, TAU_CAP = 1e4, 1e3, 1e5
+RESYNC_AFTER = 100  # stamps in a row that lie before the newest: the newest was wrong
 NOTEWORTHY = (NON_FINITE, OUT_OF_RANGE, TIME_BACKWARDS, SATURATED)
 VERDICTS = (
     "",
@@ -61,7 +64,7 @@ class FrontEndSettings:
 def judge(q, dq, tau, last, lower, upper, dq_max, tau_max):
     """Verdict on raw readings: 0 good, 1 non-finite, 2 out of range, 3 all the same as `last`.
 
-    `last` (3, n) is overwritten with good readings. NaN limits allow anything.
+    `last` (3, n) is overwritten with good readings.
     """
     same = True
     for j in range(q.shape[0]):
@@ -98,16 +101,19 @@ def process(
     dy,
     out,
     verdicts,
+    before,
 ):
     """Check and filter samples in order; one call serves one sample or a whole recording.
 
     Args:
         stamps: (m,) int64 ns; q, dq, tau: (m, n).
         limits: (4, n) lowest and highest q, highest |dq| and |tau|; effort: (n,) saturation.
-        marks: (2,) int64 stamps: saturated until, first moving sample.
+        marks: (3,) int64: stamps saturated until, of the first moving sample; how many samples
+            in a row came with a stamp before the newest.
         last, times, old, y, dy: state, see `judge` and `filter_step`.
         out: (m, size) records, stamp and filtered signals filled where the verdict is 0.
         verdicts: (m,) index into `VERDICTS`; negative where a gap restarted the filter.
+        before: (m,) int64 the stamp before that gap.
     """
     n = q.shape[1]
     u = np.empty(3 * n)
@@ -115,12 +121,16 @@ def process(
         stamp = stamps[i]
         verdict = judge(q[i], dq[i], tau[i], last, limits[0], limits[1], limits[2], limits[3])
         if verdict == 0 and times[0] != NEVER and stamp <= times[0]:
-            verdict = 4
+            marks[2] += 1
+            if marks[2] < RESYNC_AFTER:
+                verdict = 4
         verdicts[i] = verdict
         if verdict:
             continue
-        gap = times[0] != NEVER and stamp - times[0] > gap_ns
+        gap = times[0] != NEVER and (stamp <= times[0] or stamp - times[0] > gap_ns)
+        marks[2] = 0
         if gap:
+            before[i] = times[0]
             times[0] = NEVER
         u[:n], u[n : 2 * n], u[2 * n :] = q[i], dq[i], tau[i]
         settled = filter_step(stamp, u, k1, k2, SETTLING_DELAYS * delay_ns, times, old, y, dy)
@@ -174,14 +184,15 @@ class FrontEnd:
         self._effort = limits.effort * s.saturation
         self._limits = np.array(
             [
-                limits.lower - s.q_margin,
-                limits.upper + s.q_margin,
-                limits.velocity * s.range_factor,
-                limits.effort * s.range_factor,
+                np.nan_to_num(limits.lower - s.q_margin, nan=-Q_CAP),
+                np.nan_to_num(limits.upper + s.q_margin, nan=Q_CAP),
+                np.nan_to_num(limits.velocity * s.range_factor, nan=DQ_CAP),
+                np.nan_to_num(limits.effort * s.range_factor, nan=TAU_CAP),
             ]
         )
         self._last = np.full((3, n), np.nan)
-        self._marks = np.array([NEVER, NEVER])
+        self._marks = np.array([NEVER, NEVER, 0])
+        self._before = np.zeros(1, dtype=np.int64)
         self._record = self.layout.new(1)
         self._verdict = np.zeros(1, dtype=np.int64)
         self.refused: Counter[str] = Counter()
@@ -203,7 +214,6 @@ class FrontEnd:
 
         The record is reused by the next call. Reasons are counted in `refused`.
         """
-        before_ns = self.filter.times[0]
         self._process(
             np.array([sample.stamp_ns]),
             sample.q[None],
@@ -211,10 +221,11 @@ class FrontEnd:
             sample.tau[None],
             self._record,
             self._verdict,
+            self._before,
         )
         verdict = self._verdict[0]
         if verdict:
-            self._refuse(verdict, sample, before_ns)
+            self._refuse(verdict, sample, int(self._before[0]))
             return None
         record = self._record[0]
         self.twist.fill(record, sample)
@@ -236,10 +247,11 @@ class FrontEnd:
         """
         records = self.layout.new(len(q))
         verdicts = np.zeros(len(q), dtype=np.int64)
-        self._process(stamp_ns, q, dq, tau, records, verdicts)
+        before = np.zeros(len(q), dtype=np.int64)
+        self._process(stamp_ns, q, dq, tau, records, verdicts, before)
         for i in np.flatnonzero(verdicts):
-            before_ns = stamp_ns[i - 1] if i else NEVER
-            self._refuse(verdicts[i], JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i]), before_ns)
+            sample = JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i])
+            self._refuse(verdicts[i], sample, int(before[i]))
         good = verdicts == 0
         records = records[good]
         self.twist.fill_table(
@@ -259,6 +271,7 @@ class FrontEnd:
         tau: Array,
         records: Array,
         verdicts: NDArray[np.int64],
+        before: NDArray[np.int64],
     ) -> None:
         f, s = self.filter, self.settings
         process(
@@ -281,17 +294,18 @@ class FrontEnd:
             f.dy,
             records,
             verdicts,
+            before,
         )
 
     def _refuse(self, verdict: int, sample: JointSample, before_ns: int) -> None:
         if verdict < 0:
-            gap_s = 1e-9 * (sample.stamp_ns - int(before_ns))
+            gap_s = 1e-9 * (sample.stamp_ns - before_ns)
             if not self.gaps:
                 self.messages.append(
                     f"at {1e-9 * before_ns:.3f} s: {gap_s:.3f} s without a sample; the filter "
                     "starts anew"
                 )
-            self.gaps.append((int(before_ns), gap_s))
+            self.gaps.append((before_ns, gap_s))
         reason = VERDICTS[abs(verdict)]
         if reason in NOTEWORTHY and not self.refused[reason]:
             self.messages.append(self._sentence(reason, sample))

@@ -67,6 +67,7 @@ class Learner:
         settings: of the learner.
         noise_gain: of the filter (`JointFilter.noise_gain`).
         tool_theta: (10,) of a known tool on the last link, kept out of θ.
+        delay_s: of the filter (`JointFilter.delay_s`).
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class Learner:
         *,
         noise_gain: float = 1.0,
         tool_theta: Array | None = None,
+        delay_s: float = 0.0,
     ) -> None:
         self.settings = s = settings or LearnerSettings()
         self.tree, self.layout = tree, StateLayout(tree.n)
@@ -92,6 +94,7 @@ class Learner:
             mode=s.mode,
             noise_gain=noise_gain,
             tool_theta=tool_theta,
+            delay_s=delay_s,
         )
         self.change = ChangeDetector(tree.n, s.change)
         from adapter.adam import FlatAdam  # brings torch; the loop process needs only settings
@@ -135,7 +138,11 @@ class Learner:
         self.stamp_ns = stamp_of(table[-1])
         self.schema.absorb(table)
         self.schema.compute_gradient()
-        self._adam_step(self._theta_is_due(table) and self._take_torque(table))
+        theta_too = self._theta_is_due(table) and self._take_torque(table)
+        if self.settings.mode == "moments":
+            s = self.settings.theta
+            self.adam.rate = s.settled_rate if self.theta_converged else s.rate
+        self._adam_step(theta_too)
         if self.schema_trace.wants():
             self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
 
@@ -166,7 +173,7 @@ class Learner:
         self.adam.step()
         self.schema.apply_step(self.adam.rate)
         if theta_too:
-            self.theta.after_step()
+            self.theta.after_step(self.theta_converged)
 
     def _theta_is_due(self, table: Array) -> bool:
         """Whether θ is being learned; sees to it that its moments follow λ."""
@@ -231,6 +238,7 @@ class Learner:
         self.theta.start_change()
         self._held_from = self._held_to
         self._shadow = None
+        self.theta_converged = False
         self._forget_momentum()
 
     def _forget_momentum(self) -> None:

@@ -33,6 +33,7 @@ class Outcome:
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
         score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
         frames: (R0, p) that θ's moments were taken with.
+        smoothing_s: how long the filter takes a step of torque.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
     """
 
@@ -60,6 +61,7 @@ class Outcome:
     score_trace: Array
     min_eigenvalue: float
     settings: LearnerSettings
+    smoothing_s: float
 
 
 def collect(learner: Learner) -> Outcome:
@@ -96,6 +98,7 @@ def collect(learner: Learner) -> Outcome:
         score_trace=learner.score_trace.rows.copy(),
         min_eigenvalue=float(np.min(eigenvalues)),
         settings=learner.settings,
+        smoothing_s=theta.smoothing_s,
     )
 
 

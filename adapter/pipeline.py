@@ -60,4 +60,5 @@ def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
         settings.learner,
         noise_gain=front_end.filter.noise_gain,
         tool_theta=None if tool is None else tool.theta(),
+        delay_s=front_end.delay_s,
     )

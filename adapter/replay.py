@@ -85,7 +85,7 @@ def _corresponding(
     found = [number.get(_number(name)) for name in want]
     if len(number) < len(have) or None in found or "" in number:
         return [name if name in have else None for name in want], []
-    pairs = ", ".join(f"{a} = {b}" for a, b in zip(have, want, strict=False))
+    pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
     return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
 
 
@@ -118,7 +118,7 @@ def replay(
     if not 1 <= every <= MOST_PER_UPDATE:
         raise SettingsError(f"--every takes 1 to {MOST_PER_UPDATE} samples, got {every}")
     stop = len(log)
-    if until_s is not None:
+    if until_s is not None and stop:
         stop = int(np.sum(log.stamp_ns < log.stamp_ns[0] + round(1e9 * until_s)))
     if stop == 0:
         raise DriverError(f"{log.path}: no samples to learn from")

@@ -21,13 +21,15 @@ import numpy as np
 from adapter.errors import SettingsError
 from adapter.fast import jit
 from adapter.filters import THIRD_DIFFERENCE_GAIN
-from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, Array, StateLayout
+from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, Array, StateLayout, stamps_of
 from adapter.schema_kernels import DERIVATIVES, accumulate, channel_cost, signals
 from adapter.spatial import exp_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.tree import Tree
 
 NOISE_FLOOR = 1e-4  # m/s, rad/s, m/s²: below any sensor; keeps noise-free data from infinite weight
 MISFIT_FLOOR = 1e-6  # share of a signal's power that no weight looks below while the fit is rough
+
+PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,21 @@ class SchemaSettings:
 
 @jit
 def absorb(
-    parent, base, kinds, q, dq, motion, kind, keep, M, newest, noise_power, last_motion, counts
+    parent,
+    base,
+    stamps,
+    kinds,
+    q,
+    dq,
+    motion,
+    kind,
+    keep,
+    M,
+    newest,
+    noise_power,
+    last_motion,
+    last_stamps,
+    counts,
 ):
     """Add a table of samples to the moments.
 
@@ -75,7 +91,8 @@ def absorb(
         M: (n, 3, 15, 15) moments; newest: (n, 3, 15, 15) those of the last sample alone.
         noise_power: (n, 3) sum of squared third differences of v, w, a of each link.
         last_motion: (3, n, 12) the three motions before.
-        counts: (2,) samples taken, third differences taken.
+        last_stamps: (2,) int64 stamp of the last one, and the shortest step so far, ns.
+        counts: (3,) samples in the moments, third differences taken, motions since a hole.
     """
     n = parent.shape[0]
     s = np.zeros((3, 15))
@@ -88,13 +105,19 @@ def absorb(
             accumulate(s, keep, M[j])
             accumulate(s, 0.0, newest[j])
         counts[0] = keep * counts[0] + 1.0
-        if counts[1] >= 0.0:
+        step = stamps[m] - last_stamps[0]
+        last_stamps[0] = stamps[m]
+        last_stamps[1] = min(last_stamps[1], max(step, 1))
+        if 2 * step > 5 * last_stamps[1]:
+            counts[2] = 0.0  # across a hole, motion would pass for noise
+        if counts[2] >= 3.0:
+            counts[1] += 1.0
             for j in range(n):
                 for k in range(9):
                     d = motion[m, j, k] - last_motion[0, j, k]
                     d -= 3.0 * (last_motion[2, j, k] - last_motion[1, j, k])
                     noise_power[j, k // 3] += d * d / 3.0
-        counts[1] += 1.0
+        counts[2] += 1.0
         for k in range(2):
             last_motion[k] = last_motion[k + 1]
         last_motion[2] = motion[m]
@@ -236,7 +259,8 @@ class SchemaLearner:
         self.M = np.zeros((n, 3, 15, 15))
         self._clean, self._newest = np.zeros_like(self.M), np.zeros_like(self.M)
         self.noise_power, self.last_motion = np.zeros((n, 3)), np.zeros((3, n, 12))
-        self.counts = np.array([0.0, -3.0])
+        self.last_stamps = np.array([0, 2**62])
+        self.counts = np.zeros(3)
         self.updates = 0
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
         self._H, self._distance = np.zeros((n, 6, 6)), np.zeros(n)
@@ -266,7 +290,9 @@ class SchemaLearner:
     def absorb(self, table: Array) -> None:
         """Add a table (m, size) of filtered states to the moments."""
         at = self.layout
-        if not self.kind:
+        if self.kind != MOTION_MEASURED and (table[:, 1] == MOTION_MEASURED).any():
+            self._begin(MOTION_MEASURED)
+        elif not self.kind:
             self.kind = int(table[0, 1])
         keep = 1.0
         if self.settings.forget_s is not None:
@@ -274,6 +300,7 @@ class SchemaLearner:
         absorb(
             self._parent,
             self._base,
+            stamps_of(table),
             table[:, 1],
             table[:, at.motion_q],
             table[:, at.motion_dq],
@@ -284,8 +311,15 @@ class SchemaLearner:
             self._newest,
             self.noise_power,
             self.last_motion,
+            self.last_stamps,
             self.counts,
         )
+
+    def _begin(self, kind: int) -> None:
+        """Learn from this kind of motion from here on; what came of another is forgotten."""
+        self.kind = kind
+        self.M[:], self.noise_power[:], self.counts[:] = 0.0, 0.0, 0.0
+        self._calm, self.converged = 0, False
 
     def _keep(self) -> float:
         """Forgetting factor per sample; one while the window would lose what it shows."""
@@ -378,7 +412,19 @@ class SchemaLearner:
         calm = rank > 0 and rank == self.rank and bool((np.maximum(distance, std) < goal).all())
         self._calm = self._calm + self.settings.judge_every if calm else 0
         self.rank = rank
+        self._hold_unshown()
         self.converged = self._calm >= self.settings.stable_updates
+
+    def _hold_unshown(self) -> None:
+        """Put shifts that the data do not show back to where they started.
+
+        Steps keep out of such directions, but while noise still tilts the picture of what is
+        shown, a little leaks into them.
+        """
+        for j in range(len(self.p)):
+            unshown = np.eye(6) - self.identifiable[j]
+            if np.abs(unshown[:3, 3:]).max() < PURE_SHIFT:
+                self.p[j] -= unshown[3:, 3:] @ (self.p[j] - self.start_lam[j, 3:])
 
     def covariance(self) -> Array:
         """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""

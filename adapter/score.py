@@ -145,7 +145,7 @@ class ScoreRows:
         for gain, effect in zip(
             effects, effects_by_name(self._outcome.settings.effects), strict=True
         ):
-            tau += gain * effect.column(self.q, self.dq, self.ddq)
+            tau += gain * effect.column(self.q, self.dq, self.ddq, self._outcome.smoothing_s)
         return tau
 
 

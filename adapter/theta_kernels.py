@@ -180,6 +180,7 @@ def gradient(
     error,
     prior,
     prior_rhs,
+    radius_weight,
     th,
     g,
     gx,
@@ -223,6 +224,7 @@ def gradient(
         body_from_log_cholesky(x[10 * b : 10 * b + 10], U, out)
         pull_back(U, g[10 * b : 10 * b + 10], gx[10 * b : 10 * b + 10])
         for i in range(1, 4):
-            gx[10 * b + i] += (x[10 * b + i] - LOG_RADIUS) / LOG_RADIUS_STD**2
+            away = x[10 * b + i] - LOG_RADIUS
+            gx[10 * b + i] += radius_weight * away / LOG_RADIUS_STD**2
     gx[10 * bodies :] = g[10 * bodies :]
     gx *= scale

@@ -38,6 +38,10 @@ PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 
 REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.03, 0.001  # N m
 
+# A step of friction that has gone through the filter looks like tanh over this share of its delay
+# (fitted on simulated reversals; 1 for a tanh as wide as the delay).
+STEP_SMOOTHING = 0.6
+
 SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
 LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
 
@@ -48,8 +52,10 @@ class ThetaSettings:
 
     Attributes:
         rate: ADAM's rate per sample on the log-Cholesky parameters.
+        settled_rate: the same once θ has converged: smaller steps, no spikes.
         betas: ADAM's averaging constants.
         average: samples that the reported running mean spans.
+        settled_average: the same once θ has converged.
         restarts: samples after a change at which the spare body is put to the point mass that
             fits best so far; ADAM refines it from there.
         warm_up: samples in the moments before the first step.
@@ -61,8 +67,10 @@ class ThetaSettings:
     """
 
     rate: float = 3e-3
+    settled_rate: float = 1e-3
     betas: tuple[float, float] = (0.97, 0.99)
-    average: int = 300
+    average: int = 100
+    settled_average: int = 30
     restarts: tuple[int, ...] = (50, 100, 200, 400)
     warm_up: int = 50
     forget_s: float | None = None
@@ -70,9 +78,11 @@ class ThetaSettings:
     sample_rate: float = 1e-3
 
     def __post_init__(self) -> None:
-        for name in ("rate", "average", "sample_rate"):
+        for name in ("rate", "settled_rate", "average", "settled_average", "sample_rate"):
             if not getattr(self, name) > 0:
                 raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
+        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
+            raise SettingsError(f"theta.betas must be two numbers in [0, 1), got {self.betas}")
         if self.forget_s is not None and self.forget_s < 0.5:
             raise SettingsError(f"theta.forget_s must be at least 0.5 s, got {self.forget_s}")
 
@@ -137,6 +147,7 @@ class ThetaLearner:
         effects: learned beside θ.
         noise_gain: correlated samples that one independent sample is worth.
         tool_theta: (10,) of a known tool on the last link, kept out of θ.
+        delay_s: of the filter that torque and motion went through.
 
     Attributes:
         x: (P,) what ADAM steps on: log-Cholesky of the links and of the spare body, then effects.
@@ -145,6 +156,7 @@ class ThetaLearner:
         prior, prior_rhs: information (P, P) and (P,) from before: the prior and, after a change,
             all that was known then.
         spare_in_use: whether the spare body stands in for the last link.
+        smoothing_s: how long the filter takes a step of torque.
     """
 
     def __init__(
@@ -157,12 +169,14 @@ class ThetaLearner:
         mode: str = "moments",
         noise_gain: float = 1.0,
         tool_theta: Array | None = None,
+        delay_s: float = 0.0,
     ) -> None:
         if tree.floating:
             raise SettingsError("the online learner of θ needs a fixed base; this tree floats")
         self.tree, self.effects, self.mode = tree, tuple(effects), mode
         self.settings = settings or ThetaSettings()
         self.noise_gain = noise_gain
+        self.smoothing_s = STEP_SMOOTHING * delay_s
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
         n = tree.n
         self.bodies = n + 1
@@ -224,7 +238,7 @@ class ThetaLearner:
         """(m, e, n) columns of the effects for tables (m, n)."""
         out = np.empty((len(q), len(self.effects), self.tree.n))
         for k, effect in enumerate(self.effects):
-            out[:, k] = effect.column(q, dq, ddq)
+            out[:, k] = effect.column(q, dq, ddq, self.smoothing_s)
         return out
 
     def absorb(
@@ -299,6 +313,7 @@ class ThetaLearner:
             self.model_variance,
             self.prior * (1e-6 if sample else 1.0),
             self.prior_rhs * (1e-6 if sample else 1.0),
+            1e-6 if sample else 1.0,
             self._th,
             self._g,
             self.gradient,
@@ -333,10 +348,12 @@ class ThetaLearner:
         values(self.mean, self.bodies, self.th)
         self.updates = 0
 
-    def after_step(self) -> None:
+    def after_step(self, settled: bool) -> None:
         """Carry the running mean along after ADAM has moved x."""
         self.updates += 1
-        self.mean += (self.x - self.mean) / min(self.updates, self.settings.average)
+        s = self.settings
+        span = s.settled_average if settled else s.average
+        self.mean += (self.x - self.mean) / min(self.updates, span)
         values(self.mean, self.bodies, self.th)
 
     def variance(self) -> Array:

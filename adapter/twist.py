@@ -17,6 +17,9 @@ from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, MOTION_NONE, Arr
 from adapter.spatial import matrix_from_zxz
 from drivers.interface import JointSample
 
+# No link of an arm moves faster: m/s, rad/s, m/s², rad/s².
+MOTION_CAP = np.repeat([30.0, 60.0, 2e3, 2e4], 3)
+
 
 class TwistSynthesis:
     """Fills the link-motion part of a filtered state.
@@ -60,12 +63,12 @@ class TwistSynthesis:
     def _measured(self, records: Array, q: Array, dq: Array, twists: Array, accels: Array) -> None:
         at = self.layout
         records[:, at.motion_q], records[:, at.motion_dq] = q, dq
-        motion = records[:, at.motion].reshape(len(records), -1, 12)
-        motion[..., :6], motion[..., 6:] = twists, accels
-        records[:, at.motion] = motion.reshape(len(records), -1)
-        # a link that was not heard of at this stamp leaves the body schema a sample short
-        whole = np.isfinite(motion).all(axis=(1, 2))
-        records[:, 1] = np.where(whole, MOTION_MEASURED, MOTION_NONE)
+        motion = np.concatenate([twists, accels], axis=2)
+        records[:, at.motion] = motion.reshape(len(records), 12 * at.n)
+        # a link that was not heard of at this stamp, or whose sensor is mad, leaves the body
+        # schema a sample short
+        usable = (np.abs(motion) < MOTION_CAP).all(axis=(1, 2))  # false for NaN
+        records[:, 1] = np.where(usable, MOTION_MEASURED, MOTION_NONE)
 
 
 @jit

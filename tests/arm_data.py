@@ -231,13 +231,14 @@ def states_of(
 def learner_for(model: SelfModel | None = None, **settings: object) -> Learner:
     """A learner as `make_learner` builds it."""
     model = model or panda_model()
-    gain = FrontEnd(model).filter.noise_gain
+    front_end = FrontEnd(model)
     tool = None if model.tool is None else model.tool.theta()
     return Learner(
         model.tree,
         model.gravity,
         LearnerSettings(**settings),  # type: ignore[arg-type]
-        noise_gain=gain,
+        noise_gain=front_end.filter.noise_gain,
+        delay_s=front_end.delay_s,
         tool_theta=tool,
     )
 

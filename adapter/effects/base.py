@@ -25,5 +25,9 @@ class JointEffect(Protocol):
     unit: str
     prior_std: float
 
-    def column(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Torque per unit of the parameter, same shape as dq; rad, rad/s, rad/s² in."""
+    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+        """Torque per unit of the parameter, same shape as dq; rad, rad/s, rad/s² in.
+
+        Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a
+        step; what jumps in the effect must be as smooth as what jumps in the torque.
+        """

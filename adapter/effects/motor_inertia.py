@@ -13,6 +13,6 @@ class MotorInertia:
     unit = "kg m2"
     prior_std = 0.1  # a link-side sensor should see none; catalogue sizes are 0.05 to 0.3
 
-    def column(self, q: Array, dq: Array, ddq: Array) -> Array:
+    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """ddq."""
         return ddq

@@ -15,6 +15,6 @@ class TorqueOffset:
     unit = "N m"
     prior_std = 1.0
 
-    def column(self, q: Array, dq: Array, ddq: Array) -> Array:
+    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """One."""
         return np.ones_like(dq)

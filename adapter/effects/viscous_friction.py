@@ -13,6 +13,6 @@ class ViscousFriction:
     unit = "N m s/rad"
     prior_std = 1.0  # published Panda values are 0.03 to 0.09 (Knezevic)
 
-    def column(self, q: Array, dq: Array, ddq: Array) -> Array:
+    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """dq."""
         return dq

@@ -188,12 +188,11 @@ def test_gradient_is_the_slope_of_the_profiled_cost(seed: int) -> None:
     x = rng.normal(size=10) * 0.3
     nothing, no_rhs, floor = np.zeros((10, 10)), np.zeros(10), np.zeros(n)
     found = []
-    for moments in (A, 0.0 * A):
+    for radius_weight in (0.0, 1.0):
         gx = np.zeros(10)
         work = np.zeros(10), np.zeros(10)
-        # with a variance of 1e-9 in the floor, empty moments have a finite weight
-        settings = (float(m), 1.0, floor, 0.0, 1e-9)
-        gradient(x, 1, moments, sizes, place, *settings, nothing, no_rhs, *work, gx)
+        settings = (float(m), 1.0, floor, 0.0, 0.0)
+        gradient(x, 1, A, sizes, place, *settings, nothing, no_rhs, radius_weight, *work, gx)
         found.append(gx)
 
     def profiled(v: np.ndarray) -> float:
@@ -202,7 +201,10 @@ def test_gradient_is_the_slope_of_the_profiled_cost(seed: int) -> None:
 
     step = 1e-6
     slopes = [(profiled(x + e) - profiled(x - e)) / (2 * step) for e in step * np.eye(10)]
-    assert np.allclose(found[0] - found[1], slopes, rtol=1e-5, atol=1e-7)
+    assert np.allclose(found[0], slopes, rtol=1e-5, atol=1e-7)
+    pull = np.zeros(10)  # log-normal prior on the radii exp(d): 0.1 m, standard deviation 2
+    pull[1:4] = (x[1:4] - np.log(0.1)) / 4.0 / m
+    assert np.allclose(found[1] - found[0], pull, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
