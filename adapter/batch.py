@@ -13,8 +13,9 @@ from adapter.learner import Learner
 from adapter.records import Array, stamp_of
 
 SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
+SCHEMA_POLISH = 300  # more of them, to the optimum
 # (steps, share of the usual rate) at the end; the first stretch covers the distance
-THETA_STEPS = ((1500, 3.0), (1500, 1.0), (500, 0.3))
+THETA_STEPS = ((1500, 3.0), (1500, 1.0), (1000, 0.3))
 RATE_WHILE_READING = 3.0  # times the usual rate, to cover the distance in fewer steps
 
 
@@ -37,6 +38,8 @@ def learn_batch(
         learner.learn_schema(states[:0])
     if learner.settings.wait_for_schema and not learner.schema.converged:
         return
+    for _ in range(SCHEMA_POLISH):
+        learner.learn_schema(states[:0])
     learner.start_theta(stamp_of(states[0]))
     usual = learner.adam.rate
     learner.set_rate(RATE_WHILE_READING * usual)

@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 # Third differences have 1 + 9 + 9 + 1 times the variance of white noise, and next to no motion.
 THIRD_DIFFERENCE_GAIN = 20.0
 
+USUAL_DQ_NOISE = 5e-3  # rad/s, of a Panda
 SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
 
 
@@ -43,19 +44,20 @@ class FilterSettings:
             oscillation of 10 to 40 Hz that no rigid model explains, so the default stays below
             (held-out error on a real log, worst joint: 0.90 at 6 Hz, 0.93 at 8, 0.96 at 10).
         dq_noise: standard deviation of one dq sample, rad/s; only the ratio to `dq_drive` matters.
+            None: a replay takes it from the recording's high frequencies.
         dq_drive: white-noise intensity of dq's second derivative, rad/s³/√Hz; sets the gains
             together with `dq_noise` instead of `bandwidth_hz`.
         period_s: nominal sample period, s.
     """
 
     bandwidth_hz: float = 6.0
-    dq_noise: float = 5e-3
+    dq_noise: float | None = None
     dq_drive: float | None = None
     period_s: float = 1e-3
 
     def __post_init__(self) -> None:
         for name in ("bandwidth_hz", "dq_noise", "period_s"):
-            if not getattr(self, name) > 0.0:
+            if getattr(self, name) is not None and not getattr(self, name) > 0.0:
                 raise SettingsError(f"filter.{name} must be above zero, got {getattr(self, name)}")
         if self.dq_drive is not None and not self.dq_drive > 0.0:
             raise SettingsError(f"filter.dq_drive must be above zero, got {self.dq_drive}")
@@ -69,16 +71,17 @@ class FilterSettings:
 def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     """(k1, k2) of L from filterpy's Kalman filter in its steady state, 1/s and 1/s²."""
     period = settings.period_s
+    noise = USUAL_DQ_NOISE if settings.dq_noise is None else settings.dq_noise
     drive = settings.dq_drive
     if drive is None:
         # Kalman-Bucy: corner^4 = drive² / (noise² period)
-        drive = (2 * math.pi * settings.bandwidth_hz) ** 2 * settings.dq_noise * math.sqrt(period)
+        drive = (2 * math.pi * settings.bandwidth_hz) ** 2 * noise * math.sqrt(period)
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.F = np.array([[1.0, period], [0.0, 1.0]])
     kalman.H = np.array([[1.0, 0.0]])
-    kalman.R = np.array([[settings.dq_noise**2]])
+    kalman.R = np.array([[noise**2]])
     kalman.Q = Q_continuous_white_noise(2, dt=period, spectral_density=drive**2)
-    kalman.P = np.diag([settings.dq_noise**2, drive**2])
+    kalman.P = np.diag([noise**2, drive**2])
     gain = np.full((2, 1), np.inf)
     while not np.allclose(kalman.K, gain, rtol=1e-12, atol=0.0):
         gain = kalman.K.copy()

@@ -12,12 +12,16 @@ from adapter.errors import SettingsError
 from adapter.records import Array, StateLayout, stamp_of
 from adapter.schema_learner import SchemaLearner, SchemaSettings
 from adapter.spatial import log_rotation
-from adapter.theta_learner import ThetaLearner, ThetaSettings
+from adapter.theta_learner import ThetaLearner
+from adapter.theta_settings import ThetaSettings
 from adapter.trace import Trace
 from adapter.tree import Tree
 from adapter.twist import base_motion
 
 MODES = ("moments", "sample")
+JUDGE_THETA_EVERY = 100  # updates
+CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
+REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
 
 
 @dataclass(frozen=True)
@@ -280,8 +284,3 @@ class Learner:
             self.theta.replace_moments(self._shadow, float(stop - self._held_from))
             self._shadow = None
             self.rebuilds += 1
-
-
-JUDGE_THETA_EVERY = 100  # updates
-CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
-REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show

@@ -19,10 +19,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import SettingsError
-from adapter.fast import jit
 from adapter.filters import THIRD_DIFFERENCE_GAIN
 from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, Array, StateLayout, stamps_of
-from adapter.schema_kernels import DERIVATIVES, accumulate, channel_cost, signals
+from adapter.schema_kernels import (
+    DERIVATIVES,
+    absorb,
+    distances,
+    profiled,
+    residual_variance,
+    retract,
+    steepest,
+    without_noise,
+)
 from adapter.spatial import exp_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.tree import Tree
 
@@ -63,157 +71,6 @@ class SchemaSettings:
                 raise SettingsError(f"schema.{name} must be above zero, got {getattr(self, name)}")
         if self.forget_s is not None and self.forget_s < 0.05:
             raise SettingsError(f"schema.forget_s must be at least 0.05 s, got {self.forget_s}")
-
-
-@jit
-def absorb(
-    parent,
-    base,
-    stamps,
-    kinds,
-    q,
-    dq,
-    motion,
-    kind,
-    keep,
-    M,
-    newest,
-    noise_power,
-    last_motion,
-    last_stamps,
-    counts,
-):
-    """Add a table of samples to the moments.
-
-    Args:
-        kinds: (m,) kind of link motion of each sample; only `kind` is taken.
-        q, dq: (m, n); motion: (m, n, 12); base: (12,).
-        M: (n, 3, 15, 15) moments; newest: (n, 3, 15, 15) those of the last sample alone.
-        noise_power: (n, 3) sum of squared third differences of v, w, a of each link.
-        last_motion: (3, n, 12) the three motions before.
-        last_stamps: (2,) int64 stamp of the last one, and the shortest step so far, ns.
-        counts: (3,) samples in the moments, third differences taken, motions since a hole.
-    """
-    n = parent.shape[0]
-    s = np.zeros((3, 15))
-    for m in range(kinds.shape[0]):
-        if kinds[m] != kind:
-            continue
-        for j in range(n):
-            up = base if parent[j] < 0 else motion[m, parent[j]]
-            signals(q[m, j], dq[m, j], up, motion[m, j], s)
-            accumulate(s, keep, M[j])
-            accumulate(s, 0.0, newest[j])
-        counts[0] = keep * counts[0] + 1.0
-        step = stamps[m] - last_stamps[0]
-        last_stamps[0] = stamps[m]
-        last_stamps[1] = min(last_stamps[1], max(step, 1))
-        if 2 * step > 5 * last_stamps[1]:
-            counts[2] = 0.0  # across a hole, motion would pass for noise
-        if counts[2] >= 3.0:
-            counts[1] += 1.0
-            for j in range(n):
-                for k in range(9):
-                    d = motion[m, j, k] - last_motion[0, j, k]
-                    d -= 3.0 * (last_motion[2, j, k] - last_motion[1, j, k])
-                    noise_power[j, k // 3] += d * d / 3.0
-        counts[2] += 1.0
-        for k in range(2):
-            last_motion[k] = last_motion[k + 1]
-        last_motion[2] = motion[m]
-
-
-@jit
-def without_noise(parent, M, count, variance, out):
-    """out = M with the parents' noise variance (n, 3; order v, w, a) taken out.
-
-    Angular accelerations and products of angular velocities leave altogether: what they show of
-    a frame's place, the twists show as well, and their noise cannot be told from jerky motion.
-    """
-    for j in range(parent.shape[0]):
-        out[j] = M[j]
-        i = parent[j]
-        if i < 0:
-            continue
-        for a in range(3):
-            out[j, 0, 3 + a, 3 + a] -= count * variance[i, 1]
-            out[j, 1, 3 + a, 3 + a] -= count * variance[i, 0]
-            out[j, 1, 6 + a, 6 + a] -= count * variance[i, 1]
-            out[j, 2, 3 + a, 3 + a] -= count * variance[i, 2]
-        out[j, 2, 6:, :] = 0.0
-        out[j, 2, :, 6:] = 0.0
-
-
-@jit
-def profiled(M, clean, count, D, R0, p, floor, misfit, curved, g, H):
-    """Gradient g (n, 6), every channel weighted by its own residual.
-
-    If `curved`, also the curvature H (n, 6, 6) that the moments `clean` have with these weights.
-    """
-    gc, Hc, unused = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
-    for j in range(R0.shape[0]):
-        g[j] = 0.0
-        if curved:
-            H[j] = 0.0
-        for ch in range(3):
-            gc[:], Hc[:] = 0.0, 0.0
-            cost = max(channel_cost(M[j], D, ch, R0[j], p[j], False, gc, Hc), 0.0)
-            power = M[j, ch, 0, 0] + M[j, ch, 1, 1] + M[j, ch, 2, 2]
-            weight = 3.0 * count / (cost + 3.0 * count * floor * floor + misfit * power + 1e-300)
-            for a in range(6):
-                g[j, a] += weight * gc[a]
-            if curved:
-                channel_cost(clean[j], D, ch, R0[j], p[j], True, unused, Hc)
-                H[j] += weight * Hc
-
-
-@jit
-def residual_variance(M, count, D, R0, p, out):
-    """out (n, 3): mean square of what each channel's fit leaves, per component."""
-    g, H = np.zeros(6), np.zeros((6, 6))
-    for j in range(R0.shape[0]):
-        for ch in range(3):
-            cost = channel_cost(M[j], D, ch, R0[j], p[j], False, g, H)
-            out[j, ch] = max(cost, 0.0) / (3.0 * max(count, 1.0))
-
-
-@jit
-def steepest(M, D, R0, p, g, H):
-    """Gradient g (n, 6) of the plain squared error (eq. 18)."""
-    for j in range(R0.shape[0]):
-        g[j] = 0.0
-        for ch in range(3):
-            channel_cost(M[j], D, ch, R0[j], p[j], False, g[j], H[j])
-
-
-@jit
-def distances(inverse, g, out):
-    """out (n,): longest entry of each joint's Newton step, rad or m."""
-    for j in range(g.shape[0]):
-        out[j] = np.abs(inverse[j] @ g[j]).max()
-
-
-@jit
-def retract(step, scale, project, R0, p):
-    """Move every frame by its projected step (n, 6), scaled by (n,): R0 exp(phi), p + d."""
-    turn = np.empty((3, 3))
-    for j in range(R0.shape[0]):
-        x = scale[j] * (project[j] @ step[j])
-        a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-        s = np.sin(a) / a if a > 1e-8 else 1.0
-        h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
-        for r in range(3):
-            for c in range(3):
-                turn[r, c] = h * x[r] * x[c]
-            turn[r, r] += 1.0 - h * a * a
-        turn[0, 1] -= s * x[2]
-        turn[0, 2] += s * x[1]
-        turn[1, 0] += s * x[2]
-        turn[1, 2] -= s * x[0]
-        turn[2, 0] -= s * x[1]
-        turn[2, 1] += s * x[0]
-        R0[j] = R0[j] @ turn
-        p[j] += x[3:]
 
 
 class SchemaLearner:

@@ -228,3 +228,54 @@ def gradient(
             gx[10 * b + i] += radius_weight * away / LOG_RADIUS_STD**2
     gx[10 * bodies :] = g[10 * bodies :]
     gx *= scale
+
+
+@jit
+def absorb(
+    parent,
+    R0,
+    p,
+    base,
+    q,
+    dq,
+    ddq,
+    tau,
+    columns,
+    tool,
+    support,
+    sizes,
+    place,
+    th,
+    rate,
+    A,
+    newest,
+    error,
+):
+    """Predict every sample with th, then add it to the moments A (n, S+1, S+1).
+
+    Args:
+        q, dq, ddq, tau: (m, n); columns: (m, e, n) of the effects; error: (m, n), filled with
+            measured minus predicted torque.
+        tool: (10,) of a known tool on the last link; its torque is taken off first.
+        rate: of directional forgetting per sample, 0 for none.
+        newest: (n, S+1, S+1) moments of the last sample alone.
+    """
+    n = parent.shape[0]
+    motion, Y = np.empty((n, 12)), np.empty((n, 10 * n))
+    rows, expected, own = np.zeros((n, support.shape[1])), np.empty(n), np.empty(n)
+    for m in range(q.shape[0]):
+        model_rows(
+            parent, R0, p, q[m], dq[m], ddq[m], base, columns[m], motion, Y, support, sizes, rows
+        )
+        for j in range(n):
+            own[j] = tau[m, j]
+            for k in range(10):
+                own[j] -= Y[j, 10 * (n - 1) + k] * tool[k]
+        predict(th, place, sizes, rows, expected)
+        error[m] = own - expected
+        if rate > 0.0:
+            forget_along(rows, own, sizes, rate, A)
+        accumulate(rows, own, sizes, A)
+    if newest.shape[0] > 0 and q.shape[0] > 0:
+        newest[:] = 0.0
+        accumulate(rows, own, sizes, newest)

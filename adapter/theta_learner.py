@@ -11,131 +11,26 @@ known of the other links stays known, and the payload is the difference to the l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from adapter.effects.base import JointEffect
 from adapter.errors import SettingsError
-from adapter.fast import jit
 from adapter.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.records import Array
-from adapter.theta_kernels import (
-    accumulate,
-    forget_along,
-    gradient,
-    joint_costs,
-    model_rows,
-    predict,
-    values,
+from adapter.theta_kernels import absorb, gradient, joint_costs, values
+from adapter.theta_settings import (
+    IDEAL_MODEL_ERROR,
+    LOAD_RADIUS,
+    NEUTRAL_INERTIA,
+    NEUTRAL_MASS,
+    PRIOR_STD,
+    REAL_MODEL_ERROR,
+    SMALLEST_LOAD,
+    STEP_SMOOTHING,
+    ThetaSettings,
 )
 from adapter.tree import Tree
-
-# Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
-NEUTRAL_MASS = 1.0  # kg
-NEUTRAL_INERTIA = 0.02  # kg m², about every axis
-PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
-
-REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.03, 0.001  # N m
-
-# A step of friction that has gone through the filter looks like tanh over this share of its delay
-# (fitted on simulated reversals; 1 for a tanh as wide as the delay).
-STEP_SMOOTHING = 0.6
-
-SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
-LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
-
-
-@dataclass(frozen=True)
-class ThetaSettings:
-    """How θ is learned.
-
-    Attributes:
-        rate: ADAM's rate per sample on the log-Cholesky parameters.
-        settled_rate: the same once θ has converged: smaller steps, no spikes.
-        betas: ADAM's averaging constants.
-        average: samples that the reported running mean spans.
-        settled_average: the same once θ has converged.
-        restarts: samples after a change at which the spare body is put to the point mass that
-            fits best so far; ADAM refines it from there.
-        warm_up: samples in the moments before the first step.
-        forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
-        model_error: torque that the model is not trusted to explain, N m; no weight looks below
-            it. None: 0.03 where effects are learned (a real arm, whose friction no such model
-            explains better), 0.001 else.
-        sample_rate: ADAM's rate in mode `sample`.
-    """
-
-    rate: float = 3e-3
-    settled_rate: float = 1e-3
-    betas: tuple[float, float] = (0.97, 0.99)
-    average: int = 100
-    settled_average: int = 30
-    restarts: tuple[int, ...] = (50, 100, 200, 400)
-    warm_up: int = 50
-    forget_s: float | None = None
-    model_error: float | None = None
-    sample_rate: float = 1e-3
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "settled_rate", "average", "settled_average", "sample_rate"):
-            if not getattr(self, name) > 0:
-                raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
-        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
-            raise SettingsError(f"theta.betas must be two numbers in [0, 1), got {self.betas}")
-        if self.forget_s is not None and self.forget_s < 0.5:
-            raise SettingsError(f"theta.forget_s must be at least 0.5 s, got {self.forget_s}")
-
-
-@jit
-def absorb(
-    parent,
-    R0,
-    p,
-    base,
-    q,
-    dq,
-    ddq,
-    tau,
-    columns,
-    tool,
-    support,
-    sizes,
-    place,
-    th,
-    rate,
-    A,
-    newest,
-    error,
-):
-    """Predict every sample with th, then add it to the moments A (n, S+1, S+1).
-
-    Args:
-        q, dq, ddq, tau: (m, n); columns: (m, e, n) of the effects; error: (m, n), filled with
-            measured minus predicted torque.
-        tool: (10,) of a known tool on the last link; its torque is taken off first.
-        rate: of directional forgetting per sample, 0 for none.
-        newest: (n, S+1, S+1) moments of the last sample alone.
-    """
-    n = parent.shape[0]
-    motion, Y = np.empty((n, 12)), np.empty((n, 10 * n))
-    rows, expected, own = np.zeros((n, support.shape[1])), np.empty(n), np.empty(n)
-    for m in range(q.shape[0]):
-        model_rows(
-            parent, R0, p, q[m], dq[m], ddq[m], base, columns[m], motion, Y, support, sizes, rows
-        )
-        for j in range(n):
-            own[j] = tau[m, j]
-            for k in range(10):
-                own[j] -= Y[j, 10 * (n - 1) + k] * tool[k]
-        predict(th, place, sizes, rows, expected)
-        error[m] = own - expected
-        if rate > 0.0:
-            forget_along(rows, own, sizes, rate, A)
-        accumulate(rows, own, sizes, A)
-    if newest.shape[0] > 0 and q.shape[0] > 0:
-        newest[:] = 0.0
-        accumulate(rows, own, sizes, newest)
 
 
 class ThetaLearner:

@@ -16,6 +16,7 @@ from adapter.cli.common import UsageError, add_learning_options, configure, cons
 from adapter.cli.results import conclude, results_folder
 from adapter.config import REAL_ARM_EFFECTS, Config
 from adapter.errors import SettingsError
+from adapter.filters import noise_from_samples
 from adapter.model import SelfModel
 from adapter.outcome import learned_model
 from adapter.replay import Replay, matching, seconds
@@ -25,6 +26,7 @@ from adapter.torque import ModelTorque
 from adapter.validation import validation_torque_rmse
 from drivers.mcap_file import Log, read_log
 
+FEWEST_FOR_NOISE = 50  # samples
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 
@@ -61,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(args.truth, robot)
     log = matching(whole, robot)
     warn(log.warnings)
-    config = at_rate_of(log, config)
+    config = fitting(log, config)
     result = _learn(args, log, robot, config)
     front_end = result.pipeline.front_end
     numbers = figures(
@@ -79,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),
+        noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
         gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
     )
     if front_end.first_moving_ns is None:
@@ -94,19 +97,32 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def at_rate_of(log: Log, config: Config) -> Config:
-    """The settings for the rate of a recording, where it is not that of the settings."""
+def fitting(log: Log, config: Config) -> Config:
+    """The filter settings for the rate of a recording and, where they leave it open, its noise."""
+    settings = config.pipeline.filter
     steps = np.diff(log.stamp_ns)
     steps = steps[steps > 0]
-    settings = config.pipeline.filter
-    if not len(steps):
-        return config
-    period_s = 1e-9 * float(np.median(steps))
-    if 0.8 < period_s / settings.period_s < 1.25:
-        return config
-    warn([f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter is set for that rate"])
-    changed = replace(settings, period_s=period_s)
+    changes: dict[str, float] = {}
+    if len(steps):
+        period_s = 1e-9 * float(np.median(steps))
+        if not 0.8 < period_s / settings.period_s < 1.25:
+            changes["period_s"] = period_s
+            warn([f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter follows"])
+    open_noise = settings.dq_noise is None and settings.dq_drive is not None
+    if open_noise and len(log) >= FEWEST_FOR_NOISE:
+        changes["dq_noise"] = float(np.median(noise_levels(log)["dq"]))
+    changed = replace(settings, **changes)
     return replace(config, pipeline=replace(config.pipeline, filter=changed))
+
+
+def noise_levels(log: Log) -> dict[str, np.ndarray]:
+    """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies."""
+    new = np.ones(len(log), dtype=bool)
+    new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
+    return {
+        name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))
+        for name in ("q", "dq", "tau")
+    }
 
 
 def _robot(args: argparse.Namespace, log: Log) -> SelfModel:

@@ -39,7 +39,7 @@ def transfer(joint_filter: JointFilter, hz: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("settings", [*map(FilterSettings, BANDWIDTHS), FilterSettings(dq_drive=2)])
 def test_poles_are_those_of_filterpys_steady_state(settings: FilterSettings) -> None:
     """A Kalman filter runs on a signal; once settled, its errors decay with L's poles."""
-    T, noise = settings.period_s, settings.dq_noise
+    T, noise = settings.period_s, settings.dq_noise or 5e-3
     drive = settings.dq_drive
     if drive is None:
         drive = (2 * np.pi * settings.bandwidth_hz) ** 2 * noise * np.sqrt(T)

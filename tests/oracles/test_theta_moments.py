@@ -15,7 +15,8 @@ from adapter.inertia import (
 from adapter.records import StateLayout
 from adapter.spatial import matrix_from_zxz
 from adapter.theta_kernels import body_from_log_cholesky, forget_along, gradient, pull_back
-from adapter.theta_learner import ThetaLearner, ThetaSettings
+from adapter.theta_learner import ThetaLearner
+from adapter.theta_settings import ThetaSettings
 from adapter.twist import base_motion
 
 SEEDS = range(5)

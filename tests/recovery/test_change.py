@@ -18,7 +18,7 @@ from arm_data import (
 from adapter.learner import Learner
 from adapter.outcome import changes, collect
 from adapter.records import stamps_of
-from adapter.theta_learner import ThetaSettings
+from adapter.theta_settings import ThetaSettings
 from sim.scenarios import build
 from sim.truth import Truth
 
