@@ -1,13 +1,12 @@
 """torch's ADAM on one flat parameter, without the ceremony of `torch.optim.Optimizer.step`.
 
 `torch.optim.Adam(fused=True).step()` takes 29 µs for 150 numbers, most of it hooks and grouping;
-torch's own functional form of the same step takes 13. A test holds the two together bit for bit.
+the fused operator that it ends in takes 5. A test holds the two together bit for bit.
 """
 
 from __future__ import annotations
 
 import torch
-from torch.optim.adam import adam
 
 EPS = 1e-12  # gradients come in units of information per sample; far below any that matters
 
@@ -29,6 +28,7 @@ class FlatAdam:
         self.rate, self._betas = rate, betas
         self._tensors = [torch.zeros(size, dtype=torch.float64) for _ in range(4)]
         self._steps = torch.zeros((), dtype=torch.float32)
+        self._count = self._steps.numpy()
         self.parameters, self.gradient, self.first, self.second = (
             tensor.numpy() for tensor in self._tensors
         )
@@ -36,32 +36,31 @@ class FlatAdam:
     @property
     def steps(self) -> int:
         """Steps taken."""
-        return int(self._steps)
+        return int(self._count)
 
     @steps.setter
     def steps(self, count: int) -> None:
-        self._steps.fill_(count)
+        self._count[...] = count
 
     def step(self) -> None:
         """One ADAM step on the gradient as it stands."""
         parameters, gradient, first, second = self._tensors
-        with torch.no_grad():
-            adam(
-                [parameters],
-                [gradient],
-                [first],
-                [second],
-                [],
-                [self._steps],
-                fused=True,
-                amsgrad=False,
-                beta1=self._betas[0],
-                beta2=self._betas[1],
-                lr=self.rate,
-                weight_decay=0.0,
-                eps=EPS,
-                maximize=False,
-            )
+        self._count += 1.0
+        torch._fused_adam_(
+            [parameters],
+            [gradient],
+            [first],
+            [second],
+            [],
+            [self._steps],
+            lr=self.rate,
+            beta1=self._betas[0],
+            beta2=self._betas[1],
+            weight_decay=0.0,
+            eps=EPS,
+            amsgrad=False,
+            maximize=False,
+        )
 
     def forget(self, part: slice) -> None:
         """Clear the running means of a part: after a jump they are of no use."""

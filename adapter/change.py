@@ -110,12 +110,13 @@ class ChangeDetector:
         rising does not raise its own bar."""
         if self.samples < self._armed_at - self.settings.slow:
             return
-        self._block = np.maximum(self._block, (most, mean))
+        block, peaks = self._block, self._peaks
+        block[0], block[1] = max(block[0], most), max(block[1], mean)
         self._block_samples += samples
         if self._block_samples >= BURST_BLOCK:
             fade = 1.0 - self._block_samples / self.settings.burst_memory
-            self._peaks = np.maximum(fade * self._peaks, self._block)
-            self._block, self._block_samples = np.zeros(2), 0
+            peaks[:] = np.maximum(fade * peaks, block)
+            block[:], self._block_samples = 0.0, 0
 
     def _alarming(self, most: float, mean: float) -> bool:
         s = self.settings

@@ -250,10 +250,9 @@ class Learner:
         self.adam.forget(slice(6 * self.tree.n, None))
 
     def _hold(self, rows: Array) -> None:
-        size = len(self._held)
-        for row in rows:
-            self._held[self._held_to % size] = row
-            self._held_to += 1
+        size, first = len(self._held), self._held_to
+        self._held_to += len(rows)
+        self._held[np.arange(first, self._held_to) % size if len(rows) > 1 else first % size] = rows
         self._held_from = max(self._held_from, self._held_to - size)
 
     def _follow_schema(self) -> None:

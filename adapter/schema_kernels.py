@@ -286,18 +286,30 @@ def steepest(M, D, R0, p, g, H):
 
 
 @jit
-def distances(inverse, g, out):
-    """out (n,): longest entry of each joint's Newton step, rad or m."""
+def distances(inverse, count, g, out):
+    """out (n,): longest entry of each joint's Newton step, rad or m; then g is put per sample."""
     for j in range(g.shape[0]):
         out[j] = np.abs(inverse[j] @ g[j]).max()
+    g /= max(count, 1.0)
 
 
 @jit
-def retract(step, scale, project, R0, p):
-    """Move every frame by its projected step (n, 6), scaled by (n,): R0 exp(phi), p + d."""
+def descend(M, count, D, R0, p, floor, misfit, inverse, g, H, out):
+    """`profiled` without curvature, then `distances`, in one call for the 1 kHz step."""
+    profiled(M, M, count, D, R0, p, floor, misfit, False, g, H)
+    distances(inverse, count, g, out)
+
+
+@jit
+def retract(step, distance, longest, share, rate, project, R0, p):
+    """Move every frame by its projected step (n, 6): R0 exp(phi), p + d; then zero the step.
+
+    A step taken at `rate` is scaled to `longest`, or to a share of the joint's distance (n,).
+    """
     turn = np.empty((3, 3))
     for j in range(R0.shape[0]):
-        x = scale[j] * (project[j] @ step[j])
+        scale = min(longest, share * distance[j]) / rate
+        x = scale * (project[j] @ step[j])
         a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
         s = np.sin(a) / a if a > 1e-8 else 1.0
         h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
@@ -313,3 +325,4 @@ def retract(step, scale, project, R0, p):
         turn[2, 1] += s * x[0]
         R0[j] = R0[j] @ turn
         p[j] += x[3:]
+    step[:] = 0.0

@@ -24,6 +24,7 @@ from adapter.records import MOTION_DOCUMENTED, MOTION_MEASURED, Array, StateLayo
 from adapter.schema_kernels import (
     DERIVATIVES,
     absorb,
+    descend,
     distances,
     profiled,
     residual_variance,
@@ -147,10 +148,11 @@ class SchemaLearner:
     def absorb(self, table: Array) -> None:
         """Add a table (m, size) of filtered states to the moments."""
         at = self.layout
-        if self.kind != MOTION_MEASURED and (table[:, 1] == MOTION_MEASURED).any():
-            self._begin(MOTION_MEASURED)
-        elif not self.kind:
-            self.kind = int(table[0, 1])
+        if self.kind != MOTION_MEASURED:
+            newest = int(table[0, 1] if len(table) == 1 else table[:, 1].max())
+            if newest == MOTION_MEASURED:
+                self._begin(MOTION_MEASURED)
+            self.kind = newest or self.kind
         keep = 1.0
         if self.settings.forget_s is not None:
             keep = self._keep()
@@ -209,32 +211,44 @@ class SchemaLearner:
         """Fill `gradient` for one ADAM step; looks at the curvature now and then."""
         looking = self.updates % self.settings.judge_every == 0
         self.updates += 1
-        if looking or self.mode == "moments":
-            self._profile(looking)
         if looking:
+            self._profile()
             self._judge()
         if self.mode == "sample":
             steepest(self._newest, DERIVATIVES, self.R0, self.p, self.gradient, self._H)
+        elif looking:
+            distances(self._inverse, self.count, self.gradient, self._distance)
         else:
-            distances(self._inverse, self.gradient, self._distance)
-            self.gradient /= max(self.count, 1.0)
+            descend(
+                self.M,
+                self.count,
+                DERIVATIVES,
+                self.R0,
+                self.p,
+                NOISE_FLOOR,
+                MISFIT_FLOOR,
+                self._inverse,
+                self.gradient,
+                self._H,
+                self._distance,
+            )
 
     def apply_step(self, rate: float) -> None:
         """Move the frames by ADAM's step in `tangent`, taken at `rate`, and zero it."""
         s = self.settings
         if self.mode == "sample":
-            scale = np.full(len(self.p), s.sample_rate / rate)
-            retract(self.tangent, scale, self._everything, self.R0, self.p)
+            unlimited = np.full(len(self.p), np.inf)
+            frames = self._everything, self.R0, self.p
+            retract(self.tangent, unlimited, s.sample_rate, 1.0, rate, *frames)
         else:
-            scale = np.minimum(s.rate, s.share * self._distance) / rate
-            retract(self.tangent, scale, self.identifiable, self.R0, self.p)
-        self.tangent[:] = 0.0
+            frames = self.identifiable, self.R0, self.p
+            retract(self.tangent, self._distance, s.rate, s.share, rate, *frames)
 
-    def _profile(self, curved: bool) -> None:
+    def _profile(self) -> None:
         """Fill the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
         size), and the curvature from what of them is motion."""
         clean = self.M
-        if curved and self.kind == MOTION_MEASURED:
+        if self.kind == MOTION_MEASURED:
             clean = self._clean
             without_noise(self._parent, self.M, self.count, self.noise_variance(), clean)
         profiled(
@@ -246,7 +260,7 @@ class SchemaLearner:
             self.p,
             NOISE_FLOOR,
             MISFIT_FLOOR,
-            curved,
+            True,
             self.gradient,
             self._H,
         )

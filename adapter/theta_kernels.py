@@ -84,6 +84,14 @@ def values(x, bodies, th):
 
 
 @jit
+def follow(x, span, bodies, mean, th):
+    """Carry the running mean (P,) over `span` iterates along with x; th (P,) are its values."""
+    for i in range(x.shape[0]):
+        mean[i] += (x[i] - mean[i]) / span
+    values(mean, bodies, th)
+
+
+@jit
 def model_rows(parent, R0, p, q, dq, ddq, base, effect_columns, motion, Y, support, sizes, rows):
     """Fill rows (n, S) with each joint's regressor row over its support; returns nothing.
 

@@ -18,7 +18,7 @@ from adapter.effects.base import JointEffect
 from adapter.errors import SettingsError
 from adapter.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.records import Array
-from adapter.theta_kernels import absorb, gradient, joint_costs, values
+from adapter.theta_kernels import absorb, follow, gradient, joint_costs, values
 from adapter.theta_settings import (
     IDEAL_MODEL_ERROR,
     LOAD_RADIUS,
@@ -194,21 +194,25 @@ class ThetaLearner:
         if self.count < self.settings.warm_up and not self.spare_in_use:
             self.gradient[:] = 0.0
             return False
-        sample = self.mode == "sample"
+        if self.mode == "sample":  # plain squared error of the newest sample, priors next to none
+            moments, count = self.newest, 1.0
+            noise = np.ones_like(self.floor), 1e9
+            priors = 1e-6 * self.prior, 1e-6 * self.prior_rhs, 1e-6
+        else:
+            moments, count = self.A, self.count
+            noise = self.floor, self.floor_count
+            priors = self.prior, self.prior_rhs, 1.0
         gradient(
             self.x,
             self.bodies,
-            self.newest if sample else self.A,
+            moments,
             self._sizes,
             self.place,
-            1.0 if sample else self.count,
+            count,
             self.noise_gain,
-            np.ones_like(self.floor) if sample else self.floor,
-            1e9 if sample else self.floor_count,
+            *noise,
             self.model_variance,
-            self.prior * (1e-6 if sample else 1.0),
-            self.prior_rhs * (1e-6 if sample else 1.0),
-            1e-6 if sample else 1.0,
+            *priors,
             self._th,
             self._g,
             self.gradient,
@@ -248,8 +252,7 @@ class ThetaLearner:
         self.updates += 1
         s = self.settings
         span = s.settled_average if settled else s.average
-        self.mean += (self.x - self.mean) / min(self.updates, span)
-        values(self.mean, self.bodies, self.th)
+        follow(self.x, float(min(self.updates, span)), self.bodies, self.mean, self.th)
 
     def variance(self) -> Array:
         """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)²."""

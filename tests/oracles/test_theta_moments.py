@@ -144,7 +144,7 @@ def test_gradient_of_the_data_is_autograds(seed: int) -> None:
     signals = tables(seed)
     learner.x += 0.2 * np.random.default_rng(seed).normal(size=learner.P)
     learner.mean[:] = learner.x
-    learner.after_step()  # the values in use, and with them the variance, follow x
+    learner.after_step(settled=False)  # the values in use, and with them the variance, follow x
     learner.absorb(*frames(), *signals)
     assert learner.compute_gradient()
     ours = learner.gradient.copy()
