@@ -35,10 +35,13 @@ class Clock:
         spin_ns: how long before a deadline sleeping ends and spinning begins.
         now: CLOCK_MONOTONIC, ns.
         sleep: returns at a time of that clock, or earlier.
+        used: processor time that this thread has used, ns.
 
     Attributes:
         k: number of the deadline that `wait` returned at last; -1 before the first.
         missed: deadlines that went by unused.
+        missed_own: of these, such as the loop's own work took longer than a period for; at the
+            others the machine had given the processor to somebody else.
     """
 
     def __init__(
@@ -47,15 +50,18 @@ class Clock:
         spin_ns: int = SPIN_NS,
         now: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[int], None] = sleep_until,
+        used: Callable[[], int] = time.thread_time_ns,
     ) -> None:
-        self.period_ns, self.k, self.missed = period_ns, -1, 0
-        self._spin_ns, self._now, self._sleep = spin_ns, now, sleep
+        self.period_ns, self.k, self.missed, self.missed_own = period_ns, -1, 0, 0
+        self._spin_ns, self._now, self._sleep, self._used = spin_ns, now, sleep, used
+        self._used_ns = 0
         self._t0: int | None = None
 
     def start(self) -> None:
         """Deadline 0 is one period from now."""
         self._t0 = self._now() + self.period_ns
-        self.k, self.missed = -1, 0
+        self.k, self.missed, self.missed_own = -1, 0, 0
+        self._used_ns = self._used()
 
     def wait(self) -> int:
         """Wait for the next deadline; returns by how much it is late, ns.
@@ -71,6 +77,8 @@ class Clock:
         if behind > self.period_ns:
             skipped = behind // self.period_ns + 1
             self.missed += skipped
+            if self._used() - self._used_ns > self.period_ns:
+                self.missed_own += skipped
             k += skipped
         self.k = k
         deadline = self._t0 + k * self.period_ns
@@ -80,4 +88,5 @@ class Clock:
         now = self._now()
         while now < deadline:
             now = self._now()
+        self._used_ns = self._used()
         return now - deadline

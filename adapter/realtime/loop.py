@@ -171,7 +171,7 @@ def run_live(
             unrecorded=crew.unrecorded,
             ended=session.ended,
             fault=session.fault,
-            timing=timing.report(clock.missed),
+            timing=timing.report(clock.missed, clock.missed_own),
             grants=real_time.grants,
             collected=collected,
             troubles=crew.troubles,

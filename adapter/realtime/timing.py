@@ -61,6 +61,8 @@ class TimingReport:
     Attributes:
         ticks: how many.
         missed_deadlines: deadlines that went by unused.
+        missed_own: of these, such as the loop's own work took too long for; the machine took the
+            processor away at the others.
         tick_us: compute of driver, filter and synthesis.
         loop_us: all compute of a tick, controller and hand-over to the workers included.
         plant_us: what a simulated arm took for its physics, in neither of the two above.
@@ -70,6 +72,7 @@ class TimingReport:
 
     ticks: int
     missed_deadlines: int
+    missed_own: int
     tick_us: dict[str, float | None]
     loop_us: dict[str, float | None]
     plant_us: dict[str, float | None]
@@ -89,7 +92,10 @@ class TimingReport:
             "lateness": self.lateness_us,
             "period": self.period_us,
         }
-        out = [f"{self.ticks} ticks, {self.missed_deadlines} deadlines missed"]
+        out = [
+            f"{self.ticks} ticks, {self.missed_deadlines} deadlines missed "
+            f"({self.missed_own} by our own work, the others taken by the machine)"
+        ]
         for name, values in rows.items():
             if values["p50"] is not None:
                 shown = "  ".join(f"{k} {v:.1f}" for k, v in values.items() if v is not None)
@@ -119,13 +125,14 @@ class Timing:
         """A tick began this long after its deadline."""
         self._late.add(ns)
 
-    def report(self, missed: int = 0) -> TimingReport:
+    def report(self, missed: int = 0, missed_own: int = 0) -> TimingReport:
         """What was collected so far."""
         period = self._period.summary_us()
         period["mean"] = self._period.mean_us
         return TimingReport(
             self._loop.count,
             missed,
+            missed_own,
             self._tick.summary_us(),
             self._loop.summary_us(),
             self._plant.summary_us(),

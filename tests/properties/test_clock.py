@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,3 +81,22 @@ def test_physics_time_is_told_apart_and_an_empty_report_says_none():
     assert abs(report.tick_us["p50"] - 100) < 0.2 and abs(report.loop_us["max"] - 200) < 0.2
     assert abs(report.plant_us["p50"] - 200) < 0.4 and report.period_us["mean"] == 1000.0
     assert any("3 deadlines missed" in line for line in report.lines())
+
+
+@pytest.mark.parametrize(("used_ms", "own"), [(0.2, 0), (4.0, 3)])
+def test_who_is_to_blame_for_a_missed_deadline(used_ms: float, own: int) -> None:
+    """A tick that ends 3.5 ms late: our own work if the thread was running, else the machine."""
+    ms = 1_000_000
+    state = {"now": 0, "used": 0}
+    clock = Clock(
+        ms,
+        now=lambda: state["now"],
+        sleep=lambda until: state.update(now=until),
+        used=lambda: state["used"],
+        spin_ns=0,
+    )
+    clock.wait()
+    state["now"] += round(3.5 * ms)
+    state["used"] += round(used_ms * ms)
+    clock.wait()
+    assert (clock.missed, clock.missed_own) == (3, own)
