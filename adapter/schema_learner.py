@@ -56,12 +56,12 @@ class SchemaSettings:
         stable_updates: for how many updates in a row that must hold.
     """
 
-    rate: float = 1e-2
-    share: float = 0.3
+    rate: float = 1.5e-2
+    share: float = 0.15
     sample_rate: float = 1e-3
     start_rms: float = 0.01
     forget_s: float | None = None
-    judge_every: int = 20
+    judge_every: int = 10
     rotation_goal: float = 0.005
     position_goal: float = 0.0025
     stable_updates: int = 200
