@@ -36,11 +36,6 @@ class StateLayout:
         return np.zeros(self.size if rows is None else (rows, self.size))
 
 
-def set_stamp(record: Array, stamp_ns: int) -> None:
-    """Write the stamp of the filtered instant, all 64 bits of it."""
-    record[:1].view(np.int64)[0] = stamp_ns
-
-
 def stamp_of(record: Array) -> int:
     """The stamp of the filtered instant, ns."""
     return int(record[:1].view(np.int64)[0])
