@@ -16,6 +16,7 @@ SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
 SCHEMA_POLISH = 300  # more of them, to the optimum
 # (steps, share of the usual rate) at the end; the first stretch covers the distance
 THETA_STEPS = ((1500, 3.0), (1500, 1.0), (1000, 0.3))
+ADAPT_EVERY = 250  # steps between two looks at how large the effects are
 RATE_WHILE_READING = 3.0  # times the usual rate, to cover the distance in fewer steps
 
 
@@ -48,6 +49,8 @@ def learn_batch(
         progress(start)
     for steps, share in THETA_STEPS:
         learner.set_rate(share * usual)
-        for _ in range(steps):
+        for k in range(steps):
             learner.learn_theta(states[:0])
+            if k % ADAPT_EVERY == 0:
+                learner.theta.adapt_effects()
     learner.set_rate(usual)

@@ -30,7 +30,7 @@ _STATE = {
     ),
     "theta": (
         *("x", "mean", "th", "A", "newest", "count", "prior", "prior_rhs", "place", "floor"),
-        *("floor_count", "spare_in_use", "updates"),
+        *("floor_count", "spare_in_use", "updates", "effect_std", "model_variance"),
     ),
     "adam": ("first", "second", "rate"),
     "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),

@@ -19,7 +19,7 @@ from adapter.tree import Tree
 from adapter.twist import base_motion
 
 MODES = ("moments", "sample")
-JUDGE_THETA_EVERY = 100  # updates
+JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
 
@@ -219,6 +219,8 @@ class Learner:
 
     def _judge_theta(self) -> None:
         """θ has converged when it predicts the last seconds as well as it fits all samples."""
+        if self.theta.updates % ADAPT_EVERY == 0 and self.theta.count >= ADAPT_EVERY:
+            self.theta.adapt_effects()
         excess = float(np.mean(self.change.level / self.theta.variance()))
         limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
         self.theta_converged = self.change.samples >= self.change.settings.slow and excess < limit

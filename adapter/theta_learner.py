@@ -25,8 +25,10 @@ from adapter.theta_settings import (
     NEUTRAL_INERTIA,
     NEUTRAL_MASS,
     PRIOR_STD,
+    REAL_EFFECT,
     REAL_MODEL_ERROR,
     SMALLEST_LOAD,
+    SMALLEST_SPREAD,
     STEP_SMOOTHING,
     ThetaSettings,
 )
@@ -51,6 +53,7 @@ class ThetaLearner:
         prior, prior_rhs: information (P, P) and (P,) from before: the prior and, after a change,
             all that was known then.
         spare_in_use: whether the spare body stands in for the last link.
+        effect_std: (e,) spread of each effect's prior over the joints, see `adapt_effects`.
         smoothing_s: how long the filter takes a step of torque.
     """
 
@@ -84,6 +87,7 @@ class ThetaLearner:
         self.A = np.zeros((n, width, width))
         self.newest = np.zeros((n, width, width) if mode == "sample" else (0, width, width))
         self.count = 0.0
+        self.effect_std = np.array([effect.prior_std for effect in self.effects])
         self.prior, self.prior_rhs = self._neutral_prior()
         self.x, self.gradient = self._neutral(), np.zeros(self.P)
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
@@ -120,9 +124,7 @@ class ThetaLearner:
         n = self.tree.n
         std = np.full(self.P, np.inf)
         std[: 10 * n] = np.tile(PRIOR_STD, n)
-        for k, effect in enumerate(self.effects):
-            start = 10 * self.bodies + k * n
-            std[start : start + n] = effect.prior_std
+        std[10 * self.bodies :] = np.repeat(self.effect_std, n)
         mean = np.zeros(self.P)
         neutral = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
         mean[: 10 * n] = np.tile(neutral, n)
@@ -270,6 +272,28 @@ class ThetaLearner:
             H[np.ix_(at, at)] += weight * self.A[j, :s, :s]
             rhs[at] += weight * self.A[j, :s, s]
         return H, rhs
+
+    def adapt_effects(self) -> None:
+        """Let the data say how large each effect is: the spread of its prior follows.
+
+        One step of empirical Bayes a call: the square of the spread becomes the mean over the
+        joints of estimate² + variance. An effect that is not there fades away, instead of taking
+        a share of the data for itself; and where none is left, the model is trusted as that of
+        an ideal arm.
+        """
+        if not self.effects:
+            return
+        n = self.tree.n
+        variance = self.covariance().diagonal()[10 * self.bodies :].reshape(-1, n)
+        widest = np.array([effect.prior_std for effect in self.effects])
+        found = np.sqrt(np.mean(self.effect_values**2 + variance, axis=1))
+        spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
+        at = np.arange(10 * self.bodies, self.P)
+        self.prior[at, at] += np.repeat(1.0 / spread**2 - 1.0 / self.effect_std**2, n)
+        self.effect_std[:] = spread
+        if self.settings.model_error is None:
+            real = bool((spread > REAL_EFFECT).any())
+            self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
 
     def known(self) -> np.ndarray:
         """Indices of the parameters that have any information (the idle spare body has none)."""

@@ -13,7 +13,10 @@ NEUTRAL_MASS = 1.0  # kg
 NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 
-REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.03, 0.001  # N m
+REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.025, 0.001  # N m
+# An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
+# has fallen to this share of what it may be is not there.
+REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
 
 # A step of friction that has gone through the filter looks like tanh over this share of its delay
 # (fitted on simulated reversals; 1 for a tanh as wide as the delay).
@@ -38,8 +41,8 @@ class ThetaSettings:
         warm_up: samples in the moments before the first step.
         forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
         model_error: torque that the model is not trusted to explain, N m; no weight looks below
-            it. None: 0.03 where effects are learned (a real arm, whose friction no such model
-            explains better), 0.001 else.
+            it. None: 0.025 where friction or another effect is found (a real arm, whose friction
+            no such model explains better), 0.001 else.
         sample_rate: ADAM's rate in mode `sample`.
     """
 
