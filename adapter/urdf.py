@@ -219,5 +219,5 @@ class _Merge:
             axis=np.stack([joint.axis for joint in joints]),
             frames=tuple(self.frames),
             gravity=gravity,
-            provenance={"urdf": self.robot.file},
+            provenance={"urdf": Path(self.robot.file).name},
         )

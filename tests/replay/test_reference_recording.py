@@ -19,7 +19,8 @@ def test_the_reference_is_found_again(tmp_path: Path) -> None:
     expected = json.loads((RECORDINGS / "panda_nominal_6s.json").read_text())
     assert found["samples"] == expected["samples"] and found["learned"] == expected["learned"]
     assert found["refused"] == expected["refused"]
-    # other processors round otherwise; 6 s of noisy data know θ to a few percent at best
-    assert np.allclose(found["lambda"]["values"], expected["lambda"]["values"], atol=1e-6)
-    assert np.allclose(found["theta"]["values"], expected["theta"]["values"], atol=1e-3)
+    # other processors round otherwise, and what no data show may then end elsewhere
+    assert max(found["lambda"]["rotation_error_rad"]) < 1e-6
+    ours, theirs = (x["theta"]["torque_rmse_nm"] for x in (found, expected))
+    assert np.allclose(ours, theirs, rtol=0.02)
     assert abs(found["lambda"]["converged_s"] - expected["lambda"]["converged_s"]) < 0.02
