@@ -30,6 +30,7 @@ def learn_batch(
     """
     if not len(states):
         return
+    states = learner.without_known(states)
     starts = range(0, len(states), every)
     for start in starts:
         learner.learn_schema(states[start : start + every])

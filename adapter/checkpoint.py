@@ -6,6 +6,7 @@ import dataclasses
 import json
 import os
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ _STATE = {
         *("floor_count", "spare_in_use", "updates", "effect_std", "model_variance"),
     ),
     "adam": ("first", "second", "rate"),
+    "known": ("clock", "memory"),
     "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),
     "schema_trace": ("_rows", "_used", "_offers", "stride"),
     "theta_trace": ("_rows", "_used", "_offers", "stride"),
@@ -47,7 +49,7 @@ def save_checkpoint(learner: Learner, path: str | Path) -> None:
     for part, names in _STATE.items():
         owner = getattr(learner, part) if part else learner
         for name in names:
-            value = getattr(owner, name)
+            value = getattr(owner, name) if owner is not None else None
             if value is not None:
                 arrays[f"{part}.{name}"] = value
     size = len(learner._held)
@@ -83,7 +85,7 @@ def load_checkpoint(learner: Learner, path: str | Path) -> None:
         )
     for part, names in _STATE.items():
         owner = getattr(learner, part) if part else learner
-        for name in names:
+        for name in names if owner is not None else ():
             _put(owner, name, arrays.get(f"{part}.{name}"))
     size = len(learner._held)
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
@@ -103,5 +105,17 @@ def _put(owner: object, name: str, value: np.ndarray | None) -> None:
 
 def _about(learner: Learner) -> str:
     tree = learner.tree
-    about = {"parent": tree.parent, "settings": dataclasses.asdict(learner.settings)}
+    about: dict[str, Any] = {
+        "parent": tree.parent,
+        "settings": dataclasses.asdict(learner.settings),
+    }
+    if learner.given:
+        about["effects"] = [
+            [a.effect.name, a.joint + 1, _plain(a.values), _plain(a.std)] for a in learner.given
+        ]
     return json.dumps(about, sort_keys=True)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters as JSON holds them."""
+    return {key: np.asarray(value, dtype=float).tolist() for key, value in values.items()}

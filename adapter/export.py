@@ -8,14 +8,11 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.inertia import body_from_theta, min_eigenvalue, six_from_tensor
+from adapter.export_effects import UrdfParts, comment
+from adapter.inertia import CONSISTENCY_TOLERANCE, body_from_theta, min_eigenvalue, six_from_tensor
 from adapter.model import SelfModel, base_inertia, link_theta, turned_theta
-from adapter.spatial import Array, rpy_from_matrix, z_to_axis
+from adapter.spatial import Array, rot_z, rpy_from_matrix, z_to_axis
 from adapter.tree import BASE
-
-# Smallest pseudo-inertia eigenvalue that counts as positive, relative to the largest: a body
-# closer to impossible than rounding error can't be told from an impossible one.
-CONSISTENCY_TOLERANCE = 1e-12
 
 
 def to_urdf(model: SelfModel) -> str:
@@ -23,29 +20,40 @@ def to_urdf(model: SelfModel) -> str:
 
     Each link frame is turned back to its original axis, frames that ride on links come out as
     massless links on fixed joints, a tool as a link of its own. A fixed base may be massless.
+    Effects come along as far as a URDF goes (`export_effects`), so that the rigid arm in it, its
+    base upright, takes the torque of the model's; a comment lists what does not.
 
     Raises:
         ModelError: where a body is physically impossible; names the link and the eigenvalue.
     """
-    tree = model.tree
+    tree, parts = model.tree, UrdfParts.of(model)
     robot = ET.Element("robot", name=model.name)
+    if parts.left_out:
+        robot.append(ET.Comment(comment(parts.left_out)))
     turns = {tree.base_name: np.eye(3)}
     turns.update({name: z_to_axis(model.axis[k]) for k, name in enumerate(tree.link_names)})
     base = base_inertia(model)
     massless_base = not tree.floating and not np.any(base)
     _add_link(robot, tree.base_name, None if massless_base else base)
     for k, name in enumerate(tree.link_names):
-        _add_link(robot, name, turned_theta(link_theta(model)[k], turns[name]))
-        _add_joint(robot, model, k, turns)
+        _add_link(robot, name, turned_theta(link_theta(model)[k] + parts.dtheta[k], turns[name]))
+        _add_joint(robot, model, k, turns, parts)
     for frame in model.frames:
         _add_link(robot, frame.name, None)
         turn = turns[frame.parent]
         joint = _joint(robot, frame.joint, "fixed", frame.parent, frame.name)
         _add_origin(joint, turn @ frame.rotation, turn @ frame.position)
     if model.tool is not None:
-        name, turn = f"{model.tool_link}_tool", turns[model.tool_link]
-        _add_link(robot, name, turned_theta(model.tool.theta(), turn))
-        _add_origin(_joint(robot, f"{name}_joint", "fixed", model.tool_link, name), np.eye(3))
+        link = model.tool_link
+        _add_load(robot, link, "tool", turned_theta(model.tool.theta(), turns[link]))
+    last = tree.link_names[-1]
+    for k, load in enumerate(parts.loads):
+        what = "payload" if k == 0 else f"payload_{k + 1}"
+        _add_load(robot, last, what, turned_theta(load, turns[last]))
+    if parts.tilt is not None:
+        upright = f"{tree.base_name}_upright"
+        _add_link(robot, upright, None)
+        _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, tree.base_name), parts.tilt)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
@@ -80,6 +88,13 @@ def _add_link(robot: ET.Element, name: str, theta: Array | None) -> None:
     ET.SubElement(inertial, "inertia", six)
 
 
+def _add_load(robot: ET.Element, link: str, what: str, theta: Array) -> None:
+    """A body that a link carries, as a link of its own on a fixed joint."""
+    name = f"{link}_{what}"
+    _add_link(robot, name, theta)
+    _add_origin(_joint(robot, f"{name}_joint", "fixed", link, name), np.eye(3))
+
+
 def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
     joint = ET.SubElement(robot, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
@@ -87,7 +102,9 @@ def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> 
     return joint
 
 
-def _add_joint(robot: ET.Element, model: SelfModel, k: int, turns: dict[str, Array]) -> None:
+def _add_joint(
+    robot: ET.Element, model: SelfModel, k: int, turns: dict[str, Array], parts: UrdfParts
+) -> None:
     """Joint k, its frame turned back at both ends: R_urdf = Q_i R_ij Q_jᵀ, p_urdf = Q_i p."""
     tree, limits = model.tree, model.limits
     i = tree.parent[k]
@@ -96,9 +113,14 @@ def _add_joint(robot: ET.Element, model: SelfModel, k: int, turns: dict[str, Arr
     bounded = bool(np.isfinite(limits.lower[k]) and np.isfinite(limits.upper[k]))
     kind = "revolute" if bounded else "continuous"
     joint = _joint(robot, tree.joint_names[k], kind, parent, child)
-    rotation = turns[parent] @ model.joint_rotation()[k] @ turns[child].T
+    zero = model.joint_rotation()[k] @ rot_z(-parts.offset[k])  # q = q_measured - offset
+    rotation = turns[parent] @ zero @ turns[child].T
     _add_origin(joint, rotation, turns[parent] @ model.lam[k, 3:])
     ET.SubElement(joint, "axis", xyz=_text(model.axis[k]))
+    losses = {"damping": parts.damping[k], "friction": parts.friction[k]}
+    if any(losses.values()):
+        known = {key: _text(value) for key, value in losses.items() if value}
+        ET.SubElement(joint, "dynamics", known)
     values = {
         "lower": limits.lower[k],
         "upper": limits.upper[k],

@@ -18,6 +18,9 @@ PARAMETERS = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 # The place of XX XY XZ YY YZ ZZ in a symmetric 3x3 matrix.
 _ROWS = (0, 0, 0, 1, 1, 2)
 _COLS = (0, 1, 2, 1, 2, 2)
+# Smallest pseudo-inertia eigenvalue that counts as positive, relative to the largest: a body
+# closer to impossible than rounding error can't be told from an impossible one.
+CONSISTENCY_TOLERANCE = 1e-12
 
 
 def tensor_from_six(six: ArrayLike) -> Array:

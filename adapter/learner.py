@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from adapter.change import ChangeDetector, ChangeSettings
-from adapter.effects import effects_by_name
+from adapter.effects.active import Active
+from adapter.effects.catalogue import effects_by_name
 from adapter.errors import SettingsError
+from adapter.known_effects import KnownEffects, believed
 from adapter.records import Array, StateLayout, stamp_of
+from adapter.rigid_arm import RigidArm
 from adapter.schema_learner import SchemaLearner, SchemaSettings
 from adapter.spatial import log_rotation
 from adapter.theta_learner import ThetaLearner
@@ -72,6 +76,9 @@ class Learner:
         noise_gain: of the filter (`JointFilter.noise_gain`).
         tool_theta: (10,) of a known tool on the last link, kept out of θ.
         delay_s: of the filter (`JointFilter.delay_s`).
+        known: lasting effects that a model brings, none of bodies (`with_bodies`). Those that
+            are learned start from the model's values; the others are taken off the states.
+        arm: the model's rigid arm; needed where there are known effects.
     """
 
     def __init__(
@@ -83,6 +90,8 @@ class Learner:
         noise_gain: float = 1.0,
         tool_theta: Array | None = None,
         delay_s: float = 0.0,
+        known: Sequence[Active] = (),
+        arm: RigidArm | None = None,
     ) -> None:
         self.settings = s = settings or LearnerSettings()
         self.tree, self.layout = tree, StateLayout(tree.n)
@@ -99,7 +108,15 @@ class Learner:
             noise_gain=noise_gain,
             tool_theta=tool_theta,
             delay_s=delay_s,
+            believed=believed(known, s.effects, tree.n),
         )
+        fixed = [active for active in known if active.effect.name not in s.effects]
+        self.given = tuple(known)
+        self.known: KnownEffects | None = None
+        if fixed:
+            if arm is None:
+                raise SettingsError("effects of a model need the model's arm beside them")
+            self.known = KnownEffects(fixed, arm, self.theta.smoothing_s)
         self.change = ChangeDetector(tree.n, s.change)
         from adapter.adam import FlatAdam  # brings torch; the loop process needs only settings
 
@@ -138,6 +155,7 @@ class Learner:
 
     def step_table(self, table: Array) -> None:
         """Add a table (m, size) of filtered states, then make one update of λ and θ."""
+        table = self.without_known(table)
         self.learned += len(table)
         self.stamp_ns = stamp_of(table[-1])
         self.schema.absorb(table)
@@ -150,8 +168,15 @@ class Learner:
         if self.schema_trace.wants():
             self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
 
+    def without_known(self, table: Array) -> Array:
+        """Filtered states (m, size), which follow those before, without known effects."""
+        return table if self.known is None else self.known.take_off(table)
+
     def learn_schema(self, table: Array) -> None:
-        """λ's half of `step_table`; an empty table makes one more update on the same moments."""
+        """λ's half of `step_table` on states that `without_known` has seen.
+
+        An empty table makes one more update on the same moments.
+        """
         self.learned += len(table)
         if len(table):
             self.schema.absorb(table)

@@ -106,12 +106,14 @@ class SelfModel:
         theta_std: (bodies, 10) standard deviations; NaN where unknown or without meaning alone.
         lam_identifiable: (n, 6) bool, the same directions as `lam_std`; None where not judged.
         theta_identifiable: (bodies, 10) bool, the parameter alone; None where not judged.
-        effects: one mapping each {effect, joints, parameters, std, units}, JSON values only.
+        effects: one mapping each {effect, joints, parameters} with what goes along ({interval_s,
+            std, units, evidence, ...}), JSON values only; see `effects.active`.
         lambda_source: one of `LAMBDA_SOURCES`; λ from synthesized twists is never "measured".
         provenance: where the model came from, JSON values only.
 
     Raises:
-        ModelError: shapes that don't fit the tree, non-finite λ, θ or gravity, unknown source.
+        ModelError: shapes that don't fit the tree, non-finite λ, θ or gravity, unknown source, an
+            effect that is in no catalogue or has wrong joints or parameters.
     """
 
     name: str
@@ -149,6 +151,12 @@ class SelfModel:
             choices = ", ".join(f"'{s}'" for s in LAMBDA_SOURCES)
             raise ModelError(f"no lambda_source '{self.lambda_source}'; have: {choices}")
         self._check_names()
+        self._check_effects(n)
+
+    def _check_effects(self, n: int) -> None:
+        from adapter.effects.active import active_effects  # here, because effects build on models
+
+        active_effects(self.effects, n)
 
     def _check_arrays(self, n: int, bodies: int) -> None:
         known = {

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from adapter.effects import effects_by_name
+from adapter.effects.active import active_effects
+from adapter.effects.bodies import with_bodies
+from adapter.effects.catalogue import effects_by_name
 from adapter.inertia import body_from_theta, min_eigenvalue
 from adapter.learner import Learner, LearnerSettings
 from adapter.model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -103,10 +106,14 @@ def collect(learner: Learner) -> Outcome:
 
 
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
-    """The self model a run ends with: what was learned in, what was not shown held and said so."""
+    """The self model a run ends with: what was learned in, what was not shown held and said so.
+
+    Effects of the documented model that were not learned stay in it as they are; those that
+    ended with the recording they were found in are left out.
+    """
     from adapter.identifiability import base_parameters  # brings torch; not for the loop
 
-    n = documented.tree.n
+    documented, n = with_bodies(documented), documented.tree.n
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
     base = base_parameters(documented.tree, outcome.lam, documented.gravity)
@@ -124,7 +131,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lam_identifiable=shown,
         theta_std=np.sqrt(body) if known else np.full((n, 10), np.nan),
         theta_identifiable=(share > SHOWN_SHARE) & known,
-        effects=tuple(_effects(outcome, n)),
+        effects=(*_effects(outcome, n), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={
             **provenance,
@@ -150,6 +157,16 @@ def _effects(outcome: Outcome, n: int) -> list[dict[str, Any]]:
                 }
             )
     return entries
+
+
+def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, Any]]:
+    """Entries of the documented model that hold on, without the start that they had once."""
+    found: list[Mapping[str, Any]] = []
+    for entry in documented.effects:
+        active = active_effects([entry], documented.tree.n)
+        if entry["effect"] not in learned and active[0].lasting:
+            found.append({**entry, "interval_s": None} if "interval_s" in entry else entry)
+    return found
 
 
 def changes(outcome: Outcome) -> list[dict[str, Any]]:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from adapter.effects.active import lasting_effects
+from adapter.effects.bodies import with_bodies
 from adapter.filters import FilterSettings
 from adapter.front_end import FrontEnd, FrontEndSettings
 from adapter.learner import Learner, LearnerSettings
 from adapter.model import SelfModel
+from adapter.rigid_arm import RigidArm
 from drivers.interface import JointSample
 
 
@@ -24,7 +27,8 @@ class Pipeline:
     """The two pure steps, composed.
 
     Args:
-        documented: the arm as documented; the learner gets its topology, gravity and tool only.
+        documented: the arm as documented; the learner gets its topology, gravity, tool and
+            effects only.
         settings: of the parts.
 
     Attributes:
@@ -47,12 +51,14 @@ class Pipeline:
 
 def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:
     """The front end of a pipeline with these settings."""
-    return FrontEnd(documented, settings.filter, settings.front_end)
+    return FrontEnd(with_bodies(documented), settings.filter, settings.front_end)
 
 
 def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
-    """The learner of a pipeline with these settings."""
+    """The learner of a pipeline with these settings; it takes over the effects of the model."""
     front_end = make_front_end(documented, settings)
+    documented = with_bodies(documented)
+    known = lasting_effects(documented.effects, documented.tree.n)
     tool = documented.tool
     return Learner(
         documented.tree,
@@ -61,4 +67,6 @@ def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
         noise_gain=front_end.filter.noise_gain,
         tool_theta=None if tool is None else tool.theta(),
         delay_s=front_end.delay_s,
+        known=known,
+        arm=RigidArm.of(documented) if known else None,
     )

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adapter.effects import effects_by_name
+from adapter.effects.bodies import with_bodies
+from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
 from adapter.model import SelfModel
 from adapter.outcome import Outcome, changes, frame_errors
 from adapter.records import Array
-from adapter.spatial import matrix_from_zxz
-from adapter.torque import rigid_torque
-from adapter.twist import base_motion
+from adapter.rigid_arm import RigidArm
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_GOAL = 1.1  # times the final batch least squares
@@ -117,7 +116,7 @@ class ScoreRows:
         self.q, self.dq, self.ddq, self.tau, self.error = (
             np.ascontiguousarray(rows[:, 1 + k * n : 1 + (k + 1) * n]) for k in range(5)
         )
-        self._outcome, self._documented = outcome, documented
+        self._outcome, self._documented = outcome, with_bodies(documented)
         first = outcome.changes_ns[0] if outcome.changes_ns else np.inf
         self.before_change = rows[:, 0] < first
         last = outcome.changes_ns[-1] if outcome.changes_ns else -np.inf
@@ -125,23 +124,8 @@ class ScoreRows:
 
     def torque(self, theta: Array, effects: Array) -> Array:
         """(k, n) torque of θ (n, 10) and effect parameters (e, n), with the learned frames."""
-        tau = np.empty_like(self.tau)
-        tool = self._documented.tool
-        theta = theta.copy()
-        if tool is not None:
-            theta[-1] += tool.theta()
-        lam = self._outcome.lam
-        rigid_torque(
-            np.array(self._documented.tree.parent, dtype=np.int64),
-            np.ascontiguousarray(matrix_from_zxz(lam[:, :3])),
-            np.ascontiguousarray(lam[:, 3:]),
-            base_motion(self._documented.gravity),
-            theta.ravel(),
-            self.q,
-            self.dq,
-            self.ddq,
-            tau,
-        )
+        learned = replace(self._documented, lam=self._outcome.lam, theta=theta)
+        tau = RigidArm.of(learned).torque(self.q, self.dq, self.ddq)
         for gain, effect in zip(
             effects, effects_by_name(self._outcome.settings.effects), strict=True
         ):

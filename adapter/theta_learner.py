@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.effects.base import JointEffect
+from adapter.effects.base import LinearEffect
 from adapter.errors import SettingsError
 from adapter.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.records import Array
@@ -45,6 +45,8 @@ class ThetaLearner:
         noise_gain: correlated samples that one independent sample is worth.
         tool_theta: (10,) of a known tool on the last link, kept out of θ.
         delay_s: of the filter that torque and motion went through.
+        believed: (e, n) values of the effects' parameters and their standard deviations, from a
+            model; NaN where it says nothing, which is held for absent until data show it.
 
     Attributes:
         x: (P,) what ADAM steps on: log-Cholesky of the links and of the spare body, then effects.
@@ -61,13 +63,14 @@ class ThetaLearner:
         self,
         tree: Tree,
         base: Array,
-        effects: Sequence[JointEffect] = (),
+        effects: Sequence[LinearEffect] = (),
         settings: ThetaSettings | None = None,
         *,
         mode: str = "moments",
         noise_gain: float = 1.0,
         tool_theta: Array | None = None,
         delay_s: float = 0.0,
+        believed: tuple[Array, Array] | None = None,
     ) -> None:
         if tree.floating:
             raise SettingsError("the online learner of θ needs a fixed base; this tree floats")
@@ -88,6 +91,8 @@ class ThetaLearner:
         self.newest = np.zeros((n, width, width) if mode == "sample" else (0, width, width))
         self.count = 0.0
         self.effect_std = np.array([effect.prior_std for effect in self.effects])
+        nothing: Array = np.full((len(self.effects), n), np.nan)
+        self._believed, self._belief_std = believed or (nothing, nothing)
         self.prior, self.prior_rhs = self._neutral_prior()
         self.x, self.gradient = self._neutral(), np.zeros(self.P)
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
@@ -117,6 +122,7 @@ class ThetaLearner:
         body = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
         x = np.zeros(self.P)
         x[: 10 * self.bodies] = np.tile(log_cholesky_from_theta(body), self.bodies)
+        x[10 * self.bodies :] = np.nan_to_num(self._believed).ravel()
         return x
 
     def _neutral_prior(self) -> tuple[Array, Array]:
@@ -124,8 +130,11 @@ class ThetaLearner:
         n = self.tree.n
         std = np.full(self.P, np.inf)
         std[: 10 * n] = np.tile(PRIOR_STD, n)
-        std[10 * self.bodies :] = np.repeat(self.effect_std, n)
+        told = np.isfinite(self._believed)
+        spread = np.where(told, self._belief_std, self.effect_std[:, None])
+        std[10 * self.bodies :] = spread.ravel()
         mean = np.zeros(self.P)
+        mean[10 * self.bodies :] = np.nan_to_num(self._believed).ravel()
         neutral = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
         mean[: 10 * n] = np.tile(neutral, n)
         information = 1.0 / std**2
@@ -279,20 +288,26 @@ class ThetaLearner:
         One step of empirical Bayes a call: the square of the spread becomes the mean over the
         joints of estimate² + variance. An effect that is not there fades away, instead of taking
         a share of the data for itself; and where none is left, the model is trusted as that of
-        an ideal arm.
+        an ideal arm. What a model told of keeps the spread that the model gave it.
         """
         if not self.effects:
             return
         n = self.tree.n
         variance = self.covariance().diagonal()[10 * self.bodies :].reshape(-1, n)
         widest = np.array([effect.prior_std for effect in self.effects])
-        found = np.sqrt(np.mean(self.effect_values**2 + variance, axis=1))
+        square = self.effect_values**2 + variance
+        free = np.isnan(self._believed)
+        found = [
+            np.sqrt(np.mean(s[f])) if f.any() else 0.0 for s, f in zip(square, free, strict=True)
+        ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(10 * self.bodies, self.P)
-        self.prior[at, at] += np.repeat(1.0 / spread**2 - 1.0 / self.effect_std**2, n)
+        change = np.repeat(1.0 / spread**2 - 1.0 / self.effect_std**2, n)
+        self.prior[at, at] += np.where(free.ravel(), change, 0.0)
         self.effect_std[:] = spread
         if self.settings.model_error is None:
-            real = bool((spread > REAL_EFFECT).any())
+            size = np.sqrt(np.mean(square, axis=1))
+            real = bool((np.where(free.all(axis=1), spread, size) > REAL_EFFECT).any())
             self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
 
     def known(self) -> np.ndarray:

@@ -77,6 +77,11 @@ class Engine:
         for client in (world, self._queries):
             bullet.setGravity(*self._truth.gravity.tolist(), physicsClientId=client)
 
+    @property
+    def truth(self) -> Truth:
+        """The arm, payloads aside."""
+        return self._truth
+
     def place(self, q: Array, dq: Array) -> None:
         """Put the arm at positions q (n,) rad with velocities dq (n,) rad/s."""
         for j, at, speed in zip(

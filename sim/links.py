@@ -100,3 +100,29 @@ def _add(total: Array, part: Array) -> None:
     """total grows by part."""
     for i in range(3):
         total[i] += part[i]
+
+
+@njit(cache=True)
+def flange_torque(R0: Array, p0: Array, q: Array, wrench: Array, torque: Array) -> None:
+    """Add J^T wrench to `torque` (n,), N m.
+
+    Args:
+        R0: (n, 3, 3) and p0: (n, 3), the frames of a truth.
+        q: (n,) rad.
+        wrench: (6,) [f; m] on the origin of the last link, base axes, N and N m.
+        torque: (n,), changed.
+    """
+    n = len(q)
+    R, turned = np.eye(3), np.empty((3, 3))
+    axes, origins = np.empty((n, 3)), np.empty((n, 3))
+    at, lever = np.zeros(3), np.empty(3)
+    for j in range(n):
+        for i in range(3):
+            at[i] += R[i, 0] * p0[j, 0] + R[i, 1] * p0[j, 1] + R[i, 2] * p0[j, 2]
+        _next_axes(R, R0[j], np.cos(q[j]), np.sin(q[j]), turned)
+        for i in range(3):
+            origins[j, i], axes[j, i] = at[i], R[i, 2]
+    for j in range(n):
+        _cross(at - origins[j], wrench[:3], lever)
+        for i in range(3):
+            torque[j] += axes[j, i] * (lever[i] + wrench[3 + i])

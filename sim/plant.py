@@ -7,9 +7,12 @@ import time
 import numpy as np
 
 from drivers.interface import DriverError, JointSample
+from sim.effect_engine import EffectEngine, acts_on_motion
+from sim.effects import ENCODER, TORQUE
 from sim.engine import PERIOD_S, Engine
 from sim.links import link_motion
 from sim.noise import NoiseLevels, SensorNoise, levels_of
+from sim.sensors import Sensors
 from sim.truth import Array, Truth
 
 PERIOD_NS = round(PERIOD_S * 1e9)
@@ -24,7 +27,9 @@ class Plant:
 
     The driving torque goes linearly from one command to the next over a tick, so that it is
     continuous and equals the command at the end of the tick. A sample holds q, dq, the driving
-    torque plus sensor offset, and link motion of one and the same instant.
+    torque plus sensor offset, and link motion of one and the same instant. Where the truth has
+    effects in its sensors, q, dq and torque are what these make of it; brakes, limits and link
+    motion go by the links themselves.
 
     Until the first command, after `stop`, 20 ms after the last command and after a fault the
     brakes act: full deceleration, then a hold. A brake is part of the drive, so its torque is
@@ -61,7 +66,9 @@ class Plant:
         self.fault: str | None = None
         self.compute_ns = 0
         self._links = links
-        self._engine = Engine(truth)
+        self._engine = EffectEngine(truth) if acts_on_motion(truth) else Engine(truth)
+        sensing = any(effect.place in (ENCODER, TORQUE) for effect in truth.effects)
+        self._sensors = Sensors(truth, PERIOD_S) if sensing else None
         self._noise = SensorNoise(noise or levels_of("real"), truth.n, seed)
         self._carried = 0
         self._q = np.array(truth.ready if q0 is None else q0, dtype=float)
@@ -73,6 +80,7 @@ class Plant:
         self._lock, self._moving = self._q.copy(), np.zeros(truth.n, dtype=bool)
         self._k = -1
         self._clean: JointSample | None = None
+        self._seen = self._q, self._dq, self._drive + truth.torque_offset
         self._observe()  # what is compiled on first use is compiled before the clock runs
 
     @property
@@ -105,8 +113,12 @@ class Plant:
         return sample
 
     def clean(self) -> JointSample:
-        """What the last `read` would have said with perfect sensors and a perfect clock."""
+        """What the last `read` would have said without noise and with a perfect clock."""
         return self._observe() if self._clean is None else self._clean
+
+    def link_state(self) -> tuple[Array, Array, Array]:
+        """True q, dq of the links and true driving torque at the last sample, (n,) each."""
+        return self._q, self._dq, self._drive
 
     def ddq(self) -> Array:
         """True joint acceleration (n,) at the last sample, rad/s²."""
@@ -138,10 +150,16 @@ class Plant:
         self._engine.close()
 
     def _advance(self) -> None:
-        """One tick, but for the first sample, which is the start itself."""
+        """One tick, but for the first sample, which is the start itself; then the sensors."""
         self._k += 1
-        if self._k == 0:
-            return
+        if self._k > 0:
+            self._move_on()
+        if self._sensors is not None:
+            now_s = self._k * PERIOD_S
+            self._seen = self._sensors.read(now_s, self._q, self._dq, self._drive)
+
+    def _move_on(self) -> None:
+        """One tick of the arm itself."""
         self._handle_events()
         self._age += 1
         if self._age > REFRESH_TICKS:
@@ -186,10 +204,10 @@ class Plant:
 
     def _observe(self) -> JointSample:
         """The present instant, without noise."""
-        return JointSample(
-            stamp_ns=max(self._k, 0) * PERIOD_NS,
-            q=self._q,
-            dq=self._dq,
-            tau=self._drive + self.truth.torque_offset,
-            links=link_motion(self.truth, self._q, self._dq, self.ddq()) if self._links else None,
-        )
+        if self._sensors is None:
+            self._seen = self._q, self._dq, self._drive + self.truth.torque_offset
+        q, dq, tau = self._seen
+        links = None
+        if self._links:
+            links = link_motion(self._engine.truth, self._q, self._dq, self.ddq())
+        return JointSample(max(self._k, 0) * PERIOD_NS, q, dq, tau, links)

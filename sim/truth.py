@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.effects import Effect
+
 Array = NDArray[np.float64]
 
 BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
@@ -81,6 +83,10 @@ class Truth:
         torque_offset: (n,) what the torque sensor adds, N m.
         motor_inertia: (n,) reflected inertia of the drive, kg m².
         events: what changes while the arm runs.
+        effects: whatever else acts on the arm or its sensors; table in `sim.effects`.
+
+    Raises:
+        ValueError: an effect on a joint that the arm does not have.
     """
 
     joint_names: tuple[str, ...]
@@ -96,6 +102,11 @@ class Truth:
     torque_offset: Array
     motor_inertia: Array
     events: tuple[Payload, ...] = ()
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        for effect in self.effects:
+            effect.columns(self.n)
 
     @property
     def n(self) -> int:
@@ -123,6 +134,7 @@ class Truth:
             "torque_offset": self.torque_offset.tolist(),
             "motor_inertia": self.motor_inertia.tolist(),
             "events": [event.as_dict() for event in self.events],
+            "effects": [effect.as_dict() for effect in self.effects],
         }
 
 

@@ -13,8 +13,9 @@ import numpy as np
 from rich.console import Console
 
 from adapter.config import REAL_ARM_EFFECTS, Config, config_from, config_table, read_config
-from adapter.effects import CATALOGUE
+from adapter.effects import LEARNED
 from adapter.errors import SettingsError
+from adapter.known_effects import learnable
 from adapter.learner import MODES
 from adapter.model import SelfModel
 from adapter.robots import documented
@@ -45,7 +46,7 @@ def add_learning_options(parser: argparse.ArgumentParser) -> None:
         "--effects",
         metavar="LIST",
         help="effects learned beside θ: none, real, or names with commas between "
-        f"({', '.join(CATALOGUE)})",
+        f"({', '.join(LEARNED)})",
     )
     parser.add_argument("--seed", type=int, help="of every random choice")
     parser.add_argument("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
@@ -67,13 +68,17 @@ def robot_of(name: str | None) -> SelfModel:
 
 
 def configure(
-    args: argparse.Namespace, recorded: dict[str, Any] | None, default_effects: tuple[str, ...]
+    args: argparse.Namespace,
+    recorded: dict[str, Any] | None,
+    default_effects: tuple[str, ...],
+    robot: SelfModel,
 ) -> Config:
     """Settings: the defaults, over them those a recording was made with, a file, the options.
 
     Args:
         recorded: the configuration in a recording of ours, None elsewhere.
         default_effects: learned where nobody said otherwise.
+        robot: effects that it has and that can be learned are, where nobody says otherwise.
     """
     if args.config is not None or recorded is None:
         config = read_config(args.config)
@@ -83,8 +88,9 @@ def configure(
     changes: dict[str, Any] = {}
     if args.effects is not None:
         changes["effects"] = _effects(args.effects)
-    elif recorded is None and not learner.effects:
-        changes["effects"] = default_effects
+    else:
+        by_default = recorded is None and not learner.effects
+        changes["effects"] = learnable(robot, default_effects if by_default else learner.effects)
     if args.mode is not None:
         changes["mode"] = args.mode
     if args.seed is not None:
@@ -104,8 +110,8 @@ def _effects(text: str) -> tuple[str, ...]:
         return REAL_ARM_EFFECTS
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     for name in names:
-        if name not in CATALOGUE:
-            raise SettingsError(f"no effect '{name}'; have: none, real, {', '.join(CATALOGUE)}")
+        if name not in LEARNED:
+            raise SettingsError(f"no effect '{name}'; have: none, real, {', '.join(LEARNED)}")
     return names
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from adapter.cli.common import add_json_option, console, warn, write_json
 from adapter.export import to_urdf
+from adapter.export_effects import UrdfParts
 from adapter.import_spec import ImportSpec
 from adapter.importer import import_table
 from adapter.model import SelfModel
@@ -92,9 +93,10 @@ def run_export(args: argparse.Namespace) -> int:
     """Carry `export` out."""
     model = SelfModel.load(args.model)
     args.urdf.write_text(to_urdf(model))
-    left_out = sorted({str(entry["effect"]) for entry in model.effects})
+    left_out = UrdfParts.of(model).names
     if left_out:
-        warn([f"a URDF has no place for {', '.join(left_out)}; they stay in {args.model}"])
+        listed = ", ".join(left_out)
+        warn([f"a URDF has no full place for {listed}; a comment in it lists what is missing"])
     facts = {
         "model": str(args.model),
         "urdf": str(args.urdf),

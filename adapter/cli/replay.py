@@ -15,6 +15,7 @@ from rich.progress import Progress
 from adapter.cli.common import UsageError, add_learning_options, configure, console, robot_of, warn
 from adapter.cli.results import conclude, results_folder
 from adapter.config import REAL_ARM_EFFECTS, Config
+from adapter.effects.bodies import with_bodies
 from adapter.errors import SettingsError
 from adapter.filters import noise_from_samples
 from adapter.model import SelfModel
@@ -58,8 +59,9 @@ def run(args: argparse.Namespace) -> int:
     whole = read_log(args.log)
     recorded = whole.metadata.get("config")
     robot = _robot(args, whole)
-    config = configure(args, recorded if isinstance(recorded, dict) else None, REAL_ARM_EFFECTS)
-    robot = config.apply(robot)
+    recorded = recorded if isinstance(recorded, dict) else None
+    config = configure(args, recorded, REAL_ARM_EFFECTS, robot)
+    robot = with_bodies(config.apply(robot))
     reference = reference_from(args.truth, robot)
     log = matching(whole, robot)
     warn(log.warnings)

@@ -24,6 +24,8 @@ from adapter.cli.results import conclude, results_folder
 from adapter.cli.simulated import Simulation, simulation
 from adapter.config import REAL_ARM_EFFECTS, Config
 from adapter.controller import ExcitationController
+from adapter.effects.active import lasting_effects
+from adapter.effects.bodies import with_bodies
 from adapter.excitation import MotionLimits
 from adapter.feedforward import Feedforward, ModelFeedforward
 from adapter.front_end import FrontEnd
@@ -89,10 +91,10 @@ def run(args: argparse.Namespace) -> int:
     scheme, _ = split_address(args.driver)
     world = simulation(args.driver, args.scenario, args.set, args.seed or 0)
     default_effects = REAL_ARM_EFFECTS if world is None else world.effects
-    config = configure(args, None, default_effects)
+    config = configure(args, None, default_effects, robot)
     if world is not None and config.gravity is None:
         robot = world.mounted(robot)
-    robot = config.apply(robot)
+    robot = with_bodies(config.apply(robot))
     folder = results_folder(args, "run")
     truth = args.truth or _write_truth(world, folder)
     reference = reference_from(truth, robot)
@@ -130,7 +132,9 @@ def _controller(
         forward = ModelFeedforward.of(robot)
     elif args.feedforward == "learned":
         effects = config.pipeline.learner.effects
-        forward = LearnedFeedforward(robot.tree, robot.gravity, effects, tool)
+        lasting = lasting_effects(robot.effects, robot.tree.n)
+        known = [active for active in lasting if active.effect.name not in effects]
+        forward = LearnedFeedforward(robot.tree, robot.gravity, effects, tool, known)
     return ExcitationController(MotionLimits.of(robot), config.excitation, feedforward=forward)
 
 

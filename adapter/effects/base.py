@@ -1,33 +1,296 @@
-"""What a physical effect beside the rigid body looks like to the learner."""
+"""What a physical effect beside the rigid body is to the rest of the program.
+
+Sign everywhere: tau_measured = tau_rigid(q, dq, ddq) + sum of effects. The torque that a model
+predicts is computed in four stages, and every effect belongs to one of them:
+
+    motion   what the joint sensors say -> how the links really move
+    body     inertias and gravity of the arm
+    torque   what is added at the joints
+    sensor   what the torque sensors make of it
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.errors import ModelError
+from adapter.rigid_arm import RigidArm
+
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Values = Mapping[str, Any]
+
+FEWEST_TO_FILTER = 100  # instants
+
+JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 
 
-class JointEffect(Protocol):
-    """A torque on each joint, linear in one parameter per joint.
+@dataclass(frozen=True)
+class Parameter:
+    """A number that an effect needs: key and unit as in files, and what it may be."""
+
+    key: str
+    unit: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    count: int = 1
+    optional: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How an arm moves over m instants.
 
     Attributes:
-        name: canonical name.
-        key: name of the parameter.
-        unit: unit of the parameter.
+        t: (m,) s since the recording began, increasing.
+        q, dq, ddq: (m, n) rad, rad/s, rad/s².
+        arm: the rigid body that moves.
+        band_hz: where the motion is smooth but for noise: it holds next to nothing above this.
+    """
+
+    t: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    arm: RigidArm
+    band_hz: float = math.inf
+
+    def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
+        """The same with the joint (from 0) displaced by q, dq, ddq (m,)."""
+        changed = {}
+        for name, extra in (("q", q), ("dq", dq), ("ddq", ddq)):
+            table = getattr(self, name).copy()
+            table[:, joint] += extra
+            changed[name] = table
+        return replace(self, **changed)
+
+    def inside_band(self, x: Array) -> Array:
+        """x (m,) without what lies above the motion's band, where further rates are noise."""
+        if not math.isfinite(self.band_hz) or len(self.t) < FEWEST_TO_FILTER:
+            return x
+        from scipy.signal import butter, sosfiltfilt  # takes long; the loop has no use for it
+
+        fs = 1.0 / (self.t[1] - self.t[0])
+        if self.band_hz >= 0.5 * fs:
+            return x
+        return np.asarray(sosfiltfilt(butter(4, self.band_hz, fs=fs, output="sos"), x, axis=0))
+
+    def rate(self, x: Array) -> Array:
+        """Time derivative of x (m, ...); zero where there is but one instant."""
+        if len(self.t) < 2:
+            return np.zeros_like(x)
+        return np.asarray(np.gradient(x, self.t, axis=0))
+
+
+@dataclass(frozen=True)
+class Template:
+    """A way to look for an effect: coefficients in which its signature is all but linear.
+
+    What is not linear (a number of turns, a velocity scale) is fixed in a template; an effect
+    has one template for each value worth trying.
+
+    Attributes:
+        prior_std: of each coefficient; the prior's mean is zero, where the effect is absent.
+        decode: coefficients (k,) to parameters.
+        label: what is fixed, for people ("n = 3"); empty where nothing is.
+    """
+
+    prior_std: tuple[float, ...]
+    decode: Callable[[Array], dict[str, Any]]
+    label: str = ""
+
+
+class Effect:
+    """A physical effect: its names, what it needs, how to look for it.
+
+    Attributes:
+        name: canonical name; title: for people.
+        scope: what `joints` counts: `JOINT` one joint each, `LINK` the link of that number,
+            `FLANGE` and `BASE` none, `ALL` all joints or one.
+        parameters: in the order of the catalogue.
+        typical: size of its one parameter, where it has but one and is linear in it.
+        split_by: the experiment that tells it from what looks alike.
+        positive: keys of parameters that physics keeps above zero.
+        inexact: share of its torque that may be otherwise in truth: its equation is an idealisation.
+        log_odds: ln of how much more often than the common ones it is met, before any data.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    scope: ClassVar[str] = JOINT
+    parameters: ClassVar[tuple[Parameter, ...]]
+    typical: ClassVar[float] = 1.0
+    positive: ClassVar[tuple[str, ...]] = ()
+    log_odds: ClassVar[float] = 0.0
+    inexact: ClassVar[float] = 0.0
+    split_by: ClassVar[str]
+
+    def templates(self) -> tuple[Template, ...]:
+        """Ways to look for it; one parameter, linear, of typical size `typical` by default."""
+        key = self.parameters[0].key
+        return (Template((self.typical,), lambda x: {key: float(x[0])}),)
+
+    def reshaped(self, values: Values, ratio: float) -> Template | None:
+        """A template whose nonlinear setting is `ratio` times that in `values`; None without one."""
+        return None
+
+    def possible(self, values: Values) -> bool:
+        """Whether physics allows these parameters; a fit may ask for others."""
+        return all(float(values[key]) > 0.0 for key in self.positive)
+
+    def check(self, values: Values) -> None:
+        """Raises ModelError for a parameter that is missing, unknown or out of range."""
+        known = [p.key for p in self.parameters]
+        for key in values:
+            if key not in known:
+                raise ModelError(f"{self.name} has no parameter '{key}'; have: {', '.join(known)}")
+        for p in self.parameters:
+            if p.key not in values:
+                if p.optional:
+                    continue
+                raise ModelError(f"{self.name} needs '{p.key}' ({p.unit})")
+            _check_number(self.name, p, values[p.key])
+
+    def units(self) -> dict[str, str]:
+        """Unit of each parameter."""
+        return {p.key: p.unit for p in self.parameters}
+
+
+def _check_number(name: str, p: Parameter, given: Any) -> None:
+    try:
+        value = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        value = np.full(p.count, np.nan)
+    if value.shape != (() if p.count == 1 else (p.count,)) or not np.all(np.isfinite(value)):
+        wanted = "a finite number" if p.count == 1 else f"{p.count} finite numbers"
+        raise ModelError(f"{name}: '{p.key}' must hold {wanted} ({p.unit}), got {given!r}")
+    if np.any(value < p.lower) or np.any(value > p.upper):
+        raise ModelError(f"{name}: '{p.key}' is {given}, outside {p.lower:g} to {p.upper:g}")
+
+
+class MotionEffect(Effect):
+    """Makes the measured motion differ from that of the links."""
+
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
+        """Motion of the links behind a measured motion; tau (m, n) is the joint torque."""
+        raise NotImplementedError
+
+
+class BodyEffect(Effect):
+    """Changes inertias or gravity."""
+
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+        """(theta (n, 10), gravity (3,)) with the effect; joint from 0, -1 for the last."""
+        raise NotImplementedError
+
+
+class TorqueEffect(Effect):
+    """Adds torque at the joints."""
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """(m, n) N m that it adds; tau (m, n) is the rigid torque."""
+        raise NotImplementedError
+
+
+class SensorEffect(Effect):
+    """Makes the measured torque differ from the torque."""
+
+    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """(m, n) N m as the sensors say it, of the torques tau (m, n); joint -1: all joints."""
+        raise NotImplementedError
+
+
+def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
+    """(m, n) with `torque` (m,) on one joint."""
+    out = np.zeros_like(motion.q)
+    out[:, joint] = torque
+    return out
+
+
+SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
+
+
+def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -> Array:
+    """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s.
+
+    Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a step;
+    what jumps in the effect must be as smooth as what jumps in the torque, so w is at least as
+    far as dq goes within that time.
+    """
+    if not smoothing_s or ddq is None:
+        return np.tanh(dq / SMOOTHING_DQ)
+    return np.tanh(dq / np.hypot(SMOOTHING_DQ, smoothing_s * ddq))
+
+
+class JointTorque(TorqueEffect):
+    """A torque effect that each joint has for itself, by its own signals and numbers alone."""
+
+    def law(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        tau: Array,
+        values: Values,
+        smoothing_s: float = 0.0,
+    ) -> Array:
+        """Torque, same shape as dq, of signals in rad, rad/s, rad/s², N m (the rigid torque).
+
+        Parameters are numbers or arrays that fit the signals' shape. Where the signals have gone
+        through a low-pass, `smoothing_s` says how long it takes a step; what jumps in the effect
+        must be as smooth as what jumps in the torque.
+        """
+        raise NotImplementedError
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """The law on one joint."""
+        q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
+        numbers = {key: float(value) for key, value in values.items()}
+        return on_joint(motion, joint, self.law(q, dq, ddq, own, numbers))
+
+
+class LinearEffect(JointTorque):
+    """A torque effect with one parameter per joint in which it is linear; the learner has these.
+
+    Attributes:
         prior_std: how large the parameter may well be, in its unit; the prior's mean is zero.
     """
 
-    name: str
-    key: str
-    unit: str
-    prior_std: float
+    prior_std: ClassVar[float]
+
+    @property
+    def key(self) -> str:
+        """Name of the parameter."""
+        return self.parameters[0].key
+
+    @property
+    def unit(self) -> str:
+        """Unit of the parameter."""
+        return self.parameters[0].unit
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
-        """Torque per unit of the parameter, same shape as dq; rad, rad/s, rad/s² in.
+        """Torque per unit of the parameter; the arguments are those of `law`."""
+        raise NotImplementedError
 
-        Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a
-        step; what jumps in the effect must be as smooth as what jumps in the torque.
-        """
+    def law(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        tau: Array,
+        values: Values,
+        smoothing_s: float = 0.0,
+    ) -> Array:
+        """Parameter times column."""
+        return np.asarray(values[self.key] * self.column(q, dq, ddq, smoothing_s))
+
+
+def polar(x: Array) -> tuple[float, float]:
+    """Size and phase of x[0] sin + x[1] cos = size sin(. + phase)."""
+    return float(np.hypot(x[0], x[1])), float(np.arctan2(x[1], x[0]))

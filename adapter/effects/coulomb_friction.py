@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from adapter.effects.base import Array
-
-SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a filtered velocity is noise
+from adapter.effects.base import Array, LinearEffect, Parameter, smooth_sign
 
 
-class CoulombFriction:
+class CoulombFriction(LinearEffect):
     """Friction torque that depends on the direction of motion alone."""
 
     name = "coulomb_friction"
-    key = "Fc"
-    unit = "N m"
+    title = "Coulomb friction"
+    parameters = (Parameter("Fc", "N m"),)
     prior_std = 1.0  # published Panda values are 0.2 to 0.5 (Knezevic)
+    typical = 1.0
+    positive = ("Fc",)
+    inexact = 0.02
+    split_by = "repeat the motion with a ladder of loads at the flange, at the same speed"
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """tanh(dq / w) with w = 0.01 rad/s, or as far as dq goes within the smoothing time."""
-        if not smoothing_s:
-            return np.tanh(dq / SMOOTHING_DQ)
-        return np.tanh(dq / np.hypot(SMOOTHING_DQ, smoothing_s * ddq))
+        return smooth_sign(dq, ddq, smoothing_s)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from adapter.effects.active import Active
 from adapter.feedforward import ModelFeedforward
 from adapter.realtime.snapshot import SnapshotReader
 from adapter.records import Array
@@ -22,6 +23,7 @@ class LearnedFeedforward:
         gravity: (3,) m/s² in base axes.
         effect_names: effects that the learner learns, in the order of the snapshot.
         tool_theta: (10,) of a known tool on the last link, which θ leaves out.
+        known: lasting effects of the documented model that are not learned.
     """
 
     def __init__(
@@ -30,10 +32,11 @@ class LearnedFeedforward:
         gravity: Array,
         effect_names: Sequence[str] = (),
         tool_theta: Array | None = None,
+        known: Sequence[Active] = (),
     ) -> None:
         n = tree.n
         self._model = ModelFeedforward(
-            tree, gravity, np.zeros((n, 6)), np.zeros((n, 10)), effect_names
+            tree, gravity, np.zeros((n, 6)), np.zeros((n, 10)), effect_names, known=known
         )
         self._tool = np.zeros((n, 10))
         if tool_theta is not None:

@@ -7,9 +7,10 @@ from robot_models import PANDA, Case, pinocchio_case, random_urdf, relative, urd
 
 from adapter import dynamics, kinematics
 from adapter.fast import body_wrench_regressor, link_motion, regressor
+from adapter.rigid_arm import rigid_torque
 from adapter.robots import documented
 from adapter.spatial import matrix_from_zxz
-from adapter.torque import ModelTorque, rigid_torque
+from adapter.torque import ModelTorque
 from adapter.tree import Tree
 from adapter.twist import base_motion
 

@@ -28,6 +28,31 @@ def arrays(element: st.SearchStrategy[float], *shape: int) -> st.SearchStrategy[
 
 
 @st.composite
+def effects(draw: st.DrawFn, n: int) -> tuple[dict[str, Any], ...]:
+    """The learner's form, and a finding's with what goes along."""
+    each = draw(st.lists(finite, min_size=n, max_size=n))
+    learned = {
+        "effect": "viscous_friction",
+        "joints": list(range(1, n + 1)),
+        "parameters": {"Fv": each},
+        "std": {"Fv": [None] * n},
+        "units": {"Fv": "N m s/rad"},
+    }
+    found = {
+        "effect": "payload",
+        "joints": [],
+        "interval_s": [draw(st.floats(0.0, 10.0)), None],
+        "parameters": {"m": draw(finite), "cx": 0.0, "cy": 0.1, "cz": draw(finite)},
+        "std": {"m": draw(st.floats(0.0, 1.0))},
+        "units": {"m": "kg", "cx": "m", "cy": "m", "cz": "m"},
+        "evidence": 0.99,
+        "ambiguous_with": ["link_inertia"],
+        "split_by": "weigh it",
+    }
+    return tuple(draw(st.lists(st.sampled_from([learned, found]), max_size=3)))
+
+
+@st.composite
 def models(draw: st.DrawFn) -> SelfModel:
     n = draw(st.integers(1, 4))
     parent = tuple(draw(st.integers(-1, k - 1)) for k in range(n))
@@ -48,7 +73,7 @@ def models(draw: st.DrawFn) -> SelfModel:
         lam_std=draw(arrays(any_number, n, 6)),
         theta_std=draw(arrays(any_number, tree.bodies, 10)),
         lam_identifiable=draw(st.sampled_from([None, np.eye(n, 6, dtype=bool)])),
-        effects=({"effect": "viscous", "joints": [0], "parameters": [0.1], "std": [None]},),
+        effects=draw(effects(n)),
         lambda_source=draw(st.sampled_from(["measured", "reproduces the documentation"])),
         provenance={"log": "a.mcap", "samples": 3},
     )
@@ -79,10 +104,20 @@ def same(first: Any, second: Any) -> None:
 def test_numpy_values_and_unknowns_in_effects_are_written_plainly() -> None:
     model = dataclasses.replace(
         documented("panda"),
-        effects=({"effect": "coulomb", "parameters": np.array([0.3, np.nan]), "n": np.int64(2)},),
+        effects=(
+            {
+                "effect": "coulomb_friction",
+                "joints": np.array([1, 2]),
+                "parameters": {"Fc": np.array([0.3, 0.2])},
+                "std": {"Fc": np.array([0.1, np.nan])},
+                "n": np.int64(2),
+            },
+        ),
     )
     back = loads(dumps(model))
-    assert back.effects == ({"effect": "coulomb", "parameters": [0.3, None], "n": 2},)
+    (entry,) = back.effects
+    assert entry["parameters"] == {"Fc": [0.3, 0.2]} and entry["joints"] == [1, 2]
+    assert entry["std"] == {"Fc": [0.1, None]} and entry["n"] == 2
 
 
 def test_the_file_reads_as_tables() -> None:

@@ -1,0 +1,133 @@
+"""Effects at work: the entries of model files and findings, checked, one joint at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import ALL, JOINT, LINK, Array, Effect, Flags, Parameter, Values
+from adapter.effects.catalogue import CATALOGUE
+from adapter.errors import ModelError
+
+WHOLE = (-np.inf, np.inf)
+NEEDED = ("effect", "parameters")
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """An effect at work.
+
+    Attributes:
+        effect: of the catalogue.
+        joint: from 0; -1 where the effect has no joint of its own.
+        values: its parameters.
+        interval_s: (from, to) s of the recording in which it acts.
+        std: of the parameters, None where unknown.
+    """
+
+    effect: Effect
+    joint: int
+    values: Values
+    interval_s: tuple[float, float] = WHOLE
+    std: Mapping[str, float | None] = field(default_factory=dict)
+
+    def on(self, t: Array) -> Flags | None:
+        """(m,) where it acts; None where it always does."""
+        if self.interval_s == WHOLE:
+            return None
+        return np.asarray((t >= self.interval_s[0]) & (t < self.interval_s[1]))
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it has no end: it is there in whatever comes after the recording."""
+        return self.interval_s[1] == np.inf
+
+
+def active_effects(entries: Iterable[Mapping[str, Any]], n: int) -> tuple[Active, ...]:
+    """The effects in a model file's or report's entries, one for each joint named.
+
+    A parameter is one value for all joints of the entry, or a list with one for each of them.
+
+    Raises:
+        ModelError: an effect that is not in the catalogue, a joint outside 1 to n, a parameter
+            that is missing or out of range, an interval that is none.
+    """
+    return tuple(active for entry in entries for active in _of_entry(entry, n))
+
+
+def lasting_effects(entries: Iterable[Mapping[str, Any]], n: int) -> tuple[Active, ...]:
+    """Those without an end, taken as acting always: what holds beyond the recording."""
+    return tuple(replace(a, interval_s=WHOLE) for a in active_effects(entries, n) if a.lasting)
+
+
+def _of_entry(entry: Any, n: int) -> list[Active]:
+    if not isinstance(entry, Mapping) or any(key not in entry for key in NEEDED):
+        raise ModelError(f"an effect needs {' and '.join(NEEDED)}, got {entry!r}")
+    name = entry["effect"]
+    if not isinstance(name, str) or name not in CATALOGUE:
+        raise ModelError(f"no effect '{name}'; have: {', '.join(CATALOGUE)}")
+    effect = CATALOGUE[name]
+    values = entry["parameters"]
+    if not isinstance(values, Mapping):
+        raise ModelError(f"{effect.name}: 'parameters' must hold {_keys(effect)}, got {values!r}")
+    joints, interval = _joints(effect, entry.get("joints"), n), _interval(effect, entry)
+    std = entry.get("std") or {}
+    if not isinstance(std, Mapping):
+        raise ModelError(f"{effect.name}: 'std' must hold {_keys(effect)}, got {std!r}")
+    if not joints:
+        effect.check(values)
+        return [Active(effect, -1, values, interval, std)]
+    found = []
+    for k, joint in enumerate(joints):
+        own = {key: _of_joint(effect, key, value, k, len(joints)) for key, value in values.items()}
+        effect.check(own)
+        spread = {key: _of_joint(effect, key, s, k, len(joints)) for key, s in std.items()}
+        found.append(Active(effect, joint - 1, own, interval, spread))
+    return found
+
+
+def _keys(effect: Effect) -> str:
+    return ", ".join(f"'{p.key}'" for p in effect.parameters)
+
+
+def _joints(effect: Effect, joints: Any, n: int) -> list[int]:
+    """The joints that the effect has for its own; none for one of the flange, the base or all."""
+    given = [] if joints is None else joints
+    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str):
+        raise ModelError(f"{effect.name}: 'joints' must be a list of 1 to {n}, got {joints!r}")
+    for j in given:
+        if isinstance(j, bool) or not isinstance(j, int | np.integer) or not 1 <= j <= n:
+            raise ModelError(f"{effect.name}: no joint {j!r}; have: 1 to {n}")
+    if effect.scope in (JOINT, LINK) and not len(given):
+        raise ModelError(f"{effect.name} needs 'joints'; have: 1 to {n}")
+    return [int(j) for j in given] if effect.scope in (JOINT, LINK, ALL) else []
+
+
+def _interval(effect: Effect, entry: Mapping[str, Any]) -> tuple[float, float]:
+    """(from, to) in s; infinite where the entry leaves an end open."""
+    given = entry.get("interval_s")
+    if given is None:
+        return WHOLE
+    try:
+        begin, end = given
+        found = (-np.inf if begin is None else float(begin), np.inf if end is None else float(end))
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"{effect.name}: 'interval_s' must be [from, to] in s, or null; got {given!r}"
+        ) from None
+    if not found[0] < found[1]:
+        raise ModelError(f"{effect.name}: 'interval_s' {given!r} does not end after it begins")
+    return found
+
+
+def _of_joint(effect: Effect, key: str, value: Any, k: int, joints: int) -> Any:
+    """A parameter of the k-th joint: entries may hold one value for each."""
+    parameter: Parameter | None = next((p for p in effect.parameters if p.key == key), None)
+    if parameter is None or np.ndim(value) == (0 if parameter.count == 1 else 1):
+        return value
+    if not hasattr(value, "__len__") or len(value) != joints:
+        raise ModelError(f"{effect.name}: '{key}' holds not one value for each of {joints} joints")
+    return value[k]

@@ -1,0 +1,33 @@
+"""Base tilt: the base turned by the rotation vector [rx, ry, 0] in base axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import BASE, Array, BodyEffect, Parameter, Template, Values
+from adapter.spatial import exp_rotation
+
+
+class BaseTilt(BodyEffect):
+    """A base that does not stand as the model says: gravity in the base is R(r)^T g."""
+
+    name = "base_tilt"
+    title = "base tilt"
+    scope = BASE
+    parameters = (Parameter("rx", "rad"), Parameter("ry", "rad"))
+    split_by = "turn joint 1 through its range with the arm stretched out, or measure the base"
+
+    def templates(self) -> tuple[Template, ...]:
+        """Both angles."""
+        return (Template((0.03, 0.03), _decode),)
+
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+        """Gravity seen from the tilted base."""
+        turn = exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
+        return theta, np.asarray(turn.T @ gravity)
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    return {"rx": float(x[0]), "ry": float(x[1])}

@@ -1,0 +1,68 @@
+"""All the physical effects beside the rigid body, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from adapter.effects.asymmetric_friction import AsymmetricFriction
+from adapter.effects.backlash import Backlash
+from adapter.effects.base import Effect, LinearEffect
+from adapter.effects.base_tilt import BaseTilt
+from adapter.effects.coulomb_friction import CoulombFriction
+from adapter.effects.encoder_offset import EncoderOffset
+from adapter.effects.encoder_ripple import EncoderRipple
+from adapter.effects.external_wrench import ExternalWrench
+from adapter.effects.friction_drift import FrictionDrift
+from adapter.effects.joint_elasticity import JointElasticity
+from adapter.effects.joint_spring import JointSpring
+from adapter.effects.link_inertia import LinkInertia
+from adapter.effects.load_dependent_friction import LoadDependentFriction
+from adapter.effects.motor_inertia import MotorInertia
+from adapter.effects.payload import Payload
+from adapter.effects.signal_delay import SignalDelay
+from adapter.effects.stribeck_friction import StribeckFriction
+from adapter.effects.torque_gain import TorqueGain
+from adapter.effects.torque_offset import TorqueOffset
+from adapter.effects.torque_ripple import TorqueRipple
+from adapter.effects.viscous_friction import ViscousFriction
+from adapter.errors import SettingsError
+
+CATALOGUE: dict[str, Effect] = {
+    effect.name: effect
+    for effect in (
+        ViscousFriction(),
+        CoulombFriction(),
+        AsymmetricFriction(),
+        StribeckFriction(),
+        LoadDependentFriction(),
+        MotorInertia(),
+        JointElasticity(),
+        Backlash(),
+        TorqueRipple(),
+        JointSpring(),
+        TorqueOffset(),
+        TorqueGain(),
+        EncoderOffset(),
+        EncoderRipple(),
+        SignalDelay(),
+        Payload(),
+        LinkInertia(),
+        BaseTilt(),
+        ExternalWrench(),
+        FrictionDrift(),
+    )
+}
+
+# Linear in one parameter per joint: what the learner can carry beside θ from nothing.
+LEARNED: dict[str, LinearEffect] = {
+    name: effect for name, effect in CATALOGUE.items() if isinstance(effect, LinearEffect)
+}
+
+
+def effects_by_name(names: Iterable[str]) -> tuple[LinearEffect, ...]:
+    """The learner's effects of these names, in order. Raises SettingsError with the choices."""
+    chosen = list(names)
+    for name in chosen:
+        if name not in LEARNED:
+            raise SettingsError(f"no effect '{name}'; have: {', '.join(LEARNED)}")
+    return tuple(LEARNED[name] for name in chosen)

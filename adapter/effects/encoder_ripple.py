@@ -1,0 +1,44 @@
+"""Encoder ripple: q_measured = q + a sin(q + phase), an encoder that sits off its centre."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import (
+    Array,
+    Motion,
+    MotionEffect,
+    Parameter,
+    Template,
+    Values,
+    polar,
+)
+
+
+class EncoderRipple(MotionEffect):
+    """A position error of once a turn."""
+
+    name = "encoder_ripple"
+    title = "encoder ripple"
+    parameters = (Parameter("a", "rad"), Parameter("phase", "rad"))
+    log_odds = -2.0
+    inexact = 0.02
+    split_by = "move the joint over a whole turn, faster"
+
+    def templates(self) -> tuple[Template, ...]:
+        """Sine and cosine."""
+        return (Template((5e-3, 5e-3), _decode),)
+
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
+        """q - a sin(q + phase) with its two derivatives (to first order in a)."""
+        a, angle = float(values["a"]), motion.q[:, joint] + float(values["phase"])
+        dq, ddq = motion.dq[:, joint], motion.ddq[:, joint]
+        sine, cosine = a * np.sin(angle), a * np.cos(angle)
+        return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    size, phase = polar(x)
+    return {"a": size, "phase": phase}

@@ -1,0 +1,46 @@
+"""External wrench: something pushes the flange for a time; tau_measured = tau_rigid - J^T w."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import (
+    FLANGE,
+    Array,
+    Motion,
+    Parameter,
+    Template,
+    TorqueEffect,
+    Values,
+)
+
+KEYS = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+class ExternalWrench(TorqueEffect):
+    """A constant wrench on the arm at the origin of the last link, base axes."""
+
+    name = "external_wrench"
+    title = "external wrench"
+    scope = FLANGE
+    parameters = (
+        *(Parameter(key, "N") for key in KEYS[:3]),
+        *(Parameter(key, "N m") for key in KEYS[3:]),
+    )
+    inexact = 0.05
+    split_by = "repeat the motion with nothing near the arm"
+
+    def templates(self) -> tuple[Template, ...]:
+        """Force and moment."""
+        return (Template((15.0, 15.0, 15.0, 2.0, 2.0, 2.0), _decode),)
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """-J^T w."""
+        wrench = np.array([values[key] for key in KEYS], dtype=float)
+        return -motion.arm.wrench_torque(motion.q, wrench)
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    return dict(zip(KEYS, map(float, x), strict=True))

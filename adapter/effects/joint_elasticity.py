@@ -1,0 +1,34 @@
+"""Joint elasticity: the encoder sits on the motor side, q_measured = q_link + tau / k."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Template, Values
+
+COMPLIANCE = 2e-4  # rad/(N m), typical: 1/k of a harmonic drive of 5000 N m/rad
+
+
+class JointElasticity(MotionEffect):
+    """A gear that twists under the joint's torque."""
+
+    name = "joint_elasticity"
+    title = "joint elasticity"
+    parameters = (Parameter("k", "N m/rad"),)
+    positive = ("k",)
+    inexact = 0.05
+    split_by = "move faster, and repeat with and without a load at the flange"
+
+    def templates(self) -> tuple[Template, ...]:
+        """In 1/k, which is zero where the gear is rigid."""
+        return (Template((COMPLIANCE,), _decode),)
+
+    def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
+        """q - tau/k with two derivatives: fourth ones of q, nothing but noise above a band."""
+        twist = -motion.inside_band(tau[:, joint]) / float(values["k"])
+        speed = motion.rate(twist)
+        return motion.moved(joint, twist, speed, motion.rate(speed))
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    return {"k": 1.0 / float(x[0])}

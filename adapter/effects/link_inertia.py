@@ -1,0 +1,35 @@
+"""Link inertia: theta of one link differs from the model by dtheta (order of eq. 4b)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import LINK, Array, BodyEffect, Parameter, Template, Values
+
+
+class LinkInertia(BodyEffect):
+    """A link that weighs something else than the model says."""
+
+    name = "link_inertia"
+    title = "wrong link inertia"
+    scope = LINK
+    parameters = (Parameter("dtheta", "kg, kg m, kg m2", count=10),)
+    log_odds = -2.0
+    split_by = "weigh the link, or repeat the motion with the base rotated and a wider range"
+
+    def templates(self) -> tuple[Template, ...]:
+        """Ten inertial parameters."""
+        sizes = (1.0, 0.1, 0.1, 0.1, *(0.05 * np.ones(6)))
+        return (Template(tuple(map(float, sizes)), _decode),)
+
+    def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
+        """Link `joint` with its change."""
+        changed = theta.copy()
+        changed[joint] += np.asarray(values["dtheta"], dtype=float)
+        return changed, gravity
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    return {"dtheta": [float(v) for v in x]}

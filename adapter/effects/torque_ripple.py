@@ -1,0 +1,55 @@
+"""Torque ripple: a sin(n q + phase), n a whole number per turn."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import (
+    Array,
+    JointTorque,
+    Parameter,
+    Template,
+    Values,
+    polar,
+)
+
+# Harmonic drives and motors give 1, 2, 4 and the numbers of poles and rollers.
+NUMBERS = tuple(range(1, 31))
+
+
+class TorqueRipple(JointTorque):
+    """A torque that repeats with the joint's angle."""
+
+    name = "torque_ripple"
+    title = "torque ripple"
+    parameters = (
+        Parameter("a", "N m"),
+        Parameter("n", "per turn", lower=0.0),
+        Parameter("phase", "rad"),
+    )
+    inexact = 0.01
+    split_by = "move the joint over a wider range, slowly and at several speeds"
+
+    def templates(self) -> tuple[Template, ...]:
+        """Sine and cosine of each number per turn."""
+        return tuple(Template((0.3, 0.3), partial(_decode, n), f"n = {n}") for n in NUMBERS)
+
+    def law(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        tau: Array,
+        values: Values,
+        smoothing_s: float = 0.0,
+    ) -> Array:
+        """a sin(n q + phase)."""
+        return np.asarray(values["a"] * np.sin(values["n"] * q + values["phase"]))
+
+
+def _decode(n: int, x: Array) -> dict[str, Any]:
+    size, phase = polar(x)
+    return {"a": size, "n": float(n), "phase": phase}

@@ -1,0 +1,1 @@
+"""Where a model and recordings disagree, which effect is missing, and the model with it."""

@@ -1,0 +1,239 @@
+"""The model as it stands: nominal, its small inertial corrections, and the effects named so far.
+
+Everything is refitted together and exactly: Gauss and Newton on the torque that the stages of
+`adapter.torque` predict, with the inertias held to their prior and the noise coloured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from adapter.effects import CATALOGUE
+from adapter.gap.candidates import Candidate
+from adapter.gap.evidence import Carried, Score, score
+from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
+from adapter.gap.signals import Signals
+from adapter.records import Array
+from adapter.rigid_arm import RigidArm
+from adapter.effects.active import WHOLE, Active
+from adapter.torque import moved_links, sensed_torque
+
+TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
+STEP = 0.01  # of a coefficient's prior, for differences
+EDGE_S = 0.06  # a change takes so long, and its date is no better known
+BAND_HZ = 25.0  # samples a second
+SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
+
+
+@dataclass(frozen=True, eq=False)
+class Named:
+    """An effect that has been named.
+
+    Attributes:
+        candidate: what and where; x: (k,) its coefficients.
+        interval_s: when; recording: in which one, None in all.
+    """
+
+    candidate: Candidate
+    x: Array
+    interval_s: tuple[float, float] = WHOLE
+    recording: int | None = None
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Its parameters."""
+        return self.candidate.template.decode(self.x)
+
+    def active(self) -> Active:
+        """As the model uses it."""
+        c = self.candidate
+        return Active(c.effect, c.joint, self.values, self.interval_s)
+
+    def at(self, x: Array) -> Named:
+        """With other coefficients."""
+        return replace(self, x=x)
+
+
+def theta_prior(theta: Array, share: float) -> Array:
+    """(n, 10) standard deviation of inertial parameters that are known to a `share` of their size.
+
+    A parameter that happens to be near zero is no better known than its like: to its own size a
+    quarter of its kind's (mass, first moment, mean moment of inertia) is added.
+    """
+    kind = np.empty_like(theta)
+    kind[:, 0] = theta[:, 0]
+    kind[:, 1:4] = np.linalg.norm(theta[:, 1:4], axis=1)[:, None]
+    kind[:, 4:] = np.abs(theta[:, [4, 7, 9]].mean(axis=1))[:, None]
+    return np.asarray(share * np.hypot(theta, SPREAD * kind))
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model fitted to recordings.
+
+    Attributes:
+        recordings: as the search sees them; their arm is the nominal one.
+        prior: (n, 10) standard deviation of the nominal inertias.
+        noise: one model per recording.
+        dtheta: (n, 10) correction of the nominal inertias.
+        delay_s: by how much torques are late, within the timing of a sample.
+        named: effects named so far.
+        weights: (k, n) by which white rows count, per recording; empty where all count alike.
+    """
+
+    recordings: tuple[Signals, ...]
+    prior: Array
+    noise: tuple[Noise, ...]
+    dtheta: Array
+    delay_s: float = 0.0
+    named: tuple[Named, ...] = ()
+    weights: tuple[Array, ...] = ()
+
+    @property
+    def arm(self) -> RigidArm:
+        """With its corrections."""
+        nominal = self.recordings[0].motion.arm
+        return nominal.changed(nominal.theta + self.dtheta)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return self.recordings[0].motion.arm.n
+
+    def actives(self, recording: int) -> tuple[Active, ...]:
+        """Effects at work in a recording, the timing's error among them."""
+        own = [e.active() for e in self.named if e.recording in (None, recording)]
+        own.append(Active(CATALOGUE["signal_delay"], -1, {"d": self.delay_s}))
+        return tuple(own)
+
+    def signals(self, recording: int) -> Signals:
+        """A recording with the corrected arm."""
+        own = self.recordings[recording]
+        return replace(own, motion=replace(own.motion, arm=self.arm))
+
+    def predicted(self, recording: int) -> Array:
+        """(k, n) torque in the band."""
+        own = self.signals(recording)
+        return own.low(sensed_torque(own.motion, self.actives(recording)))
+
+    def residual(self, recording: int) -> Array:
+        """(k, n) measured less predicted, N m."""
+        return self.recordings[recording].tau - self.predicted(recording)
+
+    def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
+        """The same under another noise model; that of its own residuals where None is given."""
+        if noise is None:
+            noise = [noise_of(r, LEAST_NM) for r in self.residuals()]
+        fit = replace(self, noise=tuple(noise))
+        return replace(fit, weights=tuple(fit._weights(i) for i in range(len(fit.recordings))))
+
+    def _weights(self, recording: int) -> Array:
+        """Rows count less where a named effect is strong, for its equation is an idealisation.
+
+        They don't count at all around its start and end: nobody picks up a load in no time.
+        """
+        own, level = self.recordings[recording], self.noise[recording].level
+        weight = np.ones_like(own.tau)
+        for k, e in enumerate(self.named):
+            if e.recording not in (None, recording):
+                continue
+            if e.candidate.effect.inexact:
+                share = e.candidate.effect.inexact * self.contribution(recording, k)
+                weight /= np.sqrt(1.0 + (share / level) ** 2)
+            for edge in e.interval_s:
+                after = EDGE_S + ORDER / BAND_HZ
+                weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
+        return weight
+
+    def contribution(self, recording: int, place: int) -> Array:
+        """(k, n) what a named effect adds to the torque in the band, N m."""
+        others = self.named[:place] + self.named[place + 1 :]
+        return self.predicted(recording) - replace(self, named=others).predicted(recording)
+
+    def residuals(self) -> list[Array]:
+        """Of every recording."""
+        return [self.residual(i) for i in range(len(self.recordings))]
+
+    def whiten(self, tables: Sequence[Array]) -> Array:
+        """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
+        white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
+        if self.weights:
+            white = [x * w[ORDER:] for x, w in zip(white, self.weights, strict=True)]
+        return np.concatenate([x.reshape(*x.shape[:-2], -1) for x in white], axis=-1)
+
+    @property
+    def coefficients(self) -> Array:
+        """All that is fitted: corrections, delay, coefficients of the named effects."""
+        return np.concatenate([self.dtheta.ravel(), [self.delay_s], *(e.x for e in self.named)])
+
+    @property
+    def prior_std(self) -> Array:
+        """Of the coefficients."""
+        own = [e.candidate.prior_std for e in self.named]
+        return np.concatenate([self.prior.ravel(), [TIMING_STD_S], *own])
+
+    def at(self, x: Array) -> Fit:
+        """The same model with other coefficients."""
+        size = self.dtheta.size
+        named, k = [], size + 1
+        for e in self.named:
+            named.append(e.at(x[k : k + len(e.x)]))
+            k += len(e.x)
+        dtheta = x[:size].reshape(self.dtheta.shape)
+        return replace(self, dtheta=dtheta, delay_s=float(x[size]), named=tuple(named))
+
+    def carried_signatures(self, recording: int) -> Array:
+        """(c, k, n) change of the torque per unit of each coefficient, where they are."""
+        own, effects = self.signals(recording), self.actives(recording)
+        links = moved_links(own.motion, effects)
+        theta = np.moveaxis(own.low(links.arm.regressor(links.q, links.dq, links.ddq)), 2, 0)
+        total = sensed_torque(own.motion, effects)
+        rest = [-own.low(own.motion.rate(total))]
+        for place, e in enumerate(self.named):
+            for i in range(len(e.x)):
+                rest.append(self._difference(recording, place, i, total))
+        return np.concatenate([theta, np.array(rest)])
+
+    def _difference(self, recording: int, place: int, i: int, total: Array) -> Array:
+        e = self.named[place]
+        if e.recording not in (None, recording):
+            return np.zeros_like(self.recordings[recording].tau)
+        x = e.x.copy()
+        h = STEP * e.candidate.prior_std[i]
+        x[i] += h
+        named = [*self.named[:place], e.at(x), *self.named[place + 1 :]]
+        other = replace(self, named=tuple(named))
+        own = other.signals(recording)
+        return own.low((sensed_torque(own.motion, other.actives(recording)) - total) / h)
+
+    def carried(self) -> Carried:
+        """What is carried along when further effects are sought, about the present model."""
+        tables = [self.carried_signatures(i) for i in range(len(self.recordings))]
+        N = self.whiten(tables)
+        data = self.whiten(self.residuals()) + self.coefficients @ N
+        return Carried(N, self.prior_std, data)
+
+
+def worth(fit: Fit, carried: Carried, place: int) -> Score:
+    """Evidence of one of the named effects, the others and the corrections carried along."""
+    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:place])
+    own = np.arange(begin, begin + len(fit.named[place].x))
+    rest = np.delete(np.arange(len(carried.N)), own)
+    others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
+    return score(*others.without(carried.N[own]), carried.prior_std[own])
+
+
+def refitted(fit: Fit, rounds: int = 3) -> tuple[Fit, Carried]:
+    """The model at its most probable coefficients, and what is known of them."""
+    carried = fit.carried()
+    for _ in range(rounds):
+        before = fit.coefficients
+        fit = fit.at(carried.x)
+        carried = fit.carried()
+        if np.all(np.abs(carried.x - before) < 0.02 * carried.std()):
+            break
+    return fit, carried

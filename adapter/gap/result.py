@@ -1,0 +1,236 @@
+"""What the workflow ends with: findings, what stays unexplained, the gap before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from adapter.records import Array
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that the model lacks.
+
+    Attributes:
+        effect: canonical name; title: for people.
+        joints: from 1; empty where the effect has none of its own.
+        interval_s: (from, to) s of the recording in which it acts.
+        lasting: it goes on to the end of the recording.
+        parameters, std, units: by key.
+        evidence: posterior probability against the best rival, 0 to 1.
+        overlaps: rivals, effect -> share of this signature that it explains on these data,
+            0.9 and more, best first, at most three.
+        split_by: the experiment that would tell them apart.
+        detectability: z, its size in standard deviations of what else could explain it.
+        torque_rms_nm: (n,) what it adds to each joint, rms while it acts.
+    """
+
+    effect: str
+    title: str
+    joints: tuple[int, ...]
+    interval_s: tuple[float, float]
+    lasting: bool
+    parameters: dict[str, Any]
+    std: dict[str, Any]
+    units: dict[str, str]
+    evidence: float
+    overlaps: dict[str, float]
+    split_by: str
+    detectability: float
+    torque_rms_nm: Array
+
+    def as_dict(self) -> dict[str, Any]:
+        """As in the JSON file."""
+        return {
+            "effect": self.effect,
+            "joints": list(self.joints),
+            "interval_s": list(self.interval_s),
+            "lasting": self.lasting,
+            "parameters": self.parameters,
+            "std": self.std,
+            "units": self.units,
+            "evidence": self.evidence,
+            "ambiguous_with": list(self.overlaps),
+            "overlap": self.overlaps,
+            "split_by": self.split_by,
+            "z": self.detectability,
+            "torque_rms_nm": self.torque_rms_nm.tolist(),
+        }
+
+    def entry(self) -> dict[str, Any]:
+        """As in a model file; what lasts has no end there, what lasted throughout no start."""
+        return {
+            "effect": self.effect,
+            "joints": list(self.joints),
+            "interval_s": self._file_interval(),
+            "parameters": self.parameters,
+            "std": self.std,
+            "units": self.units,
+            "evidence": self.evidence,
+        }
+
+    def _file_interval(self) -> list[float | None] | None:
+        begin = self.interval_s[0] if self.interval_s[0] > 0.0 else None
+        end = None if self.lasting else self.interval_s[1]
+        return None if begin is None and end is None else [begin, end]
+
+
+@dataclass(frozen=True)
+class Leftover:
+    """What no effect of the catalogue explains.
+
+    Attributes:
+        joint: from 1.
+        rmse_nm: of what is left, in the band; noise_floor_nm: of the noise there.
+        depends_on: signals that it follows, strongest first ("dq3", "q3", "tau2", "t", ...).
+        interval_s: when.
+    """
+
+    joint: int
+    rmse_nm: float
+    noise_floor_nm: float
+    depends_on: tuple[str, ...]
+    interval_s: tuple[float, float]
+
+    def as_dict(self) -> dict[str, Any]:
+        """As in the JSON file."""
+        return {
+            "joint": self.joint,
+            "rmse_nm": self.rmse_nm,
+            "noise_floor_nm": self.noise_floor_nm,
+            "depends_on": list(self.depends_on),
+            "interval_s": list(self.interval_s),
+        }
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """How far model and data are apart on data that the fit never saw, by joint.
+
+    Attributes:
+        torque_rmse_nm: (n,) inverse dynamics, by the recipe of `adapter.validation`.
+        rollout_rmse_rad, rollout_rmse_rad_s: (n,) forward simulation restarted every 0.5 s;
+            None where it was not asked for.
+    """
+
+    torque_rmse_nm: Array
+    rollout_rmse_rad: Array | None = None
+    rollout_rmse_rad_s: Array | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As in the JSON file."""
+        out = {"torque_rmse_nm": self.torque_rmse_nm.tolist()}
+        for key in ("rollout_rmse_rad", "rollout_rmse_rad_s"):
+            value = getattr(self, key)
+            out[key] = None if value is None else [_known(x) for x in value]
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Signals of one recording at 25 Hz, for plots: (k,) and (k, n).
+
+    Attributes:
+        recording: name of the file.
+        t: s; q, dq, ddq, tau: smooth motion and measured torque in the band.
+        before, after: measured less predicted torque, nominal model and new one, N m; after is
+            predicted without the block of data that holds the instant.
+        held_out: (k,) bool, whether the instant is in data that the fit never saw at all.
+    """
+
+    recording: str
+    t: Array
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    before: Array
+    after: Array
+    held_out: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutCurves:
+    """Forward simulation against data, (k,) and (k, n), rad: NaN between segments."""
+
+    t: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class GapResult:
+    """All that `adapter gap` says.
+
+    Attributes:
+        joint_names: of the arm; model_name: what it is called.
+        recordings: names of the files; model_in: of the model.
+        noise_floor_nm: (n,) rms of the torque noise in the band of the figures.
+        before, after: nominal model and new one.
+        findings, unexplained: see there.
+        corrections: (n, 10) the small correction of the inertias; corrections_std: of it, and
+            corrections_prior: (n, 10) what was allowed a priori, one standard deviation each.
+        notes: sentences about the log (timing, joints that stand still, ...).
+        problem: why nothing could be told; None where something could.
+        curves: one per recording; rollouts: one per recording that was simulated.
+        model_out: where the new model is.
+        what_next: experiments worth making, best first.
+    """
+
+    joint_names: tuple[str, ...]
+    model_name: str
+    recordings: tuple[str, ...]
+    model_in: str
+    noise_floor_nm: Array
+    before: Shortfall
+    after: Shortfall
+    findings: tuple[Finding, ...] = ()
+    unexplained: tuple[Leftover, ...] = ()
+    corrections: Array | None = None
+    corrections_prior: Array | None = None
+    notes: tuple[str, ...] = ()
+    problem: str | None = None
+    curves: tuple[Curves, ...] = ()
+    rollouts: tuple[RolloutCurves, ...] = ()
+    model_out: str | None = None
+    what_next: tuple[str, ...] = field(default=())
+    wall_s: float = 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """As in the JSON file."""
+        from adapter.gap.words import headline  # words are made of results
+
+        return {
+            "headline": headline(self),
+            "problem": self.problem,
+            "noise_floor_nm": self.noise_floor_nm.tolist(),
+            "before": self.before.as_dict(),
+            "after": self.after.as_dict(),
+            "findings": [finding.as_dict() for finding in self.findings],
+            "unexplained": [leftover.as_dict() for leftover in self.unexplained],
+            "model_out": self.model_out,
+            "inertial_correction": self._correction(),
+            "what_next": list(self.what_next),
+            "notes": list(self.notes),
+            "recordings": list(self.recordings),
+            "model_in": self.model_in,
+            "joint_names": list(self.joint_names),
+            "wall_s": self.wall_s,
+        }
+
+    def _correction(self) -> dict[str, Any] | None:
+        if self.corrections is None or self.corrections_prior is None:
+            return None
+        return {
+            "dtheta": self.corrections.tolist(),
+            "prior_std": self.corrections_prior.tolist(),
+            "largest_in_prior_std": float(np.abs(self.corrections / self.corrections_prior).max()),
+        }
+
+
+def _known(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None

@@ -1,0 +1,193 @@
+"""Looking for the next effect: every template, in every joint, at all times or from some time on.
+
+Times are scanned in blocks of 0.4 s through running sums of the products, so that a start costs
+no more than a small solve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from adapter.gap.candidates import Candidate, base_of, signatures
+from adapter.gap.evidence import score, scores
+from adapter.gap.fit import Fit
+from adapter.gap.noise import LEAST_NM, Noise, noise_of
+from adapter.records import Array
+from adapter.effects.active import WHOLE
+
+BLOCK_S = 0.4
+FEWEST_BLOCKS = 1  # nothing shorter is dated
+FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
+RICH_ROUNDS = 2
+LONGEST_CONTACT_S = 8.0
+MARGIN_S = 0.8  # a start so near either end is no change
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """A candidate with its evidence.
+
+    Attributes:
+        candidate: what and where.
+        log_evidence: nats over nothing, its odds and the number of ways to look included.
+        chi2: fall of the squared distance.
+        x: (k,) coefficients.
+        interval_s, recording: when and where it acts.
+    """
+
+    candidate: Candidate
+    log_evidence: float
+    chi2: float
+    x: Array
+    interval_s: tuple[float, float] = WHOLE
+    recording: int | None = None
+
+
+def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> Noise:
+    """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it."""
+    prior = np.zeros(len(X))
+    for c in candidates:
+        k = list(c.columns)
+        prior[k] = np.maximum(prior[k], c.prior_std)
+    sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
+    white = (X / sigma).reshape(len(X), -1), (residual / sigma).ravel()
+    for _ in range(RICH_ROUNDS):
+        information = white[0] @ white[0].T
+        information[np.diag_indices(len(X))] += prior**-2.0
+        x = cho_solve(cho_factor(information, lower=True), white[0] @ white[1])
+        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM)
+        white = noise.whiten(X).reshape(len(X), -1), noise.whiten(residual).ravel()
+    return noise
+
+
+class Field:
+    """All signatures of the recordings about the present model, white.
+
+    The noise that whitens them is what the richest model of all leaves: whatever the catalogue
+    can explain is taken out, the more so as nobody knows yet what it is. That is too little to
+    believe a lead by, and right to find one.
+
+    Args:
+        fit: the model as it stands; joints: (from 0) that move.
+    """
+
+    def __init__(self, fit: Fit, joints: Sequence[int]) -> None:
+        tables, noise = [], []
+        self.candidates: list[Candidate] = []
+        for i in range(len(fit.recordings)):
+            own = fit.signals(i)
+            table, self.candidates = signatures(own, base_of(own, fit.actives(i)), joints)
+            tables.append(table)
+            noise.append(rich_noise(table, self.candidates, fit.residual(i)))
+        self.fit = fit.with_noise(noise)
+        self.carried = self.fit.carried()
+        self.X = self.fit.whiten(tables)
+        self.times = [
+            r.t[own.ar.shape[1] :] for r, own in zip(fit.recordings, noise, strict=True)
+        ]
+
+    def whole(self) -> list[Lead]:
+        """Every candidate, acting all the time."""
+        leads = []
+        G, g = self.carried.without(self.X)
+        for c in self.candidates:
+            k = np.ix_(c.columns, c.columns)
+            found = score(G[k], g[list(c.columns)], c.prior_std)
+            leads.append(Lead(c, found.log_evidence + log_odds(c), found.chi2, found.x))
+        return leads
+
+    def timed(self, candidates: Sequence[Candidate]) -> list[Lead]:
+        """The best start of each candidate in each recording."""
+        leads = []
+        for i in range(len(self.fit.recordings)):
+            edges, C, g, self_products = self._running(i, candidates)
+            keep = self._starts(i, edges)
+            for c, G in zip(candidates, self_products, strict=True):
+                k = list(c.columns)
+                reduced = self.carried.reduced(G[keep], C[keep][:, k], g[keep][:, k])
+                evidence, _ = scores(*reduced, c.prior_std)
+                best = int(np.argmax(evidence))
+                found = score(reduced[0][best], reduced[1][best], c.prior_std)
+                ways = np.log(len(keep))
+                leads.append(
+                    Lead(
+                        c,
+                        found.log_evidence + log_odds(c, timed=True) - ways,
+                        found.chi2,
+                        found.x,
+                        (float(edges[keep[best]]), np.inf),
+                        i,
+                    )
+                )
+        return leads
+
+    def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
+        """The best interval of each candidate in each recording: it comes and goes."""
+        leads = []
+        longest = round(LONGEST_CONTACT_S / BLOCK_S)
+        for i in range(len(self.fit.recordings)):
+            edges, C, g, self_products = self._running(i, candidates)
+            last = len(edges) - 1
+            pairs = np.array(
+                [
+                    (a, b)
+                    for a in range(last)
+                    for b in range(a + FEWEST_BLOCKS, min(a + longest, last) + 1)
+                ]
+            )
+            for c, G in zip(candidates, self_products, strict=True):
+                k = list(c.columns)
+                parts = (G, C[:, k], g[:, k])
+                reduced = self.carried.reduced(*(p[pairs[:, 0]] - p[pairs[:, 1]] for p in parts))
+                evidence, _ = scores(*reduced, c.prior_std)
+                best = int(np.argmax(evidence))
+                found = score(reduced[0][best], reduced[1][best], c.prior_std)
+                begin, end = (float(edges[x]) for x in pairs[best])
+                worth = found.log_evidence + log_odds(c, passing=True) - np.log(len(pairs))
+                leads.append(Lead(c, worth, found.chi2, found.x, (begin, end), i))
+        return leads
+
+    def _starts(self, recording: int, edges: Array) -> np.ndarray:
+        t = self.times[recording]
+        inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
+        return np.flatnonzero(inside)
+
+    def _running(
+        self, recording: int, candidates: Sequence[Candidate]
+    ) -> tuple[Array, Array, Array, list[Array]]:
+        """Sums from each edge to the end: with the carried (b, c, N), the data (b, c), itself."""
+        t, n = self.times[recording], self.fit.n
+        begin = sum(len(x) for x in self.times[:recording]) * n
+        rows = slice(begin, begin + len(t) * n)
+        edges = np.append(np.arange(t[0], t[-1], BLOCK_S), t[-1] + 1.0)
+        block = np.repeat(np.searchsorted(edges, t, side="right") - 1, n)
+        cuts = np.searchsorted(block, np.arange(len(edges)))
+        X, N, data = self.X[:, rows], self.carried.N[:, rows], self.carried.data[rows]
+        size = len(edges)
+        C, g = np.zeros((size, len(X), len(N))), np.zeros((size, len(X)))
+        own = [np.zeros((size, len(c.columns), len(c.columns))) for c in candidates]
+        for b in range(size - 2, -1, -1):
+            part = slice(cuts[b], cuts[b + 1])
+            C[b] = C[b + 1] + X[:, part] @ N[:, part].T
+            g[b] = g[b + 1] + X[:, part] @ data[part]
+            for G, c in zip(own, candidates, strict=True):
+                x = X[list(c.columns), part]
+                G[b] = G[b + 1] + x @ x.T
+        return edges, C, g, own
+
+
+def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
+    """ln of what a candidate is worth before the data, the ways to look for it included."""
+    odds = -np.log(20.0) + c.effect.log_odds
+    if c.joint >= 0:
+        odds -= np.log(7.0)
+    odds -= np.log(len(c.effect.templates()))
+    if c.effect.name == "external_wrench" and not passing:
+        odds -= 6.0  # what pushes for a whole recording is rather a tilted base
+    if timed or passing:
+        odds -= 2.0
+    return float(odds)

@@ -1,0 +1,297 @@
+"""Whether a recording's samples belong to the instants that they are stamped with."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+from adapter.records import Array
+
+HOLE_PERIODS = 3.0  # a step longer than so many median periods is a hole
+FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, not a repeat
+FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
+HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
+CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
+MOVES_DQ = 0.02  # rad/s; slower is noise
+FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
+STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
+BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What a recording's clock is like.
+
+    Attributes:
+        samples: rows of the recording; kept: those that `uniform` keeps.
+        span_s: from the first kept stamp to the last.
+        rate_hz: one over the median step of the stamps.
+        jitter_s: standard deviation of the steps, holes left out.
+        holes: (start, length) s of steps of more than 3 median periods, from the first stamp.
+        frozen: (start, length) s of runs in which no signal changes though the arm moves.
+        repeated: share of rows identical to the one before.
+        held: share of the other rows in which this signal ("q", "dq", "tau") stays as it was.
+        out_of_order: rows whose stamps don't increase; not_finite: rows with no number in them.
+        lateness_s, lateness_std_s: of dq against q, dq(t) = d/dt q(t - lateness); NaN where the
+            motion does not tell.
+        velocity_gain: (n,) size of dq against d/dt q; NaN where a joint does not move.
+    """
+
+    samples: int
+    kept: int
+    span_s: float
+    rate_hz: float
+    jitter_s: float
+    holes: tuple[tuple[float, float], ...]
+    frozen: tuple[tuple[float, float], ...]
+    repeated: float
+    held: dict[str, float]
+    out_of_order: int
+    not_finite: int
+    lateness_s: float
+    lateness_std_s: float
+    velocity_gain: Array
+
+    @property
+    def period_s(self) -> float:
+        """Median step of the stamps."""
+        return 1.0 / self.rate_hz if self.rate_hz else float("nan")
+
+    def hold_lag_s(self, signal: str) -> float:
+        """Mean age of a signal that arrives more often than it is updated; 0 where it is new."""
+        share = self.held[signal]
+        if share < HELD_SHARE or share > 0.999:
+            return 0.0
+        return 0.5 * self.period_s * share / (1.0 - share)
+
+    def words(self) -> list[str]:
+        """What is worth knowing, a sentence each; a recording without fault has none."""
+        return [*self._words_on_stamps(), *self._words_on_rows(), *self._words_on_signals()]
+
+    def _words_on_stamps(self) -> list[str]:
+        said = []
+        if self.out_of_order:
+            said.append(f"{self.out_of_order} stamps do not increase; those samples are left out.")
+        if self.holes:
+            start, length = max(self.holes, key=lambda hole: hole[1])
+            many = "a hole" if len(self.holes) == 1 else f"{len(self.holes)} holes"
+            said.append(
+                f"The stamps have {many}, {sum(x for _, x in self.holes):.3g} s in all; the "
+                f"longest is {1e3 * length:.3g} ms at {start:.2f} s."
+            )
+        if self.jitter_s > 0.1 * self.period_s:
+            said.append(
+                f"The steps between stamps scatter by {1e3 * self.jitter_s:.2g} ms around "
+                f"{1e3 * self.period_s:.3g} ms."
+            )
+        return said
+
+    def _words_on_rows(self) -> list[str]:
+        said = []
+        if self.not_finite:
+            said.append(f"{self.not_finite} samples hold no number; they are left out.")
+        if self.repeated > 0.001:
+            said.append(
+                f"{100 * self.repeated:.1f} % of the samples repeat the one before; they are "
+                "left out."
+            )
+        if self.frozen:
+            start, length = max(self.frozen, key=lambda run: run[1])
+            said.append(
+                f"The signals stand still while the arm moves, {len(self.frozen)} times, longest "
+                f"for {1e3 * length:.3g} ms at {start:.2f} s."
+            )
+        return said
+
+    def _words_on_signals(self) -> list[str]:
+        said = []
+        for signal, share in self.held.items():
+            if self.hold_lag_s(signal):
+                said.append(
+                    f"{signal} is updated at {(1 - share) * self.rate_hz:.4g} Hz only and held in "
+                    f"between: on average it is {1e3 * self.hold_lag_s(signal):.2g} ms old."
+                )
+        late, std = self.lateness_s, self.lateness_std_s
+        if not abs(late) > max(3.0 * std, 1e-4):
+            return said
+        side = "behind" if late > 0 else "ahead of"
+        sentence = f"dq is {1e3 * abs(late):.2f} ± {1e3 * std:.2g} ms {side} q"
+        if abs(abs(late) / self.period_s - 0.5) < 0.1 and std < 0.1 * self.period_s:
+            sentence += ", half a sample: the mark of a simulator that holds torque over its step"
+        return [*said, sentence + "."]
+
+
+def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Timing:
+    """Examine a recording's clock.
+
+    Args:
+        stamp_ns: (m,) ns as recorded; q, dq, tau: (m, n) rad, rad/s, N m.
+    """
+    m = len(stamp_ns)
+    finite = _finite(q, dq, tau)
+    increasing = _increasing(stamp_ns)
+    keep = uniform(stamp_ns, q, dq, tau)
+    steps_s = 1e-9 * np.diff(stamp_ns[increasing])
+    period_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    since_s = 1e-9 * (stamp_ns - stamp_ns[increasing[0]]) if m else np.zeros(0)
+    gaps = np.flatnonzero(steps_s > HOLE_PERIODS * period_s)
+    holes = [(float(since_s[increasing[k]]), float(steps_s[k])) for k in gaps]
+    regular = np.delete(steps_s, gaps)
+    same = {name: _same(x) for name, x in (("q", q), ("dq", dq), ("tau", tau))}
+    moving = np.any(np.nan_to_num(dq[1:]) != 0.0, axis=1)  # a simulated arm at rest repeats itself
+    again = same["q"] & same["dq"] & same["tau"] & moving
+    fresh = ~again & moving
+    late_s, std_s, gain = _lateness(since_s[keep], q[keep], dq[keep], period_s)
+    return Timing(
+        samples=m,
+        kept=len(keep),
+        span_s=float(since_s[keep[-1]] - since_s[keep[0]]) if len(keep) else 0.0,
+        rate_hz=1.0 / period_s if period_s else 0.0,
+        jitter_s=float(np.std(regular)) if len(regular) else 0.0,
+        holes=tuple(holes),
+        frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > FROZEN_DQ), since_s),
+        repeated=float(again.sum()) / max(m, 1),
+        held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
+        out_of_order=m - len(increasing),
+        not_finite=int((~finite).sum()),
+        lateness_s=late_s,
+        lateness_std_s=std_s,
+        velocity_gain=gain,
+    )
+
+
+def uniform(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Index:
+    """(k,) rows worth keeping: strictly increasing stamps, finite, none that repeats the last.
+
+    The most rows whose stamps increase are kept, so a single stamp far ahead costs itself and
+    not everything after it. Arguments as of `check_timing`.
+    """
+    rows = _increasing(stamp_ns)
+    rows = rows[_finite(q, dq, tau)[rows]]
+    again = _same(q[rows]) & _same(dq[rows]) & _same(tau[rows])
+    return rows[np.concatenate([[True], ~again])[: len(rows)]]
+
+
+def _finite(*signals: Array) -> NDArray[np.bool_]:
+    return np.all([np.isfinite(x).all(axis=1) for x in signals], axis=0)
+
+
+def _same(x: Array) -> NDArray[np.bool_]:
+    """(m - 1,) whether a row of x (m, n) equals the one before."""
+    return np.asarray((x[1:] == x[:-1]).all(axis=1))
+
+
+def _increasing(stamp_ns: Index) -> Index:
+    """Rows of a longest strictly increasing part of the stamps."""
+    if np.all(np.diff(stamp_ns) > 0):
+        return np.arange(len(stamp_ns))
+    ends: list[int] = []  # smallest last stamp of a part of each length
+    rows: list[int] = []  # where it stands
+    before = np.full(len(stamp_ns), -1)
+    for row, stamp in enumerate(stamp_ns.tolist()):
+        length = bisect_left(ends, stamp)
+        before[row] = rows[length - 1] if length else -1
+        if length == len(ends):
+            ends.append(stamp)
+            rows.append(row)
+        else:
+            ends[length], rows[length] = stamp, row
+    chain = [rows[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])
+
+
+def _runs(again: NDArray[np.bool_], since_s: Array) -> tuple[tuple[float, float], ...]:
+    """(start, length) s of long runs of repeats."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], again, [False]]).astype(int)))
+    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a >= FROZEN_PERIODS]
+    return tuple((float(since_s[a]), float(since_s[b] - since_s[a])) for a, b in runs)
+
+
+def _lateness(t: Array, q: Array, dq: Array, period_s: float) -> tuple[float, float, Array]:
+    """(lateness, its std, gain (n,)) of dq(t) = gain d/dt q(t - lateness).
+
+    Both are brought to one even grid and through one low-pass, so that what the grid and the
+    filter do, they do to both. Then dq = g dq' - g l ddq' + o per joint, with dq' and ddq' from q
+    taken at t - (lateness so far); l corrects the lateness. Joints count by what their residual
+    allows, blocks of time left out in turn give the standard deviation.
+    """
+    n = q.shape[1]
+    nothing = (float("nan"), float("nan"), np.full(n, np.nan))
+    if len(t) < FEWEST_COMPARED or not period_s:
+        return nothing
+    step_s = min(period_s, 0.01)
+    grid = np.arange(t[0], t[-1], step_s)
+    sos = butter(3, min(CUT_HZ, 0.1 / period_s), fs=1.0 / step_s, output="sos")
+    if len(grid) * step_s < 1.0:
+        return nothing
+    pick = _compared(t, grid, period_s)
+    if pick.size < FEWEST_COMPARED:
+        return nothing
+    table = np.column_stack([np.interp(grid, t, x) for x in np.concatenate([q, dq], axis=1).T])
+    smooth = sosfiltfilt(sos, table, axis=0)
+    rate = np.gradient(smooth[:, :n], step_s, axis=0)
+    late_s, found = 0.0, nothing
+    for _ in range(STEPS_OF_LATENESS):
+        moved = np.column_stack([np.interp(grid - late_s, grid, x) for x in rate.T])
+        change, std_s, gain = _fit(moved, smooth[:, n:], step_s, pick)
+        if not np.isfinite(change):
+            return (*nothing[:2], gain)
+        late_s += float(np.clip(change, -0.05, 0.05))
+        found = (late_s, std_s, gain)
+    return found
+
+
+def _compared(t: Array, grid: Array, period_s: float) -> Index:
+    """Points of the grid, 10 ms apart, away from either end and from holes."""
+    every = max(1, round(0.01 / (grid[1] - grid[0])))
+    points = np.arange(0, len(grid), every)
+    wide = np.flatnonzero(np.diff(t) > max(HOLE_PERIODS * period_s, 0.02))
+    at = grid[points]
+    clear = (at > t[0] + 0.3) & (at < t[-1] - 0.3)
+    for k in wide:
+        clear &= (at < t[k] - 0.2) | (at > t[k + 1] + 0.2)
+    return points[clear]
+
+
+def _fit(rate: Array, dq: Array, step_s: float, pick: Index) -> tuple[float, float, Array]:
+    """(lateness, its std, gain (n,)) of dq against the rate of q, both (m, n), at rows `pick`."""
+    accel = np.gradient(rate, step_s, axis=0)
+    x = np.stack([rate, accel, np.ones_like(rate)], axis=2)[pick]
+    y = dq[pick]
+    blocks = np.array_split(np.arange(len(pick)), BLOCKS)
+    xx = np.array([np.einsum("tji,tjk->jik", x[b], x[b]) for b in blocks])
+    xy = np.array([np.einsum("tji,tj->ji", x[b], y[b]) for b in blocks])
+    moves = np.std(rate[pick], axis=0) > MOVES_DQ
+    gain = np.where(moves, 0.0, np.nan)
+    moves &= np.std(y, axis=0) > 0.0
+    if not moves.any():
+        return float("nan"), float("nan"), gain
+    xx, xy = xx[:, moves], xy[:, moves]
+    best = _solve(xx.sum(axis=0), xy.sum(axis=0))
+    gain[moves] = best[:, 0]
+    spread = np.std(y[:, moves] - np.einsum("tji,ji->tj", x[:, moves], best), axis=0)
+    # information on the lateness: accelerations against the residual
+    size = np.abs(best[:, 0]) * np.std(accel[pick][:, moves], axis=0)
+    weight = (size / np.maximum(spread, 1e-6)) ** 2
+
+    def common(coefficients: Array) -> float:
+        return float(np.average(-coefficients[:, 1] / coefficients[:, 0], weights=weight))
+
+    total = xx.sum(axis=0), xy.sum(axis=0)
+    without = [common(_solve(total[0] - a, total[1] - b)) for a, b in zip(xx, xy, strict=True)]
+    std = float(np.sqrt((BLOCKS - 1) * np.var(without)))
+    return common(best), std, gain
+
+
+def _solve(xx: Array, xy: Array) -> Array:
+    """Coefficients (n, 3) of normal equations (n, 3, 3), (n, 3); a trace of ridge for rest."""
+    ridge = 1e-9 * np.trace(xx, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-15 * np.eye(3)
+    return np.asarray(np.linalg.solve(xx + ridge, xy[..., None])[..., 0])

@@ -1,0 +1,200 @@
+"""Effects that a simulated arm can hold: names, parameters, intervals.
+
+Sign of all of them: `tau_measured = tau_rigid(q, dq, ddq) + sum of effects`. Names, keys, units
+and frames of the catalogue are those of its table; names that begin with `x_` are in no
+catalogue: what is to be said of them is that something is unexplained.
+
+| name | torque on the joint, or what its sensor makes of it | keys (unit) |
+|---|---|---|
+| x_quadratic_drag | c dq abs(dq) | c (N m s²/rad²) |
+| x_cubic_spring | c (q - q0)³ | c (N m/rad³), q0 (rad) |
+| x_position_friction | A (1 + sin(q + phase)) sign(dq) | A (N m), phase (rad) |
+| x_sine_disturbance | a sin(2 pi f t + phase) | a (N m), f (Hz), phase (rad) |
+| x_velocity_ripple | a sin(n q + phase) dq | a (N m s/rad), n (per turn), phase (rad) |
+| x_hysteresis | Dahl: dz/dq = sigma (1 - z/F sign(dq)), torque z | F (N m), sigma (N m/rad) |
+| x_cross_viscous | joints [i, j]: c dq_i on joint j | c (N m s/rad) |
+| x_torque_crosstalk | joints [i, j]: sensor j reads share tau_i on top | share (1) |
+| x_sensor_lowpass | the torque sensor lags: T d(read)/dt = tau - read | T (s) |
+| x_torque_deadband | the sensor reads tau - clip(tau, -w, w) | w (N m) |
+| x_torque_saturation | the sensor's curve bends: s tanh(tau/s) | s (N m) |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Number = float | list[float]
+
+# Where an effect acts: on the motion of a joint, on the rigid bodies, at the flange, on what an
+# encoder or a torque sensor says. Name -> (place, needed keys, keys with a default).
+MOTION, BODY, WRENCH, ENCODER, TORQUE = "motion", "body", "wrench", "encoder", "torque"
+SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
+    "viscous_friction": (MOTION, ("Fv",), ()),
+    "coulomb_friction": (MOTION, ("Fc",), ()),
+    "asymmetric_friction": (MOTION, ("Fc_pos", "Fc_neg"), ()),
+    "stribeck_friction": (MOTION, ("Fc", "Fs", "vs"), ()),
+    "load_dependent_friction": (MOTION, ("Fl",), ()),
+    "friction_drift": (MOTION, ("dFc",), ()),
+    "motor_inertia": (MOTION, ("B",), ()),
+    "torque_ripple": (MOTION, ("a", "n"), ("phase",)),
+    "joint_spring": (MOTION, ("k", "q0"), ()),
+    "payload": (BODY, ("m", "cx", "cy", "cz"), ("inertia",)),
+    "link_inertia": (BODY, ("dtheta",), ()),
+    "base_tilt": (BODY, ("rx", "ry"), ()),
+    "external_wrench": (WRENCH, ("fx", "fy", "fz"), ("mx", "my", "mz")),
+    "joint_elasticity": (ENCODER, ("k",), ()),
+    "backlash": (ENCODER, ("b",), ()),
+    "encoder_offset": (ENCODER, ("o",), ()),
+    "encoder_ripple": (ENCODER, ("a",), ("phase",)),
+    "torque_gain": (TORQUE, ("g",), ()),
+    "torque_offset": (TORQUE, ("o",), ()),
+    "signal_delay": (TORQUE, ("d",), ()),
+    "x_quadratic_drag": (MOTION, ("c",), ()),
+    "x_cubic_spring": (MOTION, ("c",), ("q0",)),
+    "x_position_friction": (MOTION, ("A",), ("phase",)),
+    "x_sine_disturbance": (MOTION, ("a", "f"), ("phase",)),
+    "x_velocity_ripple": (MOTION, ("a", "n"), ("phase",)),
+    "x_hysteresis": (MOTION, ("F", "sigma"), ()),
+    "x_cross_viscous": (MOTION, ("c",), ()),
+    "x_torque_crosstalk": (TORQUE, ("share",), ()),
+    "x_sensor_lowpass": (TORQUE, ("T",), ()),
+    "x_torque_deadband": (TORQUE, ("w",), ()),
+    "x_torque_saturation": (TORQUE, ("s",), ()),
+}
+PAIRS = ("x_cross_viscous", "x_torque_crosstalk")  # joints [from, to]
+LENGTHS = {"inertia": 6, "dtheta": 10}
+POSITIVE = {
+    "joint_elasticity": "k",
+    "stribeck_friction": "vs",
+    "x_hysteresis": "F",
+    "x_sensor_lowpass": "T",
+    "x_torque_saturation": "s",
+}
+NOT_NEGATIVE = {"signal_delay": "d", "backlash": "b", "motor_inertia": "B"}
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect of a simulated arm.
+
+    Attributes:
+        name: one of `SPECS`.
+        joints: counted from 1; what acts on the whole arm needs none, `signal_delay` without
+            joints acts on all.
+        parameters: by key; SI.
+        interval_s: [from, to) in seconds of plant time, `to` None to the end; None for always.
+    """
+
+    name: str
+    joints: tuple[int, ...]
+    parameters: Mapping[str, Number] = field(hash=False)
+    interval_s: tuple[float, float | None] | None = None
+
+    def __post_init__(self) -> None:
+        if self.name not in SPECS:
+            raise ValueError(f"no effect {self.name!r}; have: {', '.join(SPECS)}")
+        object.__setattr__(self, "joints", tuple(int(j) for j in self.joints))
+        _check_keys(self)
+        _check_joints(self)
+        if self.interval_s is not None and not self.start_s < self.end_s:
+            raise ValueError(f"{self.name}: interval {self.interval_s} ends before it starts")
+
+    @property
+    def place(self) -> str:
+        """Where it acts: motion, body, wrench, encoder or torque."""
+        return SPECS[self.name][0]
+
+    @property
+    def start_s(self) -> float:
+        """When it begins; -inf where it always acts."""
+        return -np.inf if self.interval_s is None else float(self.interval_s[0])
+
+    @property
+    def end_s(self) -> float:
+        """When it ends; inf where it does not."""
+        last = None if self.interval_s is None else self.interval_s[1]
+        return np.inf if last is None else float(last)
+
+    def number(self, key: str, default: float = 0.0) -> float:
+        """A parameter that is one number."""
+        return float(self.parameters.get(key, default))  # type: ignore[arg-type]
+
+    def acts(self, t: Any) -> Any:
+        """Whether it acts at t (s), a number or an array."""
+        return (t >= self.start_s - 1e-9) & (t < self.end_s - 1e-9)
+
+    def columns(self, n: int) -> list[int]:
+        """Its joints counted from 0; all of n where none is named.
+
+        Raises:
+            ValueError: a joint that the arm does not have.
+        """
+        if any(j > n for j in self.joints):
+            raise ValueError(f"{self.name} is on joints {list(self.joints)}; have: 1 to {n}")
+        return [j - 1 for j in self.joints] or list(range(n))
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of a truth file."""
+        return {
+            "effect": self.name,
+            "joints": list(self.joints),
+            "interval_s": None if self.interval_s is None else list(self.interval_s),
+            "parameters": dict(self.parameters),
+        }
+
+
+def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
+    """The effect of a canonical entry: effect, joints, interval_s, parameters; no other key counts.
+
+    Raises:
+        ValueError: unknown name, a key that is missing, unknown or not a number.
+    """
+    if isinstance(entry, Effect):
+        return entry
+    if "effect" not in entry or "parameters" not in entry:
+        raise ValueError(f"an effect entry has {sorted(entry)}; needs: effect, parameters")
+    span = entry.get("interval_s")
+    interval = None if span is None else (float(span[0] or 0.0), span[1])
+    return Effect(entry["effect"], tuple(entry.get("joints") or ()), entry["parameters"], interval)
+
+
+def _check_keys(effect: Effect) -> None:
+    """Raises ValueError for missing, unknown, non-finite or impossible parameters."""
+    _, needed, optional = SPECS[effect.name]
+    for key in needed:
+        if key not in effect.parameters:
+            raise ValueError(f"{effect.name} has no {key!r}; needs: {', '.join(needed)}")
+    for key, value in effect.parameters.items():
+        if key not in needed + optional:
+            raise ValueError(
+                f"{effect.name} has no parameter {key!r}; have: {', '.join(needed + optional)}"
+            )
+        shape = (LENGTHS[key],) if key in LENGTHS else ()
+        try:
+            numbers = np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            numbers = np.array(np.nan)
+        if numbers.shape != shape or not np.isfinite(numbers).all():
+            raise ValueError(f"{effect.name}: {key} is {value!r}; needs {shape or 'one'} number(s)")
+    for table, fits in ((POSITIVE, np.greater), (NOT_NEGATIVE, np.greater_equal)):
+        if effect.name in table and not fits(effect.number(table[effect.name]), 0.0):
+            raise ValueError(f"{effect.name}: {table[effect.name]} is too small")
+
+
+def _check_joints(effect: Effect) -> None:
+    """Raises ValueError for a wrong number of joints or joints that do not count from 1."""
+    joints, whole = effect.joints, effect.place in (BODY, WRENCH) or effect.name == "signal_delay"
+    if any(j < 1 for j in joints):
+        raise ValueError(f"{effect.name} is on joints {list(joints)}; they count from 1")
+    if effect.name == "link_inertia" and len(joints) != 1:
+        raise ValueError("link_inertia needs the one joint that moves its link")
+    if effect.name in PAIRS and len(joints) != 2:
+        raise ValueError(f"{effect.name} needs two joints: [from, to]")
+    if not joints and not whole:
+        raise ValueError(f"{effect.name} needs at least one joint")

@@ -1,0 +1,246 @@
+"""What encoders and torque sensors make of the arm's true state, noise aside.
+
+The encoder sits on the motor's side of the gear: it reads the link angle plus the gear's twist
+tau/k plus the play, and has an offset and a ripple of its own. The torque sensor's chain is
+crosstalk, bent curve, gain and offset, deadband, lag, and last the delay of its signal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from sim.effects import ENCODER, TORQUE, Array, Effect
+from sim.truth import Truth
+
+CROSSING_S = 0.01  # the motor crosses the gear's play in this time
+DIRECTION_WIDTH = 0.01  # rad/s, below it the motor pushes neither way in full
+RIPPLE_ROUNDS = 30  # of the fixed point for q + a sin(q + phase), a below 0.1 rad
+
+
+def encoded(
+    effects: Sequence[Effect], t: Array | float, q: Array, dq: Array, twisting: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """What the encoders read.
+
+    Args:
+        effects: any; those of encoders count, play aside.
+        t: s, a number or (m, 1).
+        q: (n,) or (m, n) link angle plus play, rad.
+        dq: its velocity, rad/s.
+        twisting: joint torque and its rate, like q, N m and N m/s.
+
+    Returns:
+        Measured q and dq.
+    """
+    q, dq = q + _twist(effects, t, twisting[0]), dq + _twist(effects, t, twisting[1])
+    add_q, add_dq = np.zeros_like(q), np.zeros_like(q)
+    for effect, j, on in _encoder_terms(effects, t, q.shape[-1]):
+        if effect.name == "encoder_offset":
+            add_q[..., j] += on * effect.number("o")
+        else:
+            angle = q[..., j] + effect.number("phase")
+            add_q[..., j] += on * effect.number("a") * np.sin(angle)
+            add_dq[..., j] += on * effect.number("a") * np.cos(angle) * dq[..., j]
+    return q + add_q, dq + add_dq
+
+
+def decoded(
+    effects: Sequence[Effect], t: Array | float, q: Array, dq: Array, twisting: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The opposite of `encoded`: link angle plus play, and its velocity, from measured ones."""
+    true = q.copy()
+    terms = list(_encoder_terms(effects, t, q.shape[-1]))
+    for _ in range(RIPPLE_ROUNDS if terms else 0):
+        guess, true = true, q.copy()
+        for effect, j, on in terms:
+            if effect.name == "encoder_offset":
+                true[..., j] -= on * effect.number("o")
+            else:
+                sine = np.sin(guess[..., j] + effect.number("phase"))
+                true[..., j] -= on * effect.number("a") * sine
+        if np.abs(true - guess).max() < 1e-12:
+            break
+    slope = np.ones_like(q)
+    for effect, j, on in terms:
+        if effect.name == "encoder_ripple":
+            slope[..., j] += on * effect.number("a") * np.cos(true[..., j] + effect.number("phase"))
+    twist, twist_rate = _twist(effects, t, twisting[0]), _twist(effects, t, twisting[1])
+    return true - twist, dq / slope - twist_rate
+
+
+def _twist(effects: Sequence[Effect], t: Array | float, tau: Array) -> Array:
+    """tau / k of the elastic joints, zero on the others."""
+    out = np.zeros_like(tau)
+    for effect in effects:
+        if effect.name == "joint_elasticity":
+            for j in effect.columns(tau.shape[-1]):
+                out[..., j] += _on(effect, t) * tau[..., j] / effect.number("k")
+    return out
+
+
+def _encoder_terms(
+    effects: Sequence[Effect], t: Array | float, n: int
+) -> Iterator[tuple[Effect, int, Array | float]]:
+    """Offsets and ripples: effect, joint from 0, where in time it acts (0 or 1)."""
+    for effect in effects:
+        if effect.name in ("encoder_offset", "encoder_ripple"):
+            for j in effect.columns(n):
+                yield effect, j, _on(effect, t)
+
+
+def _on(effect: Effect, t: Array | float) -> Array | float:
+    """1 where an effect acts, else 0; (m,) for t (m, 1)."""
+    if np.ndim(t):
+        return np.asarray(effect.acts(np.ravel(np.asarray(t))), float)
+    return float(effect.acts(t))
+
+
+class Play:
+    """The gears' play: motor angle minus link angle, within half the width on either side.
+
+    The link lags the motor: while the joint moves forwards the motor is ahead by half the width.
+    At a reversal the motor crosses the play in `CROSSING_S`; at rest the play stays as it is.
+    """
+
+    def __init__(self, effects: Sequence[Effect], n: int) -> None:
+        self._terms = [(e, j) for e in effects if e.name == "backlash" for j in e.columns(n)]
+        self.exists = bool(self._terms)
+        self.gap, self.rate, self._n = np.zeros(n), np.zeros(n), n
+
+    def move(self, t: float, dq: Array, period_s: float) -> None:
+        """Go on by one period at the end of which it is t and the links move at dq (n,)."""
+        if not self.exists:
+            return
+        width = np.zeros(self._n)
+        for effect, j in self._terms:
+            width[j] += effect.number("b") * float(effect.acts(t))
+        way = np.clip(dq / DIRECTION_WIDTH, -1.0, 1.0)
+        moved = np.clip(self.gap + way * width * period_s / CROSSING_S, -width / 2, width / 2)
+        self.rate, self.gap = (moved - self.gap) / period_s, moved
+
+    def along(self, t: Array, dq: Array, period_s: float) -> tuple[Array, Array]:
+        """Play and its rate (m, n) along a motion dq (m, n) at t (m,)."""
+        out = np.zeros((2, *dq.shape))
+        if self.exists:
+            for k, row in enumerate(dq):
+                self.move(float(t[k]), row, period_s)
+                out[:, k] = self.gap, self.rate
+        return out[0], out[1]
+
+
+class Sensors:
+    """The sensors of a running arm: told of every tick in order."""
+
+    def __init__(self, truth: Truth, period_s: float) -> None:
+        self._effects = [e for e in truth.effects if e.place in (ENCODER, TORQUE)]
+        self._offset, self._n, self._period_s = truth.torque_offset, truth.n, period_s
+        self._play = Play(self._effects, truth.n)
+        self._tau: Array | None = None
+        self._lagging: Array | None = None
+        self._late = [e for e in self._effects if e.name == "signal_delay"]
+        longest = max((e.number("d") for e in self._late), default=0.0)
+        self._keep = int(np.ceil(len(self._late) * longest / period_s)) + 2
+        self._past: list[Array] = []
+
+    def read(self, t: float, q: Array, dq: Array, tau: Array) -> tuple[Array, Array, Array]:
+        """Measured q, dq, tau (n,) at t (s) for the links' q, dq and the driving torque."""
+        last = tau if self._tau is None else self._tau
+        rate = (tau - last) / self._period_s
+        self._tau = tau
+        self._play.move(t, dq, self._period_s)
+        q, dq = q + self._play.gap, dq + self._play.rate
+        told_q, told_dq = encoded(self._effects, t, q, dq, (tau, rate))
+        return told_q, told_dq, self._delayed(t, self._torque(t, tau) + self._offset)
+
+    def _torque(self, t: float, true: Array) -> Array:
+        """What the torque sensors say of (n,), but for their delay."""
+        tau = true.copy()
+        for name, change in _TORQUE_CHAIN.items():
+            for effect in self._effects:
+                if effect.name == name and effect.acts(t):
+                    columns = effect.columns(self._n)
+                    change(effect, columns, true, tau)
+        return self._lagged(t, tau)
+
+    def _lagged(self, t: float, tau: Array) -> Array:
+        """After the first-order lag of x_sensor_lowpass."""
+        last = self._lagging
+        slow = [e for e in self._effects if e.name == "x_sensor_lowpass" and e.acts(t)]
+        if not slow:
+            self._lagging = None
+            return tau
+        out = tau.copy()
+        for effect in slow:
+            for j in effect.columns(self._n):
+                keep = np.exp(-self._period_s / effect.number("T"))
+                out[j] = tau[j] if last is None else keep * last[j] + (1 - keep) * tau[j]
+        self._lagging = out
+        return out
+
+    def _delayed(self, t: float, tau: Array) -> Array:
+        """tau(t - d), linear between samples; the first value for what lies before the start."""
+        if not self._late:
+            return tau
+        self._past.insert(0, tau)
+        del self._past[self._keep :]
+        d = np.zeros(self._n)
+        for effect in self._late:
+            d[effect.columns(self._n)] += effect.number("d") * float(effect.acts(t))
+        steps = np.minimum(d / self._period_s, len(self._past) - 1)
+        whole = steps.astype(int)
+        part, past, joints = steps - whole, np.array(self._past), np.arange(self._n)
+        after = np.minimum(whole + 1, len(past) - 1)
+        return np.asarray((1 - part) * past[whole, joints] + part * past[after, joints])
+
+
+def _crosstalk(effect: Effect, columns: list[int], true: Array, tau: Array) -> None:
+    tau[columns[1]] += effect.number("share") * true[columns[0]]
+
+
+def _saturation(effect: Effect, columns: list[int], true: Array, tau: Array) -> None:
+    tau[columns] = effect.number("s") * np.tanh(tau[columns] / effect.number("s"))
+
+
+def _gain(effect: Effect, columns: list[int], true: Array, tau: Array) -> None:
+    tau[columns] *= 1.0 + effect.number("g")
+
+
+def _offset(effect: Effect, columns: list[int], true: Array, tau: Array) -> None:
+    tau[columns] += effect.number("o")
+
+
+def _deadband(effect: Effect, columns: list[int], true: Array, tau: Array) -> None:
+    w = effect.number("w")
+    tau[columns] -= np.clip(tau[columns], -w, w)
+
+
+_TORQUE_CHAIN = {
+    "x_torque_crosstalk": _crosstalk,
+    "x_torque_saturation": _saturation,
+    "torque_gain": _gain,
+    "torque_offset": _offset,
+    "x_torque_deadband": _deadband,
+}
+
+
+def freed(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
+    """Driving torque (m, n) from what the sensors read at t (m,): delay, offset, gain taken out."""
+    m, n = tau.shape
+    d, gain, offset = np.zeros((m, n)), np.ones((m, n)), np.zeros((m, n))
+    for effect in effects:
+        if effect.name not in ("signal_delay", "torque_gain", "torque_offset"):
+            continue
+        on = _on(effect, t[:, None])
+        for j in effect.columns(n):
+            if effect.name == "signal_delay":
+                d[:, j] += on * effect.number("d")
+            elif effect.name == "torque_gain":
+                gain[:, j] *= 1.0 + on * effect.number("g")
+            else:
+                offset[:, j] += on * effect.number("o")
+    out = (tau - offset) / gain
+    for j in np.flatnonzero(d.any(axis=0)).tolist():
+        out[:, j] = np.interp(t + d[:, j], t, out[:, j])
+    return out

@@ -1,0 +1,124 @@
+"""Hidden-effect trials of `adapter gap`: draw, record, find the gap, score. `make trials`.
+
+The workflow sees a folder with the recording and the nominal model; the truth lies elsewhere,
+sealed, and is opened after it has answered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from sim.hidden import Trial, draw, unseal
+from sim.hidden_record import Recording, pybullet_recording, write
+from tests.gap_judges import torque_judge
+from tests.gap_mujoco import mujoco_recording
+from tests.gap_oracle import detectability
+from tests.gap_scorer import Row, score_trial, summary, table
+from tests.gap_tools import pinocchio_recording
+
+SIMULATORS: dict[str, Callable[[Trial], Recording]] = {
+    "pybullet": pybullet_recording,
+    "mujoco": mujoco_recording,
+    "pinocchio": pinocchio_recording,
+}
+Analyse = Callable[[Sequence[Path], Path], Any]
+# Judges a result beyond its names: (trial, recording, result, its folder) -> figures for the row.
+Judge = Callable[[Trial, Recording, dict[str, Any], Path], Row]
+
+
+def workflow() -> Analyse:
+    """The function under trial."""
+    from adapter.gap.workflow import analyse
+
+    return analyse
+
+
+def run_trial(trial: Trial, simulator: str, analyse: Analyse, judges: Sequence[Judge] = ()) -> Row:
+    """Record, analyse and score one trial."""
+    recording = SIMULATORS[simulator](trial)
+    with tempfile.TemporaryDirectory() as folder:
+        shown, kept = Path(folder) / "shown", Path(folder) / "kept"
+        shown.mkdir()
+        log, model, truth = write(trial, kept, recording, simulator)
+        log, model = (path.rename(shown / path.name) for path in (log, model))
+        begun = time.perf_counter()
+        answer = analyse([log], model)
+        seconds = time.perf_counter() - begun
+        result: dict[str, Any] = answer if isinstance(answer, dict) else answer.as_dict()
+        row = score_trial(result, unseal(truth), detectability(trial))
+        for judge in judges:
+            row.update(judge(trial, recording, result, shown))
+    row["slow"], row["seconds"] = trial.motion.slow, seconds
+    row["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    row["result"] = result
+    return row
+
+
+def _job(job: tuple[int, str | None, str | None, str, bool]) -> Row:
+    seed, kind, effect, simulator, judged = job
+    judges = (torque_judge,) if judged else ()
+    try:
+        return run_trial(draw(seed, kind, effect), simulator, workflow(), judges)
+    except Exception:
+        return {"seed": seed, "failed": traceback.format_exc()}
+
+
+def told(row: Row) -> str:
+    """One line of a trial."""
+    if "failed" in row:
+        return f"{row['seed']}: failed\n{row['failed']}"
+    truth = ", ".join(
+        f"{name}{joints} z={z:.1f}"
+        for (name, joints), z in zip(row["effects"], row["z"], strict=True)
+    )
+    found = ", ".join(f"{name}{joints}" for name, joints in row["found"])
+    more = " + unexplained" if row["unexplained"] else ""
+    mark = "WRONG " if row["wrong"] else ""
+    said = f"{mark}{found or 'nothing'}{more} ({row['seconds']:.1f} s)"
+    return f"{row['seed']}: {row['kind']} {truth} -> {said}"
+
+
+def main() -> None:
+    """Run the trials asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=300)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--simulator", choices=sorted(SIMULATORS), default="pybullet")
+    parser.add_argument("--kind", choices=("null", "single", "pair", "outside"))
+    parser.add_argument("--effect", help="of all trials, instead of a drawn one")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--judge", action="store_true", help="torque error against the oracle's")
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    os.environ["OMP_NUM_THREADS"] = "1"
+    seeds = range(asked.first, asked.first + asked.trials)
+    same = asked.kind, asked.effect, asked.simulator, asked.judge
+    jobs = [(seed, *same) for seed in seeds]
+    rows = []
+    with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(_job, jobs):
+            rows.append(row)
+            print(told(row), flush=True)
+    done = [row for row in rows if "failed" not in row]
+    figures = summary(done)
+    figures["failed"] = len(rows) - len(done)
+    print(table(figures))
+    if figures["failed"]:
+        print(f"{figures['failed']} trials failed")
+    if asked.json:
+        asked.json.write_text(json.dumps({"summary": figures, "rows": rows}, default=str) + "\n")
+
+
+if __name__ == "__main__":
+    main()
