@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from adapter.effects.active import Active, active_effects
+from adapter.effects.base_tilt import BaseTilt
 from adapter.effects.payload import theta_of
 from adapter.inertia import CONSISTENCY_TOLERANCE, is_consistent
 from adapter.model import SelfModel, gravity_down
-from adapter.spatial import Array, exp_rotation
+from adapter.spatial import Array
 
 
 @dataclass
@@ -77,7 +78,7 @@ class UrdfParts:
         elif name == "payload":
             self._add_load(theta_of(v), model)
         elif name == "base_tilt" and not model.tree.floating:
-            turn = exp_rotation([float(v["rx"]), float(v["ry"]), 0.0])
+            turn = BaseTilt.turn(v)
             self.tilt = turn if self.tilt is None else self.tilt @ turn
         else:
             return False

@@ -84,6 +84,7 @@ class ModelFeedforward:
         self._signals, self._still = np.zeros((4, 1, n)), np.zeros(n)
         values = np.zeros((len(self._effects), n)) if effect_values is None else effect_values
         self.set(lam, theta, values)
+        self(*np.zeros((3, n)))  # compiled now, not in the first tick
 
     @classmethod
     def of(cls, model: SelfModel) -> ModelFeedforward:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.effects.active import Active, lasting_effects
+from adapter.effects.bodies import with_bodies
 from adapter.effects.by_joint import ByJoint, to_links
 from adapter.effects.catalogue import LEARNED, effects_by_name
 from adapter.fast import jit
@@ -20,6 +21,9 @@ from adapter.records import MOTION_MEASURED, Array, StateLayout, stamps_of
 from adapter.rigid_arm import RigidArm
 
 LONGEST_STEP_NS = 20_000_000  # between two states that a rate is taken from
+# On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's torque:
+# 0.10 N m without smoothing, 0.01 with.
+TWIST_SMOOTHING_S = 0.03
 SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
 LOAD_DEPENDENT = "load_dependent_friction"
 
@@ -32,7 +36,8 @@ def to_joints(stamps, table, half, gain, delay, gears, clock, memory):
         stamps: (m,) int64 ns; table: (m, size) of `StateLayout`.
         half, gain, delay: (n,) of `ByJoint`; gears: (4, n) its offset, ripple, phase, compliance.
         clock: (2,) int64 stamp of the state before, and states since a hole, at most 2.
-        memory: (3, n) torque of the state before, its rate, link angle behind the play.
+        memory: (4, n) torque of the state before, its rate, link angle behind the play, second
+            rate of torque.
     """
     n = half.shape[0]
     lag, rate, jerk = np.empty(n), np.empty(n), np.empty(n)
@@ -45,7 +50,11 @@ def to_joints(stamps, table, half, gain, delay, gears, clock, memory):
         dt = 1e-9 * step
         for j in range(n):
             rate[j] = (tau[j] - memory[0, j]) / dt if clock[1] >= 1 else 0.0
-            jerk[j] = (rate[j] - memory[1, j]) / dt if clock[1] >= 2 else 0.0
+            # the second rate of torque is small against its noise: followed slowly
+            newest = (rate[j] - memory[1, j]) / dt if clock[1] >= 2 else 0.0
+            old = memory[3, j] if clock[1] >= 2 else 0.0
+            memory[3, j] = old + (newest - old) * dt / (dt + TWIST_SMOOTHING_S)
+            jerk[j] = memory[3, j]
             memory[0, j], memory[1, j] = tau[j], rate[j]
             if clock[1] == 0:  # before it is known better, the motor pushes the way it moves
                 memory[2, j] = q[j] - half[j] * np.sign(dq[j])
@@ -64,6 +73,12 @@ def learnable(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
     """Effects to learn: these, and after them what the model has that can be learned further."""
     told = {a.effect.name for a in lasting_effects(model.effects, model.tree.n)}
     return (*names, *(name for name in LEARNED if name in told and name not in names))
+
+
+def not_taken_off(model: SelfModel) -> tuple[str, ...]:
+    """Names of the model's lasting effects that the learner neither learns nor takes off."""
+    whole = with_bodies(model)
+    return ByJoint.of(lasting_effects(whole.effects, whole.tree.n), whole.tree.n).left_out
 
 
 def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Array, Array] | None:
@@ -110,8 +125,10 @@ class KnownEffects:
         self._encoders = rigid if rigid[:2].any() else None
         self._sensed = own.moves or bool(own.gain.any() or own.delay_s.any())
         self._by_load = any(effect.name == LOAD_DEPENDENT for effect, _ in own.laws)
-        self.clock, self.memory = np.zeros(2, dtype=np.int64), np.zeros((3, n))
+        self.clock, self.memory = np.zeros(2, dtype=np.int64), np.zeros((4, n))
         self.left_out = own.left_out
+        self.take_off(self._layout.new(1))  # compiled now, not at the first state
+        self.clock[:], self.memory[:] = 0, 0.0
 
     def take_off(self, table: Array) -> Array:
         """A copy of filtered states (m, size), in order, as an arm without the effects gives them.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -66,6 +67,17 @@ class Change:
     stamp_ns: int
 
 
+class Watch(Protocol):
+    """What looks over the learner's shoulder; see `adapter.gap.monitor`."""
+
+    @property
+    def reports(self) -> list[dict[str, Any]]:
+        """What it has to tell."""
+
+    def __call__(self, learner: Learner, table: Array) -> None:
+        """Take states (m, size), known effects taken off, that were just learned from."""
+
+
 class Learner:
     """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
 
@@ -78,7 +90,9 @@ class Learner:
         delay_s: of the filter (`JointFilter.delay_s`).
         known: lasting effects that a model brings, none of bodies (`with_bodies`). Those that
             are learned start from the model's values; the others are taken off the states.
-        arm: the model's rigid arm; needed where there are known effects.
+        arm: the model's rigid arm, needed where there are known effects. Its gravity is what
+            torques and measured link motion show; where the base is tilted it is not `gravity`,
+            that of the documentation, which synthesized link motion is made with.
     """
 
     def __init__(
@@ -95,13 +109,20 @@ class Learner:
     ) -> None:
         self.settings = s = settings or LearnerSettings()
         self.tree, self.layout = tree, StateLayout(tree.n)
-        base = base_motion(gravity)
+        level = base_motion(gravity)
+        self.base = level if arm is None else base_motion(arm.gravity)
         self.schema = SchemaLearner(
-            tree, base, s.schema, mode=s.mode, noise_gain=noise_gain, seed=s.seed
+            tree,
+            level,
+            s.schema,
+            mode=s.mode,
+            noise_gain=noise_gain,
+            seed=s.seed,
+            measured_base=self.base,
         )
         self.theta = ThetaLearner(
             tree,
-            base,
+            self.base,
             effects_by_name(s.effects),
             s.theta,
             mode=s.mode,
@@ -130,6 +151,7 @@ class Learner:
         self.theta_started_ns: int | None = None
         self.theta_converged = False
         self.changes: list[Change] = []
+        self.watch: Watch | None = None
         self.rebuilds = 0
         self._held = np.zeros((s.held_samples, 4 * n))
         self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
@@ -167,6 +189,13 @@ class Learner:
         self._adam_step(theta_too)
         if self.schema_trace.wants():
             self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+        if self.watch is not None:
+            self.watch(self, table)
+
+    @property
+    def frames(self) -> tuple[Array, Array]:
+        """(R0, p) that θ is learned with: λ as it was when θ's moments were last rebuilt."""
+        return self._R0, self._p
 
     def without_known(self, table: Array) -> Array:
         """Filtered states (m, size), which follow those before, without known effects."""

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from adapter.gap.monitor import Monitor
 from adapter.learner import Learner
 from adapter.model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.outcome import collect
-from adapter.pipeline import PipelineSettings, make_learner
+from adapter.pipeline import PipelineSettings, make_front_end, make_learner
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import Snapshot
 from adapter.records import MOTION_MEASURED
@@ -20,15 +22,21 @@ STD_EVERY = 50  # publications; the covariance behind the standard deviations ta
 
 
 def single_thread_learner(
-    documented: SelfModel, settings: PipelineSettings, resume: Path | None
+    documented: SelfModel, settings: PipelineSettings, resume: Path | None, aloud: bool = False
 ) -> Learner:
-    """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit."""
+    """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit.
+
+    A monitor looks over its shoulder; `aloud`, it tells at once what it finds.
+    """
     import torch
 
     from adapter.checkpoint import load_checkpoint
 
     torch.set_num_threads(1)
     learner = make_learner(documented, settings)
+    delay_s = make_front_end(documented, settings).delay_s
+    tool = None if documented.tool is None else documented.tool.theta()
+    learner.watch = Monitor(documented.tree.n, tool, delay_s, tell if aloud else None)
     if resume is not None:
         load_checkpoint(learner, resume)
     return learner
@@ -39,17 +47,30 @@ def learner_job(
     settings: PipelineSettings,
     checkpoint: Path | None = None,
     resume: Path | None = None,
+    aloud: bool = False,
 ) -> LearnerJob:
-    """The learner process of a live run; everything in it can be pickled."""
+    """The learner process of a live run; everything in it can be pickled.
+
+    Args:
+        checkpoint: where the learner's state is kept; resume: one to go on from.
+        aloud: whether new disagreements are told on standard error when they are found.
+    """
     from adapter.checkpoint import save_checkpoint
 
     return LearnerJob(
-        make=partial(single_thread_learner, documented, settings, resume),
+        make=partial(single_thread_learner, documented, settings, resume, aloud),
         collect=collect,
         publish=Publisher(),
         save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
         effect_names=settings.learner.effects,
     )
+
+
+def tell(line: str) -> None:
+    """A line to standard error, over the display's own line in a terminal (it comes back)."""
+    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    sys.stderr.write(f"{clear}new disagreement: {line}\n")
+    sys.stderr.flush()
 
 
 class Publisher:

@@ -38,6 +38,7 @@ class Outcome:
         frames: (R0, p) that θ's moments were taken with.
         smoothing_s: how long the filter takes a step of torque.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
+        disagreements: what `adapter.gap.monitor` reported; None where nothing watched.
     """
 
     learned: int
@@ -65,6 +66,7 @@ class Outcome:
     min_eigenvalue: float
     settings: LearnerSettings
     smoothing_s: float
+    disagreements: tuple[dict[str, Any], ...] | None = None
 
 
 def collect(learner: Learner) -> Outcome:
@@ -102,6 +104,7 @@ def collect(learner: Learner) -> Outcome:
         min_eigenvalue=float(np.min(eigenvalues)),
         settings=learner.settings,
         smoothing_s=theta.smoothing_s,
+        disagreements=None if learner.watch is None else tuple(learner.watch.reports),
     )
 
 

@@ -51,14 +51,14 @@ class Pipeline:
 
 def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:
     """The front end of a pipeline with these settings."""
-    return FrontEnd(with_bodies(documented), settings.filter, settings.front_end)
+    return FrontEnd(documented, settings.filter, settings.front_end)
 
 
 def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
     """The learner of a pipeline with these settings; it takes over the effects of the model."""
     front_end = make_front_end(documented, settings)
-    documented = with_bodies(documented)
-    known = lasting_effects(documented.effects, documented.tree.n)
+    whole = with_bodies(documented)
+    known = lasting_effects(whole.effects, whole.tree.n)
     tool = documented.tool
     return Learner(
         documented.tree,
@@ -68,5 +68,5 @@ def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
         tool_theta=None if tool is None else tool.theta(),
         delay_s=front_end.delay_s,
         known=known,
-        arm=RigidArm.of(documented) if known else None,
+        arm=None if whole is documented and not known else RigidArm.of(whole),
     )

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from adapter.batch import learn_batch
 from adapter.checkpoint import load_checkpoint
 from adapter.errors import SettingsError
+from adapter.gap.monitor import Monitor
 from adapter.model import SelfModel
 from adapter.outcome import Outcome, collect
 from adapter.pipeline import Pipeline, PipelineSettings
@@ -102,14 +103,17 @@ def replay(
     until_s: float | None = None,
     progress: Progress | None = None,
     resume: Path | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Replay:
     """Learn from a recording (as `matching` returns it).
 
     Args:
-        every: samples per update; 1 is the exact mode, which equals the live estimates.
+        every: samples per update; 1 is the exact mode, which equals the live estimates and is
+            watched for disagreements as the live process is.
         until_s: learn only from samples before this time after the first stamp.
         progress: called with the number of samples taken so far.
         resume: a checkpoint to go on from.
+        say: takes a sentence on each new disagreement when it is found.
 
     Raises:
         SettingsError: `every` out of range, or a checkpoint that does not fit.
@@ -123,6 +127,10 @@ def replay(
     if stop == 0:
         raise DriverError(f"{log.path}: no samples to learn from")
     pipeline = Pipeline(documented, settings)
+    if every == 1:  # a batch learns of everything before it could tell what is new
+        tool = None if documented.tool is None else documented.tool.theta()
+        delay_s = pipeline.front_end.delay_s
+        pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
     if resume is not None:
         load_checkpoint(pipeline.learner, resume)
     started = time.perf_counter()

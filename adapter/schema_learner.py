@@ -79,10 +79,11 @@ class SchemaLearner:
 
     Args:
         tree: N and A; nothing else of the robot is known.
-        base: (12,) motion of the base.
+        base: (12,) motion of the base, as the documentation has it.
         noise_gain: correlated samples that one independent sample is worth, for synthesized
             (filtered) motion; measured motion is white.
         seed: of the random start.
+        measured_base: (12,) the same where link motion was measured; `base` where None.
 
     Attributes:
         R0 (n, 3, 3), p (n, 3): the frames; `lam` reads λ off them.
@@ -102,11 +103,13 @@ class SchemaLearner:
         mode: str = "moments",
         noise_gain: float = 1.0,
         seed: int = 0,
+        measured_base: Array | None = None,
     ) -> None:
         n = tree.n
         self.settings, self.mode = settings or SchemaSettings(), mode
         self.layout = StateLayout(n)
-        self._parent, self._base = np.array(tree.parent, dtype=np.int64), base
+        self._parent = np.array(tree.parent, dtype=np.int64)
+        self._base, self._measured_base = base, base if measured_base is None else measured_base
         self._noise_gain = noise_gain
         rng = np.random.default_rng(seed)
         start = self.settings.start_rms * rng.normal(size=(n, 6))
@@ -158,7 +161,7 @@ class SchemaLearner:
             keep = self._keep()
         absorb(
             self._parent,
-            self._base,
+            self._measured_base if self.kind == MOTION_MEASURED else self._base,
             stamps_of(table),
             table[:, 1],
             table[:, at.motion_q],

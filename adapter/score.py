@@ -214,5 +214,6 @@ def figures(
         "tick_us": dict(tick_us),
         "lambda": schema_score(outcome, documented, reference, start_s),
         "theta": theta_score(outcome, documented, start_s),
+        "disagreements": None if outcome.disagreements is None else list(outcome.disagreements),
         **more,
     }

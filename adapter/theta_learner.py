@@ -265,10 +265,13 @@ class ThetaLearner:
         span = s.settled_average if settled else s.average
         follow(self.x, float(min(self.updates, span)), self.bodies, self.mean, self.th)
 
-    def variance(self) -> Array:
-        """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)²."""
+    def variance(self, th: Array | None = None) -> Array:
+        """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)².
+
+        The residual is that of the parameters in use, or of others, th (P,).
+        """
         cost = np.empty(self.tree.n)
-        joint_costs(self.th, self.A, self._sizes, self.place, cost)
+        joint_costs(self.th if th is None else th, self.A, self._sizes, self.place, cost)
         own = (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
         return own + self.model_variance
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from adapter.config import REAL_ARM_EFFECTS, Config, config_from, config_table, read_config
 from adapter.effects import LEARNED
 from adapter.errors import SettingsError
-from adapter.known_effects import learnable
+from adapter.known_effects import learnable, not_taken_off
 from adapter.learner import MODES
 from adapter.model import SelfModel
 from adapter.robots import documented
@@ -91,6 +91,7 @@ def configure(
     else:
         by_default = recorded is None and not learner.effects
         changes["effects"] = learnable(robot, default_effects if by_default else learner.effects)
+    warn([f"{robot.name}: the learner leaves out {name}" for name in not_taken_off(robot)])
     if args.mode is not None:
         changes["mode"] = args.mode
     if args.seed is not None:

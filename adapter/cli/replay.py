@@ -15,7 +15,6 @@ from rich.progress import Progress
 from adapter.cli.common import UsageError, add_learning_options, configure, console, robot_of, warn
 from adapter.cli.results import conclude, results_folder
 from adapter.config import REAL_ARM_EFFECTS, Config
-from adapter.effects.bodies import with_bodies
 from adapter.errors import SettingsError
 from adapter.filters import noise_from_samples
 from adapter.model import SelfModel
@@ -61,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     robot = _robot(args, whole)
     recorded = recorded if isinstance(recorded, dict) else None
     config = configure(args, recorded, REAL_ARM_EFFECTS, robot)
-    robot = with_bodies(config.apply(robot))
+    robot = config.apply(robot)
     reference = reference_from(args.truth, robot)
     log = matching(whole, robot)
     warn(log.warnings)
@@ -160,7 +159,13 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
             until_s=args.validate_from,
             progress=progress,
             resume=args.resume,
+            say=None if args.quiet else tell,
         )
+
+
+def tell(line: str) -> None:
+    """A new disagreement, when it is found."""
+    console.print(f"[yellow]new disagreement:[/] {line}", soft_wrap=True)
 
 
 def _held_out(

@@ -15,6 +15,7 @@ from adapter.cli.common import console, plain, program_version, warn, write_json
 from adapter.errors import ModelError
 from adapter.export import to_urdf
 from adapter.front_end import FrontEnd
+from adapter.gap.monitor_book import sentence
 from adapter.model import SelfModel
 from adapter.outcome import Outcome
 from adapter.report import write_report
@@ -86,6 +87,8 @@ def print_figures(figures: dict[str, Any]) -> None:
         load = change.get("payload")
         what = f"{load['m']:.3f} ± {load['m_std']:.3f} kg" if load else "superseded"
         table.add_row("change at the hand", f"at {change['stamp_s']:.2f} s: {what}")
+    for line in disagreement_lines(figures.get("disagreements", [])):
+        table.add_row("new disagreement", line)
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])
         table.add_row("held-out torque", f"{values} N m")
@@ -99,6 +102,13 @@ def print_figures(figures: dict[str, Any]) -> None:
     if "report" in figures:
         table.add_row("report", figures["report"])
     console.print(table)
+
+
+def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
+    """One line each; one that says so where nothing watched."""
+    if reports is None:
+        return ["not watched for in batches (--every above 1)"]
+    return [sentence(report) for report in reports]
 
 
 def _seconds(value: float | None) -> str:

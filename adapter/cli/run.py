@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     config = configure(args, None, default_effects, robot)
     if world is not None and config.gravity is None:
         robot = world.mounted(robot)
-    robot = with_bodies(config.apply(robot))
+    robot = config.apply(robot)
     folder = results_folder(args, "run")
     truth = args.truth or _write_truth(world, folder)
     reference = reference_from(truth, robot)
@@ -132,9 +132,10 @@ def _controller(
         forward = ModelFeedforward.of(robot)
     elif args.feedforward == "learned":
         effects = config.pipeline.learner.effects
-        lasting = lasting_effects(robot.effects, robot.tree.n)
+        whole = with_bodies(robot)
+        lasting = lasting_effects(whole.effects, robot.tree.n)
         known = [active for active in lasting if active.effect.name not in effects]
-        forward = LearnedFeedforward(robot.tree, robot.gravity, effects, tool, known)
+        forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known)
     return ExcitationController(MotionLimits.of(robot), config.excitation, feedforward=forward)
 
 
@@ -169,7 +170,9 @@ def _go(
         driver,
         front_end,
         controller=_controller(args, config, robot, driver),
-        learner=learner_job(robot, config.pipeline, args.checkpoint, args.resume),
+        learner=learner_job(
+            robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
+        ),
         recording=recording,
         watch=watch,
         options=LiveOptions(duration_s=args.duration),

@@ -23,6 +23,7 @@ class AsymmetricFriction(JointTorque):
     positive = ("Fc_pos", "Fc_neg")
     log_odds = -3.0  # Coulomb friction and an offset say the same in simpler words
     inexact = 0.02
+    simpler = {"coulomb_friction": 0.1, "load_dependent_friction": 0.1}
     split_by = (
         "hold the joint still after moving in either direction: an offset stays, friction fades"
     )

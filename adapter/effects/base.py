@@ -117,7 +117,9 @@ class Effect:
         typical: size of its one parameter, where it has but one and is linear in it.
         split_by: the experiment that tells it from what looks alike.
         positive: keys of parameters that physics keeps above zero.
-        inexact: share of its torque that may be otherwise in truth: its equation is an idealisation.
+        inexact: share of its torque that may be otherwise in truth: an idealised equation.
+        simpler: effects of which it is a finer form, each with the share of the evidence that
+            the finer form must add: no gear is exactly as an equation says.
         log_odds: ln of how much more often than the common ones it is met, before any data.
     """
 
@@ -129,6 +131,7 @@ class Effect:
     positive: ClassVar[tuple[str, ...]] = ()
     log_odds: ClassVar[float] = 0.0
     inexact: ClassVar[float] = 0.0
+    simpler: ClassVar[Mapping[str, float]] = {}
     split_by: ClassVar[str]
 
     def templates(self) -> tuple[Template, ...]:
@@ -137,7 +140,7 @@ class Effect:
         return (Template((self.typical,), lambda x: {key: float(x[0])}),)
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
-        """A template whose nonlinear setting is `ratio` times that in `values`; None without one."""
+        """A template with the nonlinear setting in `values` times `ratio`; None without one."""
         return None
 
     def possible(self, values: Values) -> bool:

@@ -25,8 +25,12 @@ class BaseTilt(BodyEffect):
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """Gravity seen from the tilted base."""
-        turn = exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
-        return theta, np.asarray(turn.T @ gravity)
+        return theta, np.asarray(self.turn(values).T @ gravity)
+
+    @staticmethod
+    def turn(values: Values) -> Array:
+        """Orientation (3, 3) of the base against one that stands as the model says."""
+        return exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
 
 
 def _decode(x: Array) -> dict[str, Any]:

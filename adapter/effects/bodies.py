@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def with_bodies(model: SelfModel) -> SelfModel:
     """The model with its lasting `BodyEffect`s in θ and gravity, and without their entries.
 
-    One that ends with its recording is over and left as it is. A model without any is returned
-    itself.
+    An effect that ends with its recording is over and left as it is. A model without any is
+    returned itself.
     """
     n, theta, gravity, kept = model.tree.n, model.theta.copy(), model.gravity, []
     for entry in model.effects:

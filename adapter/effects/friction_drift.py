@@ -20,7 +20,7 @@ class FrictionDrift(TorqueEffect):
     title = "friction drift"
     parameters = (Parameter("dFc", "N m/s"),)
     typical = 0.05
-    log_odds = -2.0
+    log_odds = -5.0
     inexact = 0.03
     split_by = "repeat the motion after the arm has moved for ten minutes"
 

@@ -21,7 +21,7 @@ class LinkInertia(BodyEffect):
 
     def templates(self) -> tuple[Template, ...]:
         """Ten inertial parameters."""
-        sizes = (1.0, 0.1, 0.1, 0.1, *(0.05 * np.ones(6)))
+        sizes = (1.0, 0.1, 0.1, 0.1, *(0.03 * np.ones(6)))
         return (Template(tuple(map(float, sizes)), _decode),)
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:

@@ -28,7 +28,7 @@ class Payload(BodyEffect):
 
     def templates(self) -> tuple[Template, ...]:
         """Ten inertial parameters."""
-        sizes = (1.0, 0.1, 0.1, 0.1, *(0.02 * np.ones(6)))
+        sizes = (1.0, 0.1, 0.1, 0.1, *(0.03 * np.ones(6)))
         return (Template(tuple(map(float, sizes)), parameters_of),)
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.effects import CATALOGUE
+from adapter.effects.active import Active
 from adapter.effects.base import (
     ALL,
     BASE,
@@ -26,7 +27,6 @@ from adapter.effects.base import (
 )
 from adapter.gap.signals import Signals
 from adapter.records import Array
-from adapter.effects.active import Active
 from adapter.torque import added, bodies, moved_links
 
 STEP = 0.02  # of a coefficient's typical size, for the differences
@@ -90,12 +90,13 @@ def places(effect: Effect, n: int) -> tuple[int, ...]:
 
 
 def signatures(
-    signals: Signals, base: Base, joints: Sequence[int]
+    signals: Signals, base: Base, joints: Sequence[int], extra: Sequence[tuple[Effect, int]] = ()
 ) -> tuple[Array, list[Candidate]]:
     """Every signature in the band, and what each belongs to.
 
     Args:
         joints: (from 0) that move; effects of others cannot be told.
+        extra: further effects, each with its joint.
 
     Returns:
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
@@ -118,6 +119,12 @@ def signatures(
                     columns = tuple(range(size, size + count))
                     size += count
                 candidates.append(Candidate(effect, template, joint, columns))
+    for effect, joint in extra:
+        template = effect.templates()[0]
+        tables.append(_differences(signals, base, effect, template, joint))
+        columns = tuple(range(size, size + len(template.prior_std)))
+        size += len(columns)
+        candidates.append(Candidate(effect, template, joint, columns))
     return np.concatenate(tables), candidates
 
 

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import CATALOGUE
+from adapter.effects.active import WHOLE, Active
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried, Score, score
 from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
 from adapter.gap.signals import Signals
 from adapter.records import Array
 from adapter.rigid_arm import RigidArm
-from adapter.effects.active import WHOLE, Active
 from adapter.torque import moved_links, sensed_torque
 
 TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
@@ -82,6 +82,7 @@ class Fit:
         dtheta: (n, 10) correction of the nominal inertias.
         delay_s: by how much torques are late, within the timing of a sample.
         named: effects named so far.
+        known: effects that the nominal model has already.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -92,6 +93,7 @@ class Fit:
     delay_s: float = 0.0
     named: tuple[Named, ...] = ()
     weights: tuple[Array, ...] = ()
+    known: tuple[Active, ...] = ()
 
     @property
     def arm(self) -> RigidArm:
@@ -106,7 +108,8 @@ class Fit:
 
     def actives(self, recording: int) -> tuple[Active, ...]:
         """Effects at work in a recording, the timing's error among them."""
-        own = [e.active() for e in self.named if e.recording in (None, recording)]
+        own = [*self.known]
+        own += [e.active() for e in self.named if e.recording in (None, recording)]
         own.append(Active(CATALOGUE["signal_delay"], -1, {"d": self.delay_s}))
         return tuple(own)
 
@@ -210,9 +213,10 @@ class Fit:
         own = other.signals(recording)
         return own.low((sensed_torque(own.motion, other.actives(recording)) - total) / h)
 
-    def carried(self) -> Carried:
+    def carried(self, tables: Sequence[Array] | None = None) -> Carried:
         """What is carried along when further effects are sought, about the present model."""
-        tables = [self.carried_signatures(i) for i in range(len(self.recordings))]
+        if tables is None:
+            tables = [self.carried_signatures(i) for i in range(len(self.recordings))]
         N = self.whiten(tables)
         data = self.whiten(self.residuals()) + self.coefficients @ N
         return Carried(N, self.prior_std, data)

@@ -7,17 +7,20 @@ no more than a small solve.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from adapter.gap.candidates import Candidate, base_of, signatures
-from adapter.gap.evidence import score, scores
-from adapter.gap.fit import Fit
-from adapter.gap.noise import LEAST_NM, Noise, noise_of
-from adapter.records import Array
 from adapter.effects.active import WHOLE
+from adapter.effects.base import Effect
+from adapter.gap.candidates import Candidate, base_of, signatures
+from adapter.gap.evidence import Carried, score, scores
+from adapter.gap.fit import BAND_HZ, Fit
+from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
+from adapter.gap.patterns import Pattern, line, patterns
+from adapter.records import Array
 
 BLOCK_S = 0.4
 FEWEST_BLOCKS = 1  # nothing shorter is dated
@@ -37,6 +40,7 @@ class Lead:
         chi2: fall of the squared distance.
         x: (k,) coefficients.
         interval_s, recording: when and where it acts.
+        odds: the part of the evidence that is older than the data.
     """
 
     candidate: Candidate
@@ -45,14 +49,17 @@ class Lead:
     x: Array
     interval_s: tuple[float, float] = WHOLE
     recording: int | None = None
+    odds: float = 0.0
 
 
 def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> Noise:
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it."""
     prior = np.zeros(len(X))
     for c in candidates:
-        k = list(c.columns)
-        prior[k] = np.maximum(prior[k], c.prior_std)
+        if not isinstance(c.effect, Pattern):  # these are so many that they would explain noise
+            k = list(c.columns)
+            prior[k] = np.maximum(prior[k], c.prior_std)
+    X, prior = X[prior > 0.0], prior[prior > 0.0]
     sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
     white = (X / sigma).reshape(len(X), -1), (residual / sigma).ravel()
     for _ in range(RICH_ROUNDS):
@@ -73,22 +80,71 @@ class Field:
 
     Args:
         fit: the model as it stands; joints: (from 0) that move.
+        rich: whiten by that noise; by the fit's own where False.
     """
 
-    def __init__(self, fit: Fit, joints: Sequence[int]) -> None:
+    def __init__(self, fit: Fit, joints: Sequence[int], rich: bool = True) -> None:
         tables, noise = [], []
+        extra = self._patterns(fit, joints)
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
             own = fit.signals(i)
-            table, self.candidates = signatures(own, base_of(own, fit.actives(i)), joints)
+            table, self.candidates = signatures(own, base_of(own, fit.actives(i)), joints, extra)
             tables.append(table)
-            noise.append(rich_noise(table, self.candidates, fit.residual(i)))
-        self.fit = fit.with_noise(noise)
-        self.carried = self.fit.carried()
+            if rich:
+                noise.append(rich_noise(table, self.candidates, fit.residual(i)))
+        self.fit = fit.with_noise(noise) if rich else fit
+        self.tables = tables
+        self.carried_tables = [self.fit.carried_signatures(i) for i in range(len(tables))]
+        self.carried = self.fit.carried(self.carried_tables)
         self.X = self.fit.whiten(tables)
-        self.times = [
-            r.t[own.ar.shape[1] :] for r, own in zip(fit.recordings, noise, strict=True)
+        self.times = [r.t[ORDER:] for r in fit.recordings]
+
+    def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
+        """What no effect of the catalogue has: patterns of each joint, and lines in time."""
+        found: list[tuple[Effect, int]] = [(p, j) for j in joints for p in patterns(fit.n, j)]
+        longest = max(fit.residuals(), key=len)
+        for j in joints:
+            peak = line(longest[:, j], BAND_HZ)
+            if peak is not None:
+                found.append((peak, j))
+        return found
+
+    def gated(self, lead: Lead) -> list[Array]:
+        """Signatures (c, k, n) of a lead in each recording, in its interval alone."""
+        return self.within(lead.interval_s, lead.recording, list(lead.candidate.columns))
+
+    def within(
+        self, interval_s: tuple[float, float], recording: int | None, columns: Any = slice(None)
+    ) -> list[Array]:
+        """Signatures (c, k, n) of each recording, zero outside an interval."""
+        out = []
+        for i, (table, own) in enumerate(zip(self.tables, self.fit.recordings, strict=True)):
+            on = (own.t >= interval_s[0]) & (own.t < interval_s[1])
+            if recording not in (None, i):
+                on[:] = False
+            out.append(table[columns] * on[:, None])
+        return out
+
+    def honest(self, lead: Lead) -> Lead:
+        """A lead under the noise that it leaves itself, in place of that of the richest model."""
+        lead_tables = self.gated(lead)
+        tables = [np.concatenate(x) for x in zip(self.carried_tables, lead_tables, strict=True)]
+        prior_std = np.concatenate([self.fit.prior_std, lead.candidate.prior_std])
+        fit, start = self.fit, self.fit.coefficients
+        targets = [
+            r + np.tensordot(start, c, 1)
+            for r, c in zip(fit.residuals(), self.carried_tables, strict=True)
         ]
+        x = Carried(fit.whiten(tables), prior_std, fit.whiten(targets)).x
+        left = [t - np.tensordot(x, c, 1) for t, c in zip(targets, tables, strict=True)]
+        fit = replace(fit, noise=tuple(noise_of(r) for r in left))
+        N, X = fit.whiten(self.carried_tables), fit.whiten(lead_tables)
+        others = Carried(N, fit.prior_std, fit.whiten(targets))
+        found = score(*others.without(X), lead.candidate.prior_std)
+        return replace(
+            lead, log_evidence=found.log_evidence + lead.odds, chi2=found.chi2, x=found.x
+        )
 
     def whole(self) -> list[Lead]:
         """Every candidate, acting all the time."""
@@ -97,7 +153,8 @@ class Field:
         for c in self.candidates:
             k = np.ix_(c.columns, c.columns)
             found = score(G[k], g[list(c.columns)], c.prior_std)
-            leads.append(Lead(c, found.log_evidence + log_odds(c), found.chi2, found.x))
+            odds = log_odds(c)
+            leads.append(Lead(c, found.log_evidence + odds, found.chi2, found.x, odds=odds))
         return leads
 
     def timed(self, candidates: Sequence[Candidate]) -> list[Lead]:
@@ -112,17 +169,10 @@ class Field:
                 evidence, _ = scores(*reduced, c.prior_std)
                 best = int(np.argmax(evidence))
                 found = score(reduced[0][best], reduced[1][best], c.prior_std)
-                ways = np.log(len(keep))
-                leads.append(
-                    Lead(
-                        c,
-                        found.log_evidence + log_odds(c, timed=True) - ways,
-                        found.chi2,
-                        found.x,
-                        (float(edges[keep[best]]), np.inf),
-                        i,
-                    )
-                )
+                odds = log_odds(c, timed=True) - float(np.log(len(keep)))
+                when = (float(edges[keep[best]]), np.inf)
+                worth = found.log_evidence + odds
+                leads.append(Lead(c, worth, found.chi2, found.x, when, i, odds))
         return leads
 
     def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
@@ -147,8 +197,9 @@ class Field:
                 best = int(np.argmax(evidence))
                 found = score(reduced[0][best], reduced[1][best], c.prior_std)
                 begin, end = (float(edges[x]) for x in pairs[best])
-                worth = found.log_evidence + log_odds(c, passing=True) - np.log(len(pairs))
-                leads.append(Lead(c, worth, found.chi2, found.x, (begin, end), i))
+                odds = log_odds(c, passing=True) - float(np.log(len(pairs)))
+                worth = found.log_evidence + odds
+                leads.append(Lead(c, worth, found.chi2, found.x, (begin, end), i, odds))
         return leads
 
     def _starts(self, recording: int, edges: Array) -> np.ndarray:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from adapter.effects.active import active_effects
+from adapter.effects.base import ALL
 from adapter.report.torque_panels import EFFECT_UNITS, SHARE_ALONE, theta_started
 from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
 from adapter.run_folder import RunData
@@ -95,20 +97,24 @@ def _column(values: Sequence[Any], scale: float = 1.0) -> list[str]:
 
 
 def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
-    """The effects of the model file: value ± standard deviation by joint."""
+    """The effects of the model file: value ± standard deviation by joint.
+
+    One of all joints stands at each of them; one of the flange at none.
+    """
     columns: dict[tuple[str, str], list[str]] = {}
-    for entry in data.model.effects:
-        for key, value in entry.get("parameters", {}).items():
-            unit = entry.get("units", {}).get(key, "")
+    for active in active_effects(data.model.effects, data.n):
+        effect = active.effect
+        joints = range(data.n) if effect.scope == ALL and active.joint < 0 else [active.joint]
+        for key, value in active.values.items():
+            if np.ndim(value) or joints[0] < 0:
+                continue
+            unit = effect.units()[key]
+            head = effect.name.replace("_", " ").capitalize()
             column = columns.setdefault(
-                (
-                    entry["effect"].replace("_", " ").capitalize(),
-                    f"{key}, {EFFECT_UNITS.get(unit, unit)}",
-                ),
-                [NOTHING] * data.n,
+                (head, f"{key}, {EFFECT_UNITS.get(unit, unit)}"), [NOTHING] * data.n
             )
-            for j in entry.get("joints", ()):
-                column[j - 1] = plus_minus(value, entry.get("std", {}).get(key))
+            for j in joints:
+                column[j] = plus_minus(value, active.std.get(key))
     return [(head, unit, cells) for (head, unit), cells in columns.items()]
 
 

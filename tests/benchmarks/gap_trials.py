@@ -32,7 +32,7 @@ SIMULATORS: dict[str, Callable[[Trial], Recording]] = {
     "mujoco": mujoco_recording,
     "pinocchio": pinocchio_recording,
 }
-Analyse = Callable[[Sequence[Path], Path], Any]
+Analyse = Callable[..., Any]
 # Judges a result beyond its names: (trial, recording, result, its folder) -> figures for the row.
 Judge = Callable[[Trial, Recording, dict[str, Any], Path], Row]
 
@@ -53,7 +53,7 @@ def run_trial(trial: Trial, simulator: str, analyse: Analyse, judges: Sequence[J
         log, model, truth = write(trial, kept, recording, simulator)
         log, model = (path.rename(shown / path.name) for path in (log, model))
         begun = time.perf_counter()
-        answer = analyse([log], model)
+        answer = analyse([log], model, model_out=shown / "model.json")
         seconds = time.perf_counter() - begun
         result: dict[str, Any] = answer if isinstance(answer, dict) else answer.as_dict()
         row = score_trial(result, unseal(truth), detectability(trial))

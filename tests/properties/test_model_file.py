@@ -147,6 +147,23 @@ FAULTS = {
         "rides on 'moon'; have: panda_link0",
     ),
     "tool": (lambda d: d.update(tool={"mass": 1}), "'com' in 'tool'"),
+    "effect": (
+        lambda d: d.update(effects=[{"effect": "stiction", "parameters": {}}]),
+        r"no effect 'stiction'; have: viscous_friction, .*friction_drift",
+    ),
+    "effect's joint": (
+        lambda d: d.update(
+            effects=[{"effect": "motor_inertia", "joints": [9], "parameters": {"B": 0.1}}]
+        ),
+        "motor_inertia: no joint 9; have: 1 to 7",
+    ),
+    "effect's key": (
+        lambda d: d.update(
+            effects=[{"effect": "motor_inertia", "joints": [1], "parameters": {"J": 0.1}}]
+        ),
+        "motor_inertia has no parameter 'J'; have: B",
+    ),
+    "effects": (lambda d: d.update(effects={}), "'effects' must be a list, got dict"),
     "flags": (lambda d: d.update(lambda_identifiable=[1]), "'lambda_identifiable' must hold true"),
 }
 

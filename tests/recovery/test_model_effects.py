@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from arm_data import ArmData, Motion, arm, model_torque, panda_model, record, rms, states_of
 
+from adapter.batch import learn_batch
+from adapter.checkpoint import load_checkpoint, save_checkpoint
 from adapter.effects.active import lasting_effects
+from adapter.effects.bodies import with_bodies
 from adapter.errors import SettingsError
-from adapter.known_effects import KnownEffects, learnable
+from adapter.known_effects import KnownEffects, learnable, not_taken_off
 from adapter.learner import Learner, LearnerSettings
 from adapter.model import SelfModel
 from adapter.outcome import collect, learned_model
 from adapter.pipeline import PipelineSettings, make_front_end, make_learner
 from adapter.records import StateLayout
 from adapter.rigid_arm import RigidArm
+from adapter.spatial import exp_rotation, matrix_from_zxz
 from adapter.theta_settings import STEP_SMOOTHING
+from adapter.torque import ModelTorque
 
 N = 7
 AT = StateLayout(N)
@@ -169,11 +175,13 @@ def learn(data: ArmData, model: SelfModel, *effects: str) -> Learner:
     return learner
 
 
-def held_out(learner: Learner) -> np.ndarray:
-    """(n,) torque error of θ alone on another motion of the arm without effects, N m rms."""
-    q, dq, ddq, tau = record(arm(), Motion(6.0, seed=104), noisy=False).true
+def held_out(learner: Learner, *effects: dict[str, object]) -> np.ndarray:
+    """(n,) torque error of θ alone on another motion of an arm with effects, N m rms."""
+    q, dq, ddq = record(arm(), Motion(6.0, seed=104), noisy=False).true[:3]
+    tau = ModelTorque(with_effects(*effects))(q, dq, ddq)
     theta = learner.theta.theta
-    return rms(tau - model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq))
+    base = with_bodies(with_effects(*effects))  # gravity alone is taken of it
+    return rms(tau - model_torque(base, learner.schema.lam, theta, q, dq, ddq))
 
 
 def test_theta_is_the_arms_where_the_model_knows_of_sensors_and_gears() -> None:
@@ -237,17 +245,41 @@ def test_a_surer_model_is_left_less_easily() -> None:
 
 
 def test_bodies_are_in_the_model_the_learner_compares_with() -> None:
+    """The arm stands on a tilted base: torques know, and λ is there as soon as ever."""
     tilt = entry("base_tilt", rx=0.03, ry=-0.02)
     model = with_effects(tilt, entry("payload", **LOAD))
-    front_end = make_front_end(model, PipelineSettings())
-    learner = make_learner(model, PipelineSettings())
+    data = record(arm(), MOTION, noisy=False).part(8.0)
+    turned = exp_rotation([0.03, -0.02, 0.0]).T @ panda_model().gravity
+    tau = data.tau + ModelTorque(replace(panda_model(), gravity=turned))(*data.true[:3])
+    tau -= ModelTorque(panda_model())(*data.true[:3])
+    learner, plain = (make_learner(m, PipelineSettings()) for m in (model, panda_model()))
     assert learner.known is None
-    base = front_end.twist._base
-    np.testing.assert_allclose(np.linalg.norm(base[6:9]), 9.81)
-    assert abs(base[7]) > 0.2 and abs(base[6]) > 0.1
+    for state in states_of(replace(data, tau=tau), model):
+        learner.step(state)
+    for state in states_of(data):
+        plain.step(state)
+    assert learner.theta_started_ns == plain.theta_started_ns
+    # how joint 1 turns about the vertical, no level base shows; it stays where it began
+    np.testing.assert_allclose(learner.schema.R0[0], model.joint_rotation()[0], atol=0.02)
+    for ours, theirs in zip(held_out(learner, tilt), held_out(plain), strict=True):
+        assert ours < 1.5 * theirs + 0.01
+    assert held_out(learner).max() < 0.03  # the same θ on a level base
     outcome = learned_model(collect(learner), model)
     assert outcome.effects == ()
-    np.testing.assert_allclose(outcome.gravity, -base[6:9])
+    np.testing.assert_allclose(outcome.gravity, turned)
+
+
+def test_measured_link_motion_feels_the_tilt() -> None:
+    """Accelerations of the links hold gravity as it is."""
+    model = with_effects(entry("base_tilt", rx=0.3, ry=-0.2))
+    turned = with_bodies(model).gravity
+    tilted = arm().with_changes(gravity=turned)
+    data = record(tilted, Motion(6.0, seed=2), links=True)
+    learner = make_learner(model, PipelineSettings())
+    for state in states_of(data, model):
+        learner.step(state)
+    turn = matrix_from_zxz(learner.schema.lam[:, :3])
+    assert np.abs(turn - model.joint_rotation()).max() < 0.02
 
 
 def test_what_ended_with_its_recording_is_not_looked_for() -> None:
@@ -262,6 +294,45 @@ def test_what_ended_with_its_recording_is_not_looked_for() -> None:
         collect(make_learner(with_effects(begun), PipelineSettings())), with_effects(begun)
     ).effects
     assert kept["interval_s"] is None and kept["parameters"] == {"o": 3.0}
+
+
+def test_a_checkpoint_goes_on_where_it_was(tmp_path: Path) -> None:
+    model = with_effects(
+        *(TAKEN_OFF[name] for name in ("signal_delay", "backlash", "joint_elasticity")),
+        *wrong_friction(0.4, 0.1).effects,
+    )
+    settings = PipelineSettings(learner=LearnerSettings(effects=FRICTION))
+    whole, first, second = (make_learner(model, settings) for _ in range(3))
+    states = states_of(record(arm(), MOTION).part(3.0), model)
+    for k, state in enumerate(states):
+        whole.step(state)
+        if k < 1500:
+            first.step(state)
+    save_checkpoint(first, tmp_path / "half.npz")
+    load_checkpoint(second, tmp_path / "half.npz")
+    for state in states[1500:]:
+        second.step(state)
+    np.testing.assert_array_equal(whole.theta.th, second.theta.th)
+    for other in (panda_model(), with_effects(*wrong_friction(0.5, 0.1).effects)):
+        with pytest.raises(SettingsError, match="other learner settings"):
+            load_checkpoint(make_learner(other, settings), tmp_path / "half.npz")
+
+
+def test_what_cannot_be_taken_off_is_said() -> None:
+    drift = entry("friction_drift", [2], dFc=0.01)
+    assert not_taken_off(with_effects(drift, entry("base_tilt", rx=0.01, ry=0.0))) == (
+        "friction_drift",
+    )
+    assert not_taken_off(panda_model()) == ()
+
+
+def test_batches_take_off_what_is_known() -> None:
+    """The model is the arm's, spring and offset included: in batches as sample by sample."""
+    model = with_effects(TAKEN_OFF["joint_spring"], TAKEN_OFF["encoder_offset"])
+    data = changed(changed(record(arm(), MOTION), "joint_spring"), "encoder_offset")
+    learner = make_learner(model, PipelineSettings())
+    learn_batch(learner, states_of(data, model), 10, lambda done: None)
+    assert held_out(learner).max() < 0.05
 
 
 def test_effects_need_an_arm() -> None:

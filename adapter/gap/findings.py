@@ -1,0 +1,157 @@
+"""From a fit to what people and files are told: parameters, deviations, rivals, what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.active import WHOLE
+from adapter.effects.base import ALL, JOINT, LINK
+from adapter.gap.fit import Fit, Named
+from adapter.gap.patterns import Pattern
+from adapter.gap.result import Finding, Leftover
+from adapter.gap.rivals import Standing, place_of
+from adapter.gap.search import Found
+from adapter.records import Array
+
+OVERLAP = 0.9
+MOST_RIVALS = 3
+DIFFERENCE = 1e-4  # of a coefficient's prior
+DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
+SHAPE_STEP = 0.04
+
+
+def _joints(named: Named) -> list[int]:
+    scope = named.candidate.effect.scope
+    own = scope in (JOINT, LINK) or (scope == ALL and named.candidate.joint >= 0)
+    return [named.candidate.joint + 1] if own else []
+
+
+def entries(fit: Fit) -> list[dict[str, Any]]:
+    """Entries of a model file for the named effects of the catalogue."""
+    out = []
+    for named in fit.named:
+        if not isinstance(named.candidate.effect, Pattern):
+            begin, end = (None if not np.isfinite(x) else float(x) for x in named.interval_s)
+            out.append(
+                {
+                    "effect": named.candidate.effect.name,
+                    "joints": _joints(named),
+                    "interval_s": None if begin is None and end is None else [begin, end],
+                    "parameters": named.values,
+                    "units": named.candidate.effect.units(),
+                }
+            )
+    return out
+
+
+def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
+    """Standard deviations of the parameters of the k-th named effect, through its decoding."""
+    named, own = fit.named[k], place_of(fit, k)
+    template, steps = named.candidate.template, DIFFERENCE * named.candidate.prior_std
+    at = _flat(named.values)
+    slopes = np.array(
+        [
+            (_flat(template.decode(named.x + step * unit)) - at) / step
+            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
+        ]
+    )
+    deviations = np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
+    std, place = {}, 0
+    for key, value in named.values.items():
+        size = np.size(value)
+        part = deviations[place : place + size]
+        std[key] = float(part[0]) if np.ndim(value) == 0 else [float(x) for x in part]
+        place += size
+    return std
+
+
+def _flat(values: dict[str, Any]) -> Array:
+    return np.concatenate([np.atleast_1d(np.asarray(v, dtype=float)) for v in values.values()])
+
+
+def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
+    """Every named effect of the catalogue. `ends`: (recordings,) s, when each ends."""
+    fit, covariance = found.fit, found.carried.covariance()
+    out = []
+    for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
+        effect = named.candidate.effect
+        if isinstance(effect, Pattern):
+            continue
+        recording = named.recording or 0
+        begin, end = named.interval_s
+        torque = fit.contribution(recording, k)
+        t = fit.recordings[recording].t
+        on = (t >= begin) & (t < end)
+        out.append(
+            Finding(
+                effect=effect.name,
+                title=effect.title,
+                joints=tuple(_joints(named)),
+                interval_s=(max(begin, 0.0), min(end, ends[recording])),
+                lasting=not np.isfinite(end),
+                parameters=named.values,
+                std=parameter_std(fit, covariance, k),
+                units=effect.units(),
+                evidence=standing.probability,
+                overlaps=_overlaps(standing, named),
+                split_by=effect.split_by,
+                detectability=float(np.sqrt(standing.chi2)),
+                torque_rms_nm=np.sqrt(np.mean(torque[on] ** 2, axis=0)),
+            )
+        )
+    return tuple(sorted(out, key=lambda f: -f.detectability))
+
+
+def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
+    """Other names that explain 0.9 and more of the signature, best first."""
+    best: dict[str, float] = {}
+    for rival in standing.rivals:
+        effect = rival.candidate.effect
+        if isinstance(effect, Pattern) or effect.name == named.candidate.effect.name:
+            continue
+        if rival.overlap >= OVERLAP:
+            best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
+    # of rivals that explain all but the same, those that the data favour come first
+    credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
+    order = sorted(best, key=lambda name: (-round(best[name], 2), credible.get(name, 0)))
+    return {name: best[name] for name in order[:MOST_RIVALS]}
+
+
+def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
+    """What patterns found that no effect explains, one entry for each joint."""
+    fit = found.fit
+    out = []
+    for j in range(fit.n):
+        own = [
+            (k, e)
+            for k, e in enumerate(fit.named)
+            if isinstance(e.candidate.effect, Pattern) and e.candidate.joint == j
+        ]
+        if not own:
+            continue
+        parts = [fit.contribution(0, k)[:, j] for k, _ in own]
+        size = float(np.sqrt(np.mean(np.sum(parts, axis=0) ** 2)))
+        named = [
+            float(np.sqrt(np.mean(fit.contribution(e.recording or 0, k)[:, j] ** 2)))
+            for k, e in enumerate(fit.named)
+            if not isinstance(e.candidate.effect, Pattern)
+        ]
+        if size < DISCREPANCY * max(named, default=0.0):
+            continue
+        level = float(fit.noise[0].level[j])
+        order = np.argsort([-np.mean(part**2) for part in parts])
+        signals = [s for i in order for s in own[i][1].candidate.effect.depends_on]  # type: ignore[attr-defined]
+        interval = next((e.interval_s for _, e in own if e.interval_s != WHOLE), WHOLE)
+        out.append(
+            Leftover(
+                joint=j + 1,
+                rmse_nm=float(np.hypot(size, level)),
+                noise_floor_nm=level,
+                depends_on=tuple(dict.fromkeys(signals)),
+                interval_s=(max(interval[0], 0.0), min(interval[1], ends[0])),
+            )
+        )
+    return tuple(out)

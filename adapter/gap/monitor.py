@@ -1,0 +1,140 @@
+"""A light watch over the residual while an arm is learned: what is new, where, since when.
+
+It runs beside the learner, on the states the learner sees, at 25 rows a second. Once θ has seen
+three seconds it takes over what the learner knows and keeps a belief of its own from then on,
+which takes in rows only when they are two seconds old: what begins meanwhile is judged against a
+model that has not learned it yet. A disagreement that was reported stays in the belief with its
+own coefficients, so it is reported once, its size becomes better, and it does not spoil the rest.
+An arm at rest shows nothing: the front end passes on states of motion only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from adapter.gap.monitor_book import Book
+from adapter.gap.monitor_evidence import Belief
+from adapter.gap.monitor_intake import ROWS_PER_GROUP, Blocks, Group, Level
+from adapter.gap.monitor_judge import GROUPS, Judge
+from adapter.gap.monitor_signatures import Frames
+from adapter.learner import Learner
+from adapter.records import Array
+
+ENOUGH = 3000  # states behind θ before its least squares is taken over
+TRUST = 4.0  # the learner's information counts one in so many
+KEEP = 1.0 - 0.2 / 120.0  # of the belief, from one group to the next
+MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
+START_INFLATION = 2.0  # of sums of rows, before it is measured
+
+
+class Monitor:
+    """Watches a learner's states; `learner.watch = Monitor(...)`.
+
+    Args:
+        n: joints.
+        tool_theta: (10,) of a known tool on the last link, which θ leaves out.
+        delay_s: age of a filtered state against the sample that completed it.
+        say: takes a sentence when something is reported, and when it is over.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        tool_theta: Array | None = None,
+        delay_s: float = 0.0,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self._n, self._delay_s = n, delay_s
+        self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
+        self._blocks, self._book = Blocks(n), Book(say)
+        self._frames: Frames | None = None
+        self._groups: list[Group] = []
+        self._rows: list[tuple[float, Array]] = []
+
+    @property
+    def reports(self) -> list[dict[str, Any]]:
+        """One dict per disagreement, in the order they were found.
+
+        "what" (a name of the catalogue, or "unexplained"), "joints" (from 1; empty at the
+        flange), "since_s", "reported_s" and "over_s" (None while it lasts) in s on the arm's
+        clock, "size" (parameters of the catalogue), "score" (standard deviations),
+        "ambiguous_with" (what else it may be: "what" and "joints").
+        """
+        return self._book.reports
+
+    def __call__(self, learner: Learner, table: Array) -> None:
+        """Look at states (m, size) that the learner has just learned from."""
+        rows = self._blocks.add(table)
+        if not rows:
+            return
+        if learner.theta.count >= ENOUGH and self._outdated(learner):
+            self._take_over(learner)
+        if self._frames is None:
+            return
+        for row in rows:
+            self._rows.append(row)
+            if len(self._rows) == ROWS_PER_GROUP:
+                self._take(learner, self._frames)
+
+    def _outdated(self, learner: Learner) -> bool:
+        """Nothing is known yet, or λ was learned further while nothing else was new."""
+        if self._frames is None:
+            return True
+        R0, p = learner.frames
+        moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
+        return bool(moved > MOVED) and not self._book.active
+
+    def _take_over(self, learner: Learner) -> None:
+        """Start from what the learner knows."""
+        theta, n = learner.theta, self._n
+        H, rhs = theta.information()
+        if theta.spare_in_use:  # it stands behind the last link, whose place it takes
+            before = Belief(H, rhs)
+            before.drop(slice(10 * n - 10, 10 * n))
+            H, rhs = before.H, before.rhs
+        else:
+            rest = np.r_[: 10 * n, 10 * n + 10 : len(rhs)]
+            H, rhs = H[np.ix_(rest, rest)], rhs[rest]
+        self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
+        R0, p = learner.frames
+        self._frames = Frames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
+        self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
+        self._judge = Judge(n, self._belief, self._level, self._book)
+        self._groups, self._rows = [], []
+
+    def _take(self, learner: Learner, frames: Frames) -> None:
+        """A group is full: judge the window with it, and let the oldest group into the belief."""
+        t, table = (np.array(column) for column in zip(*self._rows, strict=True))
+        self._rows = []
+        self._groups.append(self._group(learner, frames, t, table))
+        if len(self._groups) > GROUPS:
+            self._absorb(self._groups.pop(0))
+        if len(self._groups) == GROUPS:
+            self._judge.judge(self._groups, float(t[-1]) + self._delay_s)
+
+    def _group(self, learner: Learner, frames: Frames, t: Array, table: Array) -> Group:
+        q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
+        Y = frames.regressor(q, dq, ddq)
+        tool = Y[:, :, -10:] @ self._tool
+        Z = np.zeros((len(t), self._n, self._size))
+        links, joints = Y.shape[2], np.arange(self._n)
+        Z[:, :, :links] = Y
+        columns = learner.theta.effect_columns(q, dq, ddq)
+        for k in range(columns.shape[1]):
+            Z[:, joints, links + k * self._n + joints] = columns[:, k]
+        model = Z @ self._belief.mean()[: self._size] + tool
+        return Group(t, Z, frames.signatures(q, dq, ddq, model, Y), tau - tool)
+
+    def _absorb(self, group: Group) -> None:
+        """Learn from a group that left the window, and its noise."""
+        Z = self._book.columns(group.t, group.Z, group.S)
+        weight = self._book.weights(group.t, self._level.weight)
+        residual = group.tau - Z @ self._belief.mean()
+        if (weight == self._level.weight).all():
+            self._level.look(residual)
+        flat = Z.reshape(-1, Z.shape[2])
+        self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
+        self._book.forget_before(float(group.t[0]), self._belief)

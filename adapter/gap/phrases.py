@@ -1,0 +1,288 @@
+"""Numbers with their units and doubt, and what each effect is called in a sentence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import ALL, BASE, FLANGE, LINK
+from adapter.effects.catalogue import CATALOGUE
+from adapter.gap.result import Finding
+
+DASH = "–"
+MOST_DIGITS = 5  # of a value, however small its standard deviation
+SMALL_RAD = 0.1  # angles below it are shown in mrad
+SHOWN_UNITS = {"1": (100.0, "%"), "s": (1e3, "ms"), "m": (1e3, "mm"), "kg m2": (1.0, "kg m²")}
+FORCE, MOMENT, TILT = ("fx", "fy", "fz"), ("mx", "my", "mz"), ("rx", "ry")
+LACKED = frozenset(
+    (
+        "viscous_friction",
+        "coulomb_friction",
+        "asymmetric_friction",
+        "stribeck_friction",
+        "load_dependent_friction",
+        "motor_inertia",
+    )
+)  # what a model lacks; of the others it is said that a joint shows them
+
+
+@dataclass(frozen=True)
+class Phrase:
+    """How to say that an effect is there.
+
+    Attributes:
+        more: names of parameters in braces stand for their values, {x} for the size of that of
+            `key`; {lacks} and {has} follow the number of joints.
+        key: parameter whose sign decides; less: said where that is negative.
+    """
+
+    more: str
+    key: str = ""
+    less: str = ""
+
+
+PHRASES = {
+    "viscous_friction": Phrase(
+        "{who} {lacks} {x} of viscous friction",
+        "Fv",
+        "{who} {has} {x} less viscous friction than the model says",
+    ),
+    "coulomb_friction": Phrase(
+        "{who} {lacks} {x} of Coulomb friction",
+        "Fc",
+        "{who} {has} {x} less Coulomb friction than the model says",
+    ),
+    "asymmetric_friction": Phrase(
+        "{who} {lacks} Coulomb friction of {Fc_pos} forwards and {Fc_neg} backwards"
+    ),
+    "stribeck_friction": Phrase(
+        "{who} {lacks} Stribeck friction of {Fs} at rest and {Fc} in motion"
+    ),
+    "load_dependent_friction": Phrase(
+        "{who} {lacks} friction of {x} of its load",
+        "Fl",
+        "{who} {has} less friction than the model says, by {x} of its load",
+    ),
+    "motor_inertia": Phrase(
+        "{who} {lacks} {x} of reflected motor inertia",
+        "B",
+        "{who} {has} {x} less motor inertia than the model says",
+    ),
+    "joint_elasticity": Phrase("{who} {is} elastic, with a stiffness of {k}"),
+    "backlash": Phrase("{who} {has} {b} of backlash"),
+    "torque_ripple": Phrase("{who} {has} a torque ripple of {a}, {n}"),
+    "joint_spring": Phrase(
+        "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"
+    ),
+    "torque_offset": Phrase(
+        "the torque sensor of {who} reads {x} too much",
+        "o",
+        "the torque sensor of {who} reads {x} too little",
+    ),
+    "torque_gain": Phrase(
+        "the torque sensor of {who} reads {x} too much",
+        "g",
+        "the torque sensor of {who} reads {x} too little",
+    ),
+    "encoder_offset": Phrase(
+        "the encoder of {who} reads {x} too much",
+        "o",
+        "the encoder of {who} reads {x} too little",
+    ),
+    "encoder_ripple": Phrase("the encoder of {who} errs by {a} once per turn"),
+    "signal_delay": Phrase(
+        "the torque of {who} comes {x} after the position",
+        "d",
+        "the torque of {who} comes {x} before the position",
+    ),
+    "payload": Phrase(
+        "the flange carries {x}", "m", "the flange carries {x} less than the model says"
+    ),
+    "link_inertia": Phrase("{who} {has} other inertias than the model says ({torque})"),
+    "base_tilt": Phrase("the base is tilted by {tilt}"),
+    "external_wrench": Phrase("something pushes the flange with {force}"),
+    "friction_drift": Phrase(
+        "the friction of {who} rises by {x}", "dFc", "the friction of {who} falls by {x}"
+    ),
+}
+
+
+def plain(value: Any, digits: int = 3) -> str:
+    """A number with that many significant digits and no exponent; a dash where there is none.
+
+    >>> plain(0.012345), plain(12345.6), plain(None), plain(-2.0)
+    ('0.0123', '12346', '–', '-2.00')
+    """
+    if value is None or not math.isfinite(value):
+        return DASH
+    if abs(value) < 1e-9:
+        return "0"
+    return f"{value:.{max(0, digits - 1 - _order(value))}f}"
+
+
+def plus_minus(value: Any, std: Any) -> str:
+    """Value ± standard deviation, both to the second digit of the latter.
+
+    >>> plus_minus(2.0, 0.03), plus_minus(12345.0, 340.0), plus_minus(1.5, None)
+    ('2.000 ± 0.030', '12340 ± 340', '1.50')
+    """
+    if value is None or not math.isfinite(value) or not _is_size(std):
+        return plain(value)
+    decimals = 1 - _order(std)
+    if value and decimals > MOST_DIGITS - 1 - _order(value):
+        return plain(value, MOST_DIGITS)
+    shown, doubt = round(float(value), decimals), round(float(std), decimals)
+    return f"{shown:.{max(decimals, 0)}f} ± {doubt:.{max(decimals, 0)}f}"
+
+
+def measured(value: Any, std: Any, unit: str) -> str:
+    """Value ± standard deviation in the unit that people use.
+
+    >>> measured(0.05, 0.0021, "1"), measured(0.0123, 0.0002, "rad")
+    ('5.00 ± 0.21 %', '12.30 ± 0.20 mrad')
+    """
+    factor, name = shown_unit(value, unit)
+    text = plus_minus(_times(value, factor), _times(std, factor))
+    return f"{text} {name}".rstrip()
+
+
+def shown_unit(value: Any, unit: str) -> tuple[float, str]:
+    """(factor, name) of the unit in which a value of a file's unit is shown."""
+    if unit == "rad" and _is_size(value) and abs(value) < SMALL_RAD:
+        return 1e3, "mrad"
+    return SHOWN_UNITS.get(unit, (1.0, unit))
+
+
+def parameter(finding: Finding, key: str, size: bool = False) -> str:
+    """One parameter, a number, of a finding; `size`: without its sign."""
+    value = finding.parameters.get(key)
+    std, unit = finding.std.get(key), finding.units.get(key, "")
+    if unit == "per turn" and value is not None and not _is_size(std):
+        return f"{value:g} {unit}"  # a whole number that was chosen, not fitted
+    return measured(abs(value) if size and value is not None else value, std, unit)
+
+
+def parameter_lines(finding: Finding) -> list[str]:
+    """The numbers of a finding, one line each: "Fc = 2.000 ± 0.030 N m"."""
+    lines = []
+    for key, value in finding.parameters.items():
+        if np.ndim(value) == 0:
+            lines.append(f"{key} = {parameter(finding, key)}")
+    if "rx" in finding.parameters:
+        lines.append(f"tilt {norm(finding, TILT, 180.0 / math.pi, '°')}")
+    if "dtheta" in finding.parameters:
+        lines += inertia_lines(finding.parameters["dtheta"], finding.std.get("dtheta"))
+    return lines
+
+
+THETA = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
+THETA_UNITS = ("kg", *["kg m"] * 3, *["kg m²"] * 6)
+MOST_PARTS = 4
+
+
+def inertia_lines(dtheta: Sequence[float], std: Any) -> list[str]:
+    """The surest parts of a change of ten inertial parameters, in standard deviations of each."""
+    doubt = np.full(10, np.nan) if std is None else np.asarray(std, dtype=float)
+    value = np.asarray(dtheta, dtype=float)
+    usable = np.isfinite(doubt) & (doubt > 0.0)
+    surety = np.where(usable, np.abs(value) / np.where(usable, doubt, 1.0), 0.0)
+    if not usable.any():
+        surety = np.abs(value)
+    best = [k for k in np.argsort(-surety)[:MOST_PARTS] if surety[k] > 0.0]
+    return [
+        f"Δ{THETA[k]} = {plus_minus(value[k], doubt[k])} {THETA_UNITS[k]}" for k in sorted(best)
+    ]
+
+
+def norm(finding: Finding, keys: Sequence[str], factor: float, unit: str) -> str:
+    """Length of a vector of parameters ± its standard deviation, times a factor."""
+    value = np.array([finding.parameters.get(key, np.nan) for key in keys], dtype=float)
+    std = np.array([_number(finding.std.get(key)) for key in keys], dtype=float)
+    length = float(np.linalg.norm(value))
+    doubt = float(np.linalg.norm(value * std)) / length if length > 0.0 else math.nan
+    text = plus_minus(factor * length, factor * doubt)
+    return f"{text}{unit}" if unit == "°" else f"{text} {unit}"
+
+
+def who(effect: str, joints: Sequence[int]) -> str:
+    """What an effect acts on: "joint 4", "joints 1 and 2", "link 5", "all joints", "the flange"."""
+    scope = CATALOGUE[effect].scope if effect in CATALOGUE else ""
+    if scope in (FLANGE, BASE):
+        return f"the {scope}"
+    if not joints:
+        return "all joints" if scope == ALL else "the arm"
+    name = "link" if scope == LINK else "joint"
+    return f"{name}{'s' if len(joints) > 1 else ''} {numbered(joints)}"
+
+
+def numbered(joints: Sequence[int]) -> str:
+    """Numbers of joints: "1, 2 and 4", or "1 to 7" for a run of them.
+
+    >>> numbered([4]), numbered([1, 2, 4]), numbered([1, 2, 3, 4])
+    ('4', '1, 2 and 4', '1 to 4')
+    """
+    run = len(joints) > 2 and list(joints) == list(range(joints[0], joints[-1] + 1))
+    return f"{joints[0]} to {joints[-1]}" if run else listed([str(j) for j in joints])
+
+
+def listed(items: Sequence[str]) -> str:
+    """Items with commas, and "and" before the last."""
+    return " and ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else "".join(items)
+
+
+def phrase(finding: Finding) -> str:
+    """What is missing and how much of it, without when."""
+    known = PHRASES.get(finding.effect, Phrase("{who} {has} " + finding.title))
+    main = finding.parameters.get(known.key)
+    template = known.less if known.less and _number(main) < 0.0 else known.more
+    several = len(finding.joints) > 1
+    values: Mapping[str, str] = {
+        key: parameter(finding, key)
+        for key, value in finding.parameters.items()
+        if np.ndim(value) == 0
+    }
+    derived = {
+        "who": who(finding.effect, finding.joints),
+        "lacks": "lack" if several else "lacks",
+        "has": "have" if several else "has",
+        "is": "are" if several else "is",
+        "x": parameter(finding, known.key, size=True) if known.key else "",
+        "torque": _worth(finding),
+    }
+    if finding.effect == "base_tilt":
+        derived["tilt"] = norm(finding, TILT, 180.0 / math.pi, "°")
+    if finding.effect == "external_wrench":
+        derived["force"] = _push(finding)
+    return template.format_map({**values, **derived})
+
+
+def _push(finding: Finding) -> str:
+    force = [_number(finding.parameters.get(key)) for key in FORCE]
+    if np.any(np.nan_to_num(force) != 0.0):
+        return norm(finding, FORCE, 1.0, "N")
+    return "a moment of " + norm(finding, MOMENT, 1.0, "N m")
+
+
+def _worth(finding: Finding) -> str:
+    worth = np.asarray(finding.torque_rms_nm, dtype=float)
+    return f"{plain(np.max(worth), 2)} N m of torque" if worth.size else "its torque differs"
+
+
+def _order(value: float) -> int:
+    return math.floor(math.log10(abs(value)))
+
+
+def _is_size(value: Any) -> bool:
+    return value is not None and math.isfinite(value) and value != 0.0
+
+
+def _times(value: Any, factor: float) -> float | None:
+    return None if value is None else factor * value
+
+
+def _number(value: Any) -> float:
+    return math.nan if value is None else float(value)

@@ -1,0 +1,242 @@
+"""Where simulation and data disagree, which effect is missing, what the gap is with it.
+
+    recordings, nominal model -> screened -> smooth -> searched -> named -> added -> measured again
+
+Reads nothing but the recordings and the model.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from adapter.gap.findings import findings_of, leftovers_of
+from adapter.gap.fit import Fit, theta_prior
+from adapter.gap.inertias import wrong_inertias
+from adapter.gap.noise import noise_of
+from adapter.gap.recorded import Recorded
+from adapter.gap.refusals import Refusal, refuse
+from adapter.gap.result import Curves, GapResult, RolloutCurves, Shortfall
+from adapter.gap.search import Found, search
+from adapter.gap.shrink import (
+    Simulate,
+    held_out_models,
+    model_of,
+    rms,
+    rollout_errors,
+    torque_errors,
+)
+from adapter.gap.signals import Signals, prepare
+from adapter.model import SelfModel
+from adapter.records import Array
+from adapter.rigid_arm import RigidArm
+from adapter.robots import documented
+from adapter.torque import active_effects
+from drivers.mcap_file import read_log
+
+NOT_TOLD = ("motion",)  # refusals that are an answer: the recording holds too little
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class GapSettings:
+    """How the gap is sought.
+
+    Attributes:
+        inertia_prior: by which share the model's inertias may be off, one standard deviation.
+        validate_from_s: with one recording: fit before it, score after it; None: by blocks.
+    """
+
+    inertia_prior: float = 0.02
+    validate_from_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.inertia_prior <= 1.0:
+            raise ValueError(f"the inertias' prior must be in (0, 1], got {self.inertia_prior}")
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is there to work with: recordings to fit, recordings to score on, joints that move."""
+
+    model: SelfModel
+    fitted: tuple[Recorded, ...]
+    scored: tuple[Recorded, ...]
+    moving: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def folds(self) -> bool:
+        """The fit's own recordings are scored, each block by a fit without it."""
+        return self.fitted == self.scored
+
+
+def analyse(
+    logs: Sequence[Path | str],
+    model: Path | str | SelfModel,
+    settings: GapSettings | None = None,
+    simulate: Simulate | None = None,
+    model_out: Path | None = None,
+    progress: Progress = lambda text: None,
+) -> GapResult:
+    """Find what the model lacks.
+
+    Args:
+        logs: MCAP recordings; of several the last one is held out.
+        model: self model, or a file of one, or a URDF, or a known robot's name.
+        settings: see there.
+        simulate: forward simulation; without it only torques are compared.
+        model_out: where the new model goes.
+        progress: hears what is being done.
+
+    Raises:
+        Refusal: another robot; units, sign or order of the signals are not the model's.
+        DriverError, ModelError: unreadable files.
+    """
+    begun = time.monotonic()
+    settings = settings or GapSettings()
+    name = model.name if isinstance(model, SelfModel) else str(model)
+    nominal = model if isinstance(model, SelfModel) else documented(str(model))
+    try:
+        task = _task([Path(log) for log in logs], nominal, settings, progress)
+    except Refusal as refusal:
+        if refusal.kind not in NOT_TOLD:
+            raise
+        return _untold(nominal, name, logs, str(refusal))
+    progress("smoothing")
+    found = _searched(task, settings, progress)
+    result = _measured(task, found, simulate, progress)
+    if model_out is not None:
+        model_of(nominal, found.fit).save(model_out)
+        result = replace(result, model_out=str(model_out))
+    return replace(result, model_in=name, wall_s=time.monotonic() - begun)
+
+
+def _task(
+    logs: Sequence[Path], model: SelfModel, settings: GapSettings, progress: Progress
+) -> Task:
+    """Read and screen. Raises Refusal."""
+    arm = RigidArm.of(model)
+    recordings, moving, notes = [], set(range(arm.n)), []
+    for path in logs:
+        progress(f"reading {path.name}")
+        screened = refuse(read_log(path), model, arm)
+        recordings.append(Recorded.of(screened.log, screened.timing.lateness_s))
+        moving &= set(screened.moving)
+        prefix = f"{path.name}: " if len(logs) > 1 else ""
+        notes += [prefix + sentence for sentence in screened.notes]
+    joints = tuple(sorted(moving))
+    if len(recordings) > 1:
+        fitted, scored = tuple(recordings[:-1]), tuple(recordings[-1:])
+    elif settings.validate_from_s is not None:
+        fitted, scored = _split(recordings[0], settings.validate_from_s)
+    else:
+        fitted = scored = tuple(recordings)
+    return Task(model, fitted, scored, joints, tuple(notes))
+
+
+def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorded]]:
+    if not whole.t[0] + 3.0 < at_s < whole.t[-1] - 2.0:
+        raise ValueError(
+            f"validation from {at_s} s needs 3 s before and 2 s after it; "
+            f"{whole.name} has {whole.t[-1]:.1f} s"
+        )
+    cut = int(np.searchsorted(whole.t, at_s))
+    return (whole.part(slice(cut)),), (whole.part(slice(cut, None)),)
+
+
+def _searched(task: Task, settings: GapSettings, progress: Progress) -> Found:
+    arm = RigidArm.of(task.model)
+    known = active_effects(task.model.effects, arm.n)
+    signals = tuple(prepare(r.t, r.q, r.dq, r.tau, arm, r.dq_late_s) for r in task.fitted)
+    prior = theta_prior(arm.theta, settings.inertia_prior)
+    zero = np.zeros_like(arm.theta)
+    fit = Fit(signals, prior, (), zero, known=known)
+    fit = replace(fit, noise=tuple(noise_of(r) for r in fit.residuals()))
+    progress("searching")
+    found = search(fit, task.moving, progress)
+    return wrong_inertias(fit, found, task.moving) or found
+
+
+def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Progress) -> GapResult:
+    """Before and after on held-out data, and all that was found."""
+    new = model_of(task.model, found.fit)
+    after = held_out_models(task.model, found.fit, found.carried) if task.folds else [new]
+    errors = [torque_errors(r, task.model, after) for r in task.scored]
+    before = Shortfall(rms([e.before for e in errors]))
+    behind = Shortfall(rms([e.after for e in errors]))
+    rollouts: tuple[RolloutCurves, ...] = ()
+    if simulate is not None:
+        progress("simulating forward")
+        runs = [rollout_errors(r, task.model, after, simulate) for r in task.scored]
+        before = replace(
+            before,
+            rollout_rmse_rad=rms([x.before_q for x in runs]),
+            rollout_rmse_rad_s=rms([x.before_dq for x in runs]),
+        )
+        behind = replace(
+            behind,
+            rollout_rmse_rad=rms([x.after_q for x in runs]),
+            rollout_rmse_rad_s=rms([x.after_dq for x in runs]),
+        )
+        rollouts = tuple(x.curves for x in runs)
+    ends = [float(r.t[-1]) for r in task.fitted]
+    findings = findings_of(found, ends)
+    return GapResult(
+        joint_names=task.model.tree.joint_names,
+        model_name=task.model.name,
+        recordings=tuple(dict.fromkeys(r.name for r in (*task.fitted, *task.scored))),
+        model_in="",
+        noise_floor_nm=np.max([noise.level for noise in found.fit.noise], axis=0),
+        before=before,
+        after=behind,
+        findings=findings,
+        unexplained=leftovers_of(found, ends),
+        corrections=found.fit.dtheta,
+        corrections_prior=found.fit.prior,
+        notes=task.notes,
+        curves=tuple(_curves(task, found, i) for i in range(len(task.fitted))),
+        rollouts=rollouts,
+        what_next=tuple(dict.fromkeys(f.split_by for f in findings if f.overlaps)),
+    )
+
+
+def _curves(task: Task, found: Found, i: int) -> Curves:
+    own: Signals = found.fit.recordings[i]
+    nominal = Fit(
+        (own,), found.fit.prior, (), np.zeros_like(found.fit.dtheta), known=found.fit.known
+    )
+    named = tuple(e for e in found.fit.named if ":" not in e.candidate.effect.name)
+    rows = np.searchsorted(own.motion.t, own.t - 1e-9)
+    motion = own.motion
+    return Curves(
+        task.fitted[i].name,
+        own.t,
+        motion.q[rows],
+        motion.dq[rows],
+        motion.ddq[rows],
+        own.tau,
+        nominal.residual(0),
+        replace(found.fit, named=named).residual(i),
+        np.zeros(len(own.t), dtype=bool),
+    )
+
+
+def _untold(model: SelfModel, name: str, logs: Sequence[Path | str], problem: str) -> GapResult:
+    unknown: Array = np.full(model.tree.n, np.nan)
+    nothing = Shortfall(unknown, unknown, unknown)
+    return GapResult(
+        joint_names=model.tree.joint_names,
+        model_name=model.name,
+        recordings=tuple(Path(log).name for log in logs),
+        model_in=name,
+        noise_floor_nm=unknown,
+        before=nothing,
+        after=nothing,
+        problem=problem,
+    )

@@ -1,0 +1,170 @@
+"""The gap on one self-contained page: what is missing, how sure that is, what it brings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.gap.phrases import DASH, listed, plain
+from adapter.gap.result import GapResult, Leftover
+from adapter.gap.words import fall, headline, signal_words
+from adapter.records import Array
+from adapter.report.gap_panels import error_panels
+from adapter.report.gap_signatures import signature_panels, unexplained_panels
+from adapter.report.gap_tables import (
+    correction_ratio,
+    correction_table,
+    error_table,
+    finding_rows,
+    rival_rows,
+    tied,
+)
+from adapter.report.html import fill, write_whole
+from adapter.report.page import Tile
+from adapter.report.words import NARROW
+
+TEMPLATE = "gap.html"
+MOST_NAMED = 3  # recordings, beside the name of the arm
+OURS = ("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints")
+
+
+def render_gap_page(result: GapResult) -> str:
+    """The page as HTML text; parts that the result does not have are left out."""
+    return fill(TEMPLATE, context(result))
+
+
+def write_gap_page(result: GapResult, path: str | Path) -> Path:
+    """Write the page, whole or not at all. Returns the path.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+    """
+    return write_whole(path, render_gap_page(result))
+
+
+def context(result: GapResult) -> dict[str, Any]:
+    """What the template shows."""
+    told = result.problem is None
+    shown = _tiles(result) if told else []
+    return {
+        "robot": result.model_name,
+        "headline": _headline(result),
+        "problem": not told,
+        "recordings": _named(result.recordings),
+        "several": len(result.recordings) > 1,
+        "tiles": shown,
+        "columns": max(len(shown), 1),
+        "findings": finding_rows(result),
+        "told": told,
+        "error_table": error_table(result) if told else None,
+        "after_words": _after_words(result),
+        "errors": error_panels(result) if told else [],
+        "signatures": signature_panels(result),
+        "marked": any(f.interval_s[0] > 0.0 or not f.lasting for f in result.findings),
+        "rollouts": bool(result.rollouts),
+        "rivals": rival_rows(result),
+        "unexplained": [_leftover(item) for item in result.unexplained],
+        "unexplained_panels": unexplained_panels(result),
+        "correction": correction_table(result) if told else None,
+        "correction_words": _correction_words(result),
+        "next": [_first_capital(text) for text in result.what_next],
+        "notes": result.notes,
+        "provenance": _provenance(result),
+    }
+
+
+def _headline(result: GapResult) -> str:
+    """As a sentence on a page: capital, arrow, no break before a unit."""
+    text = headline(result)
+    if result.problem is not None:
+        return text
+    text = _first_capital(text) if text.startswith(OURS) else text
+    return tied(text.replace(" -> ", " → ")) + "."
+
+
+def _first_capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _leftover(item: Leftover) -> str:
+    begin, end = item.interval_s
+    signals = [f"the {signal_words(name)} ({name})" for name in item.depends_on]
+    times = item.rmse_nm / item.noise_floor_nm if item.noise_floor_nm > 0.0 else np.nan
+    size = f", {plain(times, 2)} times its noise," if np.isfinite(times) else ""
+    follows = f"that follow {listed(signals) or 'no signal'}"
+    said = f"{plain(item.rmse_nm, 2)} N m{size} {follows}, from {begin:.1f} to {end:.1f} s"
+    return tied(f"Joint {item.joint}: {said}.")
+
+
+def _named(recordings: Sequence[str]) -> list[str]:
+    """The first few, and how many more."""
+    more = len(recordings) - MOST_NAMED
+    return [*recordings[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])]
+
+
+def _after_words(result: GapResult) -> str:
+    corrected = "the small correction of the inertias" if correction_table(result) else ""
+    found = "what was found" if result.findings else ""
+    return "with " + (" and ".join(filter(None, (found, corrected))) or "nothing added")
+
+
+def _tiles(result: GapResult) -> list[Tile]:
+    before, after = result.before, result.after
+    noise = np.asarray(result.noise_floor_nm, dtype=float)
+    count = len(result.findings)
+    left = len(result.unexplained)
+    note = f"{left} thing{'' if left == 1 else 's'} unexplained" if left else "nothing unexplained"
+    tiles = [Tile("Effects found", str(count), note)]
+    worst = _worst(before.torque_rmse_nm / np.where(noise > 0.0, noise, np.nan))
+    if worst is not None:
+        first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
+        tiles.append(Tile("Torque error", _fall(first, last), f"joint {worst + 1}, the worst; rms"))
+        tiles.append(
+            Tile(
+                "In units of its noise",
+                _arrow(first / noise[worst], last / noise[worst], "×"),
+                tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
+            )
+        )
+    return [*tiles, *_rollout_tile(result)]
+
+
+def _rollout_tile(result: GapResult) -> list[Tile]:
+    before, after = result.before.rollout_rmse_rad, result.after.rollout_rmse_rad
+    worst = None if before is None else _worst(before)
+    if worst is None or before is None:
+        return []
+    last = np.nan if after is None else after[worst]
+    value = _arrow(1e3 * before[worst], 1e3 * last, "mrad")
+    return [Tile("Forward simulation off by", value, tied(f"joint {worst + 1}, rms within 0.5 s"))]
+
+
+def _worst(values: Array) -> int | None:
+    values = np.asarray(values, dtype=float)
+    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
+
+
+def _fall(before: float, after: float) -> str:
+    return f"{fall(before, after)} N m".replace("->", "→").replace(" ", NARROW)
+
+
+def _arrow(before: float, after: float, unit: str) -> str:
+    return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
+
+
+def _correction_words(result: GapResult) -> str:
+    ratio = correction_ratio(result)
+    if ratio is None or result.problem is not None:
+        return ""
+    largest = float(np.abs(ratio).max()) if ratio.size else 0.0
+    return f"The largest part is {largest:.1f} times the deviation that was expected beforehand."
+
+
+def _provenance(result: GapResult) -> list[tuple[str, str]]:
+    took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
+    rows = [("Recordings", ", ".join(result.recordings) or DASH), ("Model", result.model_in)]
+    out = result.model_out or "none was written"
+    return [*rows, ("New model", out), ("Time taken", took)]

@@ -1,0 +1,70 @@
+"""Panels of the gap's size: errors of every joint before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from adapter.gap.result import GapResult
+from adapter.records import Array
+from adapter.report.style import ACCENT, GOAL, GRID, MUTED, Drawing, Panel, power_of_ten, time_axis
+
+
+def error_panels(result: GapResult) -> list[Panel]:
+    """Torque and rollout error of every joint, before and after."""
+    before, after = result.before, result.after
+    panels = []
+    if _any(before.torque_rmse_nm):
+        drawing = _steps(before.torque_rmse_nm, after.torque_rmse_nm, result.noise_floor_nm)
+        panels.append(drawing.panel("Torque error by joint", "N m rms", "inverse dynamics"))
+    if before.rollout_rmse_rad is not None and _any(before.rollout_rmse_rad):
+        rollout = after.rollout_rmse_rad
+        end = np.full(len(before.rollout_rmse_rad), np.nan) if rollout is None else rollout
+        drawing = _steps(1e3 * before.rollout_rmse_rad, 1e3 * end, None)
+        note = "forward simulation, restarted from the data every 0.5 s"
+        panels.append(drawing.panel("Position error by joint", "mrad rms", note))
+    return panels
+
+
+def _any(values: Array) -> bool:
+    return bool((np.isfinite(values) & (np.asarray(values) > 0.0)).any())
+
+
+def _steps(before: Array, after: Array, noise: Array | None) -> Drawing:
+    """An arrow per joint from its error before to that after, on a logarithmic scale."""
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    ax.set_yscale("log")
+    for j, (first, last) in enumerate(zip(before, after, strict=True)):
+        if noise is not None and noise[j] > 0.0:
+            ax.plot([j - 0.3, j + 0.3], [noise[j]] * 2, color=MUTED, linewidth=1.4)
+        if not (np.isfinite(first) and first > 0.0):
+            continue
+        ax.plot([j], [first], "o", color=GOAL, markersize=5)
+        if np.isfinite(last) and last > 0.0:
+            ax.plot([j, j], [first, last], color=GRID, linewidth=2.5, zorder=1)
+            ax.plot([j], [last], "o", color=ACCENT, markersize=5)
+    _log_scale(ax, [before, after, *([] if noise is None else [noise])])
+    ax.set_xlim(-0.6, len(before) - 0.4)
+    ax.xaxis.set_major_locator(FixedLocator(range(len(before))))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{round(x) + 1}"))
+    ax.grid(False, axis="x")
+    time_axis(drawing, "joint")
+    return drawing
+
+
+def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
+    """Limits that hold everything, and ticks at 1, 2 and 5 times powers of ten."""
+    values = np.concatenate([np.asarray(x, dtype=float) for x in tables])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    low, high = values.min() / 1.5, values.max() * 1.5
+    powers = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    wide = len(powers) > 4
+    ticks = [s * 10.0**p for p in powers for s in ((1.0,) if wide else (1.0, 2.0, 5.0))]
+    ax.set_ylim(low, high)
+    ax.yaxis.set_major_locator(FixedLocator([t for t in ticks if low <= t <= high]))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))

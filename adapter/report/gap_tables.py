@@ -1,0 +1,152 @@
+"""Tables of the gap report as rows of text: findings, errors by joint, rivals, corrections."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.gap.phrases import DASH, THETA, THETA_UNITS, parameter_lines, plain, who
+from adapter.gap.result import Finding, GapResult
+from adapter.gap.words import percent, span, title_of
+from adapter.records import Array
+from adapter.report.tables import Table
+from adapter.report.words import NARROW
+
+MOST_CORRECTIONS = 6
+
+
+UNIT = re.compile(
+    r"(?<=\d) (N m s/rad|N m/rad|N m/s|N m|kg m²|kg m|kg|N|mrad|rad|mm|ms|s|%)(?![\w²])"
+)
+
+
+def tied(text: str) -> str:
+    """Words as a page shows them: a true minus, no line break between a number and its unit."""
+    text = re.sub(r"(?<![\w.])-(?=\d)", "−", text).replace(" ± ", f"{NARROW}±{NARROW}")
+    return UNIT.sub(lambda found: NARROW + found[1].replace(" ", NARROW), text)
+
+
+@dataclass(frozen=True)
+class FindingRow:
+    """A finding as it stands in the table."""
+
+    what: str
+    where: str
+    when: str
+    values: list[str]
+    evidence: str
+    worth: str
+
+
+def finding_rows(result: GapResult) -> list[FindingRow]:
+    """What, where, when, how much, how sure."""
+    return [
+        FindingRow(
+            what=_first_capital(finding.title),
+            where=who(finding.effect, finding.joints),
+            when=span(finding) or "throughout",
+            values=[tied(line) for line in parameter_lines(finding)],
+            evidence=percent(finding.evidence).replace("more than", ">"),
+            worth=_worth(finding),
+        )
+        for finding in result.findings
+    ]
+
+
+def _worth(finding: Finding) -> str:
+    worth = np.asarray(finding.torque_rms_nm, dtype=float)
+    if not np.isfinite(worth).any():
+        return DASH
+    return f"{plain(np.nanmax(worth), 2)} N m"
+
+
+def _first_capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
+    """(finding, what else it could be and how much of it that explains, how to tell)."""
+    return [
+        (
+            f"{_first_capital(finding.title)}, {who(finding.effect, finding.joints)}",
+            ", ".join(f"{title_of(name)} {percent(x)}" for name, x in finding.overlaps.items()),
+            finding.split_by,
+        )
+        for finding in result.findings
+        if finding.overlaps
+    ]
+
+
+def error_table(result: GapResult) -> Table:
+    """Errors before and after by joint: torque in N m and times its noise, rollouts in mrad."""
+    before, after = result.before, result.after
+    heads = ["Joint", "Noise", *["Before", "After"] * 2]
+    units = ["", "N m", *["torque, N m"] * 2, *["× noise"] * 2]
+    decimals = [3, 3, 3, 1, 1]
+    noise = np.asarray(result.noise_floor_nm, dtype=float)
+    floor = np.where(noise > 0.0, noise, np.nan)
+    columns = [
+        noise,
+        before.torque_rmse_nm,
+        after.torque_rmse_nm,
+        before.torque_rmse_nm / floor,
+        after.torque_rmse_nm / floor,
+    ]
+    for digits, factor, unit, key in (
+        (2, 1e3, "rollout, mrad", "rollout_rmse_rad"),
+        (1, 1e3, "rollout, mrad/s", "rollout_rmse_rad_s"),
+    ):
+        pair = getattr(before, key), getattr(after, key)
+        if all(x is None or not np.isfinite(x).any() for x in pair):
+            continue
+        columns += [_scaled(x, factor, len(noise)) for x in pair]
+        heads += ["Before", "After"]
+        units += [unit, unit]
+        decimals += [digits, digits]
+    rows = [
+        [name, *(_fixed(x[j], digits) for x, digits in zip(columns, decimals, strict=True))]
+        for j, name in enumerate(result.joint_names)
+    ]
+    return Table(heads, rows, units)
+
+
+def _fixed(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if np.isfinite(value) else DASH
+
+
+def _scaled(values: Array | None, factor: float, n: int) -> Array:
+    return np.full(n, np.nan) if values is None else factor * np.asarray(values, dtype=float)
+
+
+def correction_table(result: GapResult) -> Table | None:
+    """The largest parts of the inertial correction; None without any."""
+    ratio = correction_ratio(result)
+    if ratio is None or result.corrections is None or result.corrections_prior is None:
+        return None
+    rows = []
+    for place in np.argsort(-np.abs(ratio), axis=None)[:MOST_CORRECTIONS]:
+        link, part = np.unravel_index(place, ratio.shape)
+        if ratio[link, part] == 0.0:
+            break
+        rows.append(
+            [
+                f"link {link + 1}",
+                THETA[part],
+                tied(f"{result.corrections[link, part]:+.2g} {THETA_UNITS[part]}"),
+                f"± {plain(result.corrections_prior[link, part], 2)} {THETA_UNITS[part]}",
+                tied(f"{ratio[link, part]:+.1f}"),
+            ]
+        )
+    heads = ["Link", "Parameter", "Correction", "Expected", "In units of it"]
+    return Table(heads, rows) if rows else None
+
+
+def correction_ratio(result: GapResult) -> Array | None:
+    """(n, 10) corrections in standard deviations of their prior, 0 where nothing was allowed."""
+    if result.corrections is None or result.corrections_prior is None:
+        return None
+    prior = np.asarray(result.corrections_prior, dtype=float)
+    known = np.isfinite(prior) & (prior > 0.0) & np.isfinite(result.corrections)
+    return np.where(known, result.corrections / np.where(known, prior, 1.0), 0.0)
