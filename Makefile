@@ -28,7 +28,9 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 trials: $(STAMP)
+	mkdir -p runs
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
 
 soak: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10

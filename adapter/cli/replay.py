@@ -17,9 +17,10 @@ from adapter.cli.results import conclude, results_folder
 from adapter.config import REAL_ARM_EFFECTS, Config
 from adapter.errors import SettingsError
 from adapter.filters import noise_from_samples
+from adapter.matching import matching
 from adapter.model import SelfModel
 from adapter.outcome import learned_model
-from adapter.replay import Replay, matching, seconds
+from adapter.replay import Replay, seconds
 from adapter.replay import replay as learn_from
 from adapter.score import figures, reference_from
 from adapter.torque import ModelTorque

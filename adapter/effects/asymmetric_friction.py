@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
 import numpy as np
 
 from adapter.effects.base import (
@@ -23,7 +26,10 @@ class AsymmetricFriction(JointTorque):
     positive = ("Fc_pos", "Fc_neg")
     log_odds = -3.0  # Coulomb friction and an offset say the same in simpler words
     inexact = 0.02
-    simpler = {"coulomb_friction": 0.1, "load_dependent_friction": 0.1}
+    simpler: ClassVar[Mapping[str, float]] = {
+        "coulomb_friction": 10.0,
+        "load_dependent_friction": 10.0,
+    }
     split_by = (
         "hold the joint still after moving in either direction: an offset stays, friction fades"
     )

@@ -7,6 +7,9 @@ import numpy as np
 from adapter.effects.base import ALL, Array, Motion, Parameter, SensorEffect, Values
 
 
+MOST_S = 0.012  # a bus, a filter and a hold together are faster
+
+
 class SignalDelay(SensorEffect):
     """Torque signals that arrive later than positions; of all joints or of one."""
 
@@ -17,6 +20,10 @@ class SignalDelay(SensorEffect):
     typical = 3e-3
     inexact = 0.02
     split_by = "move faster, with sharp reversals"
+
+    def possible(self, values: Values) -> bool:
+        """A dozen milliseconds at most; what asks for more is something else."""
+        return abs(float(values["d"])) < MOST_S
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """tau(t - d): by its rate, which is exact enough for a few ms of smooth torque."""

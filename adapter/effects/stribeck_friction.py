@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class StribeckFriction(JointTorque):
     positive = ("Fc", "Fs")
     log_odds = -3.0
     inexact = 0.03
-    simpler = {"coulomb_friction": 0.02, "asymmetric_friction": 0.02}
+    simpler: ClassVar[Mapping[str, float]] = {"coulomb_friction": 0.02, "asymmetric_friction": 0.02}
     split_by = "move the joint at constant speeds from 0.01 to 0.5 rad/s"
 
     def templates(self) -> tuple[Template, ...]:

@@ -29,6 +29,7 @@ from adapter.gap.signals import Signals
 from adapter.records import Array
 from adapter.torque import added, bodies, moved_links
 
+THETA_EFFECTS = ("payload", "link_inertia")
 STEP = 0.02  # of a coefficient's typical size, for the differences
 
 
@@ -51,6 +52,11 @@ class Candidate:
     def key(self) -> tuple[str, int]:
         """Effect and joint."""
         return self.effect.name, self.joint
+
+    @property
+    def columns_are_theta(self) -> bool:
+        """Whether its coefficients are inertial parameters of a link."""
+        return self.effect.name in THETA_EFFECTS
 
     @property
     def prior_std(self) -> Array:
@@ -111,7 +117,7 @@ def signatures(
                 continue
             for template in effect.templates():
                 count = len(template.prior_std)
-                if effect.name in ("payload", "link_inertia"):
+                if effect.name in THETA_EFFECTS:
                     k = 10 * (joint if joint >= 0 else n - 1)
                     columns = tuple(range(k, k + 10))
                 else:
@@ -152,7 +158,8 @@ def _change(base: Base, effect: Effect, joint: int, values: dict) -> Array:  # t
     if isinstance(effect, TorqueEffect):
         return effect.torque(links, base.rigid, joint, values)
     if isinstance(effect, SensorEffect):
-        return effect.measured(links, base.total, joint, values) - base.total
+        # not of the total: friction that was named would make a gain look like friction
+        return effect.measured(links, base.rigid, joint, values) - base.rigid
     if isinstance(effect, MotionEffect):
         moved = effect.link_side(links, base.rigid, joint, values)
         return links.arm.torque(moved.q, moved.dq, moved.ddq) - links.arm.torque(

@@ -11,19 +11,23 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from adapter.effects import CATALOGUE
 from adapter.effects.active import WHOLE, Active
+from adapter.effects.base import Motion, TorqueEffect
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried, Score, score
 from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
 from adapter.gap.signals import Signals
 from adapter.records import Array
 from adapter.rigid_arm import RigidArm
-from adapter.torque import moved_links, sensed_torque
+from adapter.torque import bodies, moved_links, sensed_torque
 
 TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
+EDGE = 0.3  # of a jump: friction turns round more softly than its equation
+JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BAND_HZ = 25.0  # samples a second
 SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
@@ -42,6 +46,11 @@ class Named:
     x: Array
     interval_s: tuple[float, float] = WHOLE
     recording: int | None = None
+
+    @property
+    def is_pattern(self) -> bool:
+        """Whether it has no name in the catalogue."""
+        return self.candidate.effect.name not in CATALOGUE
 
     @property
     def values(self) -> dict[str, Any]:
@@ -145,8 +154,9 @@ class Fit:
             if e.recording not in (None, recording):
                 continue
             if e.candidate.effect.inexact:
-                share = e.candidate.effect.inexact * self.contribution(recording, k)
-                weight /= np.sqrt(1.0 + (share / level) ** 2)
+                torque = self.contribution(recording, k)
+                unsure = np.hypot(e.candidate.effect.inexact * torque, EDGE * _jumps(torque))
+                weight /= np.sqrt(1.0 + (unsure / level) ** 2)
             for edge in e.interval_s:
                 after = EDGE_S + ORDER / BAND_HZ
                 weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
@@ -193,18 +203,45 @@ class Fit:
         """(c, k, n) change of the torque per unit of each coefficient, where they are."""
         own, effects = self.signals(recording), self.actives(recording)
         links = moved_links(own.motion, effects)
-        theta = np.moveaxis(own.low(links.arm.regressor(links.q, links.dq, links.ddq)), 2, 0)
+        rigid = bodies(links, effects)
+        Y = links.arm.regressor(links.q, links.dq, links.ddq)
         total = sensed_torque(own.motion, effects)
-        rest = [-own.low(own.motion.rate(total))]
+        tables = [np.moveaxis(own.low(Y), 2, 0), -own.low(own.motion.rate(total))[None]]
         for place, e in enumerate(self.named):
-            for i in range(len(e.x)):
-                rest.append(self._difference(recording, place, i, total))
-        return np.concatenate([theta, np.array(rest)])
+            shape = (len(e.x), *own.tau.shape)
+            if e.recording not in (None, recording):
+                tables.append(np.zeros(shape))
+            elif isinstance(e.candidate.effect, TorqueEffect):
+                tables.append(own.low_all(self._added(e, links, rigid)))
+            elif e.candidate.columns_are_theta:
+                k = 10 * e.candidate.joint if e.candidate.joint >= 0 else Y.shape[2] - 10
+                columns = np.moveaxis(Y[:, :, k : k + 10], 2, 0)
+                tables.append(own.low_all(columns * self._gate(e, links.t)))
+            else:
+                changes = [self._difference(recording, place, i, total) for i in range(len(e.x))]
+                tables.append(np.array(changes))
+        return np.concatenate(tables)
+
+    @staticmethod
+    def _gate(e: Named, t: Array) -> Array:
+        begin, end = e.interval_s
+        return np.asarray(((t >= begin) & (t < end)).astype(float)[:, None])
+
+    def _added(self, e: Named, links: Motion, rigid: Array) -> Array:
+        """(c, m, n) change of an added torque per unit of each of its coefficients."""
+        effect, decode = e.candidate.effect, e.candidate.template.decode
+        assert isinstance(effect, TorqueEffect)
+        at = effect.torque(links, rigid, e.candidate.joint, decode(e.x))
+        out = []
+        for i, std in enumerate(e.candidate.prior_std):
+            x = e.x.copy()
+            x[i] += STEP * std
+            moved = effect.torque(links, rigid, e.candidate.joint, decode(x))
+            out.append((moved - at) / (STEP * std) * self._gate(e, links.t))
+        return np.array(out)
 
     def _difference(self, recording: int, place: int, i: int, total: Array) -> Array:
         e = self.named[place]
-        if e.recording not in (None, recording):
-            return np.zeros_like(self.recordings[recording].tau)
         x = e.x.copy()
         h = STEP * e.candidate.prior_std[i]
         x[i] += h
@@ -222,13 +259,36 @@ class Fit:
         return Carried(N, self.prior_std, data)
 
 
+def _jumps(torque: Array) -> Array:
+    """(k, n) by how much a torque (k, n) changes around each instant."""
+    back, ahead = JUMP_ROWS
+    size, shift = back + ahead + 1, (back - ahead) // 2
+    high = maximum_filter1d(torque, size, axis=0, origin=shift)
+    return np.asarray(high - minimum_filter1d(torque, size, axis=0, origin=shift))
+
+
 def worth(fit: Fit, carried: Carried, place: int) -> Score:
-    """Evidence of one of the named effects, the others and the corrections carried along."""
-    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:place])
-    own = np.arange(begin, begin + len(fit.named[place].x))
-    rest = np.delete(np.arange(len(carried.N)), own)
+    """Evidence of one of the named effects, what is carried with it eliminated."""
+    own, rest = beside(fit, place)
     others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
     return score(*others.without(carried.N[own]), carried.prior_std[own])
+
+
+def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of a named effect, and those that are carried along when it is judged.
+
+    These are all others; but an effect of the catalogue need not pay beside patterns, which
+    could stand for it.
+    """
+    sizes = [fit.dtheta.size + 1, *(len(e.x) for e in fit.named)]
+    ends = np.cumsum(sizes)
+    own = np.arange(ends[place], ends[place + 1])
+    left_out = [own]
+    if not fit.named[place].is_pattern:
+        left_out += [
+            np.arange(ends[k], ends[k + 1]) for k, e in enumerate(fit.named) if e.is_pattern
+        ]
+    return own, np.delete(np.arange(ends[-1]), np.concatenate(left_out))
 
 
 def refitted(fit: Fit, rounds: int = 3) -> tuple[Fit, Carried]:

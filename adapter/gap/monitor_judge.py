@@ -25,6 +25,7 @@ NEW = 4.0  # log evidence for a start inside the window against one before it
 SOONEST_S = 0.7  # after its start: before, all names look alike
 LATEST_S = 1.4  # after its start the best name is told even if another is close
 OVER_THRESHOLD = 10.0
+OVER_SHARE = 0.7  # of the best new name's evidence, which has more freedom around the edge
 PEAK_FACTOR = 2.0  # a report needs so many times the evidence that came and went before
 PEAK_KEEP = 0.997  # of such a peak, from one group to the next: a minute
 QUIET_GROUPS = 30  # after the start, while the window fills and peaks are learned
@@ -115,7 +116,7 @@ class Judge:
         first, t = int(np.argmax(own)) * ROWS_PER_GROUP, evidence.rows.t
         ends = t[max(first - ROWS_PER_GROUP, 0) : first + ROWS_PER_GROUP : 2]
         gains = [self._gain_of_end(found, float(end), evidence) for end in ends]
-        if max(gains) > max(OVER_THRESHOLD, float(scores.max()) - 3.0 * MARGIN):
+        if max(gains) > max(OVER_THRESHOLD, OVER_SHARE * float(scores.max())):
             return float(ends[int(np.argmax(gains))])
         return None
 

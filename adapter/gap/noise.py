@@ -11,6 +11,7 @@ from scipy.signal import welch
 from adapter.records import Array
 
 ORDER = 6  # at 25 Hz
+WHITE = 0.02  # share of white noise added: edges of models are not known any better
 WINDOW = 128  # samples, 5 s
 LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
@@ -59,7 +60,7 @@ def noise_of(residual: Array, floor: float = LEAST_NM) -> Noise:
         return_onesided=False,
     )
     covariance = np.fft.ifft(power, axis=0).real[: ORDER + 1]
-    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + 1e-3 * covariance[0]
+    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + WHITE * covariance[0]
     n = residual.shape[1]
     ar, sigma = np.zeros((n, ORDER)), np.empty(n)
     for j in range(n):

@@ -15,6 +15,7 @@ STEP_S = 1e-3
 COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
 UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
 FAR_S = 0.05  # a command older than that does not drive any more
+HOLE_S = 0.05  # between samples: what happened in there is not known
 EDGE_S = 0.3
 
 
@@ -27,7 +28,6 @@ class Recorded:
         t: (m,) s since its first sample, increasing; q, dq, tau: (m, n).
         command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
         dq_late_s: how much later dq is than q.
-        weight: whether the fit may use it.
     """
 
     name: str
@@ -45,9 +45,10 @@ class Recorded:
         start = log.stamp_ns[0]
         command_t = commands = None
         if log.commands is not None and len(log.commands.stamp_ns) > 1:
-            order = np.argsort(log.commands.stamp_ns, kind="stable")
-            command_t = 1e-9 * (log.commands.stamp_ns[order] - start).astype(float)
-            commands = log.commands.tau[order]
+            stamps, first = np.unique(log.commands.stamp_ns, return_index=True)
+            known = np.isfinite(log.commands.tau[first]).all(axis=1)
+            command_t = 1e-9 * (stamps[known] - start).astype(float)
+            commands = log.commands.tau[first][known]
         t = 1e-9 * (log.stamp_ns - start).astype(float)
         return cls(log.path.name, t, log.q, log.dq, log.tau, command_t, commands, dq_late_s)
 
@@ -68,6 +69,17 @@ class Recorded:
         """Splines through its motion."""
         return smooth_motion(self.t, self.q, self.dq, self.dq_late_s)
 
+    def grid(self) -> Array:
+        """(m,) s, even times 1 ms apart within the recording, its edges left out."""
+        span = self.t[-1] - self.t[0] - 2 * EDGE_S
+        return self.t[0] + EDGE_S + STEP_S * np.arange(max(int(span / STEP_S), 0))
+
+    def is_whole(self, begin_s: float, end_s: float) -> bool:
+        """Whether there are samples all the way between two of its times."""
+        first, last = np.searchsorted(self.t, (begin_s, end_s))
+        around = self.t[max(first - 1, 0) : last + 1]
+        return bool(len(around) > 1 and np.diff(around).max() < HOLE_S)
+
     def drive(self, t: Array) -> tuple[Array, str]:
         """Torque (m, n) that moved the arm at times t, and which of `COMMANDS`, `MEASURED` it is.
 
@@ -75,12 +87,21 @@ class Recorded:
         or that leave out parts of the time are no drive.
         """
         measured = np.column_stack([np.interp(t, self.t, column) for column in self.tau.T])
-        if self.command_t is None or self.commands is None:
+        given = self._commanded(t)
+        if given is None:
             return measured, MEASURED
+        size = float(np.sqrt(np.mean(measured**2)))
+        off = float(np.sqrt(np.mean((given - measured) ** 2)))
+        return (given, COMMANDS) if off < UNLIKE * size else (measured, MEASURED)
+
+    def _commanded(self, t: Array) -> Array | None:
+        """Commands (m, n) at times t; None where there are none for part of the time."""
+        if self.command_t is None or self.commands is None or len(self.command_t) < 2:
+            return None
         at = self.command_t + COMMAND_DELAY_S
-        whole = at[0] < t[0] + FAR_S and at[-1] > t[-1] - FAR_S and np.diff(at).max() < FAR_S
-        given = np.column_stack([np.interp(t, at, column) for column in self.commands.T])
-        off = np.sqrt(np.mean((given - measured) ** 2)) / np.sqrt(np.mean(measured**2))
-        if not whole or not np.isfinite(off) or off > UNLIKE:
-            return measured, MEASURED
-        return given, COMMANDS
+        inside = at[(at > t[0] - FAR_S) & (at < t[-1] + FAR_S)] if len(t) else at[:0]
+        if len(inside) < 2 or inside[0] > t[0] + FAR_S or inside[-1] < t[-1] - FAR_S:
+            return None
+        if np.diff(inside).max() > FAR_S:
+            return None
+        return np.column_stack([np.interp(t, at, column) for column in self.commands.T])

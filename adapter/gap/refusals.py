@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from adapter.gap.timing import Timing, check_timing, uniform
 from adapter.gap.torque_units import Judge, convincing, readings
 from adapter.gap.torque_words import in_words, unit
+from adapter.matching import matching
 from adapter.model import SelfModel
 from adapter.records import Array
-from adapter.replay import matching
 from adapter.rigid_arm import RigidArm
 from adapter.torque import ModelTorque
 from adapter.validation import GRID_S, smooth

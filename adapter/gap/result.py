@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -199,6 +200,29 @@ class GapResult:
     model_out: str | None = None
     what_next: tuple[str, ...] = field(default=())
     wall_s: float = 0.0
+
+    @classmethod
+    def untold(
+        cls,
+        joint_names: Sequence[str],
+        model_name: str,
+        recordings: Sequence[str],
+        model_in: str,
+        problem: str,
+    ) -> GapResult:
+        """Nothing but the reason why nothing could be told."""
+        unknown: Array = np.full(len(joint_names), np.nan)
+        nothing = Shortfall(unknown, unknown, unknown)
+        return cls(
+            tuple(joint_names),
+            model_name,
+            tuple(recordings),
+            model_in,
+            unknown,
+            nothing,
+            nothing,
+            problem=problem,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """As in the JSON file."""

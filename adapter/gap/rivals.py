@@ -9,7 +9,7 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried, score
-from adapter.gap.fit import Fit, Named
+from adapter.gap.fit import Fit, Named, beside
 from adapter.gap.noise import ORDER
 from adapter.gap.patterns import Pattern
 from adapter.gap.scan import Field, log_odds
@@ -32,6 +32,7 @@ class Rival:
         chi2: fall of the squared distance.
         overlap: share of the named effect's signature that it explains on these data.
         x: its coefficients.
+        credible: physics allows these coefficients, and the effect is not named already.
     """
 
     candidate: Candidate
@@ -39,6 +40,7 @@ class Rival:
     chi2: float
     overlap: float
     x: Array
+    credible: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +61,7 @@ class Standing:
     @property
     def probability(self) -> float:
         """Posterior probability against the best rival."""
-        behind = max((self.gain(rival) for rival in self.rivals), default=-np.inf)
+        behind = max((self.gain(rival) for rival in self.rivals if rival.credible), default=-np.inf)
         return float(1.0 / (1.0 + np.exp(min(behind, 700.0))))
 
     def gain(self, rival: Rival) -> float:
@@ -101,14 +103,14 @@ def price(named: Named) -> float:
 
 def standing(fit: Fit, carried: Carried, field: Field, k: int) -> Standing:
     """The k-th named effect of a fit against all candidates in its interval."""
-    named, own = fit.named[k], place_of(fit, k)
-    rest = np.delete(np.arange(len(carried.N)), own)
+    named = fit.named[k]
+    own, rest = beside(fit, k)
     others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
     mine = score(*others.without(carried.N[own]), named.candidate.prior_std)
     X = fit.whiten(field.within(named.interval_s, named.recording))
     signature = named.x @ carried.N[own]
     G, g = others.without(np.vstack([X, signature]))
-    found = []
+    found, taken = [], {e.candidate.key for e in fit.named}
     for c in field.candidates:
         if c.key == named.candidate.key:
             continue
@@ -118,7 +120,10 @@ def standing(fit: Fit, carried: Carried, field: Field, k: int) -> Standing:
         overlap = float(cross @ np.linalg.solve(wide, cross) / G[-1, -1])
         other = score(block, g[at], c.prior_std)
         odds = price(Named(c, other.x, named.interval_s, named.recording))
-        found.append(Rival(c, other.log_evidence + odds, other.chi2, overlap, other.x))
+        credible = c.key not in taken and c.effect.possible(c.template.decode(other.x))
+        found.append(
+            Rival(c, other.log_evidence + odds, other.chi2, overlap, other.x, credible)
+        )
     found.sort(key=lambda rival: -rival.log_evidence)
     return Standing(
         named.candidate, mine.log_evidence + price(named), mine.chi2, tuple(_best_of_each(found))
@@ -143,12 +148,12 @@ def fold_rows(fit: Fit) -> np.ndarray:
 
 def pays_held_out(fit: Fit, carried: Carried, k: int) -> bool:
     """Whether the k-th named effect predicts blocks that its fit has not seen."""
-    own, fold = place_of(fit, k), fold_rows(fit)
-    rest = np.delete(np.arange(len(carried.N)), own)
+    fold = fold_rows(fit)
+    own, rest = beside(fit, k)
     gain = 0.0
     for f in range(FOLDS):
         seen, new = fold != f, fold == f
-        for sign, at in ((1.0, rest), (-1.0, np.arange(len(carried.N)))):
+        for sign, at in ((1.0, rest), (-1.0, np.concatenate([rest, own]))):
             fitted = Carried(carried.N[np.ix_(at, seen)], carried.prior_std[at], carried.data[seen])
             left = carried.data[new] - fitted.x @ carried.N[np.ix_(at, new)]
             gain += sign * float(left @ left)

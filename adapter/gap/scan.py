@@ -14,14 +14,15 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from adapter.effects.active import WHOLE
-from adapter.effects.base import Effect
+from adapter.effects.base import ALL, Effect
 from adapter.gap.candidates import Candidate, base_of, signatures
-from adapter.gap.evidence import Carried, score, scores
+from adapter.gap.evidence import Carried, Score, score, scores
 from adapter.gap.fit import BAND_HZ, Fit
 from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
 from adapter.gap.patterns import Pattern, line, patterns
 from adapter.records import Array
 
+CATALOGUED, PATTERNS = "catalogued", "patterns"
 BLOCK_S = 0.4
 FEWEST_BLOCKS = 1  # nothing shorter is dated
 FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
@@ -80,12 +81,15 @@ class Field:
 
     Args:
         fit: the model as it stands; joints: (from 0) that move.
+        kind: of the candidates, `CATALOGUED` or `PATTERNS`.
         rich: whiten by that noise; by the fit's own where False.
     """
 
-    def __init__(self, fit: Fit, joints: Sequence[int], rich: bool = True) -> None:
+    def __init__(
+        self, fit: Fit, joints: Sequence[int], kind: str = CATALOGUED, rich: bool = True
+    ) -> None:
         tables, noise = [], []
-        extra = self._patterns(fit, joints)
+        extra = self._patterns(fit, joints) if kind == PATTERNS else []
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
             own = fit.signals(i)
@@ -93,10 +97,16 @@ class Field:
             tables.append(table)
             if rich:
                 noise.append(rich_noise(table, self.candidates, fit.residual(i)))
+        if kind == PATTERNS:
+            self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
         self.fit = fit.with_noise(noise) if rich else fit
         self.tables = tables
         self.carried_tables = [self.fit.carried_signatures(i) for i in range(len(tables))]
         self.carried = self.fit.carried(self.carried_tables)
+        self.targets = [
+            r + np.tensordot(self.fit.coefficients, c, 1)
+            for r, c in zip(self.fit.residuals(), self.carried_tables, strict=True)
+        ]
         self.X = self.fit.whiten(tables)
         self.times = [r.t[ORDER:] for r in fit.recordings]
 
@@ -128,23 +138,34 @@ class Field:
 
     def honest(self, lead: Lead) -> Lead:
         """A lead under the noise that it leaves itself, in place of that of the richest model."""
-        lead_tables = self.gated(lead)
-        tables = [np.concatenate(x) for x in zip(self.carried_tables, lead_tables, strict=True)]
-        prior_std = np.concatenate([self.fit.prior_std, lead.candidate.prior_std])
-        fit, start = self.fit, self.fit.coefficients
-        targets = [
-            r + np.tensordot(start, c, 1)
-            for r, c in zip(fit.residuals(), self.carried_tables, strict=True)
-        ]
-        x = Carried(fit.whiten(tables), prior_std, fit.whiten(targets)).x
-        left = [t - np.tensordot(x, c, 1) for t, c in zip(targets, tables, strict=True)]
-        fit = replace(fit, noise=tuple(noise_of(r) for r in left))
-        N, X = fit.whiten(self.carried_tables), fit.whiten(lead_tables)
-        others = Carried(N, fit.prior_std, fit.whiten(targets))
-        found = score(*others.without(X), lead.candidate.prior_std)
+        found = self.together([lead])
         return replace(
             lead, log_evidence=found.log_evidence + lead.odds, chi2=found.chi2, x=found.x
         )
+
+    def together(self, leads: Sequence[Lead]) -> Score:
+        """Several leads at once under the noise that they leave, without their odds."""
+        parts = [self.gated(lead) for lead in leads]
+        lead_tables = [np.concatenate(x) for x in zip(*parts, strict=True)]
+        tables = [np.concatenate(x) for x in zip(self.carried_tables, lead_tables, strict=True)]
+        own_std = np.concatenate([lead.candidate.prior_std for lead in leads])
+        fit = self.fit
+        prior_std = np.concatenate([fit.prior_std, own_std])
+        x = Carried(fit.whiten(tables), prior_std, fit.whiten(self.targets)).x
+        left = [t - np.tensordot(x, c, 1) for t, c in zip(self.targets, tables, strict=True)]
+        fit = replace(fit, noise=tuple(noise_of(r) for r in left))
+        N, X = fit.whiten(self.carried_tables), fit.whiten(lead_tables)
+        others = Carried(N, fit.prior_std, fit.whiten(self.targets))
+        return score(*others.without(X), own_std)
+
+    def honest_of(self, candidate: Candidate) -> Lead:
+        """A candidate, acting all the time, under its own noise."""
+        same = next(
+            c
+            for c in self.candidates
+            if c.key == candidate.key and c.template.label == candidate.template.label
+        )
+        return self.honest(Lead(same, 0.0, 0.0, np.zeros(len(same.columns)), odds=log_odds(same)))
 
     def whole(self) -> list[Lead]:
         """Every candidate, acting all the time."""
@@ -237,6 +258,8 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     if c.joint >= 0:
         odds -= np.log(7.0)
     odds -= np.log(len(c.effect.templates()))
+    if c.effect.scope == ALL and c.joint >= 0:
+        odds -= 4.0  # signals of one bus are late together
     if c.effect.name == "external_wrench" and not passing:
         odds -= 6.0  # what pushes for a whole recording is rather a tilted base
     if timed or passing:

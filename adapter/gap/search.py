@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,19 +12,34 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import JOINT, TorqueEffect
 from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit, Named, refitted, worth
+from adapter.gap.noise import Noise
 from adapter.gap.patterns import Pattern
-from adapter.gap.rivals import Standing, pays_held_out, price, simpler_wins, standing
-from adapter.gap.scan import Field, Lead
+from adapter.gap.rivals import (
+    PATTERN_SHARE,
+    Standing,
+    pays_held_out,
+    price,
+    simpler_wins,
+    standing,
+)
+from adapter.gap.scan import CATALOGUED, PATTERNS, Field, Lead
 
 BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
 CHI2_LEAST = 30.0
-LOOKED_AT, PATTERNS, TRIED = 40, 15, 3  # leads of a round: under their own noise; refitted
+PATIENCE_S = 35.0  # after which nothing further is sought
+BEST_OF_ALL, BEST_OF_JOINT = 6, 4  # leads of a round that are looked at under their own noise
+TRIED = 3
+BUNDLE = (
+    "coulomb_friction",
+    "viscous_friction",
+    "torque_offset",
+)  # leads of a round: under their own noise; refitted
 ROUNDS = 12
-MOST_SWAPS = 12
+MOST_SWAPS = 4
 SWAP_NATS = 1.0
 SURE_NATS = 20.0  # a lead that may be taken along with another joint's
 CHANGE_NATS = 6.0  # by which acting from some time on must beat acting always
-CHANGE_SHARE = 0.04  # of the squared distance explained, a nat each: no arm is quite steady
+CHANGE_SHARE = 0.1  # of the squared distance explained, a nat each: no arm is quite steady
 
 Progress = Callable[[str], None]
 
@@ -42,6 +58,29 @@ class Found:
     standings: tuple[Standing, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Leads to be named together, and their evidence."""
+
+    leads: tuple[Lead, ...]
+    log_evidence: float
+
+    @property
+    def joint(self) -> int:
+        """Where they are, from 0; -1 for the arm."""
+        return self.leads[0].candidate.joint
+
+    @property
+    def plain(self) -> bool:
+        """Whether they only add torque on their joint, all the time."""
+        return all(
+            isinstance(x.candidate.effect, TorqueEffect)
+            and x.candidate.effect.scope == JOINT
+            and x.interval_s == WHOLE
+            for x in self.leads
+        )
+
+
 def leads_of(field: Field) -> list[Lead]:
     """The best leads first, no two of one effect on one joint and of one kind of interval."""
     best: dict[tuple[str, int, str], Lead] = {}
@@ -58,19 +97,54 @@ def leads_of(field: Field) -> list[Lead]:
     return sorted(best.values(), key=lambda lead: -lead.log_evidence)
 
 
-def honest_leads(field: Field, refused: set[tuple[str, int]]) -> list[Lead]:
-    """The leads worth trying, under their own noise, in the order in which to try them.
+def honest_moves(field: Field, refused: set[tuple[str, int]]) -> list[Move]:
+    """What is worth trying, under its own noise, in the order in which to try it.
 
     What is simpler goes first: always before from some time on, an effect before its finer
-    form, an effect of the catalogue before a pattern, unless the other explains clearly more.
+    form, unless the other explains clearly more. Friction and an offset can hide each other:
+    they are also tried together.
     """
     leads = [x for x in leads_of(field) if x.candidate.key not in refused]
-    named = [x for x in leads if not isinstance(x.candidate.effect, Pattern)]
-    others = [x for x in leads if isinstance(x.candidate.effect, Pattern)]
-    chosen = [x for x in (*named[:LOOKED_AT], *others[:PATTERNS]) if x.log_evidence > BELIEF]
-    found = [x for x in map(field.honest, chosen) if x.log_evidence > BELIEF]
+    found = [x for x in map(field.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
+    found = [x for x in found if x.chi2 > CHI2_LEAST]
     found = [x for x in found if not any(outdone(x, y) for y in found)]
-    return sorted(found, key=lambda x: -x.log_evidence)
+    moves = [Move((x,), x.log_evidence) for x in found] + _bundles(field, leads, found)
+    return sorted(moves, key=lambda x: -x.log_evidence)
+
+
+def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
+    """The best leads of each joint and the best of all."""
+    seen: dict[int, int] = {}
+    chosen = []
+    for place, lead in enumerate(leads):
+        if lead.log_evidence < BELIEF:
+            break
+        joint = lead.candidate.joint
+        plain = lead.candidate.effect.name in BUNDLE and lead.interval_s == WHOLE
+        if plain or place < BEST_OF_ALL or seen.get(joint, 0) < BEST_OF_JOINT:
+            chosen.append(lead)
+            seen[joint] = seen.get(joint, 0) + 1
+    return chosen
+
+
+def _bundles(field: Field, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
+    """Friction with an offset, on each joint where they say more together than one of them."""
+    moves = []
+    for joint in {x.candidate.joint for x in leads}:
+        own = [
+            x
+            for x in leads
+            if x.candidate.joint == joint
+            and x.candidate.effect.name in BUNDLE
+            and x.interval_s == WHOLE
+        ]
+        if len(own) < 2 or max(x.log_evidence for x in own) < BELIEF:
+            continue
+        worth_it = field.together(own).log_evidence + sum(x.odds for x in own)
+        alone = max((x.log_evidence for x in found if x.candidate.joint == joint), default=BELIEF)
+        if worth_it > alone + BELIEF:
+            moves.append(Move(tuple(own), worth_it))
+    return moves
 
 
 def outdone(lead: Lead, by: Lead) -> bool:
@@ -97,59 +171,122 @@ def _values(lead: Lead) -> dict:  # type: ignore[type-arg]
 def search(fit: Fit, joints: Sequence[int], progress: Progress = lambda text: None) -> Found:
     """Name what is missing.
 
+    The catalogue goes first. What is left then may follow a pattern that no effect has; and
+    where an effect was named for want of a better word, the pattern takes its place.
+
     Args:
         fit: the nominal model on the recordings, with any noise model.
         joints: (from 0) that move.
         progress: hears what is being tried.
     """
+    begun = time.monotonic()
     fit, _ = refitted(fit)
-    refused: set[tuple[str, int]] = set()
-    for _ in range(ROUNDS):
-        field = Field(fit, joints)
-        fit, accepted = field.fit, False
-        done = refused | {e.candidate.key for e in fit.named}
-        honest = [x for x in honest_leads(field, done) if x.chi2 > CHI2_LEAST]
-        for lead in honest[:TRIED]:
-            progress(f"{lead.candidate.effect.title}, joint {lead.candidate.joint + 1}")
-            trial = _with(fit, lead)
-            if trial is None:
-                refused.add(lead.candidate.key)
-                continue
-            fit, accepted = trial, True
-            fit = _alongside(fit, lead, honest)
-            break
-        if not accepted:
-            break
+    fit = settled(_extended(fit, joints, CATALOGUED, progress, begun), joints).fit
+    if fit.named:  # noise that was taken for the first effect's may have hidden another one
+        fit = _extended(fit, joints, CATALOGUED, progress, begun)
+    fit = _extended(fit, joints, PATTERNS, progress, begun)
+    fit = _renamed(fit, joints)
     return settled(fit, joints)
 
 
-def _alongside(fit: Fit, first: Lead, honest: Sequence[Lead]) -> Fit:
-    """With the plain leads of other joints, which do not touch the first one."""
-    taken = {first.candidate.joint, -1}
-    for lead in honest:
-        c = lead.candidate
-        if c.joint in taken or lead.log_evidence < BELIEF + SURE_NATS or lead.interval_s != WHOLE:
-            continue
-        taken.add(c.joint)  # the best lead of a joint decides, whatever it is
-        if isinstance(c.effect, TorqueEffect) and c.effect.scope == JOINT:
-            fit = _with(fit, lead) or fit
+def _extended(fit: Fit, joints: Sequence[int], kind: str, progress: Progress, begun: float) -> Fit:
+    """With all that pays of one kind of candidates."""
+    refused: set[tuple[str, int]] = set()
+    for _ in range(ROUNDS):
+        field = Field(fit, joints, kind)
+        fit, accepted = field.fit, False
+        moves = honest_moves(field, refused | {e.candidate.key for e in fit.named})
+        for move in moves[:TRIED]:
+            trial = _with(fit, move, field.fit.noise, progress)
+            if trial is None:
+                refused |= {x.candidate.key for x in move.leads if len(move.leads) == 1}
+                continue
+            fit, accepted = _alongside(trial, move, moves, field, progress), True
+            break
+        if not accepted or time.monotonic() - begun > PATIENCE_S:
+            break
     return fit
 
 
-def _with(fit: Fit, lead: Lead) -> Fit | None:
-    """The model with a lead named, refitted; None where it does not pay under its own noise."""
-    new = Named(lead.candidate, lead.x, lead.interval_s, lead.recording)
-    trial, carried = refitted(replace(fit, named=(*fit.named, new)))
-    if lead.interval_s != WHOLE:
-        trial = dated(trial, len(trial.named) - 1)
-    trial = shaped(trial, len(trial.named) - 1).with_noise()
-    trial, carried = refitted(trial)
+def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
+    """Patterns in place of effects that explain clearly less than a pattern does alone."""
+    own = {e.candidate.joint for e in fit.named if isinstance(e.candidate.effect, Pattern)}
+    for joint in own:
+        names = [
+            e
+            for e in fit.named
+            if e.candidate.joint == joint and isinstance(e.candidate.effect, TorqueEffect)
+        ]
+        words = [e for e in names if not isinstance(e.candidate.effect, Pattern)]
+        if len(words) != 1 or words[0].interval_s != WHOLE:
+            continue
+        bare = replace(fit, named=tuple(e for e in fit.named if e not in names)).with_noise()
+        bare, _ = refitted(bare)
+        named = Field(bare, joints, CATALOGUED).honest_of(words[0].candidate)
+        field = Field(bare, joints, PATTERNS)
+        patterns = [c for c in field.candidates if c.joint == joint]
+        best = max(map(field.honest_of, patterns), key=lambda x: x.chi2)
+        import os
+
+        if os.environ.get("DBG"):
+            kk = [fit.named.index(e) for e in names]
+            print(
+                "RENAME?",
+                joint + 1,
+                [
+                    (e.candidate.effect.name, round(float(fit.contribution(0, k).std(0)[joint]), 3))
+                    for e, k in zip(names, kk)
+                ],
+                named.chi2 / best.chi2,
+                best.candidate.effect.name,
+            )
+        if named.chi2 < PATTERN_SHARE * best.chi2:
+            fit = _with(bare, Move((best,), best.log_evidence), field.fit.noise) or fit
+    return fit
+
+
+def _alongside(
+    fit: Fit, first: Move, moves: Sequence[Move], field: Field, progress: Progress
+) -> Fit:
+    """With the plain moves of other joints, which do not touch the first one."""
+    taken = {first.joint, -1}
+    for move in moves:
+        if move.joint in taken or move.log_evidence < BELIEF + SURE_NATS:
+            continue
+        taken.add(move.joint)  # the best move of a joint decides, whatever it is
+        if move.plain:
+            fit = _with(fit, move, field.fit.noise, progress) or fit
+    return fit
+
+
+def _with(
+    fit: Fit, move: Move, rich: Sequence[Noise], progress: Progress = lambda text: None
+) -> Fit | None:
+    """The model with a move's effects, refitted; None where none pays under its own noise.
+
+    It is fitted under the noise of the richest model first: under its own, an effect that is
+    not in yet counts as noise, and would be kept out by itself.
+    """
+    progress(", ".join(f"{x.candidate.effect.title} {x.candidate.joint + 1}" for x in move.leads))
+    before = len(fit.named)
+    new = tuple(Named(x.candidate, x.x, x.interval_s, x.recording) for x in move.leads)
+    trial, _ = refitted(replace(fit, named=(*fit.named, *new)).with_noise(rich))
     last = len(trial.named) - 1
-    found = worth(trial, carried, last)
-    if found.log_evidence + price(trial.named[last]) < BELIEF or found.chi2 < CHI2_LEAST:
-        return None
-    if not pays_held_out(trial, carried, last):
-        return None
+    if new[-1].interval_s != WHOLE:
+        trial = dated(trial, last)
+    trial = shaped(trial, last)
+    while True:
+        trial, carried = refitted(trial.with_noise())
+        bad = _worst(trial, carried, before)
+        if bad is None:
+            break
+        import os
+        if os.environ.get('DBG'):
+            e=trial.named[bad]; w=worth(trial,carried,bad)
+            print('   NOT',e.candidate.key,e.values if len(e.x)<4 else '', round(w.log_evidence+price(e),1),round(w.chi2,1),pays_held_out(trial,carried,bad),trial.noise[0].level.round(3),trial.residual(0).std(0).round(3))
+        trial = replace(trial, named=trial.named[:bad] + trial.named[bad + 1 :])
+        if len(trial.named) == before:
+            return None
     return trial if all(e.candidate.effect.possible(e.values) for e in trial.named) else None
 
 
@@ -197,51 +334,68 @@ def _distance(fit: Fit) -> float:
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
-    for _ in range(MOST_SWAPS):
+    swaps = 0
+    while True:
         fit, carried = refitted(fit.with_noise())
         bad = _worst(fit, carried)
         if bad is not None:
+            import os
+
+            if os.environ.get("DBG"):
+                e = fit.named[bad]
+                w = worth(fit, carried, bad)
+                print(
+                    "DROP",
+                    e.candidate.key,
+                    e.values if len(e.x) < 4 else "",
+                    w.log_evidence + price(e),
+                    w.chi2,
+                    pays_held_out(fit, carried, bad),
+                )
             fit = replace(fit, named=fit.named[:bad] + fit.named[bad + 1 :])
             continue
-        field = Field(fit, joints, rich=False)
-        standings = [standing(fit, carried, field, k) for k in range(len(fit.named))]
-        swapped = _swapped(fit, standings)
+        field = Field(fit, joints, CATALOGUED, rich=False)
+        standings = tuple(standing(fit, carried, field, k) for k in range(len(fit.named)))
+        swapped = _swapped(fit, standings) if swaps < MOST_SWAPS else None
+        import os
+
+        if swapped is not None and os.environ.get("DBG"):
+            print(
+                "SWAP",
+                [e.candidate.key for e in fit.named if e not in swapped.named],
+                [e.candidate.key for e in swapped.named if e not in fit.named],
+            )
         if swapped is None:
-            break
-        fit = swapped
-    return Found(fit, carried, tuple(standings))
+            return Found(fit, carried, standings)
+        fit, swaps = swapped, swaps + 1
 
 
-def _worst(fit: Fit, carried: Carried) -> int | None:
-    """The named effect that is least worth having, if one is not."""
-    found = [worth(fit, carried, k) for k in range(len(fit.named))]
-    values = [s.log_evidence + price(e) for s, e in zip(found, fit.named, strict=True)]
-    bad = [
-        k
-        for k, (s, e) in enumerate(zip(found, fit.named, strict=True))
-        if values[k] < BELIEF
-        or s.chi2 < CHI2_LEAST
-        or not e.candidate.effect.possible(e.values)
-        or not pays_held_out(fit, carried, k)
-    ]
-    return min(bad, key=lambda k: values[k]) if bad else None
+def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
+    """Of the named effects from `first` on the one that is least worth having, if one is not."""
+    values = {}
+    for k in range(first, len(fit.named)):
+        found, e = worth(fit, carried, k), fit.named[k]
+        value = found.log_evidence + price(e)
+        if (
+            value < BELIEF
+            or found.chi2 < CHI2_LEAST
+            or not e.candidate.effect.possible(e.values)
+            or not pays_held_out(fit, carried, k)
+        ):
+            values[k] = value
+    return min(values, key=values.__getitem__) if values else None
 
 
 def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
     """The model with its worst named effect under a better name, if there is one."""
-    taken = {e.candidate.key for e in fit.named}
     best, gain = None, SWAP_NATS
     for k, own in enumerate(standings):
+        if isinstance(own.candidate.effect, Pattern):
+            continue
         for rival in own.rivals:
-            c = rival.candidate
             better = own.gain(rival)
-            if (
-                better > gain
-                and c.key not in taken
-                and c.effect.possible(c.template.decode(rival.x))
-            ):
+            if rival.credible and better > gain:
                 best, gain = (k, rival), better
-                break
     if best is None:
         return None
     k, rival = best

@@ -11,7 +11,7 @@ from adapter.errors import ModelError
 from adapter.gap.evidence import Carried
 from adapter.gap.findings import entries
 from adapter.gap.fit import Fit
-from adapter.gap.recorded import EDGE_S, STEP_S, Recorded
+from adapter.gap.recorded import STEP_S, Recorded
 from adapter.gap.result import RolloutCurves
 from adapter.gap.rivals import FOLD_S, FOLDS, fold_rows
 from adapter.inertia import is_consistent
@@ -23,9 +23,10 @@ from adapter.validation import smooth
 
 SEGMENT_S = 0.5
 THINNED = 10  # rollout rows kept for a plot: one in so many
-WORST_RAD = 100.0  # a simulation that runs away
+WORST = 100.0  # rad, rad/s: a simulation that runs away
 
-# (model, t, q, dq, u, segments, drive) -> simulated q, dq (m, n), NaN outside the segments
+# (model, t, q, dq, u, segments, drive) -> simulated q, dq (m, n), NaN outside the segments and
+# all over where the model cannot be simulated
 Simulate = Callable[
     [SelfModel, Array, Array, Array, Array, Sequence[tuple[int, int]], str], tuple[Array, Array]
 ]
@@ -93,14 +94,19 @@ def torque_errors(
 
 
 def rms(errors: Sequence[Array]) -> Array:
-    """(n,) root of the mean square over all rows of all tables."""
+    """(n,) root of the mean square over all rows of all tables; NaN where there is no row."""
     table = np.concatenate(list(errors))
+    if not len(table):
+        return np.full(table.shape[1], np.nan)
     return np.sqrt(np.mean(np.square(table), axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class RolloutErrors:
-    """Squared errors by row and joint, (m, n), and curves for a plot."""
+    """Simulated less measured by row and joint, (k, n) rad and rad/s, and curves for a plot.
+
+    Rows are those that both models could be simulated along; none where one could not at all.
+    """
 
     before_q: Array
     before_dq: Array
@@ -114,25 +120,53 @@ def rollout_errors(
 ) -> RolloutErrors:
     """Forward simulation restarted from the data every 0.5 s, each segment by the model of its
     fold."""
-    span = recording.t[-1] - recording.t[0] - 2 * EDGE_S
-    t = recording.t[0] + EDGE_S + STEP_S * np.arange(int(span / STEP_S))
+    t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
-    rows = round(SEGMENT_S / STEP_S)
-    segments = [(k, k + rows) for k in range(0, len(t) - rows, rows)]
-    old = simulate(before, t, q, dq, u, segments, drive)
-    new = np.full_like(q, np.nan), np.full_like(q, np.nan)
-    for f, model in enumerate(after):
-        own = [s for s in segments if fold_of(t[s[0] : s[0] + 1])[0] % len(after) == f]
+    segments = [s for s in _segments(len(t)) if recording.is_whole(t[s[0]], t[s[1] - 1])]
+    old = _along(segments, [before], simulate, (t, q, dq, u), drive)
+    new = _along(segments, after, simulate, (t, q, dq, u), drive)
+    told = np.zeros(len(t), dtype=bool)
+    for begin, end in segments:  # a simulation that was refused lacks even its start
+        told[begin:end] = np.isfinite(old[0][begin]).all() and np.isfinite(new[0][begin]).all()
+    thin = slice(None, None, THINNED)
+    curves = RolloutCurves(t[thin], q[thin], old[0][thin], new[0][thin])
+    return RolloutErrors(
+        _off(old[0], q)[told],
+        _off(old[1], dq)[told],
+        _off(new[0], q)[told],
+        _off(new[1], dq)[told],
+        curves,
+    )
+
+
+def _segments(rows: int) -> list[tuple[int, int]]:
+    """[start, stop) of 0.5 s each; the row at stop is the next start."""
+    length = round(SEGMENT_S / STEP_S)
+    return [(k, k + length) for k in range(0, rows - length, length)]
+
+
+def _along(
+    segments: Sequence[tuple[int, int]],
+    models: Sequence[SelfModel],
+    simulate: Simulate,
+    table: tuple[Array, Array, Array, Array],
+    drive: str,
+) -> tuple[Array, Array]:
+    """Simulated q, dq (m, n), NaN outside the segments; `models` has one per fold, or one."""
+    t, q, dq, u = table
+    out = np.full_like(q, np.nan), np.full_like(q, np.nan)
+    for f, model in enumerate(models):
+        own = [s for s in segments if fold_of(t[s[0] : s[0] + 1])[0] % len(models) == f]
         if own:
             found = simulate(model, t, q, dq, u, own, drive)
             for begin, end in own:
-                for table, part in zip(new, found, strict=True):
-                    table[begin:end] = part[begin:end]
-    thin = slice(None, None, THINNED)
-    curves = RolloutCurves(t[thin], q[thin], old[0][thin], new[0][thin])
-    squares = [
-        np.minimum(np.nan_to_num(np.abs(mine - true), nan=0.0), WORST_RAD)[: segments[-1][1]]
-        for mine, true in ((old[0], q), (old[1], dq), (new[0], q), (new[1], dq))
-    ]
-    return RolloutErrors(*squares, curves)
+                for mine, part in zip(out, found, strict=True):
+                    mine[begin:end] = part[begin:end]
+    return out
+
+
+def _off(simulated: Array, measured: Array) -> Array:
+    """Error of a simulation; of one that ran away the worst that counts."""
+    off = np.abs(simulated - measured)
+    return np.minimum(np.where(np.isfinite(off), off, WORST), WORST)

@@ -57,6 +57,10 @@ class Signals:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
         return low(x)
 
+    def low_all(self, x: Array) -> Array:
+        """Torques (c, m, n) in the band (c, k, n)."""
+        return np.moveaxis(low(np.moveaxis(x, 0, -1)), -1, 0)
+
 
 def prepare(
     t: Array, q: Array, dq: Array, tau: Array, arm: RigidArm, dq_late_s: float = 0.0

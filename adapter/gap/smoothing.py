@@ -8,11 +8,13 @@ likelihood, the noise levels being those of the data's high frequencies.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
+from scipy.sparse import diags
 
 from adapter.filters import noise_from_samples
 from adapter.records import Array
@@ -82,27 +84,28 @@ def _stiffest(data: Array, right: Array, rough: Array) -> Array:
     return np.asarray(cho_solve_banded((factor, True), right))
 
 
-def _derivative_design(t: Array, knots: Array):  # type: ignore[no-untyped-def]
+def _derivative_design(t: Array, knots: Array) -> Any:
     """Sparse matrix of the basis functions' first derivatives at t."""
-    from scipy.sparse import diags
-
     lower = BSpline.design_matrix(t, knots[1:-1], DEGREE - 1)
     size = len(knots) - DEGREE - 1
     gain = DEGREE / (knots[DEGREE + 1 : DEGREE + size] - knots[1:size])
-    step = diags([-gain, gain], [0, 1], shape=(size - 1, size))
-    return lower @ step
+    return lower @ _differences(gain, size)
 
 
-def _roughness(knots: Array):  # type: ignore[no-untyped-def]
+def _differences(gain: Array, size: int) -> Any:
+    """Sparse (size - 1, size): differences of neighbours times gain (size - 1,)."""
+    bands: Any = [-gain, gain]
+    return diags(bands, offsets=[0, 1], shape=(size - 1, size))
+
+
+def _roughness(knots: Array) -> Any:
     """Integral of products of third derivatives of the basis functions, sparse."""
-    from scipy.sparse import diags
-
     degree, size = DEGREE, len(knots) - DEGREE - 1
-    product = None
+    product: Any = None
     inner = knots
     for _ in range(3):
         gain = degree / (inner[degree + 1 : degree + size] - inner[1:size])
-        step = diags([-gain, gain], [0, 1], shape=(size - 1, size))
+        step = _differences(gain, size)
         product = step if product is None else step @ product
         inner, degree, size = inner[1:-1], degree - 1, size - 1
     # degree-2 splines: exact with three Gauss points per knot interval
@@ -115,7 +118,7 @@ def _roughness(knots: Array):  # type: ignore[no-untyped-def]
     return product.T @ mass @ product
 
 
-def _bands(matrix) -> Array:  # type: ignore[no-untyped-def]
+def _bands(matrix: Any) -> Array:
     """Lower bands (DEGREE + 1, size) of a sparse symmetric matrix."""
     size = matrix.shape[0]
     out = np.zeros((DEGREE + 1, size))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
+from adapter.gap.monitor_book import sentence
 from adapter.model import LAMBDA_MEASURED
 from adapter.report import tables, words
+from adapter.report.html import fill, write_whole
 from adapter.report.schema_panels import schema_panels
 from adapter.report.skeleton import has_reference, skeleton_panels
 from adapter.report.style import JOINT_COLORS
@@ -24,7 +23,7 @@ from adapter.report.torque_panels import (
     theta_panels,
     theta_started,
 )
-from adapter.run_folder import RunData, RunFolderError
+from adapter.run_folder import RunData
 from adapter.score import TORQUE_GOAL
 
 TEMPLATE = "report.html"
@@ -42,14 +41,7 @@ class Tile:
 
 def render(data: RunData) -> str:
     """The page as HTML text; parts that the run does not have are left out."""
-    environment = Environment(
-        loader=PackageLoader("adapter", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template(TEMPLATE).render(context(data))
+    return fill(TEMPLATE, context(data))
 
 
 def write_report(path: str | Path, data: RunData) -> Path:
@@ -58,16 +50,7 @@ def write_report(path: str | Path, data: RunData) -> Path:
     Raises:
         RunFolderError: the file cannot be written.
     """
-    path = Path(path)
-    page = render(data)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(path.name + ".part")
-        beside.write_text(page, encoding="utf-8")
-        os.replace(beside, path)
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be written: {error.strerror}") from error
-    return path
+    return write_whole(path, render(data))
 
 
 def context(data: RunData) -> dict[str, Any]:
@@ -121,7 +104,8 @@ def _against(data: RunData) -> str:
 def _warnings(figures: dict[str, Any]) -> list[str]:
     fault = figures.get("fault")
     ended = [f"The run ended early: {fault}"] if fault else []
-    return [*ended, *map(str, figures.get("warnings") or [])]
+    new = [f"New disagreement: {sentence(report)}" for report in figures.get("disagreements") or []]
+    return [*ended, *new, *map(str, figures.get("warnings") or [])]
 
 
 def _fit_span(data: RunData) -> str:

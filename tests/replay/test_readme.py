@@ -1,5 +1,6 @@
 """What the README tells people to type works, word for word."""
 
+import json
 import os
 import re
 import shlex
@@ -56,9 +57,18 @@ def toured(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_tour(toured: Path) -> None:
-    for name in ("tour", "again", "fast", "load", "bent", "forward"):
+    for name in ("tour", "again", "fast", "load", "bent", "forward", "gap"):
         assert (toured / "runs" / name / "report.html").exists()
     assert (toured / "panda_learned.urdf").exists()
+
+
+def test_the_gap(toured: Path) -> None:
+    found = json.loads((toured / "gap.json").read_text())["findings"]
+    coulomb = {j for f in found if f["effect"] == "coulomb_friction" for j in f["joints"]}
+    assert coulomb == set(range(1, 8))
+    code = next(block for block in blocks("python") if "analyse" in block)
+    short = ROOT / "recordings" / "panda_nominal_6s.mcap"
+    exec(code.replace("runs/friction/recording.mcap", str(short)), {})
 
 
 def test_your_own_log(toured: Path) -> None:
@@ -81,7 +91,8 @@ def test_settings(tmp_path: Path) -> None:
 def test_reading_the_estimate() -> None:
     writer = SnapshotWriter.create(("a", "b"), name="panda_adapter_readme")
     try:
-        exec(blocks("python")[0].replace('"panda_adapter"', '"panda_adapter_readme"'), {})
+        code = next(block for block in blocks("python") if "SnapshotReader" in block)
+        exec(code.replace('"panda_adapter"', '"panda_adapter_readme"'), {})
     finally:
         writer.close()
 

@@ -9,8 +9,9 @@ from arm_data import ArmData, Motion, arm, panda_model, record
 
 from adapter.errors import SettingsError
 from adapter.learner import Learner, LearnerSettings
+from adapter.matching import matching
 from adapter.pipeline import Pipeline, PipelineSettings
-from adapter.replay import MOST_PER_UPDATE, Replay, matching, replay
+from adapter.replay import MOST_PER_UPDATE, Replay, replay
 from adapter.spatial import log_rotation, matrix_from_zxz
 from drivers.interface import DriverError
 from drivers.mcap_file import Log, McapWriter, read_log

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
-import subprocess
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import Links, screenshot
 
 from adapter.controller import ExcitationController
 from adapter.excitation import ExcitationSettings, MotionLimits
@@ -30,7 +27,6 @@ from adapter.score import figures, reference_from
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
-CHROMIUM = Path("/usr/bin/chromium")
 PERCENTILES = {"p50": 90.0, "p99": 140.0, "p99.9": 200.0, "max": 900.0}
 SECTIONS = "schema skeleton dynamics prequential fit joints identifiability samples provenance"
 MOST_BYTES = 2_000_000
@@ -75,24 +71,6 @@ def page(data: RunData) -> str:
 
 def with_figures(data: RunData, **more) -> RunData:
     return replace(data, figures={**data.figures, **more})
-
-
-class Links(HTMLParser):
-    """Everything in a page that could fetch something, and every id."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.ids: list[str] = []
-
-    def handle_starttag(self, tag, attrs) -> None:
-        for name, value in attrs:
-            if name == "id":
-                self.ids.append(value)
-            if name in ("src", "href", "xlink:href", "action", "data", "poster", "srcset"):
-                self.found.append(value)
-        if tag in ("script", "link", "iframe", "object", "embed", "base"):
-            self.found.append(tag)
 
 
 def test_page_has_all_sections_and_is_small(page: str) -> None:
@@ -294,19 +272,7 @@ def test_rotation_path_has_no_jump_at_half_a_turn() -> None:
 
 
 def test_a_browser_shows_it_without_complaint(page: str, tmp_path: Path) -> None:
-    if not CHROMIUM.exists():
-        assert not os.environ.get("CI"), f"CI needs {CHROMIUM}"
-        pytest.skip(f"{CHROMIUM} is not installed")
-    path, picture, profile = tmp_path / "r.html", tmp_path / "r.png", tmp_path / "profile"
-    path.write_text(page, encoding="utf-8")
-    command = [
-        str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-        "--no-first-run", "--disable-background-networking", "--disable-component-update",
-        "--disable-sync", f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0",
-        "--window-size=1300,1200", f"--screenshot={picture}", path.as_uri(),
-    ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    shutil.rmtree(profile, ignore_errors=True)
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    assert picture.stat().st_size > 50_000  # more than an empty page
+    picture, complaints = screenshot(page, tmp_path)
+    assert complaints == []
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 50_000  # more than an empty page
