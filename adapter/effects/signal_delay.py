@@ -6,7 +6,6 @@ import numpy as np
 
 from adapter.effects.base import ALL, Array, Motion, Parameter, SensorEffect, Values
 
-
 MOST_S = 0.012  # a bus, a filter and a hold together are faster
 
 

@@ -33,7 +33,7 @@ class StribeckFriction(JointTorque):
     positive = ("Fc", "Fs")
     log_odds = -3.0
     inexact = 0.03
-    simpler: ClassVar[Mapping[str, float]] = {"coulomb_friction": 0.02, "asymmetric_friction": 0.02}
+    simpler: ClassVar[Mapping[str, float]] = {"coulomb_friction": 0.01, "asymmetric_friction": 0.01}
     split_by = "move the joint at constant speeds from 0.01 to 0.5 rad/s"
 
     def templates(self) -> tuple[Template, ...]:

@@ -152,7 +152,7 @@ def _differences(
     return np.array(out)
 
 
-def _change(base: Base, effect: Effect, joint: int, values: dict) -> Array:  # type: ignore[type-arg]
+def _change(base: Base, effect: Effect, joint: int, values: dict) -> Array:
     """(m, n) by how much a small effect changes the torque."""
     links = base.links
     if isinstance(effect, TorqueEffect):

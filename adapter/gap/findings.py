@@ -143,7 +143,7 @@ def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
             continue
         level = float(fit.noise[0].level[j])
         order = np.argsort([-np.mean(part**2) for part in parts])
-        signals = [s for i in order for s in own[i][1].candidate.effect.depends_on]  # type: ignore[attr-defined]
+        signals = [s for i in order for s in own[i][1].candidate.effect.depends_on]
         interval = next((e.interval_s for _, e in own if e.interval_s != WHOLE), WHOLE)
         out.append(
             Leftover(

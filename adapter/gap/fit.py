@@ -92,6 +92,7 @@ class Fit:
         delay_s: by how much torques are late, within the timing of a sample.
         named: effects named so far.
         known: effects that the nominal model has already.
+        still: joints (from 0) that stand: their friction takes whatever torque there is.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -103,6 +104,7 @@ class Fit:
     named: tuple[Named, ...] = ()
     weights: tuple[Array, ...] = ()
     known: tuple[Active, ...] = ()
+    still: tuple[int, ...] = ()
 
     @property
     def arm(self) -> RigidArm:
@@ -150,6 +152,7 @@ class Fit:
         """
         own, level = self.recordings[recording], self.noise[recording].level
         weight = np.ones_like(own.tau)
+        weight[:, self.still] = 0.0
         for k, e in enumerate(self.named):
             if e.recording not in (None, recording):
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from drivers.mcap_file import Log
 
 COMMANDS, MEASURED = "commands", "measured"
 STEP_S = 1e-3
+SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
+SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
 COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
 UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
 FAR_S = 0.05  # a command older than that does not drive any more
@@ -64,6 +67,19 @@ class Recorded:
             self.commands,
             self.dq_late_s,
         )
+
+    def repeated_in(self, others: Sequence[Recorded]) -> Recorded | None:
+        """Another recording of the same motion, if one of these is."""
+        return next((x for x in others if x is not self and self._repeats(x)), None)
+
+    def _repeats(self, other: Recorded) -> bool:
+        if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
+            return False
+        span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])
+        t = np.arange(span[0], span[1], SAME_STEP_S)
+        mine, theirs = self.smoothed().at(t), other.smoothed().at(t)
+        off = [np.sqrt(np.mean((a - b) ** 2)) for a, b in zip(mine, theirs, strict=True)]
+        return bool(off[0] < SAME_RAD and off[1] < SAME_RAD_S)
 
     def smoothed(self) -> Smoothed:
         """Splines through its motion."""

@@ -121,9 +121,7 @@ def standing(fit: Fit, carried: Carried, field: Field, k: int) -> Standing:
         other = score(block, g[at], c.prior_std)
         odds = price(Named(c, other.x, named.interval_s, named.recording))
         credible = c.key not in taken and c.effect.possible(c.template.decode(other.x))
-        found.append(
-            Rival(c, other.log_evidence + odds, other.chi2, overlap, other.x, credible)
-        )
+        found.append(Rival(c, other.log_evidence + odds, other.chi2, overlap, other.x, credible))
     found.sort(key=lambda rival: -rival.log_evidence)
     return Standing(
         named.candidate, mine.log_evidence + price(named), mine.chi2, tuple(_best_of_each(found))

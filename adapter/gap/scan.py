@@ -158,14 +158,12 @@ class Field:
         others = Carried(N, fit.prior_std, fit.whiten(self.targets))
         return score(*others.without(X), own_std)
 
-    def honest_of(self, candidate: Candidate) -> Lead:
-        """A candidate, acting all the time, under its own noise."""
-        same = next(
-            c
-            for c in self.candidates
-            if c.key == candidate.key and c.template.label == candidate.template.label
-        )
-        return self.honest(Lead(same, 0.0, 0.0, np.zeros(len(same.columns)), odds=log_odds(same)))
+    def lead_of(self, candidate: Candidate) -> Lead:
+        """A candidate, acting all the time, of which nothing is known yet."""
+        alike = [c for c in self.candidates if c.key == candidate.key]
+        same = [c for c in alike if c.template.label == candidate.template.label]
+        own = (same or alike)[0]
+        return Lead(own, 0.0, 0.0, np.zeros(len(own.columns)), odds=log_odds(own))
 
     def whole(self) -> list[Lead]:
         """Every candidate, acting all the time."""

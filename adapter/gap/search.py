@@ -34,6 +34,7 @@ BUNDLE = (
     "viscous_friction",
     "torque_offset",
 )  # leads of a round: under their own noise; refitted
+CURVE, CURVE_SHARE = {"joint_spring", "torque_ripple"}, 1.1
 ROUNDS = 12
 MOST_SWAPS = 4
 SWAP_NATS = 1.0
@@ -164,7 +165,7 @@ def _keep(best: dict[tuple[str, int, str], Lead], lead: Lead, kind: str) -> None
         best[key] = lead
 
 
-def _values(lead: Lead) -> dict:  # type: ignore[type-arg]
+def _values(lead: Lead) -> dict:
     return lead.candidate.template.decode(lead.x)
 
 
@@ -209,38 +210,29 @@ def _extended(fit: Fit, joints: Sequence[int], kind: str, progress: Progress, be
 
 
 def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
-    """Patterns in place of effects that explain clearly less than a pattern does alone."""
-    own = {e.candidate.joint for e in fit.named if isinstance(e.candidate.effect, Pattern)}
-    for joint in own:
+    """Patterns in place of effects that explain clearly less than a pattern does alone.
+
+    A spring and a ripple on one joint are two words for one curve over the angle; a pattern
+    need not explain more than both together.
+    """
+    for joint in joints:
         names = [
             e
             for e in fit.named
             if e.candidate.joint == joint and isinstance(e.candidate.effect, TorqueEffect)
         ]
-        words = [e for e in names if not isinstance(e.candidate.effect, Pattern)]
-        if len(words) != 1 or words[0].interval_s != WHOLE:
+        words = [e for e in names if not e.is_pattern and e.interval_s == WHOLE]
+        curve = {e.candidate.effect.name for e in words} == CURVE
+        if not curve and (len(words) != 1 or len(names) == 1):
             continue
         bare = replace(fit, named=tuple(e for e in fit.named if e not in names)).with_noise()
         bare, _ = refitted(bare)
-        named = Field(bare, joints, CATALOGUED).honest_of(words[0].candidate)
+        catalogued = Field(bare, joints, CATALOGUED)
+        named = catalogued.together([catalogued.lead_of(e.candidate) for e in words])
         field = Field(bare, joints, PATTERNS)
-        patterns = [c for c in field.candidates if c.joint == joint]
-        best = max(map(field.honest_of, patterns), key=lambda x: x.chi2)
-        import os
-
-        if os.environ.get("DBG"):
-            kk = [fit.named.index(e) for e in names]
-            print(
-                "RENAME?",
-                joint + 1,
-                [
-                    (e.candidate.effect.name, round(float(fit.contribution(0, k).std(0)[joint]), 3))
-                    for e, k in zip(names, kk)
-                ],
-                named.chi2 / best.chi2,
-                best.candidate.effect.name,
-            )
-        if named.chi2 < PATTERN_SHARE * best.chi2:
+        patterns = [field.lead_of(c) for c in field.candidates if c.joint == joint]
+        best = max(map(field.honest, patterns), key=lambda x: x.chi2)
+        if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
             fit = _with(bare, Move((best,), best.log_evidence), field.fit.noise) or fit
     return fit
 
@@ -280,10 +272,6 @@ def _with(
         bad = _worst(trial, carried, before)
         if bad is None:
             break
-        import os
-        if os.environ.get('DBG'):
-            e=trial.named[bad]; w=worth(trial,carried,bad)
-            print('   NOT',e.candidate.key,e.values if len(e.x)<4 else '', round(w.log_evidence+price(e),1),round(w.chi2,1),pays_held_out(trial,carried,bad),trial.noise[0].level.round(3),trial.residual(0).std(0).round(3))
         trial = replace(trial, named=trial.named[:bad] + trial.named[bad + 1 :])
         if len(trial.named) == before:
             return None
@@ -339,32 +327,11 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         fit, carried = refitted(fit.with_noise())
         bad = _worst(fit, carried)
         if bad is not None:
-            import os
-
-            if os.environ.get("DBG"):
-                e = fit.named[bad]
-                w = worth(fit, carried, bad)
-                print(
-                    "DROP",
-                    e.candidate.key,
-                    e.values if len(e.x) < 4 else "",
-                    w.log_evidence + price(e),
-                    w.chi2,
-                    pays_held_out(fit, carried, bad),
-                )
             fit = replace(fit, named=fit.named[:bad] + fit.named[bad + 1 :])
             continue
         field = Field(fit, joints, CATALOGUED, rich=False)
         standings = tuple(standing(fit, carried, field, k) for k in range(len(fit.named)))
         swapped = _swapped(fit, standings) if swaps < MOST_SWAPS else None
-        import os
-
-        if swapped is not None and os.environ.get("DBG"):
-            print(
-                "SWAP",
-                [e.candidate.key for e in fit.named if e not in swapped.named],
-                [e.candidate.key for e in swapped.named if e not in fit.named],
-            )
         if swapped is None:
             return Found(fit, carried, standings)
         fit, swaps = swapped, swaps + 1

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 
 from adapter.effects.base import Motion
-from adapter.gap.smoothing import smooth_motion
+from adapter.gap.recorded import Recorded
 from adapter.records import Array
 from adapter.rigid_arm import RigidArm
 
@@ -44,7 +44,7 @@ class Signals:
     """One recording, ready for the search.
 
     Attributes:
-        motion: smooth motion at 250 Hz; its `t` counts from the recording's first sample.
+        motion: smooth motion at 250 Hz; its `t` is that of the recording.
         tau: (k, n) measured torque in the band, N m.
         t: (k,) s, its instants.
     """
@@ -62,25 +62,25 @@ class Signals:
         return np.moveaxis(low(np.moveaxis(x, 0, -1)), -1, 0)
 
 
-def prepare(
-    t: Array, q: Array, dq: Array, tau: Array, arm: RigidArm, dq_late_s: float = 0.0
-) -> Signals:
+def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) -> Signals:
     """Smooth a recording.
 
     Args:
-        t: (m,) s, increasing; q, dq, tau: (m, n).
-        arm: that moves.
-        dq_late_s: how much later dq is than q.
+        recording: to be searched; arm: that moves.
+        repeat: of the same motion, whose positions and velocities are taken instead: their noise
+            has nothing to do with that of this recording's torques and positions.
 
     Raises:
         ValueError: less than two seconds of data.
     """
+    t = recording.t
     if t[-1] - t[0] < 2.0:
         raise ValueError(f"the search needs 2 s of data, got {t[-1] - t[0]:.2f} s")
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
-    smoothed = smooth_motion(t, q, dq, dq_late_s).at(grid)
-    motion = Motion(grid - t[0], *smoothed, arm, _band(smoothed[1]))
-    return Signals(motion, low(_at(grid, t, tau)), (grid - t[0])[TAPS // 2 : -(TAPS // 2)][::STEP])
+    smoothed = (repeat or recording).smoothed().at(grid)
+    motion = Motion(grid, *smoothed, arm, _band(smoothed[1]))
+    band_t = grid[TAPS // 2 : -(TAPS // 2)][::STEP]
+    return Signals(motion, low(_at(grid, t, recording.tau)), band_t)
 
 
 def _band(dq: Array) -> float:

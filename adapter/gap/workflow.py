@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from adapter.gap.evidence import Carried
 from adapter.gap.findings import findings_of, leftovers_of
-from adapter.gap.fit import Fit, theta_prior
+from adapter.gap.fit import Fit, refitted, theta_prior
 from adapter.gap.inertias import wrong_inertias
-from adapter.gap.noise import noise_of
 from adapter.gap.recorded import Recorded
 from adapter.gap.refusals import Refusal, refuse
 from adapter.gap.result import Curves, GapResult, RolloutCurves, Shortfall
@@ -32,12 +32,12 @@ from adapter.gap.shrink import (
 )
 from adapter.gap.signals import Signals, prepare
 from adapter.model import SelfModel
-from adapter.records import Array
 from adapter.rigid_arm import RigidArm
 from adapter.robots import documented
 from adapter.torque import active_effects
 from drivers.mcap_file import read_log
 
+NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 NOT_TOLD = ("motion",)  # refusals that are an answer: the recording holds too little
 
 Progress = Callable[[str], None]
@@ -107,9 +107,11 @@ def analyse(
     except Refusal as refusal:
         if refusal.kind not in NOT_TOLD:
             raise
-        return _untold(nominal, name, logs, str(refusal))
+        names = [Path(log).name for log in logs]
+        joints = nominal.tree.joint_names
+        return GapResult.untold(joints, nominal.name, names, name, str(refusal))
     progress("smoothing")
-    found = _searched(task, settings, progress)
+    found = _corrected_where_it_pays(task, _searched(task, settings, progress))
     result = _measured(task, found, simulate, progress)
     if model_out is not None:
         model_of(nominal, found.fit).save(model_out)
@@ -153,20 +155,42 @@ def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorde
 def _searched(task: Task, settings: GapSettings, progress: Progress) -> Found:
     arm = RigidArm.of(task.model)
     known = active_effects(task.model.effects, arm.n)
-    signals = tuple(prepare(r.t, r.q, r.dq, r.tau, arm, r.dq_late_s) for r in task.fitted)
+    everything = tuple(dict.fromkeys((*task.fitted, *task.scored)))
+    signals = tuple(prepare(r, arm, r.repeated_in(everything)) for r in task.fitted)
     prior = theta_prior(arm.theta, settings.inertia_prior)
     zero = np.zeros_like(arm.theta)
-    fit = Fit(signals, prior, (), zero, known=known)
-    fit = replace(fit, noise=tuple(noise_of(r) for r in fit.residuals()))
+    still = tuple(j for j in range(arm.n) if j not in task.moving)
+    fit = Fit(signals, prior, (), zero, known=known, still=still)
+    fit = fit.with_noise()
     progress("searching")
     found = search(fit, task.moving, progress)
     return wrong_inertias(fit, found, task.moving) or found
 
 
+def _corrected_where_it_pays(task: Task, found: Found) -> Found:
+    """Without the corrections of the inertias where they do not pay on held-out data."""
+    fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
+    costs = []
+    for own, known in ((found.fit, found.carried), (fit, carried)):
+        errors = [torque_errors(r, task.model, _after(task, own, known)) for r in task.scored]
+        level = np.max([noise.level for noise in found.fit.noise], axis=0)
+        costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
+    if costs[0] <= costs[1]:
+        return found
+    kept = replace(fit, dtheta=np.zeros_like(fit.dtheta), prior=found.fit.prior)
+    return replace(found, fit=kept, carried=carried)
+
+
+def _after(task: Task, fit: Fit, carried: Carried) -> list[SelfModel]:
+    """The models to score: one per fold, or one where the data are apart from the fit's."""
+    if task.folds:
+        return held_out_models(task.model, fit, carried)
+    return [model_of(task.model, fit)]
+
+
 def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Progress) -> GapResult:
     """Before and after on held-out data, and all that was found."""
-    new = model_of(task.model, found.fit)
-    after = held_out_models(task.model, found.fit, found.carried) if task.folds else [new]
+    after = _after(task, found.fit, found.carried)
     errors = [torque_errors(r, task.model, after) for r in task.scored]
     before = Shortfall(rms([e.before for e in errors]))
     behind = Shortfall(rms([e.after for e in errors]))
@@ -224,19 +248,4 @@ def _curves(task: Task, found: Found, i: int) -> Curves:
         nominal.residual(0),
         replace(found.fit, named=named).residual(i),
         np.zeros(len(own.t), dtype=bool),
-    )
-
-
-def _untold(model: SelfModel, name: str, logs: Sequence[Path | str], problem: str) -> GapResult:
-    unknown: Array = np.full(model.tree.n, np.nan)
-    nothing = Shortfall(unknown, unknown, unknown)
-    return GapResult(
-        joint_names=model.tree.joint_names,
-        model_name=model.name,
-        recordings=tuple(Path(log).name for log in logs),
-        model_in=name,
-        noise_floor_nm=unknown,
-        before=nothing,
-        after=nothing,
-        problem=problem,
     )
