@@ -20,7 +20,7 @@ OVERLAP = 0.9
 MOST_RIVALS = 3
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
-SHAPE_STEP = 0.04
+VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
 
 
 def _joints(named: Named) -> list[int]:
@@ -120,6 +120,13 @@ def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
     return {name: best[name] for name in order[:MOST_RIVALS]}
 
 
+def noise_floor(fit: Fit) -> Array:
+    """(n,) rms in the band of what is left when all is explained that can be, N m."""
+    left = np.concatenate(fit.residuals())
+    levels = [noise.level for noise in fit.noise]
+    return np.minimum(np.max(levels, axis=0), np.sqrt(np.mean(left**2, axis=0)))
+
+
 def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
     """What patterns found that no effect explains, one entry for each joint."""
     fit = found.fit
@@ -133,23 +140,24 @@ def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
         if not own:
             continue
         parts = [fit.contribution(0, k)[:, j] for k, _ in own]
-        size = float(np.sqrt(np.mean(np.sum(parts, axis=0) ** 2)))
+        left, pattern = fit.residual(0)[:, j], np.sum(parts, axis=0)
+        floor, rmse = (float(np.sqrt(np.mean(x**2))) for x in (left, left + pattern))
         named = [
             float(np.sqrt(np.mean(fit.contribution(e.recording or 0, k)[:, j] ** 2)))
             for k, e in enumerate(fit.named)
-            if not isinstance(e.candidate.effect, Pattern)
+            if not e.is_pattern
         ]
-        if size < DISCREPANCY * max(named, default=0.0):
+        size = float(np.sqrt(np.mean(pattern**2)))
+        if rmse < VISIBLE * floor or size < DISCREPANCY * max(named, default=0.0):
             continue
-        level = float(fit.noise[0].level[j])
         order = np.argsort([-np.mean(part**2) for part in parts])
         signals = [s for i in order for s in own[i][1].candidate.effect.depends_on]
         interval = next((e.interval_s for _, e in own if e.interval_s != WHOLE), WHOLE)
         out.append(
             Leftover(
                 joint=j + 1,
-                rmse_nm=float(np.hypot(size, level)),
-                noise_floor_nm=level,
+                rmse_nm=rmse,
+                noise_floor_nm=floor,
                 depends_on=tuple(dict.fromkeys(signals)),
                 interval_s=(max(interval[0], 0.0), min(interval[1], ends[0])),
             )

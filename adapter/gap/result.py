@@ -237,6 +237,7 @@ class GapResult:
             "findings": [finding.as_dict() for finding in self.findings],
             "unexplained": [leftover.as_dict() for leftover in self.unexplained],
             "model_out": self.model_out,
+            "where": self._where(),
             "inertial_correction": self._correction(),
             "what_next": list(self.what_next),
             "notes": list(self.notes),
@@ -245,6 +246,11 @@ class GapResult:
             "joint_names": list(self.joint_names),
             "wall_s": self.wall_s,
         }
+
+    def _where(self) -> list[dict[str, Any]]:
+        from adapter.gap.where import disagreement  # which builds on results
+
+        return disagreement(self.curves[0], self.noise_floor_nm) if self.curves else []
 
     def _correction(self) -> dict[str, Any] | None:
         if self.corrections is None or self.corrections_prior is None:

@@ -279,7 +279,11 @@ def _with(
 
 
 def dated(fit: Fit, place: int) -> Fit:
-    """A named effect with the start (and end) that the data like best, on a grid of 12 ms."""
+    """A named effect with the start (and end) that the data like best, on a grid of 12 ms.
+
+    All rows count here, those around the dates above all.
+    """
+    fit = replace(fit, weights=())
     for reach in (0.15, 0.04, 0.012):
         for side in (0, 1):
             centre = fit.named[place].interval_s[side]

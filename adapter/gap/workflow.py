@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from adapter.gap.evidence import Carried
-from adapter.gap.findings import findings_of, leftovers_of
+from adapter.gap.findings import findings_of, leftovers_of, noise_floor
 from adapter.gap.fit import Fit, refitted, theta_prior
 from adapter.gap.inertias import wrong_inertias
 from adapter.gap.recorded import Recorded
@@ -173,7 +173,7 @@ def _corrected_where_it_pays(task: Task, found: Found) -> Found:
     costs = []
     for own, known in ((found.fit, found.carried), (fit, carried)):
         errors = [torque_errors(r, task.model, _after(task, own, known)) for r in task.scored]
-        level = np.max([noise.level for noise in found.fit.noise], axis=0)
+        level = noise_floor(found.fit)
         costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
     if costs[0] <= costs[1]:
         return found
@@ -216,7 +216,7 @@ def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Pro
         model_name=task.model.name,
         recordings=tuple(dict.fromkeys(r.name for r in (*task.fitted, *task.scored))),
         model_in="",
-        noise_floor_nm=np.max([noise.level for noise in found.fit.noise], axis=0),
+        noise_floor_nm=noise_floor(found.fit),
         before=before,
         after=behind,
         findings=findings,
