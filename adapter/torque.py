@@ -10,6 +10,7 @@ import numpy as np
 
 from adapter.effects.active import Active, active_effects, lasting_effects
 from adapter.effects.base import BodyEffect, Flags, Motion, MotionEffect, SensorEffect, TorqueEffect
+from adapter.effects.torque_offset import TorqueOffset
 from adapter.model import SelfModel
 from adapter.records import Array
 from adapter.rigid_arm import RigidArm
@@ -86,8 +87,11 @@ def added(motion: Motion, tau: Array, effects: Sequence[Active]) -> Array:
     """Stage 3: rigid torque (m, n) with what acts at the joints."""
     total = tau.copy()
     for active in effects:
-        if isinstance(active.effect, TorqueEffect):
-            extra = active.effect.torque(motion, tau, active.joint, active.values)
+        if isinstance(active.effect, TorqueEffect) and not isinstance(active.effect, TorqueOffset):
+            own, begin = motion, active.interval_s[0]
+            if begin > -np.inf:  # what changes with time counts from the effect's own start
+                own = replace(motion, t=motion.t - begin)
+            extra = active.effect.torque(own, tau, active.joint, active.values)
             on = active.on(motion.t)
             total += extra if on is None else extra * on[:, None]
     return total
@@ -100,6 +104,11 @@ def sensors(motion: Motion, tau: Array, effects: Sequence[Active]) -> Array:
             read = active.effect.measured(motion, tau, active.joint, active.values)
             on = active.on(motion.t)
             tau = read if on is None else np.where(on[:, None], read, tau)
+    for active in effects:  # a sensor's offset is added to whatever else it does
+        if isinstance(active.effect, TorqueOffset):
+            extra = active.effect.torque(motion, tau, active.joint, active.values)
+            on = active.on(motion.t)
+            tau = tau + (extra if on is None else extra * on[:, None])
     return tau
 
 

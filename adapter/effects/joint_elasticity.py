@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Template, Values
@@ -31,4 +32,4 @@ class JointElasticity(MotionEffect):
 
 
 def _decode(x: Array) -> dict[str, Any]:
-    return {"k": 1.0 / float(x[0])}
+    return {"k": 1.0 / float(x[0]) if x[0] else math.inf}

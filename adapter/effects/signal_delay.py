@@ -21,8 +21,8 @@ class SignalDelay(SensorEffect):
     split_by = "move faster, with sharp reversals"
 
     def possible(self, values: Values) -> bool:
-        """A dozen milliseconds at most; what asks for more is something else."""
-        return abs(float(values["d"])) < MOST_S
+        """Late, by a dozen milliseconds at most; what asks for more is something else."""
+        return 0.0 < float(values["d"]) < MOST_S
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """tau(t - d): by its rate, which is exact enough for a few ms of smooth torque."""

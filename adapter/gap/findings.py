@@ -20,6 +20,7 @@ OVERLAP = 0.9
 MOST_RIVALS = 3
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
+SHAPES, SHAPE_STEP = ("vs",), 0.03
 VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
 
 
@@ -64,6 +65,8 @@ def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
         size = np.size(value)
         part = deviations[place : place + size]
         std[key] = float(part[0]) if np.ndim(value) == 0 else [float(x) for x in part]
+        if key in SHAPES:  # found on a grid
+            std[key] = SHAPE_STEP * abs(float(value))
         place += size
     return std
 
@@ -74,7 +77,7 @@ def _flat(values: dict[str, Any]) -> Array:
 
 def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
     """Every named effect of the catalogue. `ends`: (recordings,) s, when each ends."""
-    fit, covariance = found.fit, found.carried.covariance()
+    fit, covariance = found.fit, (found.known or found.carried).covariance()
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
         effect = named.candidate.effect
@@ -145,7 +148,7 @@ def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
         named = [
             float(np.sqrt(np.mean(fit.contribution(e.recording or 0, k)[:, j] ** 2)))
             for k, e in enumerate(fit.named)
-            if not e.is_pattern
+            if e.candidate.effect.inexact
         ]
         size = float(np.sqrt(np.mean(pattern**2)))
         if rmse < VISIBLE * floor or size < DISCREPANCY * max(named, default=0.0):

@@ -30,6 +30,7 @@ EDGE = 0.3  # of a jump: friction turns round more softly than its equation
 JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BAND_HZ = 25.0  # samples a second
+LIGHT_KG, SMALL_M = 0.1, 0.05
 SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
 
 
@@ -71,12 +72,16 @@ def theta_prior(theta: Array, share: float) -> Array:
     """(n, 10) standard deviation of inertial parameters that are known to a `share` of their size.
 
     A parameter that happens to be near zero is no better known than its like: to its own size a
-    quarter of its kind's (mass, first moment, mean moment of inertia) is added.
+    quarter of its kind's (mass, first moment, mean moment of inertia) is added, and no body is
+    lighter than 0.1 kg or smaller than 5 cm for that.
     """
     kind = np.empty_like(theta)
     kind[:, 0] = theta[:, 0]
-    kind[:, 1:4] = np.linalg.norm(theta[:, 1:4], axis=1)[:, None]
-    kind[:, 4:] = np.abs(theta[:, [4, 7, 9]].mean(axis=1))[:, None]
+    mass = np.maximum(theta[:, :1], LIGHT_KG)
+    kind[:, :1] = mass
+    first, second = np.linalg.norm(theta[:, 1:4], axis=1), theta[:, [4, 7, 9]].mean(axis=1)
+    kind[:, 1:4] = np.maximum(first[:, None], SMALL_M * mass)
+    kind[:, 4:] = np.maximum(np.abs(second)[:, None], SMALL_M**2 * mass)
     return np.asarray(share * np.hypot(theta, SPREAD * kind))
 
 
@@ -92,7 +97,9 @@ class Fit:
         delay_s: by how much torques are late, within the timing of a sample.
         named: effects named so far.
         known: effects that the nominal model has already.
-        still: joints (from 0) that stand: their friction takes whatever torque there is.
+        still: joints (from 0) that stand, per recording: their friction takes whatever torque
+            there is.
+        timing_std_s: how far the torques' timing may be off without being an effect.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -104,7 +111,8 @@ class Fit:
     named: tuple[Named, ...] = ()
     weights: tuple[Array, ...] = ()
     known: tuple[Active, ...] = ()
-    still: tuple[int, ...] = ()
+    still: tuple[tuple[int, ...], ...] = ()
+    timing_std_s: float = TIMING_STD_S
 
     @property
     def arm(self) -> RigidArm:
@@ -116,6 +124,10 @@ class Fit:
     def n(self) -> int:
         """Number of joints."""
         return self.recordings[0].motion.arm.n
+
+    def without_patterns(self) -> Fit:
+        """With the effects of the catalogue alone."""
+        return replace(self, named=tuple(e for e in self.named if not e.is_pattern))
 
     def actives(self, recording: int) -> tuple[Active, ...]:
         """Effects at work in a recording, the timing's error among them."""
@@ -152,7 +164,8 @@ class Fit:
         """
         own, level = self.recordings[recording], self.noise[recording].level
         weight = np.ones_like(own.tau)
-        weight[:, self.still] = 0.0
+        if self.still:
+            weight[:, self.still[recording]] = 0.0
         for k, e in enumerate(self.named):
             if e.recording not in (None, recording):
                 continue
@@ -190,7 +203,7 @@ class Fit:
     def prior_std(self) -> Array:
         """Of the coefficients."""
         own = [e.candidate.prior_std for e in self.named]
-        return np.concatenate([self.prior.ravel(), [TIMING_STD_S], *own])
+        return np.concatenate([self.prior.ravel(), [self.timing_std_s], *own])
 
     def at(self, x: Array) -> Fit:
         """The same model with other coefficients."""
@@ -232,15 +245,18 @@ class Fit:
 
     def _added(self, e: Named, links: Motion, rigid: Array) -> Array:
         """(c, m, n) change of an added torque per unit of each of its coefficients."""
+        gate = self._gate(e, links.t)
         effect, decode = e.candidate.effect, e.candidate.template.decode
         assert isinstance(effect, TorqueEffect)
+        if np.isfinite(e.interval_s[0]):
+            links = replace(links, t=links.t - e.interval_s[0])
         at = effect.torque(links, rigid, e.candidate.joint, decode(e.x))
         out = []
         for i, std in enumerate(e.candidate.prior_std):
             x = e.x.copy()
             x[i] += STEP * std
             moved = effect.torque(links, rigid, e.candidate.joint, decode(x))
-            out.append((moved - at) / (STEP * std) * self._gate(e, links.t))
+            out.append((moved - at) / (STEP * std) * gate)
         return np.array(out)
 
     def _difference(self, recording: int, place: int, i: int, total: Array) -> Array:

@@ -12,7 +12,7 @@ from adapter.records import Array
 
 ORDER = 6  # at 25 Hz
 WHITE = 0.02  # share of white noise added: edges of models are not known any better
-WINDOW = 128  # samples, 5 s
+WINDOW, WINDOWS, SHORTEST = 128, 5, 32  # samples, 5 s at most; how many at least; the least
 LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
 
@@ -49,7 +49,7 @@ def noise_of(residual: Array, floor: float = LEAST_NM) -> Noise:
     Args:
         floor: least standard deviation, N m.
     """
-    window = min(WINDOW, len(residual))
+    window = min(WINDOW, max(len(residual) // WINDOWS, SHORTEST))
     _, power = welch(
         residual,
         window="hann",

@@ -18,6 +18,7 @@ from adapter.records import Array
 FOLDS = 4
 FOLD_S = 2.0  # a block of time is held out as a whole: neighbours know each other
 WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
+SHORTEST_S = 0.2
 TIE_CHI2 = 2.0  # by which held-out data may be worse and still leave it to the evidence
 PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
 DATES = 50.0  # starts that were looked at
@@ -135,12 +136,22 @@ def _best_of_each(rivals: list[Rival]) -> list[Rival]:
     return list(best.values())
 
 
+def block_s(fit: Fit) -> float:
+    """Length of the blocks that are held out: what lasts but a second is in several of them."""
+    spans = [e.interval_s[1] - e.interval_s[0] for e in fit.named]
+    return float(max(min([FOLD_S, *(x / (2 * FOLDS) for x in spans)]), SHORTEST_S))
+
+
+def fold_of(t: Array, block: float) -> np.ndarray:
+    """(m,) fold of each instant: blocks of time in turn."""
+    return np.asarray((t // block).astype(int) % FOLDS)
+
+
 def fold_rows(fit: Fit) -> np.ndarray:
-    """(r,) fold of each white row: blocks of time in turn."""
+    """(r,) fold of each white row."""
     rows = []
     for own in fit.recordings:
-        fold = (own.t[ORDER:] // FOLD_S).astype(int) % FOLDS
-        rows.append(np.repeat(fold, fit.n))
+        rows.append(np.repeat(fold_of(own.t[ORDER:], block_s(fit)), fit.n))
     return np.concatenate(rows)
 
 

@@ -23,7 +23,8 @@ from adapter.gap.patterns import Pattern, line, patterns
 from adapter.records import Array
 
 CATALOGUED, PATTERNS = "catalogued", "patterns"
-BLOCK_S = 0.4
+BLOCK_S, DATE_STEP_S = 0.4, 0.04
+UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 FEWEST_BLOCKS = 1  # nothing shorter is dated
 FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
 RICH_ROUNDS = 2
@@ -108,6 +109,7 @@ class Field:
             for r, c in zip(self.fit.residuals(), self.carried_tables, strict=True)
         ]
         self.X = self.fit.whiten(tables)
+        self.weights = self.fit.weights or tuple(np.ones_like(r.tau) for r in fit.recordings)
         self.times = [r.t[ORDER:] for r in fit.recordings]
 
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
@@ -138,10 +140,31 @@ class Field:
 
     def honest(self, lead: Lead) -> Lead:
         """A lead under the noise that it leaves itself, in place of that of the richest model."""
+        if lead.interval_s != WHOLE:
+            lead = self.dated(lead)
         found = self.together([lead])
         return replace(
             lead, log_evidence=found.log_evidence + lead.odds, chi2=found.chi2, x=found.x
         )
+
+    def dated(self, lead: Lead) -> Lead:
+        """A lead with the dates that its evidence likes best, to a sample of the band."""
+        for side in (0, 1):
+            if np.isfinite(lead.interval_s[side]):
+                around = np.arange(-BLOCK_S, BLOCK_S + 0.5 * DATE_STEP_S, DATE_STEP_S)
+                trials = [self._with_edge(lead, side, lead.interval_s[side] + x) for x in around]
+                lead = max(trials, key=lambda x: x.chi2)
+        return lead
+
+    def _with_edge(self, lead: Lead, side: int, t: float) -> Lead:
+        """A lead with another date, and what it explains then."""
+        interval = (t, lead.interval_s[1]) if side == 0 else (lead.interval_s[0], t)
+        lead = replace(lead, interval_s=interval)
+        if interval[1] <= interval[0]:
+            return replace(lead, chi2=-np.inf)
+        X = self.fit.whiten(self.gated(lead))
+        found = score(*self.carried.without(X), lead.candidate.prior_std)
+        return replace(lead, chi2=found.chi2)
 
     def together(self, leads: Sequence[Lead]) -> Score:
         """Several leads at once under the noise that they leave, without their odds."""
@@ -149,14 +172,28 @@ class Field:
         lead_tables = [np.concatenate(x) for x in zip(*parts, strict=True)]
         tables = [np.concatenate(x) for x in zip(self.carried_tables, lead_tables, strict=True)]
         own_std = np.concatenate([lead.candidate.prior_std for lead in leads])
-        fit = self.fit
+        weights = self._undated(leads)
+        fit = replace(self.fit, weights=weights)
         prior_std = np.concatenate([fit.prior_std, own_std])
         x = Carried(fit.whiten(tables), prior_std, fit.whiten(self.targets)).x
         left = [t - np.tensordot(x, c, 1) for t, c in zip(self.targets, tables, strict=True)]
-        fit = replace(fit, noise=tuple(noise_of(r) for r in left))
+        quiet = [r * (w > 0.0) for r, w in zip(left, weights, strict=True)]
+        fit = replace(fit, noise=tuple(noise_of(r) for r in quiet))
         N, X = fit.whiten(self.carried_tables), fit.whiten(lead_tables)
         others = Carried(N, fit.prior_std, fit.whiten(self.targets))
         return score(*others.without(X), own_std)
+
+    def _undated(self, leads: Sequence[Lead]) -> tuple[Array, ...]:
+        """Weights (k, n) of the rows: none where a lead's start is not known well enough yet."""
+        out = []
+        for i, (own, weight) in enumerate(zip(self.fit.recordings, self.weights, strict=True)):
+            weight = weight.copy()
+            for lead in leads:
+                for edge in lead.interval_s if lead.recording in (None, i) else ():
+                    near = (own.t > edge - UNSURE_S) & (own.t < edge + UNSURE_S + ORDER / BAND_HZ)
+                    weight[near] = 0.0
+            out.append(weight)
+        return tuple(out)
 
     def lead_of(self, candidate: Candidate) -> Lead:
         """A candidate, acting all the time, of which nothing is known yet."""
@@ -182,6 +219,8 @@ class Field:
         for i in range(len(self.fit.recordings)):
             edges, C, g, self_products = self._running(i, candidates)
             keep = self._starts(i, edges)
+            if not len(keep):
+                continue
             for c, G in zip(candidates, self_products, strict=True):
                 k = list(c.columns)
                 reduced = self.carried.reduced(G[keep], C[keep][:, k], g[keep][:, k])
@@ -208,7 +247,7 @@ class Field:
                     for b in range(a + FEWEST_BLOCKS, min(a + longest, last) + 1)
                 ]
             )
-            for c, G in zip(candidates, self_products, strict=True):
+            for c, G in zip(candidates if len(pairs) else [], self_products, strict=False):
                 k = list(c.columns)
                 parts = (G, C[:, k], g[:, k])
                 reduced = self.carried.reduced(*(p[pairs[:, 0]] - p[pairs[:, 1]] for p in parts))

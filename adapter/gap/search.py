@@ -52,11 +52,14 @@ class Found:
     Attributes:
         fit: the model, under its own noise; carried: what is known of its coefficients.
         standings: of each named effect among its rivals.
+        known: what is known of them with the inertias free within their prior, where `carried`
+            holds these fast.
     """
 
     fit: Fit
     carried: Carried
     standings: tuple[Standing, ...]
+    known: Carried | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,18 +282,27 @@ def _with(
 
 
 def dated(fit: Fit, place: int) -> Fit:
-    """A named effect with the start (and end) that the data like best, on a grid of 12 ms.
+    """A named effect with the start (and end) that the data like best, on a grid of 8 ms.
 
     All rows count here, those around the dates above all.
     """
     fit = replace(fit, weights=())
-    for reach in (0.15, 0.04, 0.012):
+    for reach in (0.06, 0.02, 0.008):
         for side in (0, 1):
             centre = fit.named[place].interval_s[side]
             if np.isfinite(centre):
                 trials = [_moved(fit, place, side, centre + reach * k) for k in range(-3, 4)]
                 fit = min(trials, key=_distance)
         fit, _ = refitted(fit, 1)
+    return fit
+
+
+def _dated_anew(fit: Fit) -> Fit:
+    """With the dates of all named effects sought again: one of them has another name now."""
+    fit, _ = refitted(fit)
+    for k, e in enumerate(fit.named):
+        if e.interval_s != WHOLE:
+            fit = dated(fit, k)
     return fit
 
 
@@ -338,7 +350,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         swapped = _swapped(fit, standings) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, standings)
-        fit, swaps = swapped, swaps + 1
+        fit, swaps = _dated_anew(swapped), swaps + 1
 
 
 def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:

@@ -13,7 +13,7 @@ from adapter.gap.findings import entries
 from adapter.gap.fit import Fit
 from adapter.gap.recorded import STEP_S, Recorded
 from adapter.gap.result import RolloutCurves
-from adapter.gap.rivals import FOLD_S, FOLDS, fold_rows
+from adapter.gap.rivals import FOLD_S, FOLDS, fold_of, fold_rows
 from adapter.inertia import is_consistent
 from adapter.model import SelfModel
 from adapter.records import Array
@@ -38,7 +38,8 @@ def model_of(model: SelfModel, fit: Fit) -> SelfModel:
     A correction that would make a body impossible is taken back as far as it must be.
     """
     theta = model.theta.copy()
-    for k, change in enumerate(fit.dtheta):
+    first = len(theta) - len(fit.dtheta)  # a floating base comes before the links
+    for k, change in enumerate(fit.dtheta, start=first):
         share = 1.0
         while not is_consistent(theta[k] + share * change) and is_consistent(theta[k]):
             share *= 0.7
@@ -49,22 +50,25 @@ def model_of(model: SelfModel, fit: Fit) -> SelfModel:
     return replace(model, theta=theta, effects=(*model.effects, *entries(fit)))
 
 
+def held_out_coefficients(fit: Fit, carried: Carried) -> list[Array]:
+    """Coefficients of a fit, one set per fold, each without that fold's blocks of time.
+
+    Names, dates and the noise are those that all data gave; what is fitted is refitted.
+    """
+    fold = fold_rows(fit)
+    seen = [fold != f for f in range(FOLDS)]
+    return [Carried(carried.N[:, s], carried.prior_std, carried.data[s]).x for s in seen]
+
+
 def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfModel]:
     """One model per fold: the named effects refitted without that fold's blocks of time."""
-    fold, models = fold_rows(fit), []
-    for f in range(FOLDS):
-        seen = fold != f
-        x = Carried(carried.N[:, seen], carried.prior_std, carried.data[seen]).x
+    models = []
+    for x in held_out_coefficients(fit, carried):
         try:
             models.append(model_of(model, fit.at(x)))
         except ModelError:  # a coefficient at its bound without these data
             models.append(model_of(model, fit))
     return models
-
-
-def fold_of(t: Array) -> np.ndarray:
-    """(m,) fold of each instant."""
-    return np.asarray((t // FOLD_S).astype(int) % FOLDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +81,13 @@ class TorqueErrors:
 
 
 def torque_errors(
-    recording: Recorded, before: SelfModel, after: Sequence[SelfModel]
+    recording: Recorded, before: SelfModel, after: Sequence[SelfModel], block: float = FOLD_S
 ) -> TorqueErrors:
-    """Measured less predicted torque; `after` holds one model per fold, or one for all."""
+    """Measured less predicted torque; `after` has one model per fold of `block` s, or one."""
     q, dq, ddq, tau = smooth(recording.t, recording.q, recording.dq, recording.tau)
     t = recording.t[0] + 1e-3 * np.arange(len(q))
     old = tau - ModelTorque(before)(q, dq, ddq, t)
-    fold = fold_of(t) % len(after)
+    fold = fold_of(t, block) % len(after)
     new = np.empty_like(old)
     for f, model in enumerate(after):
         rows = fold == f
@@ -116,16 +120,22 @@ class RolloutErrors:
 
 
 def rollout_errors(
-    recording: Recorded, before: SelfModel, after: Sequence[SelfModel], simulate: Simulate
+    recording: Recorded,
+    before: SelfModel,
+    after: Sequence[SelfModel],
+    simulate: Simulate,
+    block: float = FOLD_S,
 ) -> RolloutErrors:
-    """Forward simulation restarted from the data every 0.5 s, each segment by the model of its
-    fold."""
+    """Forward simulation restarted from the data every 0.5 s.
+
+    Each segment goes by the model of the fold that it starts in (blocks of `block` s).
+    """
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
     segments = [s for s in _segments(len(t)) if recording.is_whole(t[s[0]], t[s[1] - 1])]
-    old = _along(segments, [before], simulate, (t, q, dq, u), drive)
-    new = _along(segments, after, simulate, (t, q, dq, u), drive)
+    old = _along(segments, [before], simulate, (t, q, dq, u), drive, block)
+    new = _along(segments, after, simulate, (t, q, dq, u), drive, block)
     told = np.zeros(len(t), dtype=bool)
     for begin, end in segments:  # a simulation that was refused lacks even its start
         told[begin:end] = np.isfinite(old[0][begin]).all() and np.isfinite(new[0][begin]).all()
@@ -152,12 +162,13 @@ def _along(
     simulate: Simulate,
     table: tuple[Array, Array, Array, Array],
     drive: str,
+    block: float,
 ) -> tuple[Array, Array]:
     """Simulated q, dq (m, n), NaN outside the segments; `models` has one per fold, or one."""
     t, q, dq, u = table
     out = np.full_like(q, np.nan), np.full_like(q, np.nan)
     for f, model in enumerate(models):
-        own = [s for s in segments if fold_of(t[s[0] : s[0] + 1])[0] % len(models) == f]
+        own = [s for s in segments if fold_of(t[s[0] : s[0] + 1], block)[0] % len(models) == f]
         if own:
             found = simulate(model, t, q, dq, u, own, drive)
             for begin, end in own:

@@ -246,7 +246,7 @@ def _orders(judge: Judge, tau: Array) -> Iterator[Reading]:
     apart = np.abs(tau[:, None, :] - judge.model[:, :, None]) / judge.sigma[:, None]
     order = linear_sum_assignment(np.mean(np.minimum(apart, 20.0) ** 2, axis=0))[1]
     cost = judge.cost(tau[:, order])
-    while True:
+    while n > 1:
         swaps = []
         for a, b in combinations(range(n), 2):
             trial = order.copy()

@@ -16,14 +16,16 @@ import numpy as np
 
 from adapter.gap.evidence import Carried
 from adapter.gap.findings import findings_of, leftovers_of, noise_floor
-from adapter.gap.fit import Fit, refitted, theta_prior
+from adapter.gap.fit import TIMING_STD_S, Fit, refitted, theta_prior
 from adapter.gap.inertias import wrong_inertias
 from adapter.gap.recorded import Recorded
 from adapter.gap.refusals import Refusal, refuse
 from adapter.gap.result import Curves, GapResult, RolloutCurves, Shortfall
+from adapter.gap.rivals import block_s, fold_of
 from adapter.gap.search import Found, search
 from adapter.gap.shrink import (
     Simulate,
+    held_out_coefficients,
     held_out_models,
     model_of,
     rms,
@@ -31,12 +33,15 @@ from adapter.gap.shrink import (
     torque_errors,
 )
 from adapter.gap.signals import Signals, prepare
+from adapter.gap.timing import Timing
 from adapter.model import SelfModel
 from adapter.rigid_arm import RigidArm
 from adapter.robots import documented
 from adapter.torque import active_effects
 from drivers.mcap_file import read_log
 
+SIGNIFICANT = 3.0  # standard deviations
+TIMING_SHARE = 0.4  # of a sample period: holds of half a sample are no effect of the arm
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 NOT_TOLD = ("motion",)  # refusals that are an answer: the recording holds too little
 
@@ -62,12 +67,23 @@ class GapSettings:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """What is there to work with: recordings to fit, recordings to score on, joints that move."""
+    """What is there to work with.
+
+    Attributes:
+        model: the nominal one.
+        fitted, scored: recordings to fit and to score on; the same ones where blocks are held out.
+        moving: joints (from 0) that move, per fitted recording.
+        period_s: the longest sample period.
+        one_clock: what is scored belongs to the recording that is fitted.
+        notes: what is known of the logs.
+    """
 
     model: SelfModel
     fitted: tuple[Recorded, ...]
     scored: tuple[Recorded, ...]
-    moving: tuple[int, ...]
+    moving: tuple[tuple[int, ...], ...]
+    period_s: float
+    one_clock: bool
     notes: tuple[str, ...]
 
     @property
@@ -101,7 +117,8 @@ def analyse(
     begun = time.monotonic()
     settings = settings or GapSettings()
     name = model.name if isinstance(model, SelfModel) else str(model)
-    nominal = model if isinstance(model, SelfModel) else documented(str(model))
+    # dates of an earlier recording mean nothing in this one
+    nominal = lasting(model if isinstance(model, SelfModel) else documented(str(model)))
     try:
         task = _task([Path(log) for log in logs], nominal, settings, progress)
     except Refusal as refusal:
@@ -124,22 +141,39 @@ def _task(
 ) -> Task:
     """Read and screen. Raises Refusal."""
     arm = RigidArm.of(model)
-    recordings, moving, notes = [], set(range(arm.n)), []
+    recordings, moving, periods, notes = [], [], [], []
     for path in logs:
         progress(f"reading {path.name}")
         screened = refuse(read_log(path), model, arm)
-        recordings.append(Recorded.of(screened.log, screened.timing.lateness_s))
-        moving &= set(screened.moving)
+        recordings.append(Recorded.of(screened.log, _lateness(screened.timing)))
+        moving.append(screened.moving)
+        periods.append(screened.timing.period_s)
         prefix = f"{path.name}: " if len(logs) > 1 else ""
         notes += [prefix + sentence for sentence in screened.notes]
-    joints = tuple(sorted(moving))
     if len(recordings) > 1:
         fitted, scored = tuple(recordings[:-1]), tuple(recordings[-1:])
     elif settings.validate_from_s is not None:
         fitted, scored = _split(recordings[0], settings.validate_from_s)
     else:
         fitted = scored = tuple(recordings)
-    return Task(model, fitted, scored, joints, tuple(notes))
+    stay = moving[: len(fitted)]
+    return Task(model, fitted, scored, tuple(stay), max(periods), len(logs) == 1, tuple(notes))
+
+
+def _lateness(timing: Timing) -> float:
+    """How much later dq is than q, where that is known, s."""
+    late, std = timing.lateness_s, timing.lateness_std_s
+    return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
+
+
+def lasting(model: SelfModel) -> SelfModel:
+    """The model in another recording: its effects that had not ended, at all times."""
+    kept = []
+    for entry in model.effects:
+        begin, end = entry.get("interval_s") or (None, None)
+        if end is None:
+            kept.append(dict(entry, interval_s=None) if begin is not None else entry)
+    return replace(model, effects=tuple(kept))
 
 
 def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorded]]:
@@ -155,16 +189,18 @@ def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorde
 def _searched(task: Task, settings: GapSettings, progress: Progress) -> Found:
     arm = RigidArm.of(task.model)
     known = active_effects(task.model.effects, arm.n)
+    anywhere = sorted({j for joints in task.moving for j in joints})
     everything = tuple(dict.fromkeys((*task.fitted, *task.scored)))
     signals = tuple(prepare(r, arm, r.repeated_in(everything)) for r in task.fitted)
     prior = theta_prior(arm.theta, settings.inertia_prior)
     zero = np.zeros_like(arm.theta)
-    still = tuple(j for j in range(arm.n) if j not in task.moving)
-    fit = Fit(signals, prior, (), zero, known=known, still=still)
+    still = tuple(tuple(j for j in range(arm.n) if j not in m) for m in task.moving)
+    timing = max(TIMING_STD_S, TIMING_SHARE * task.period_s)
+    fit = Fit(signals, prior, (), zero, known=known, still=still, timing_std_s=timing)
     fit = fit.with_noise()
     progress("searching")
-    found = search(fit, task.moving, progress)
-    return wrong_inertias(fit, found, task.moving) or found
+    found = search(fit, anywhere, progress)
+    return wrong_inertias(fit, found, anywhere) or found
 
 
 def _corrected_where_it_pays(task: Task, found: Found) -> Found:
@@ -172,32 +208,36 @@ def _corrected_where_it_pays(task: Task, found: Found) -> Found:
     fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
     costs = []
     for own, known in ((found.fit, found.carried), (fit, carried)):
-        errors = [torque_errors(r, task.model, _after(task, own, known)) for r in task.scored]
+        folds = held_out_models(task.model, own, known)
+        errors = [torque_errors(r, task.model, folds, block_s(own)) for r in task.fitted]
         level = noise_floor(found.fit)
         costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
     if costs[0] <= costs[1]:
         return found
     kept = replace(fit, dtheta=np.zeros_like(fit.dtheta), prior=found.fit.prior)
-    return replace(found, fit=kept, carried=carried)
+    return replace(found, fit=kept, carried=carried, known=kept.carried())
 
 
 def _after(task: Task, fit: Fit, carried: Carried) -> list[SelfModel]:
     """The models to score: one per fold, or one where the data are apart from the fit's."""
     if task.folds:
         return held_out_models(task.model, fit, carried)
-    return [model_of(task.model, fit)]
+    model = model_of(task.model, fit)
+    return [model if task.one_clock else lasting(model)]
 
 
 def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Progress) -> GapResult:
     """Before and after on held-out data, and all that was found."""
     after = _after(task, found.fit, found.carried)
-    errors = [torque_errors(r, task.model, after) for r in task.scored]
+    errors = [torque_errors(r, task.model, after, block_s(found.fit)) for r in task.scored]
     before = Shortfall(rms([e.before for e in errors]))
     behind = Shortfall(rms([e.after for e in errors]))
     rollouts: tuple[RolloutCurves, ...] = ()
     if simulate is not None:
         progress("simulating forward")
-        runs = [rollout_errors(r, task.model, after, simulate) for r in task.scored]
+        runs = [
+            rollout_errors(r, task.model, after, simulate, block_s(found.fit)) for r in task.scored
+        ]
         before = replace(
             before,
             rollout_rmse_rad=rms([x.before_q for x in runs]),
@@ -235,7 +275,10 @@ def _curves(task: Task, found: Found, i: int) -> Curves:
     nominal = Fit(
         (own,), found.fit.prior, (), np.zeros_like(found.fit.dtheta), known=found.fit.known
     )
-    named = tuple(e for e in found.fit.named if ":" not in e.candidate.effect.name)
+    after = np.empty_like(own.tau)
+    for f, x in enumerate(held_out_coefficients(found.fit, found.carried)):
+        rows = fold_of(own.t, block_s(found.fit)) == f
+        after[rows] = found.fit.at(x).without_patterns().residual(i)[rows]
     rows = np.searchsorted(own.motion.t, own.t - 1e-9)
     motion = own.motion
     return Curves(
@@ -246,6 +289,6 @@ def _curves(task: Task, found: Found, i: int) -> Curves:
         motion.ddq[rows],
         own.tau,
         nominal.residual(0),
-        replace(found.fit, named=named).residual(i),
+        after,
         np.zeros(len(own.t), dtype=bool),
     )

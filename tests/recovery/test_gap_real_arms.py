@@ -59,9 +59,7 @@ def test_gap_after_is_small(published: GapResult) -> None:
 
 @pytest.mark.parametrize("joint", RUBBING)
 def test_friction_is_named(published: GapResult, joint: int) -> None:
-    own = [
-        f for f in published.findings if f.effect == "coulomb_friction" and f.joints == (joint,)
-    ]
+    own = [f for f in published.findings if f.effect == "coulomb_friction" and f.joints == (joint,)]
     assert own, [(f.effect, f.joints) for f in published.findings]
     size, plain = sum(f.parameters["Fc"] for f in own), COULOMB[joint - 1]
     assert abs(size - plain) < max(ROOM, 0.5 * plain)
