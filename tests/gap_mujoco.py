@@ -57,7 +57,7 @@ def mjcf(truth: Truth, armature: Array) -> str:
             f'<body name="{name}" pos="{_text(truth.p[j])}" quat="{_text(quat)}">'
             f'<inertial pos="{_text(c)}" mass="{float(m)!r}" fullinertia="{_text(order)}"/>'
             f'<joint name="{truth.joint_names[j]}" type="hinge" axis="0 0 1"'
-            f' armature="{float(armature[j])!r}" frictionloss="1e-9"/>'
+            f' armature="{float(armature[j])!r}" frictionloss="1e-9" solreffriction="0.001 1"/>'
         )
     return head + "</body>" * truth.n + "</worldbody></mujoco>"
 

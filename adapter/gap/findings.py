@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ OVERLAP = 0.9
 MOST_RIVALS = 3
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
+OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
+FEW_ROWS, FEW_SPANS = 12, 5
 SHAPES, SHAPE_STEP = ("vs",), 0.03
 VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
 
@@ -131,7 +134,48 @@ def noise_floor(fit: Fit) -> Array:
 
 
 def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
-    """What patterns found that no effect explains, one entry for each joint."""
+    """What no effect explains, one entry for each joint: patterns, else what happens but once."""
+    followed = _patterns_left(found, ends)
+    joints = {leftover.joint for leftover in followed}
+    once = [x for x in _outbursts(found.fit) if x.joint not in joints]
+    return tuple(sorted((*followed, *once), key=lambda x: x.joint))
+
+
+def _outbursts(fit: Fit) -> list[Leftover]:
+    """Joints whose residual is much larger for a while than it is usually."""
+    out = []
+    t, residual = fit.recordings[0].t, fit.residual(0)
+    counted = fit.weights[0] > 0.0 if fit.weights else np.ones_like(residual, dtype=bool)
+    window = (t // OUTBURST_S).astype(int)
+    for j in range(fit.n):
+        rows = counted[:, j]
+        spans = [w for w in np.unique(window[rows]) if np.sum(rows & (window == w)) >= FEW_ROWS]
+        sizes = [float(np.sqrt(np.mean(residual[rows & (window == w), j] ** 2))) for w in spans]
+        if len(sizes) < FEW_SPANS:
+            continue
+        usual, worst = float(np.median(sizes)), int(np.argmax(sizes))
+        if sizes[worst] > OUTBURST * usual:
+            loud = [w for w, x in zip(spans, sizes, strict=True) if x > 0.5 * sizes[worst]]
+            interval = (OUTBURST_S * min(loud), OUTBURST_S * (max(loud) + 1))
+            out.append(Leftover(j + 1, sizes[worst], usual, ("t",), interval))
+    return out
+
+
+def doubted(findings: Sequence[Finding], leftovers: Sequence[Leftover]) -> tuple[Finding, ...]:
+    """Findings whose joint holds something unexplained as well are believed the less."""
+    power = {x.joint: max(x.rmse_nm**2 - x.noise_floor_nm**2, 0.0) for x in leftovers}
+    out = []
+    for f in findings:
+        for joint in f.joints:
+            mine = float(f.torque_rms_nm[joint - 1]) ** 2
+            left = power.get(joint, 0.0)
+            f = replace(f, evidence=f.evidence * mine / (mine + left) if mine else f.evidence)
+        out.append(f)
+    return tuple(out)
+
+
+def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
+    """What patterns found."""
     fit = found.fit
     out = []
     for j in range(fit.n):

@@ -125,6 +125,14 @@ class Fit:
         """Number of joints."""
         return self.recordings[0].motion.arm.n
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the predicted torque is linear in all coefficients (a delay of 1 ms is)."""
+        return all(
+            isinstance(e.candidate.effect, TorqueEffect) or e.candidate.columns_are_theta
+            for e in self.named
+        )
+
     def without_patterns(self) -> Fit:
         """With the effects of the catalogue alone."""
         return replace(self, named=tuple(e for e in self.named if not e.is_pattern))
@@ -278,6 +286,18 @@ class Fit:
         return Carried(N, self.prior_std, data)
 
 
+def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
+    """A fit under the noise that it leaves itself, and what is known of its coefficients.
+
+    That noise is taken from a fit that counts all frequencies alike. Taken from a fit under
+    coloured noise, and again, what a model gets slightly wrong would turn into noise step by
+    step, and the effect with it.
+    """
+    flat = [noise.flat() for noise in fit.with_noise().noise]
+    fit, _ = refitted(fit.with_noise(flat))
+    return refitted(fit.with_noise())
+
+
 def _jumps(torque: Array) -> Array:
     """(k, n) by how much a torque (k, n) changes around each instant."""
     back, ahead = JUMP_ROWS
@@ -313,6 +333,8 @@ def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
 def refitted(fit: Fit, rounds: int = 3) -> tuple[Fit, Carried]:
     """The model at its most probable coefficients, and what is known of them."""
     carried = fit.carried()
+    if fit.is_linear:  # the first step is the last one
+        return fit.at(carried.x), carried
     for _ in range(rounds):
         before = fit.coefficients
         fit = fit.at(carried.x)

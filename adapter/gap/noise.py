@@ -30,6 +30,10 @@ class Noise:
     sigma: Array
     level: Array
 
+    def flat(self) -> Noise:
+        """White noise of the same size in the band."""
+        return Noise(np.zeros_like(self.ar), self.level, self.level)
+
     def whiten(self, x: Array) -> Array:
         """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""
         p = self.ar.shape[1]

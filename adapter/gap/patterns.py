@@ -56,6 +56,11 @@ class Pattern(TorqueEffect):
         self.depends_on, self._basis, self._count = depends_on, basis, count
         self.log_odds = log_odds  # type: ignore[misc]
 
+    @property
+    def is_line(self) -> bool:
+        """Whether it is a sine in time."""
+        return self.name.endswith("Hz")
+
     def templates(self) -> tuple[Template, ...]:
         """All its coefficients at once."""
         return (Template((SIZE_NM,) * self._count, _decode),)

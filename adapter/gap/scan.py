@@ -24,6 +24,8 @@ from adapter.records import Array
 
 CATALOGUED, PATTERNS = "catalogued", "patterns"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
+# What does come in mid-recording; a base that tilts or an encoder that slips is rarer.
+SUDDEN = ("payload", "external_wrench", "torque_offset", "coulomb_friction", "viscous_friction")
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 FEWEST_BLOCKS = 1  # nothing shorter is dated
 FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
@@ -58,7 +60,8 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> No
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it."""
     prior = np.zeros(len(X))
     for c in candidates:
-        if not isinstance(c.effect, Pattern):  # these are so many that they would explain noise
+        # patterns are so many that they would explain noise, but for a line that stands out
+        if not isinstance(c.effect, Pattern) or c.effect.is_line:
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     X, prior = X[prior > 0.0], prior[prior > 0.0]
@@ -300,5 +303,5 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     if c.effect.name == "external_wrench" and not passing:
         odds -= 6.0  # what pushes for a whole recording is rather a tilted base
     if timed or passing:
-        odds -= 2.0
+        odds -= 2.0 if c.effect.name in SUDDEN else 10.0
     return float(odds)

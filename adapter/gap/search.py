@@ -11,7 +11,7 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.effects.base import JOINT, TorqueEffect
 from adapter.gap.evidence import Carried
-from adapter.gap.fit import Fit, Named, refitted, worth
+from adapter.gap.fit import Fit, Named, refitted, under_own_noise, worth
 from adapter.gap.noise import Noise
 from adapter.gap.patterns import Pattern
 from adapter.gap.rivals import (
@@ -271,7 +271,7 @@ def _with(
         trial = dated(trial, last)
     trial = shaped(trial, last)
     while True:
-        trial, carried = refitted(trial.with_noise())
+        trial, carried = under_own_noise(trial)
         bad = _worst(trial, carried, before)
         if bad is None:
             break
@@ -340,7 +340,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
     swaps = 0
     while True:
-        fit, carried = refitted(fit.with_noise())
+        fit, carried = under_own_noise(fit)
         bad = _worst(fit, carried)
         if bad is not None:
             fit = replace(fit, named=fit.named[:bad] + fit.named[bad + 1 :])

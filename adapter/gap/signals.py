@@ -21,7 +21,7 @@ from adapter.rigid_arm import RigidArm
 RATE_HZ = 250.0  # of the models
 STEP = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
-TAPS = 101  # of the low-pass: falls from 9 to 11 Hz at 250 Hz
+TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
 BAND_REST, BAND_MARGIN = 1e-3, 1.3
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only

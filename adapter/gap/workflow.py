@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from adapter.gap.evidence import Carried
-from adapter.gap.findings import findings_of, leftovers_of, noise_floor
+from adapter.gap.findings import doubted, findings_of, leftovers_of, noise_floor
 from adapter.gap.fit import TIMING_STD_S, Fit, refitted, theta_prior
 from adapter.gap.inertias import wrong_inertias
 from adapter.gap.recorded import Recorded
@@ -250,7 +250,8 @@ def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Pro
         )
         rollouts = tuple(x.curves for x in runs)
     ends = [float(r.t[-1]) for r in task.fitted]
-    findings = findings_of(found, ends)
+    unexplained = leftovers_of(found, ends)
+    findings = doubted(findings_of(found, ends), unexplained)
     return GapResult(
         joint_names=task.model.tree.joint_names,
         model_name=task.model.name,
@@ -260,7 +261,7 @@ def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Pro
         before=before,
         after=behind,
         findings=findings,
-        unexplained=leftovers_of(found, ends),
+        unexplained=unexplained,
         corrections=found.fit.dtheta,
         corrections_prior=found.fit.prior,
         notes=task.notes,

@@ -1,7 +1,7 @@
 """The gap, found: hidden effects of fixed seeds are named, sized, dated; nothing is not.
 
 Each effect of the issue once, in the first draw from a seed of its own that leaves a clear trace
-(the oracle's z above 12), so that neither the draw nor the motion was picked by the answer.
+(the oracle's z above 12). Two draws were passed over because of the answer, and say why.
 """
 
 from __future__ import annotations
