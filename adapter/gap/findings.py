@@ -15,6 +15,7 @@ from adapter.gap.patterns import Pattern
 from adapter.gap.result import Finding, Leftover
 from adapter.gap.rivals import Standing, place_of
 from adapter.gap.search import Found
+from adapter.gap.where import explained
 from adapter.records import Array
 
 OVERLAP = 0.9
@@ -22,6 +23,8 @@ MOST_RIVALS = 3
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
+SMOOTH = 3.5  # level of a residual over what the samples before it do not foretell
+FOLLOWS = 0.05  # share of its power that a signal must explain to be named
 FEW_ROWS, FEW_SPANS = 12, 5
 SHAPES, SHAPE_STEP = ("vs",), 0.03
 VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
@@ -135,10 +138,32 @@ def noise_floor(fit: Fit) -> Array:
 
 def leftovers_of(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
     """What no effect explains, one entry for each joint: patterns, else what happens but once."""
-    followed = _patterns_left(found, ends)
-    joints = {leftover.joint for leftover in followed}
-    once = [x for x in _outbursts(found.fit) if x.joint not in joints]
-    return tuple(sorted((*followed, *once), key=lambda x: x.joint))
+    told = {x.joint: x for x in _patterns_left(found, ends)}
+    for leftover in (*_outbursts(found.fit), *_too_smooth(found.fit, ends)):
+        told.setdefault(leftover.joint, leftover)
+    return tuple(told[joint] for joint in sorted(told))
+
+
+def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
+    """Joints whose residual the samples before it foretell too well to be noise.
+
+    Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
+    """
+    out = []
+    noise, residual = fit.noise[0], fit.residual(0)
+    motion = fit.recordings[0].motion
+    rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
+    for j in range(fit.n):
+        surprise = float(noise.sigma[j])
+        if (fit.still and j in fit.still[0]) or noise.level[j] < SMOOTH * surprise:
+            continue
+        signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
+        shares = {name: explained(residual[:, j], x) for name, x in signals.items()}
+        follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
+        size = float(np.sqrt(np.mean(residual[:, j] ** 2)))
+        names = tuple(follows) or (f"q{j + 1}", "t")
+        out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, ends[0])))
+    return out
 
 
 def _outbursts(fit: Fit) -> list[Leftover]:

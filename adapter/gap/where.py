@@ -27,7 +27,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
         rmse = float(np.sqrt(np.mean(residual**2)))
         signals = {f"{name}{j + 1}": getattr(curves, name)[:, j] for name in SIGNALS}
         signals["t"] = curves.t
-        shares = {name: _explained(residual, x) for name, x in signals.items()}
+        shares = {name: explained(residual, x) for name, x in signals.items()}
         out.append(
             {
                 "joint": j + 1,
@@ -39,7 +39,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
     return out
 
 
-def _explained(residual: Array, x: Array) -> float:
+def explained(residual: Array, x: Array) -> float:
     """Share of the power of a residual (k,) in its means over bins of x (k,), noise discounted."""
     order = np.argsort(x, kind="stable")
     parts = np.array_split(residual[order], BINS)
