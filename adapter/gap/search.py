@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from adapter.effects.active import WHOLE
-from adapter.effects.base import JOINT, TorqueEffect
+from adapter.effects.base import TorqueEffect
+from adapter.gap.adjust import dated, dated_anew, shaped
 from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit, Named, refitted, under_own_noise, worth
+from adapter.gap.moves import BELIEF, CHI2_LEAST, Move, honest_moves
 from adapter.gap.noise import Noise
 from adapter.gap.patterns import Pattern
 from adapter.gap.rivals import (
@@ -19,28 +19,16 @@ from adapter.gap.rivals import (
     Standing,
     pays_held_out,
     price,
-    simpler_wins,
     standing,
 )
-from adapter.gap.scan import CATALOGUED, PATTERNS, Field, Lead
+from adapter.gap.scan import CATALOGUED, PATTERNS, Field
 
-BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
-CHI2_LEAST = 30.0
 PATIENCE_S = 35.0  # after which nothing further is sought
-BEST_OF_ALL, BEST_OF_JOINT = 6, 4  # leads of a round that are looked at under their own noise
-TRIED = 3
-BUNDLE = (
-    "coulomb_friction",
-    "viscous_friction",
-    "torque_offset",
-)  # leads of a round: under their own noise; refitted
-CURVE, CURVE_SHARE = {"joint_spring", "torque_ripple"}, 1.1
+TRIED = 3  # moves of a round
 ROUNDS = 12
-MOST_SWAPS = 4
-SWAP_NATS = 1.0
-SURE_NATS = 20.0  # a lead that may be taken along with another joint's
-CHANGE_NATS = 6.0  # by which acting from some time on must beat acting always
-CHANGE_SHARE = 0.1  # of the squared distance explained, a nat each: no arm is quite steady
+CURVE, CURVE_SHARE = {"joint_spring", "torque_ripple"}, 1.1  # one curve over the angle
+MOST_SWAPS, SWAP_NATS = 4, 1.0  # names that are exchanged for better ones, and by how much
+SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
 
@@ -60,116 +48,6 @@ class Found:
     carried: Carried
     standings: tuple[Standing, ...]
     known: Carried | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Move:
-    """Leads to be named together, and their evidence."""
-
-    leads: tuple[Lead, ...]
-    log_evidence: float
-
-    @property
-    def joint(self) -> int:
-        """Where they are, from 0; -1 for the arm."""
-        return self.leads[0].candidate.joint
-
-    @property
-    def plain(self) -> bool:
-        """Whether they only add torque on their joint, all the time."""
-        return all(
-            isinstance(x.candidate.effect, TorqueEffect)
-            and x.candidate.effect.scope == JOINT
-            and x.interval_s == WHOLE
-            for x in self.leads
-        )
-
-
-def leads_of(field: Field) -> list[Lead]:
-    """The best leads first, no two of one effect on one joint and of one kind of interval."""
-    best: dict[tuple[str, int, str], Lead] = {}
-    for lead in field.whole():
-        if lead.candidate.effect.possible(_values(lead)):
-            _keep(best, lead, "whole")
-    # a pattern may change in mid-recording as well, but then it is a pattern all the more
-    chosen = [x.candidate for x in best.values() if not isinstance(x.candidate.effect, Pattern)]
-    for lead in field.timed(chosen):
-        if lead.candidate.effect.possible(_values(lead)):
-            _keep(best, lead, "timed")
-    for lead in field.passing([c for c in chosen if c.effect.name == "external_wrench"]):
-        _keep(best, lead, "passing")
-    return sorted(best.values(), key=lambda lead: -lead.log_evidence)
-
-
-def honest_moves(field: Field, refused: set[tuple[str, int]]) -> list[Move]:
-    """What is worth trying, under its own noise, in the order in which to try it.
-
-    What is simpler goes first: always before from some time on, an effect before its finer
-    form, unless the other explains clearly more. Friction and an offset can hide each other:
-    they are also tried together.
-    """
-    leads = [x for x in leads_of(field) if x.candidate.key not in refused]
-    found = [x for x in map(field.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
-    found = [x for x in found if x.chi2 > CHI2_LEAST]
-    found = [x for x in found if not any(outdone(x, y) for y in found)]
-    moves = [Move((x,), x.log_evidence) for x in found] + _bundles(field, leads, found)
-    return sorted(moves, key=lambda x: -x.log_evidence)
-
-
-def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
-    """The best leads of each joint and the best of all."""
-    seen: dict[int, int] = {}
-    chosen = []
-    for place, lead in enumerate(leads):
-        if lead.log_evidence < BELIEF:
-            break
-        joint = lead.candidate.joint
-        plain = lead.candidate.effect.name in BUNDLE and lead.interval_s == WHOLE
-        if plain or place < BEST_OF_ALL or seen.get(joint, 0) < BEST_OF_JOINT:
-            chosen.append(lead)
-            seen[joint] = seen.get(joint, 0) + 1
-    return chosen
-
-
-def _bundles(field: Field, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
-    """Friction with an offset, on each joint where they say more together than one of them."""
-    moves = []
-    for joint in {x.candidate.joint for x in leads}:
-        own = [
-            x
-            for x in leads
-            if x.candidate.joint == joint
-            and x.candidate.effect.name in BUNDLE
-            and x.interval_s == WHOLE
-        ]
-        if len(own) < 2 or max(x.log_evidence for x in own) < BELIEF:
-            continue
-        worth_it = field.together(own).log_evidence + sum(x.odds for x in own)
-        alone = max((x.log_evidence for x in found if x.candidate.joint == joint), default=BELIEF)
-        if worth_it > alone + BELIEF:
-            moves.append(Move(tuple(own), worth_it))
-    return moves
-
-
-def outdone(lead: Lead, by: Lead) -> bool:
-    """Whether a simpler lead says all but the same."""
-    a, b = lead.candidate, by.candidate
-    if lead is by:
-        return False
-    if a.key == b.key:
-        more = lead.interval_s != WHOLE and by.interval_s == WHOLE
-        return more and lead.log_evidence < by.log_evidence + CHANGE_NATS + CHANGE_SHARE * by.chi2
-    return simpler_wins((b, by.chi2), (a, lead.chi2))
-
-
-def _keep(best: dict[tuple[str, int, str], Lead], lead: Lead, kind: str) -> None:
-    key = (*lead.candidate.key, kind)
-    if key not in best or lead.log_evidence > best[key].log_evidence:
-        best[key] = lead
-
-
-def _values(lead: Lead) -> dict:
-    return lead.candidate.template.decode(lead.x)
 
 
 def search(fit: Fit, joints: Sequence[int], progress: Progress = lambda text: None) -> Found:
@@ -281,61 +159,6 @@ def _with(
     return trial if all(e.candidate.effect.possible(e.values) for e in trial.named) else None
 
 
-def dated(fit: Fit, place: int) -> Fit:
-    """A named effect with the start (and end) that the data like best, on a grid of 8 ms.
-
-    All rows count here, those around the dates above all.
-    """
-    fit = replace(fit, weights=())
-    for reach in (0.06, 0.02, 0.008):
-        for side in (0, 1):
-            centre = fit.named[place].interval_s[side]
-            if np.isfinite(centre):
-                trials = [_moved(fit, place, side, centre + reach * k) for k in range(-3, 4)]
-                fit = min(trials, key=_distance)
-        fit, _ = refitted(fit, 1)
-    return fit
-
-
-def _dated_anew(fit: Fit) -> Fit:
-    """With the dates of all named effects sought again: one of them has another name now."""
-    fit, _ = refitted(fit)
-    for k, e in enumerate(fit.named):
-        if e.interval_s != WHOLE:
-            fit = dated(fit, k)
-    return fit
-
-
-def shaped(fit: Fit, place: int) -> Fit:
-    """A named effect with the nonlinear setting that the data like best."""
-    for step in (1.25, 1.08, 1.03):
-        named = fit.named[place]
-        trials = [fit]
-        for ratio in (step**-2, 1.0 / step, step, step**2):
-            template = named.candidate.effect.reshaped(named.values, ratio)
-            if template is None:
-                return fit
-            other = replace(named, candidate=replace(named.candidate, template=template))
-            changed = (*fit.named[:place], other, *fit.named[place + 1 :])
-            trials.append(refitted(replace(fit, named=changed), 1)[0])
-        fit = min(trials, key=_distance)
-    return fit
-
-
-def _moved(fit: Fit, place: int, side: int, t: float) -> Fit:
-    named = list(fit.named)
-    interval = list(named[place].interval_s)
-    interval[side] = t
-    named[place] = replace(named[place], interval_s=(interval[0], interval[1]))
-    return replace(fit, named=tuple(named))
-
-
-def _distance(fit: Fit) -> float:
-    """Squared distance, in units of the noise, with what the coefficients cost."""
-    white = fit.whiten(fit.residuals())
-    return float(white @ white + np.sum((fit.coefficients / fit.prior_std) ** 2))
-
-
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
     swaps = 0
@@ -350,7 +173,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         swapped = _swapped(fit, standings) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, standings)
-        fit, swaps = _dated_anew(swapped), swaps + 1
+        fit, swaps = dated_anew(swapped), swaps + 1
 
 
 def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:

@@ -99,6 +99,7 @@ def main() -> None:
     parser.add_argument("--effect", help="of all trials, instead of a drawn one")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--judge", action="store_true", help="torque error against the oracle's")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so long")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -106,10 +107,14 @@ def main() -> None:
     same = asked.kind, asked.effect, asked.simulator, asked.judge
     jobs = [(seed, *same) for seed in seeds]
     rows = []
+    begun = time.monotonic()
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
         for row in pool.map(_job, jobs):
             rows.append(row)
             print(told(row), flush=True)
+            if time.monotonic() - begun > 60.0 * asked.minutes:
+                pool.shutdown(wait=False, cancel_futures=True)
+                break
     done = [row for row in rows if "failed" not in row]
     figures = summary(done)
     figures["failed"] = len(rows) - len(done)

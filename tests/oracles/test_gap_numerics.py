@@ -21,12 +21,12 @@ from adapter.gap.candidates import THETA_EFFECTS, Candidate, base_of, signatures
 from adapter.gap.evidence import Carried, score, scores
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import Fit, Named, beside, refitted, theta_prior, worth
+from adapter.gap.moves import BELIEF, honest_moves
 from adapter.gap.noise import LEAST_NM, ORDER, WHITE, Noise, noise_of
 from adapter.gap.patterns import patterns
 from adapter.gap.recorded import Recorded
 from adapter.gap.rivals import fold_rows, pays_held_out, standing
 from adapter.gap.scan import BLOCK_S, MARGIN_S, PATTERNS, Field, log_odds
-from adapter.gap.search import BELIEF, honest_moves
 from adapter.gap.signals import RATE_HZ, Signals, low, prepare
 from adapter.gap.smoothing import smooth_motion
 from adapter.rigid_arm import RigidArm
