@@ -11,7 +11,7 @@ from adapter.effects.base import TorqueEffect
 from adapter.gap.adjust import dated, dated_anew, shaped
 from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit, Named, refitted, under_own_noise, worth
-from adapter.gap.moves import BELIEF, CHI2_LEAST, Move, honest_moves
+from adapter.gap.moves import BELIEF, Move, honest_moves, least_chi2
 from adapter.gap.noise import Noise
 from adapter.gap.patterns import Pattern
 from adapter.gap.rivals import (
@@ -184,7 +184,7 @@ def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
         value = found.log_evidence + price(e)
         if (
             value < BELIEF
-            or found.chi2 < CHI2_LEAST
+            or found.chi2 < least_chi2(e.interval_s)
             or not e.candidate.effect.possible(e.values)
             or not pays_held_out(fit, carried, k)
         ):
