@@ -24,7 +24,8 @@ DT = 2e-3
 
 
 def _starts(draw_share):
-    return LIMITS.lower + np.array(draw_share) * (LIMITS.upper - LIMITS.lower)
+    start = LIMITS.lower + np.array(draw_share) * (LIMITS.upper - LIMITS.lower)
+    return np.minimum(start, LIMITS.upper)  # rounding may lead a last bit beyond
 
 
 shares = st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7)

@@ -185,7 +185,7 @@ def test_oracle_sees_what_can_be_seen():
 def _peeking(trial):
     """A workflow that knows the trial, and says so as `adapter gap` would."""
     findings = [{**effect.as_dict(), "evidence": 1.0} for effect in trial.effects]
-    return lambda logs, model: {"findings": findings, "unexplained": []}
+    return lambda logs, model, **more: {"findings": findings, "unexplained": []}
 
 
 def test_trials_run_and_score():
