@@ -12,7 +12,7 @@ from adapter.cli.main import main
 
 
 def warm_up() -> int:
-    """A short run and its replays, on the simulated arm; nothing of it is kept."""
+    """Short runs, replays and a search for the gap, on the simulated arm; nothing is kept."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = str(folder / "warm.mcap")
@@ -21,8 +21,10 @@ def warm_up() -> int:
         code = main([*live, *common])
         for every in ("1", "10"):
             code = code or main(["replay", recording, "--every", every, *common])
-        live = ["run", "--duration", "3", "--scenario", "friction", "--no-record"]
-        return code or main([*live, *common])
+        rubbing = str(folder / "rubbing.mcap")
+        live = ["run", "--duration", "6", "--scenario", "friction", "--record", rubbing]
+        code = code or main([*live, *common])
+        return code or main(["gap", rubbing, "--model", "panda", *common])
 
 
 if __name__ == "__main__":
