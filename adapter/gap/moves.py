@@ -10,11 +10,12 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import JOINT, TorqueEffect
 from adapter.gap.patterns import Pattern
 from adapter.gap.rivals import simpler_wins
-from adapter.gap.scan import Field, Lead
+from adapter.gap.scan import SUDDEN, Field, Lead
 
 BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
-# Fall of the squared distance below which nothing is named; slow noise looks like a small start.
-CHI2_LEAST, CHI2_LEAST_DATED = 30.0, 90.0
+# Fall of the squared distance below which nothing is named: always there, of what does come in
+# mid-recording, of what rarely does. Slow noise looks like a small start.
+CHI2_LEAST, CHI2_LEAST_SUDDEN, CHI2_LEAST_DATED = 30.0, 90.0, 250.0
 BEST_OF_ALL, BEST_OF_JOINT = 6, 4  # leads that are looked at under their own noise
 BUNDLE = ("coulomb_friction", "viscous_friction", "torque_offset")  # can hide each other
 CHANGE_NATS = 6.0  # by which acting from some time on must beat acting always
@@ -69,15 +70,17 @@ def honest_moves(field: Field, refused: set[tuple[str, int]]) -> list[Move]:
     """
     leads = [x for x in leads_of(field) if x.candidate.key not in refused]
     found = [x for x in map(field.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
-    found = [x for x in found if x.chi2 > least_chi2(x.interval_s)]
+    found = [x for x in found if x.chi2 > least_chi2(x.candidate.effect.name, x.interval_s)]
     found = [x for x in found if not any(outdone(x, y) for y in found)]
     moves = [Move((x,), x.log_evidence) for x in found] + _bundles(field, leads, found)
     return sorted(moves, key=lambda x: -x.log_evidence)
 
 
-def least_chi2(interval_s: tuple[float, float]) -> float:
+def least_chi2(effect: str, interval_s: tuple[float, float]) -> float:
     """What an effect must explain to be named."""
-    return CHI2_LEAST if interval_s == WHOLE else CHI2_LEAST_DATED
+    if interval_s == WHOLE:
+        return CHI2_LEAST
+    return CHI2_LEAST_SUDDEN if effect in SUDDEN else CHI2_LEAST_DATED
 
 
 def _shortlist(leads: Sequence[Lead]) -> list[Lead]:

@@ -12,7 +12,8 @@ from adapter.records import Array
 
 ORDER = 6  # at 25 Hz
 WHITE = 0.02  # share of white noise added: edges of models are not known any better
-WINDOW, WINDOWS, SHORTEST = 128, 5, 32  # samples, 5 s at most; how many at least; the least
+WINDOW, SHORTEST = 128, 32  # samples, 5 s at most, and the least
+ROBUST, PLAIN = 5, 2  # windows at least: where something may be in a few of them, and else
 LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
 
@@ -44,7 +45,7 @@ class Noise:
         return np.asarray(out)
 
 
-def noise_of(residual: Array, floor: float = LEAST_NM) -> Noise:
+def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> Noise:
     """Noise model of a residual (k, n), N m.
 
     The spectrum is the median over windows of 5 s, so that what happens but once, a contact or
@@ -52,8 +53,9 @@ def noise_of(residual: Array, floor: float = LEAST_NM) -> Noise:
 
     Args:
         floor: least standard deviation, N m.
+        windows: at least so many; the more, the less does slow noise count in short recordings.
     """
-    window = min(WINDOW, max(len(residual) // WINDOWS, SHORTEST))
+    window = min(WINDOW, max(len(residual) // windows, SHORTEST))
     _, power = welch(
         residual,
         window="hann",

@@ -18,7 +18,7 @@ from adapter.effects.base import ALL, Effect
 from adapter.gap.candidates import Candidate, base_of, signatures
 from adapter.gap.evidence import Carried, Score, score, scores
 from adapter.gap.fit import BAND_HZ, Fit
-from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
+from adapter.gap.noise import LEAST_NM, ORDER, ROBUST, Noise, noise_of
 from adapter.gap.patterns import Pattern, line, patterns
 from adapter.records import Array
 
@@ -71,7 +71,7 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> No
         information = white[0] @ white[0].T
         information[np.diag_indices(len(X))] += prior**-2.0
         x = cho_solve(cho_factor(information, lower=True), white[0] @ white[1])
-        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM)
+        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM, ROBUST)
         white = noise.whiten(X).reshape(len(X), -1), noise.whiten(residual).ravel()
     return noise
 

@@ -184,7 +184,7 @@ def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
         value = found.log_evidence + price(e)
         if (
             value < BELIEF
-            or found.chi2 < least_chi2(e.interval_s)
+            or found.chi2 < least_chi2(e.candidate.effect.name, e.interval_s)
             or not e.candidate.effect.possible(e.values)
             or not pays_held_out(fit, carried, k)
         ):
