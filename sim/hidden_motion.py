@@ -55,14 +55,6 @@ class Motion:
         return {**numbers, "slow": self.slow}
 
 
-def motion_from(numbers: dict[str, object]) -> Motion:
-    """The motion that `Motion.as_dict` wrote."""
-    middle, size, w, phase = (
-        np.array(numbers[key], float) for key in ("middle", "size", "w", "phase")
-    )
-    return Motion(middle, size, w, phase, bool(numbers["slow"]))
-
-
 def draw_motion(rng: np.random.Generator, limits: Limits, ready: Array) -> Motion:
     """A random motion around the ready posture (n,) rad that keeps all limits."""
     n = len(ready)

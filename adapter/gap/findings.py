@@ -10,10 +10,10 @@ import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK
-from adapter.gap.fit import Fit, Named
+from adapter.gap.fit import Fit, Named, place_of
 from adapter.gap.patterns import Pattern
 from adapter.gap.result import Finding, Leftover
-from adapter.gap.rivals import Standing, place_of
+from adapter.gap.rivals import Standing
 from adapter.gap.search import Found
 from adapter.gap.where import explained
 from adapter.records import Array

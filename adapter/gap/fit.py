@@ -319,15 +319,17 @@ def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
     These are all others; but an effect of the catalogue need not pay beside patterns, which
     could stand for it.
     """
-    sizes = [fit.dtheta.size + 1, *(len(e.x) for e in fit.named)]
-    ends = np.cumsum(sizes)
-    own = np.arange(ends[place], ends[place + 1])
+    own = place_of(fit, place)
     left_out = [own]
     if not fit.named[place].is_pattern:
-        left_out += [
-            np.arange(ends[k], ends[k + 1]) for k, e in enumerate(fit.named) if e.is_pattern
-        ]
-    return own, np.delete(np.arange(ends[-1]), np.concatenate(left_out))
+        left_out += [place_of(fit, k) for k, e in enumerate(fit.named) if e.is_pattern]
+    return own, np.delete(np.arange(len(fit.coefficients)), np.concatenate(left_out))
+
+
+def place_of(fit: Fit, k: int) -> np.ndarray:
+    """Where the coefficients of the k-th named effect are among all."""
+    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:k])
+    return np.arange(begin, begin + len(fit.named[k].x))
 
 
 def refitted(fit: Fit, rounds: int = 3) -> tuple[Fit, Carried]:

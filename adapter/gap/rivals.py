@@ -89,12 +89,6 @@ def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]
     return share is not None and a.joint == b.joint and theirs < (1.0 + share) * mine
 
 
-def place_of(fit: Fit, k: int) -> np.ndarray:
-    """Where the coefficients of the k-th named effect are among all."""
-    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:k])
-    return np.arange(begin, begin + len(fit.named[k].x))
-
-
 def price(named: Named) -> float:
     """ln of what a named effect was worth before the data (negative), dates included."""
     timed, passing = named.interval_s != WHOLE, bool(np.isfinite(named.interval_s[1]))

@@ -23,7 +23,6 @@ DEGREE = 5
 KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
 Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
 STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
-BRIDGE_S = 0.02  # a jump of q over a longer hole is no noise
 
 
 @dataclass(frozen=True)
