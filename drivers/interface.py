@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -35,7 +36,10 @@ class LinkMotion:
 
 @dataclass(frozen=True, slots=True)
 class JointSample:
-    """What the arm says of one instant.
+    """What the arm says of one instant; NaN where nothing was measured.
+
+    A driver that bridges a joint's missing message predicts its q and dq and leaves its tau NaN:
+    such a sample serves a controller, and nobody learns from it.
 
     Attributes:
         stamp_ns: the instant, nanoseconds on the source's own clock.
@@ -52,12 +56,37 @@ class JointSample:
     links: LinkMotion | None = None
 
 
+@dataclass
+class Intake:
+    """What arrived from an arm and what became of it: received = used + refused.
+
+    Attributes:
+        received: messages that arrived: datagrams, joint replies, rows of a recording.
+        used: of these, that went into samples.
+        refused: the others, by reason.
+        lost: messages that were sent (or due) and never arrived, as far as can be told.
+        notes: one sentence for each kind of trouble, written at its first occurrence.
+    """
+
+    received: int = 0
+    used: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    lost: int = 0
+    notes: list[str] = field(default_factory=list)
+
+
 class Driver(Protocol):
     """A source of samples and, where it can move, a sink of torque commands.
 
     `read` returns the next sample. Where `paced` is true the source sets the rhythm and `read`
     blocks until its sample is there; otherwise the caller keeps the clock and `read` returns at
     once. Joint and link order are those of `joint_names` and `link_names`, of equal length.
+
+    Attributes:
+        adds_gravity: the arm carries its own weight; a command is then what comes on top of it.
+        intake: the account of what arrived.
+        arrived_ns: CLOCK_MONOTONIC instant at which the last sample read had arrived at this
+            machine; 0 where that has no meaning (recordings, simulated arms).
     """
 
     joint_names: tuple[str, ...]
@@ -65,6 +94,9 @@ class Driver(Protocol):
     period_ns: int
     paced: bool
     can_move: bool
+    adds_gravity: bool
+    intake: Intake
+    arrived_ns: int
 
     def connect(self) -> None:
         """Open the connection. Raises DriverError."""
@@ -73,7 +105,10 @@ class Driver(Protocol):
         """The next sample. Raises EndOfStream at the end of a recording, DriverError on faults."""
 
     def command(self, tau: Array) -> None:
-        """Ask for (n,) joint torques, N m, gravity included. Raises DriverError if it cannot."""
+        """Ask for (n,) joint torques, N m; gravity included unless the arm `adds_gravity`.
+
+        Raises DriverError if it cannot, or for anything but n finite numbers.
+        """
 
     def stop(self) -> None:
         """Bring the arm to a safe stand; may be called at any time and more than once."""

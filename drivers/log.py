@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.interface import Array, DriverError, EndOfStream, JointSample, LinkMotion
+from drivers.interface import Array, DriverError, EndOfStream, Intake, JointSample, LinkMotion
 from drivers.mcap_file import Log, read_log
 
 _DEFAULT_PERIOD_NS = 1_000_000  # of a recording too short to say
@@ -33,6 +33,8 @@ class LogArm:
 
     paced = False
     can_move = False
+    adds_gravity = False
+    arrived_ns = 0
 
     def __init__(
         self,
@@ -52,6 +54,7 @@ class LogArm:
         steps = steps[steps > 0]
         self.period_ns = int(np.median(steps)) if steps.size else _DEFAULT_PERIOD_NS
         self._next: int | None = None
+        self.intake = Intake()
 
     def _links_present(self, log: Log) -> NDArray[np.bool_] | None:
         """(m,) whether a sample has link motion; None where the recording has none to give."""
@@ -68,7 +71,7 @@ class LogArm:
 
     def connect(self) -> None:
         """Go to the first sample."""
-        self._next = 0
+        self._next, self.intake = 0, Intake()
 
     def read(self) -> JointSample:
         """The next sample. Raises EndOfStream behind the last, DriverError before `connect`."""
@@ -78,6 +81,8 @@ class LogArm:
         if i >= len(log):
             raise EndOfStream(f"{log.path}: ends after {len(log)} samples")
         self._next = i + 1
+        self.intake.received += 1
+        self.intake.used += 1
         links = None
         if self._has_links is not None and self._has_links[i]:
             assert log.twists is not None and log.accels is not None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from drivers.interface import Array, DriverError, JointSample
+from drivers.interface import Array, DriverError, Intake, JointSample
 
 
 class Plant(Protocol):
@@ -47,12 +47,15 @@ class PyBulletArm:
 
     paced = False
     can_move = True
+    adds_gravity = False
+    arrived_ns = 0
 
     def __init__(self, plant: Plant) -> None:
         self.joint_names = plant.joint_names
         self.link_names = plant.link_names
         self.period_ns = plant.period_ns
         self.plant_time_ns = 0
+        self.intake = Intake()
         self._plant = plant
         self._open = False
         self._closed = False
@@ -68,6 +71,8 @@ class PyBulletArm:
         self._need_open()
         sample = self._plant.read()
         self.plant_time_ns = self._plant.compute_ns
+        self.intake.received += 1
+        self.intake.used += 1
         return sample
 
     def command(self, tau: Array) -> None:

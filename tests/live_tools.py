@@ -20,7 +20,7 @@ from adapter.realtime.loop import LiveOptions
 from adapter.realtime.snapshot import Snapshot, nothing_known
 from adapter.records import stamp_of
 from adapter.urdf import read_urdf
-from drivers.interface import DriverError, JointSample
+from drivers.interface import DriverError, Intake, JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
@@ -97,7 +97,7 @@ def live_options(duration_s: float | None) -> LiveOptions:
 class Swinging:
     """An arm that swings by itself and fails, where asked, at a sample or a command."""
 
-    paced, can_move = False, True
+    paced, can_move, adds_gravity, arrived_ns = False, True, False, 0
     joint_names = tuple(f"panda_joint{j}" for j in range(1, 8))
     link_names: tuple[str, ...] = ()
     period_ns = 1_000_000
@@ -105,6 +105,7 @@ class Swinging:
     def __init__(self, fail_read: int | None = None, fail_command: int | None = None) -> None:
         self._fail_read, self._fail_command = fail_read, fail_command
         self.reads = self.commands = self.stops = self.closes = 0
+        self.intake = Intake()
         self._q0 = build("nominal").truth.ready
 
     def connect(self) -> None:

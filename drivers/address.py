@@ -1,0 +1,48 @@
+"""What an address says after its scheme: //HOST:PORT/REST?KEY=VALUE&..."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from urllib.parse import parse_qsl, urlsplit
+
+from drivers.interface import DriverError
+
+
+@dataclass(frozen=True)
+class Address:
+    """The parts of `SCHEME://HOST:PORT?KEY=VALUE&...`.
+
+    Attributes:
+        scheme: before the colon.
+        host: between // and the port or the question mark; a bus channel keeps its case.
+        port: None where none is given.
+        options: after the question mark.
+    """
+
+    scheme: str
+    host: str
+    port: int | None
+    options: dict[str, str]
+
+    @classmethod
+    def of(cls, address: str, known: Sequence[str]) -> Address:
+        """Parse an address whose options may be `known`. Raises DriverError, naming the choices."""
+        parts = urlsplit(address)
+        host, colon, tail = parts.netloc.rpartition(":")
+        if not colon or (":" in host and not host.startswith("[")):  # no port, or bare IPv6
+            host, tail = parts.netloc, ""
+        if host.startswith("[") and host.endswith("]"):
+            host = host[1:-1]
+        if not host:
+            raise DriverError(f"'{address}' names nobody; write {parts.scheme}://WHERE?KEY=VALUE")
+        if tail and not tail.isdecimal():
+            raise DriverError(f"'{address}': port '{tail}' is not a number")
+        pairs = parse_qsl(parts.query, keep_blank_values=True)
+        options = dict(pairs)
+        if len(options) < len(pairs):
+            raise DriverError(f"'{address}': an option is given twice")
+        for key in options:
+            if key not in known:
+                raise DriverError(f"'{address}': no option '{key}'; have: {', '.join(known)}")
+        return cls(parts.scheme, host, int(tail) if tail else None, options)
