@@ -80,23 +80,44 @@ class Driver(Protocol):
 
     `read` returns the next sample. Where `paced` is true the source sets the rhythm and `read`
     blocks until its sample is there; otherwise the caller keeps the clock and `read` returns at
-    once. Joint and link order are those of `joint_names` and `link_names`, of equal length.
-
-    Attributes:
-        adds_gravity: the arm carries its own weight; a command is then what comes on top of it.
-        intake: the account of what arrived.
-        arrived_ns: CLOCK_MONOTONIC instant at which the last sample read had arrived at this
-            machine; 0 where that has no meaning (recordings, simulated arms).
+    once. Joint and link order are those of `joint_names` and `link_names`, which is
+    empty where no motion of links is measured.
     """
 
-    joint_names: tuple[str, ...]
-    link_names: tuple[str, ...]
-    period_ns: int
-    paced: bool
-    can_move: bool
-    adds_gravity: bool
-    intake: Intake
-    arrived_ns: int
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of every array."""
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of the links whose motion is measured; () for none."""
+
+    @property
+    def period_ns(self) -> int:
+        """Nominal time between two samples."""
+
+    @property
+    def paced(self) -> bool:
+        """Whether the source sets the rhythm."""
+
+    @property
+    def can_move(self) -> bool:
+        """Whether `command` moves anything."""
+
+    @property
+    def adds_gravity(self) -> bool:
+        """Whether the arm carries its own weight; a command is then what comes on top of it."""
+
+    @property
+    def intake(self) -> Intake:
+        """The account of what arrived."""
+
+    @property
+    def arrived_ns(self) -> int:
+        """CLOCK_MONOTONIC instant at which the last sample read had arrived at this machine.
+
+        0 where that has no meaning (recordings, simulated arms).
+        """
 
     def connect(self) -> None:
         """Open the connection. Raises DriverError."""

@@ -1,4 +1,4 @@
-"""A driver by its address: `pybullet:panda`, `log:FILE.mcap`."""
+"""A driver by its address: `pybullet:panda`, `log:FILE.mcap`, `fci://HOST`, `can://CHANNEL?...`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from drivers.interface import Driver, DriverError
 from drivers.log import LogArm
 
 Builder = Callable[[str], Driver]
-SCHEMES = ("log", "pybullet")
+HARDWARE = ("fci", "can")  # behind these an arm may be real
+SCHEMES = ("log", "pybullet", *HARDWARE)
 
 
 def split_address(address: str) -> tuple[str, str]:
@@ -16,27 +17,41 @@ def split_address(address: str) -> tuple[str, str]:
     scheme, colon, rest = address.partition(":")
     if not colon or not rest:
         raise DriverError(
-            f"'{address}' is no driver address; write SCHEME:WHAT, as in pybullet:panda"
+            f"'{address}' is no driver address; write SCHEME:WHAT, as in pybullet:panda, "
+            "fci://172.16.0.2 or can://can0?interface=socketcan"
         )
     return scheme, rest
 
 
 def open_driver(
-    address: str, builders: Mapping[str, Builder], joint_names: Sequence[str] | None = None
+    address: str,
+    builders: Mapping[str, Builder],
+    joint_names: Sequence[str] | None = None,
+    allow_motion: bool = False,
 ) -> Driver:
     """The driver that an address names, not connected yet.
 
     Args:
         address: SCHEME:WHAT.
         builders: of the schemes that need more than their address (a simulated arm needs its
-            plant), by scheme.
-        joint_names: joints wanted of a recording, in this order.
+            plant), by scheme; they take what follows the colon.
+        joint_names: joints wanted of a recording, in this order; names of an arm's joints.
+        allow_motion: whether an arm that may be real may be moved.
 
     Raises:
         DriverError: no such scheme (names the choices), or the driver cannot be built.
     """
     scheme, rest = split_address(address)
-    known: dict[str, Builder] = {"log": lambda path: LogArm(path, joint_names), **builders}
-    if scheme not in known:
-        raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
-    return known[scheme](rest)
+    if scheme in builders:
+        return builders[scheme](rest)
+    if scheme == "log":
+        return LogArm(rest, joint_names)
+    if scheme == "fci":
+        from drivers.fci.arm import FciArm
+
+        return FciArm(address, joint_names, allow_motion)
+    if scheme == "can":
+        from drivers.damiao.arm import DamiaoArm  # brings python-can
+
+        return DamiaoArm(address, joint_names, allow_motion)
+    raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")

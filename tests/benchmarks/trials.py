@@ -28,6 +28,7 @@ from adapter.robots import documented
 from adapter.score import reference_from, schema_score, theta_score
 from adapter.theta_learner import ThetaLearner
 from adapter.torque import ModelTorque
+from drivers.interface import Driver
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
@@ -53,9 +54,14 @@ def learn(
     look: Callable[[Learner, np.ndarray], None] = lambda learner, record: None,
     motion: dict[str, Any] | None = None,
     mode: str = "moments",
+    arm_of: Callable[[Any, int], Driver] = lambda world, seed: PyBulletArm(world.plant()),
     **options: Any,
 ) -> tuple[Row, Learner, Any]:
-    """Run one seed; the figures of λ and θ, the learner, and the scenario's truth."""
+    """Run one seed; the figures of λ and θ, the learner, and the scenario's truth.
+
+    Args:
+        arm_of: driver of a scenario and a seed.
+    """
     import torch
 
     torch.set_num_threads(1)
@@ -65,7 +71,7 @@ def learn(
     front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
     excitation = ExcitationSettings(seed=seed, **(motion or {}))
     controller = ExcitationController(MotionLimits.of(robot), excitation)
-    arm = PyBulletArm(world.plant())
+    arm = arm_of(world, seed)
     result = run_lockstep(arm, front_end, Watched(learner, look), controller, duration_s)
     arm.close()
     assert result.fault is None, result.fault
@@ -132,13 +138,17 @@ def regressor_rows(theta: ThetaLearner, q: np.ndarray, dq: np.ndarray, ddq: np.n
     return np.stack(columns, axis=-1)
 
 
-def theta_trial(job: tuple[int]) -> Row:
+def theta_trial(
+    job: tuple[int],
+    arm_of: Callable[[Any, int], Driver] = lambda world, seed: PyBulletArm(world.plant()),
+    **options: Any,
+) -> Row:
     """θ against batch least squares on the same samples, by held-out noiseless torque."""
     (seed,) = job
     truth = build("nominal", seed).truth
     q, dq, ddq, tau = held_out(seed, np.array(truth.theta))
     Y: list[Any] = []
-    ratios: list[tuple[float, float, float]] = []
+    ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
 
     def look(learner: Learner, record: np.ndarray) -> None:
@@ -157,9 +167,9 @@ def theta_trial(job: tuple[int]) -> Row:
         errors = [Y[0] @ th - tau for th in (theta.theta.ravel(), theta.least_squares()[:70])]
         weighted = [float(np.sqrt(np.mean((e / noise) ** 2))) for e in errors]
         plain = [float(np.sqrt(np.mean(e**2))) for e in errors]
-        ratios.append((t, weighted[0] / weighted[1], plain[0] / plain[1]))
+        ratios.append((t, weighted[0] / weighted[1], plain[0] / plain[1], *plain))
 
-    figures, _, _ = learn("nominal", seed, END_S, look)
+    figures, _, _ = learn("nominal", seed, END_S, look, arm_of=arm_of, **options)
     table = np.array(ratios)
     late = table[table[:, 0] >= LATE_S]
     lam, theta = figures["lambda"]["converged_s"], figures["theta"]["converged_s"]
@@ -169,12 +179,35 @@ def theta_trial(job: tuple[int]) -> Row:
         "worst_from_15_s_unweighted": late[:, 2].max(),
         "at_30_s": late[-1, 1],
         "at_30_s_unweighted": late[-1, 2],
+        "error_at_30_s_nm": late[-1, 3],
+        "least_squares_at_30_s_nm": late[-1, 4],
         "lambda_converged_s": lam,
         "theta_converged_s": theta,
         "theta_after_lambda_s": None if theta is None or lam is None else theta - lam,
         "min_eigenvalue": lowest[0],
         "changes": len(figures["theta"]["changes"]),
     }
+
+
+def can_arm(world: Any, seed: int) -> Driver:
+    """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
+    from drivers.damiao.arm import DamiaoArm
+    from sim.damiao import Boards, Line
+    from sim.damiao.lockstep import Lockstep
+
+    line = Line()
+    line.attach(Boards(line.boards, world, seed, now_ns=line.now_ns))
+    names = world.truth.joint_names
+    address = "can://line?interface=virtual"
+    return Lockstep(DamiaoArm(address, names, True, bus=line.host, now_ns=line.now_ns), line)
+
+
+def wire_trial(job: tuple[str, int]) -> Row:
+    """What the sensors and the wire cost: noiseless, a Panda's noise (FCI), Damiao frames."""
+    wire, seed = job
+    if wire == "can":
+        return {"wire": wire, **theta_trial((seed,), can_arm)}
+    return {"wire": wire, **theta_trial((seed,), noise="none" if wire == "noiseless" else "real")}
 
 
 def payload_trial(job: tuple[int, float]) -> Row:
@@ -261,6 +294,7 @@ TRIALS: dict[str, tuple[Callable[[Any], Row], list[Any]]] = {
     "lambda_measured": (schema_trial, [("bent_link", s, "moments") for s in range(10)]),
     "lambda_sample_mode": (schema_trial, [("nominal", s, "sample") for s in range(3)]),
     "theta": (theta_trial, [(s,) for s in range(10)]),
+    "wire": (wire_trial, [(w, s) for w in ("noiseless", "fci", "can") for s in range(5)]),
     "payload": (payload_trial, [(s, m) for m in (0.1, 0.3, 1.0) for s in range(5)]),
     "null": (null_trial, [(n, s) for n in ("nominal", "friction") for s in range(100, 110)]),
     "rest": (rest_trial, [(s,) for s in range(3)]),

@@ -1,0 +1,113 @@
+"""Bytes of Damiao frames as a motor reads and writes them; the opposite side of a host's codec."""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+FRAME_BYTES = 8
+SERVICE_ID = 0x7FF  # register access, refresh and save; the motor's id is in the data
+KP_MAX = 500.0  # N m/rad
+KD_MAX = 5.0  # N m s/rad
+
+# Byte 7 after seven bytes FF.
+CLEAR_ERROR, ENABLE, DISABLE, SET_ZERO = 0xFB, 0xFC, 0xFD, 0xFE
+SPECIAL = bytes([0xFF] * 7)
+
+# Byte 2 on SERVICE_ID.
+READ, WRITE, SAVE, REFRESH = 0x33, 0x55, 0xAA, 0xCC
+INTEGER_REGISTERS = frozenset({7, 8, 9, 10, 13, 14, 15, 16, 35, 36})  # the others are float32
+
+
+class Scale(NamedTuple):
+    """Full scale of a motor's angle (rad), speed (rad/s) and torque (N m)."""
+
+    pmax: float
+    vmax: float
+    tmax: float
+
+
+class MitCommand(NamedTuple):
+    """What the motor law works with, in the motor's own angle."""
+
+    q_des: float
+    dq_des: float
+    kp: float
+    kd: float
+    tau_ff: float
+
+
+AT_REST = MitCommand(0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def to_code(x: float, low: float, high: float, bits: int) -> int:
+    """Code of x: clamped to [low, high], then truncated, as every source does."""
+    top = (1 << bits) - 1
+    return int((min(max(x, low), high) - low) / (high - low) * top)
+
+
+def from_code(code: int, low: float, high: float, bits: int) -> float:
+    """Value of a code."""
+    return low + code / ((1 << bits) - 1) * (high - low)
+
+
+def decode_command(data: bytes, scale: Scale) -> MitCommand:
+    """The eight bytes of a MIT command."""
+    word = int.from_bytes(data, "big")
+    pmax, vmax, tmax = scale
+    return MitCommand(
+        from_code(word >> 48, -pmax, pmax, 16),
+        from_code(word >> 36 & 0xFFF, -vmax, vmax, 12),
+        from_code(word >> 24 & 0xFFF, 0.0, KP_MAX, 12),
+        from_code(word >> 12 & 0xFFF, 0.0, KD_MAX, 12),
+        from_code(word & 0xFFF, -tmax, tmax, 12),
+    )
+
+
+def encode_feedback(
+    motor_id: int,
+    status: int,
+    motion: tuple[float, float, float],
+    temperatures: tuple[float, float],
+    scale: Scale,
+) -> bytes:
+    """The eight bytes of a feedback frame.
+
+    Args:
+        motor_id: its low four bits are sent.
+        status: nibble.
+        motion: q rad, dq rad/s, torque N m.
+        temperatures: of MOSFET and rotor, deg C, cut to 0..255.
+        scale: of the motor.
+    """
+    q, dq, tau = motion
+    word = (status & 0xF) << 4 | (motor_id & 0xF)
+    word = word << 16 | to_code(q, -scale.pmax, scale.pmax, 16)
+    word = word << 12 | to_code(dq, -scale.vmax, scale.vmax, 12)
+    word = word << 12 | to_code(tau, -scale.tmax, scale.tmax, 12)
+    for temperature in temperatures:
+        word = word << 8 | min(max(int(temperature), 0), 255)
+    return word.to_bytes(FRAME_BYTES, "big")
+
+
+def register_value(register: int, data: bytes) -> float | int:
+    """Value of a register's four bytes."""
+    return struct.unpack("<I" if register in INTEGER_REGISTERS else "<f", data)[0]
+
+
+def register_bytes(register: int, value: float) -> bytes:
+    """Four bytes of a register's value."""
+    if register in INTEGER_REGISTERS:
+        return struct.pack("<I", int(value))
+    return struct.pack("<f", value)
+
+
+def encode_register_reply(motor_id: int, what: int, register: int, value: float) -> bytes:
+    """The reply to a read (`what` is READ) or the echo of a write (WRITE)."""
+    head = bytes([motor_id & 0xFF, motor_id >> 8, what, register])
+    return head + register_bytes(register, value)
+
+
+def encode_save_reply(motor_id: int) -> bytes:
+    """The reply to a save; its layout is this simulator's choice, no source describes it."""
+    return bytes([motor_id & 0xFF, motor_id >> 8, SAVE, 1, 0, 0, 0, 0])

@@ -1,0 +1,181 @@
+"""One motor board without its mechanics: registers, status, command, watchdog, temperatures."""
+
+from __future__ import annotations
+
+import math
+
+from sim.damiao.codec import (
+    AT_REST,
+    INTEGER_REGISTERS,
+    MitCommand,
+    Scale,
+    decode_command,
+    encode_feedback,
+)
+from sim.damiao.motor_types import MotorType
+
+DISABLED, ENABLED = 0x0, 0x1
+OVER_VOLTAGE, UNDER_VOLTAGE, OVER_CURRENT = 0x8, 0x9, 0xA
+HOT_MOSFET, HOT_ROTOR, LOST_COMMUNICATION, OVERLOAD = 0xB, 0xC, 0xD, 0xE
+
+# Registers that do something here.
+MST_ID, ESC_ID, TIMEOUT, CTRL_MODE = 7, 8, 9, 10
+OVER_TEMPERATURE, PMAX, VMAX, TMAX, CAN_BR = 2, 21, 22, 23, 35
+MOTOR_POSITION, OUTPUT_POSITION = 80, 81
+# What the motor measures or what it is; a write is answered with the value as it was.
+READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 55, 80, 81})
+TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
+MIT_MODE = 1
+MODES = (1, 2, 3, 4)
+MAX_STANDARD_ID = 0x7FF
+CODE_1M, CODE_5M = 4, 9  # of CAN_BR
+
+# Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
+AIR_C = 25.0
+ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
+MOSFET_RISE_K, MOSFET_TIME_S = 30.0, 60.0
+MOSFET_LIMIT_C, ROTOR_LIMIT_C = 120.0, 100.0
+NEVER_NS = 1 << 62
+
+
+class Motor:
+    """A motor as its bus sees it.
+
+    Modelling choices where no source says anything: a motor with an error takes no enable frame
+    until the error is cleared; any frame to a motor feeds its watchdog; modes other than MIT are
+    accepted and give no torque.
+
+    Attributes:
+        kind: its type.
+        scale: full scales now in force, registers 21 to 23.
+        status: nibble that its feedback carries.
+        command: the last MIT command; all zero from an enable on until the first one.
+        commanded: there has been a command since it was enabled.
+        zero: rad, joint angle at which it reads 0.
+        deadline_ns: when its watchdog bites.
+        rotor_c, mosfet_c: temperatures, deg C.
+    """
+
+    def __init__(self, motor_id: int, reply_id: int, kind: MotorType, scale: Scale) -> None:
+        self.kind, self.scale = kind, scale
+        self.status = DISABLED
+        self.command = AT_REST
+        self.commanded = False
+        self.zero = 0.0
+        self.deadline_ns = NEVER_NS
+        self.rotor_c = self.mosfet_c = AIR_C
+        self._limit_ns = NEVER_NS
+        self.registers: dict[int, float] = _delivered(motor_id, reply_id, kind, scale)
+
+    @property
+    def motor_id(self) -> int:
+        """Id of its commands."""
+        return int(self.registers[ESC_ID])
+
+    @property
+    def reply_id(self) -> int:
+        """Id of its replies."""
+        return int(self.registers[MST_ID])
+
+    @property
+    def drives(self) -> bool:
+        """It gives torque."""
+        return self.status == ENABLED and self.registers[CTRL_MODE] == MIT_MODE
+
+    @property
+    def most_torque(self) -> float:
+        """N m, the end of its scale or of its strength."""
+        return min(self.scale.tmax, self.kind.scale.tmax)
+
+    def feed(self, now_ns: int) -> None:
+        """A frame came: the watchdog starts again."""
+        if self._limit_ns != NEVER_NS:
+            self.deadline_ns = now_ns + self._limit_ns
+
+    def watch(self, now_ns: int) -> None:
+        """Let the watchdog bite if it is due."""
+        if now_ns >= self.deadline_ns and self.status == ENABLED:
+            self.fail(LOST_COMMUNICATION)
+
+    def enable(self) -> None:
+        """Give torque from the next command on; an error forbids it."""
+        if self.status == DISABLED:
+            self.status, self.command, self.commanded = ENABLED, AT_REST, False
+
+    def disable(self) -> None:
+        """Give no torque; an error stays."""
+        if self.status == ENABLED:
+            self.status = DISABLED
+
+    def fail(self, status: int) -> None:
+        """Show an error and give no torque."""
+        self.status = status
+
+    def clear_error(self) -> None:
+        """Back to disabled after an error."""
+        if self.status != ENABLED:
+            self.status = DISABLED
+
+    def take(self, data: bytes) -> None:
+        """A MIT command; without effect while the motor is not enabled."""
+        if self.status == ENABLED:
+            self.command, self.commanded = decode_command(data, self.scale), True
+
+    def feedback(self, q: float, dq: float, tau: float) -> bytes:
+        """The feedback frame's bytes for joint angle q rad, speed rad/s and torque N m."""
+        motion, temperatures = (q - self.zero, dq, tau), (self.mosfet_c, self.rotor_c)
+        return encode_feedback(self.motor_id, self.status, motion, temperatures, self.scale)
+
+    def warm_up(self, tau: float, for_s: float) -> None:
+        """Temperatures after a torque of tau N m for so long; too hot is an error."""
+        load = (tau / self.kind.rated) ** 2
+        rotor, mosfet = AIR_C + ROTOR_RISE_K * load, AIR_C + MOSFET_RISE_K * load
+        self.rotor_c += (rotor - self.rotor_c) * min(for_s / ROTOR_TIME_S, 1.0)
+        self.mosfet_c += (mosfet - self.mosfet_c) * min(for_s / MOSFET_TIME_S, 1.0)
+        if self.rotor_c > self.registers[OVER_TEMPERATURE]:
+            self.fail(HOT_ROTOR)
+        elif self.mosfet_c > MOSFET_LIMIT_C:
+            self.fail(HOT_MOSFET)
+
+    def read(self, register: int, q: float) -> float | None:
+        """Value of a register at joint angle q; None where there is none."""
+        if register == OUTPUT_POSITION:
+            return q - self.zero
+        if register == MOTOR_POSITION:
+            return (q - self.zero) * self.kind.gear
+        return self.registers.get(register)
+
+    def write(self, register: int, value: float) -> None:
+        """Set a register in RAM; what it cannot take leaves it as it was."""
+        if register in READ_ONLY or register not in self.registers or not _fits(register, value):
+            return
+        self.registers[register] = value
+        if register in (PMAX, VMAX, TMAX):
+            self.scale = Scale(*(self.registers[k] for k in (PMAX, VMAX, TMAX)))
+        elif register == TIMEOUT:
+            self._limit_ns = int(value) * TIMEOUT_UNIT_NS if value else NEVER_NS
+            self.deadline_ns = NEVER_NS
+
+
+def in_joint_angles(command: MitCommand, zero: float) -> MitCommand:
+    """The command of a motor whose angle is 0 at the joint angle `zero`."""
+    return command._replace(q_des=command.q_des + zero)
+
+
+def _fits(register: int, value: float) -> bool:
+    if register in INTEGER_REGISTERS:
+        if register in (MST_ID, ESC_ID):
+            return 0 < value <= MAX_STANDARD_ID
+        return register != CTRL_MODE or value in MODES
+    return math.isfinite(value) and (register not in (PMAX, VMAX, TMAX) or value > 0)
+
+
+def _delivered(motor_id: int, reply_id: int, kind: MotorType, scale: Scale) -> dict[int, float]:
+    """Registers as a motor has them when it is switched on; plausible where nothing hangs on it."""
+    values: dict[int, float] = dict.fromkeys([*range(37), *range(50, 56), 80, 81], 0.0)
+    values.update(dict.fromkeys(INTEGER_REGISTERS, 0))
+    values.update({0: 15.0, 1: 1.0, OVER_TEMPERATURE: ROTOR_LIMIT_C, 3: 0.98, 29: 60.0, 30: 1.0})
+    values.update({MST_ID: reply_id, ESC_ID: motor_id, TIMEOUT: 0, CTRL_MODE: MIT_MODE})
+    values.update({14: 5015, 15: motor_id, 16: 14, 20: kind.gear, CAN_BR: CODE_5M})
+    values.update({PMAX: scale.pmax, VMAX: scale.vmax, TMAX: scale.tmax})
+    return values

@@ -1,0 +1,10 @@
+"""`python -m sim.fci`: the simulated robot without the rest of the project."""
+
+import argparse
+import sys
+
+from sim.fci.command import add_arguments, run
+
+parser = argparse.ArgumentParser("python -m sim.fci", description=__doc__)
+add_arguments(parser)
+sys.exit(run(parser.parse_args()))

@@ -1,0 +1,144 @@
+"""The simulated arm as its robot controller sees it: sensors, own model, drives, brakes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.interface import DriverError, JointSample
+from sim.fci.dynamics import flange, mass_matrix, torques, wrench_at
+from sim.fci.settings import Settings
+from sim.plant import Plant
+from sim.scenarios import FLANGE_M, Scenario
+from sim.stages import payload_theta
+from sim.truth import Array, Payload, Truth
+
+TICK_S = 1e-3
+EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
+EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
+# The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
+# is what a command per millisecond holds stable on a rigid arm.
+FASTEST_RATE = 60.0  # 1/s
+SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told; 0.08 when ready
+
+
+class Arm:
+    """Plant and internal model. The model is the true arm without later payloads and losses.
+
+    Attributes:
+        truth: what the internal model knows.
+        sample: the last sample of the sensors.
+        q, dq: (7,) the true joint state at that instant, rad, rad/s.
+        tau_external: (7,) low-passed measured minus model torque, N m: positive for what the
+            robot exerts on its environment.
+        wrench: (6,) the same at the stiffness frame, base axes; zero near singular postures.
+        pose: (4, 4) of the end effector.
+        jacobian: (6, 7) of its origin, base axes.
+    """
+
+    def __init__(self, scenario: Scenario, settings: Settings) -> None:
+        self.truth = known_arm(scenario.truth)
+        self._plant: Plant = scenario.plant()
+        self._n = self.truth.n
+        self._still = np.zeros(self._n)
+        self.refresh(settings)
+        self.sample: JointSample = self._plant.read()
+        self.q, self.dq, self._drive = self._state()
+        self.tau_external: Array = np.zeros(self._n)
+        self.wrench: Array = np.zeros(6)
+        self._look()
+        self.step()  # whatever is compiled on first use is compiled before the clock runs
+        self.mass(self.q)
+
+    @property
+    def saturated(self) -> bool:
+        """The last drive asked for more than a joint can give."""
+        return self._plant.saturated
+
+    @property
+    def outside(self) -> bool:
+        """A joint is outside its range."""
+        limits = self.truth.limits
+        return bool((self.q < limits.lower).any() or (self.q > limits.upper).any())
+
+    def refresh(self, settings: Settings) -> None:
+        """Take over what a client set: end effector, stiffness frame and load."""
+        self._tool, self._to_K = settings.F_T_EE, settings.EE_T_K
+        self._theta = self.truth.theta.copy()
+        m, com, inertia = settings.load
+        if m > 0.0:
+            self._theta[-1] += payload_theta(
+                Payload(0.0, m, com + np.array([0.0, 0.0, FLANGE_M]), inertia)
+            )
+
+    def drive(self, tau: Array) -> None:
+        """Torques on top of gravity, reached at the end of the next tick; brakes open."""
+        wanted = tau + self.model(self.q, self._still, self._still)
+        try:
+            self._plant.command(wanted)
+        except DriverError:  # the plant's own guard: a joint is out of range or too fast
+            self._plant.stop()
+
+    def track(self, q: Array, dq: Array, ddq: Array, stiffness: Array) -> None:
+        """Follow a joint motion by impedance control: no steady error without external torque."""
+        M = self.mass(self.q)
+        rate = np.minimum(np.sqrt(stiffness / np.diag(M)), FASTEST_RATE)
+        push = ddq + rate * rate * (q - self.q) + 2 * rate * (dq - self.dq)
+        self.drive(self.model(self.q, self.dq, push) - self.model(self.q, self._still, self._still))
+
+    def brake(self) -> None:
+        """Slow down and hold."""
+        self._plant.stop()
+
+    def release(self) -> bool:
+        """Let the drives act again after a violation; False while a joint is out of its range."""
+        if self.outside:
+            return False
+        self._plant.fault = None
+        return True
+
+    def step(self) -> None:
+        """One tick of the world; then look at the sensors."""
+        q, dq, drive = self.q, self.dq, self._drive
+        self.sample = self._plant.read()
+        self.q, self.dq, self._drive = self._state()
+        middle = (q + self.q) / 2, (dq + self.dq) / 2, (self.dq - dq) / TICK_S
+        sensed = self.sample.tau + (drive - self._drive) / 2  # brought to the tick's middle
+        outside = sensed - self.model(*middle)
+        self.tau_external += EXTERNAL_GAIN * (outside - self.tau_external)
+        self._look()
+
+    def model(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Torques (7,) of the internal model for a motion, N m."""
+        truth = self.truth
+        return np.asarray(torques(truth.R, truth.p, self._theta, truth.gravity, q, dq, ddq))
+
+    def mass(self, q: Array) -> Array:
+        """(7, 7) mass matrix of the internal model, kg m²."""
+        return np.asarray(mass_matrix(self.truth.R, self.truth.p, self._theta, q))
+
+    def frame(self, q: Array) -> tuple[Array, Array]:
+        """Pose (4, 4) of the end effector and Jacobian (6, 7) at a posture."""
+        pose, J = flange(self.truth.R, self.truth.p, q, FLANGE_M, self._tool)
+        return pose, J
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._plant.close()
+
+    def _state(self) -> tuple[Array, Array, Array]:
+        """True q, dq and driving torque, each in one piece of memory: one compiled variant."""
+        q, dq, drive = self._plant.link_state()
+        return np.ascontiguousarray(q), np.ascontiguousarray(dq), drive
+
+    def _look(self) -> None:
+        """Pose and external wrench at the present posture."""
+        self.pose, self.jacobian = self.frame(self.q)
+        self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, SINGULAR)
+
+
+def known_arm(truth: Truth) -> Truth:
+    """What the robot knows of itself: the rigid arm as it starts, without losses."""
+    nothing = np.zeros(truth.n)
+    return truth.with_changes(
+        events=(), effects=(), Fv=nothing, Fc=nothing, torque_offset=nothing, motor_inertia=nothing
+    )

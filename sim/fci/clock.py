@@ -1,0 +1,87 @@
+"""The simulated milliseconds: absolute deadlines, and a world that slips where time was taken."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+
+PERIOD_NS = 1_000_000
+SPIN_NS = 60_000  # waiting actively for the last part: a wake-up costs the system that much
+ABSOLUTE = 1  # TIMER_ABSTIME, <time.h>
+PRIORITY = 80  # of SCHED_FIFO: above any client loop but those that take 99
+
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class _Moment(ctypes.Structure):
+    _fields_ = (("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long))
+
+
+def _sleep_to(deadline_ns: int) -> None:
+    """Sleep until CLOCK_MONOTONIC shows the deadline, or a signal comes."""
+    moment = _Moment(*divmod(deadline_ns, 1_000_000_000))
+    _libc.clock_nanosleep(time.CLOCK_MONOTONIC, ABSOLUTE, ctypes.byref(moment), None)
+
+
+class Ticks:
+    """Waits for one tick after the other; lost periods are counted, not caught up with.
+
+    Attributes:
+        stalled: periods that went by without a tick, each of them 1 ms by which the simulated
+            world is behind the clock on the wall.
+    """
+
+    def __init__(
+        self,
+        now: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[int], None] = _sleep_to,
+    ) -> None:
+        self._now, self._sleep = now, sleep
+        self.stalled = 0
+        self._due = 0
+
+    def restart(self) -> None:
+        """The next tick is one period from now."""
+        self._due = self._now()
+
+    def wait(self) -> None:
+        """Return at the next tick; a whole period too late, the world slips."""
+        self._due += PERIOD_NS
+        wake = self._due - SPIN_NS
+        now = self._now()
+        lost = (now - self._due) // PERIOD_NS
+        if lost > 0:
+            self.stalled += lost
+            self._due += lost * PERIOD_NS
+        while now < wake:
+            self._sleep(wake)
+            now = self._now()
+        while now < self._due:
+            now = self._now()
+
+
+@contextmanager
+def undisturbed(core: int | None = None) -> Iterator[None]:
+    """Priority, a core and no collector for the calling thread, as far as the system permits."""
+    with ExitStack() as undo:
+        if core is not None:
+            before = os.sched_getaffinity(0)
+            with suppress(OSError, ValueError):
+                os.sched_setaffinity(0, {core})
+                undo.callback(os.sched_setaffinity, 0, before)
+        policy = os.sched_getscheduler(0), os.sched_getparam(0)
+        with suppress(OSError, ValueError):
+            fifo = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, fifo, os.sched_param(PRIORITY))
+            undo.callback(os.sched_setscheduler, 0, *policy)
+        if gc.isenabled():
+            gc.collect()
+            gc.freeze()
+            gc.disable()
+            undo.callback(gc.enable)
+            undo.callback(gc.unfreeze)
+        yield
