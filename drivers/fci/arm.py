@@ -1,0 +1,231 @@
+"""A Franka Panda/FER or FR3 as a driver: states at 1 kHz, and torques where allowed."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+
+from drivers.fci import ledger, tables
+from drivers.fci.codec import JOINTS, State, Status
+from drivers.fci.flags import told
+from drivers.fci.guard import checked
+from drivers.fci.handshake import Link, open_link, parse, recover
+from drivers.fci.interpreter import QUICK_SWITCHING
+from drivers.fci.ledger import Ledger
+from drivers.fci.motion import Motion
+from drivers.fci.stream import StateStream
+from drivers.interface import Array, DriverError, Intake, JointSample
+
+SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
+RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it
+_NAMES = {
+    tables.PANDA: tuple(f"panda_joint{i}" for i in range(1, JOINTS + 1)),
+    tables.FR3: tuple(f"fr3_joint{i}" for i in range(1, JOINTS + 1)),
+}
+_LIMP_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP)
+_RECOVERING_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY)
+
+
+class FciArm:
+    """Driver of a robot with the Franka Control Interface.
+
+    States are received by a process of its own (`drivers.fci.reader`), so that other threads
+    here cost none; while connected, the interpreter's switch interval is short for the same
+    reason. Stamps are the robot's ticks: `message_id` milliseconds. Every datagram is accounted
+    for in `intake`: ids that are missing are lost, whatever arrived and was not used is refused
+    by a reason.
+
+    Commands need `allow_motion`. The first one asks the robot for a motion; until the robot
+    shows that it runs, commands are kept back. After a motion ended by itself, `read` and
+    `command` say why until `stop` is called. If this process dies, the robot stops by itself
+    after 20 missing commands.
+
+    Args:
+        address: `fci://HOST[:PORT][?protocol=5|10|auto&recover=1]`.
+        joint_names: 7 names; by default panda_joint1 to 7, or fr3_joint1 to 7 where the address
+            or, at `connect`, the robot says protocol 10.
+        allow_motion: whether commands may be sent.
+
+    Attributes:
+        version: of the protocol, once connected; None before.
+
+    Raises:
+        DriverError: the address is not understood, or there are not 7 names.
+    """
+
+    paced = True
+    adds_gravity = True
+    period_ns = ledger.TICK_NS
+    link_names: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        address: str,
+        joint_names: Sequence[str] | None = None,
+        allow_motion: bool = False,
+    ) -> None:
+        self._wanted = parse(address)
+        self._named = joint_names is not None
+        names = _NAMES[self._wanted.version or tables.PANDA] if joint_names is None else joint_names
+        self.joint_names: tuple[str, ...] = tuple(names)
+        if len(self.joint_names) != JOINTS:
+            raise DriverError(f"the robot has {JOINTS} joints, got {len(self.joint_names)} names")
+        self.can_move = allow_motion
+        self.version: int | None = None
+        self.arrived_ns = 0
+        self._ledger = Ledger()
+        self.intake: Intake = self._ledger.intake
+        self._link: Link | None = None
+        self._stream: StateStream | None = None
+        self._motion: Motion | None = None
+        self._first: State | None = None  # read by connect, not handed out yet
+        self._state: State | None = None
+
+    @property
+    def kernel_drops(self) -> int:
+        """Datagrams that the operating system dropped; part of `intake.lost`."""
+        return self._ledger.kernel_drops
+
+    @property
+    def reader_pid(self) -> int | None:
+        """Process id of the reader; None when not connected."""
+        return None if self._link is None else self._link.feed.pid
+
+    def connect(self) -> None:
+        """Open the connection and wait for a state; an open one is closed before.
+
+        Raises DriverError, which says what to do.
+        """
+        self.close()
+        self._ledger, self._state = Ledger(), None
+        self.intake = self._ledger.intake
+        link = self._link = open_link(self._wanted)
+        QUICK_SWITCHING.begin()
+        try:
+            stream = self._stream = StateStream(link, self._ledger)
+            self._motion = Motion(link.version, link.channel, stream.send)
+            self._first = self._make_ready(stream)
+        except BaseException:
+            self.close()
+            raise
+        self.arrived_ns = stream.arrived_ns
+        self.version = link.version
+        if not self._named:
+            self.joint_names = _NAMES[link.version]
+
+    def read(self) -> JointSample:
+        """The next state's sample; waits for it, a second at most. Raises DriverError."""
+        stream, motion = self._need_open()
+        if motion.fault is not None:
+            raise DriverError(motion.fault)
+        state = self._take_first() or stream.next(SILENCE_S)
+        if state is None:
+            raise DriverError(stream.silence())
+        self.intake.used += 1
+        self.arrived_ns = stream.arrived_ns
+        if motion.active:
+            motion.look(state)
+        elif self._state is None or state.status is not self._state.status:
+            self._note_status(state.status)
+        self._state = state
+        return JointSample(state.message_id * ledger.TICK_NS, state.q, state.dq, state.tau_J)
+
+    def command(self, tau: Array) -> None:
+        """Answer the state read last with (7,) N m on top of the arm's weight and friction.
+
+        Torques and their steps are cut at the robot's limits. Raises DriverError.
+        """
+        stream, motion = self._need_open()
+        if not self.can_move:
+            raise DriverError("this robot is only listened to; motion needs --allow-motion")
+        tau = checked(tau)
+        state = self._state
+        if state is None:
+            raise DriverError("no state was read yet; a command answers one")
+        motion.command(tau, state, stream.answered(state.message_id))
+
+    def stop(self) -> None:
+        """Brake the arm and end the motion, if there is one. Raises DriverError."""
+        if self._motion is not None:
+            self._motion.stop(self._state_while_stopping)
+
+    def close(self) -> None:
+        """Stop, then release everything; may be called more than once."""
+        link, motion = self._link, self._motion
+        if link is None:
+            return
+        try:
+            if motion is not None and motion.active:
+                self.stop()
+        except DriverError as error:
+            self._ledger.note("close", str(error))
+        finally:
+            self._link = self._stream = self._motion = self._first = None
+            link.close()
+            QUICK_SWITCHING.end()
+
+    def _need_open(self) -> tuple[StateStream, Motion]:
+        if self._stream is None or self._motion is None:
+            raise DriverError(f"{self._wanted.host}: not connected; call connect first")
+        return self._stream, self._motion
+
+    def _make_ready(self, stream: StateStream) -> State:
+        """The first state, after a recovery where that was asked for. Raises DriverError."""
+        state = stream.next(SILENCE_S)
+        if state is None:
+            raise DriverError(stream.silence())
+        if state.status.robot_mode == tables.ROBOT_REFLEX and self._wanted.recover:
+            state = self._recovered(stream, state)
+        self._note_status(state.status)
+        mode = state.status.robot_mode
+        if self.can_move and mode != tables.ROBOT_IDLE:
+            raise DriverError(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
+        return state
+
+    def _recovered(self, stream: StateStream, first: State) -> State:
+        """The first state that shows no reflex any more. Raises DriverError."""
+        assert self._link is not None
+        recover(self._link)
+        state: State | None = first
+        deadline = time.monotonic() + RECOVERED_S
+        while state is not None and state.status.robot_mode in _RECOVERING_MODES:
+            if time.monotonic() > deadline:
+                raise DriverError(
+                    f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
+                    "that it recovered, but does not show it"
+                )
+            self.intake.refused[ledger.RECOVERING] += 1
+            state = stream.next(SILENCE_S)
+        if state is None:
+            raise DriverError(stream.silence())
+        return state
+
+    def _take_first(self) -> State | None:
+        """The state that connect has read, unless it waited for too long."""
+        first, self._first = self._first, None
+        if first is not None and time.monotonic_ns() - self.arrived_ns > ledger.STALE_NS:
+            self.intake.refused[ledger.STALE] += 1
+            return None
+        return first
+
+    def _state_while_stopping(self, wait_s: float) -> State | None:
+        """The newest state there is."""
+        stream = self._need_open()[0]
+        with contextlib.suppress(DriverError):  # the motion is then ended over TCP
+            state = stream.next(wait_s)
+            while state is not None:
+                self.intake.refused[ledger.STOPPING] += 1
+                self._state = state
+                if not stream.behind:
+                    return state
+                state = stream.next(wait_s)
+        return None
+
+    def _note_status(self, status: Status) -> None:
+        """While only listening, a robot that cannot move is worth a sentence, not an end."""
+        mode = status.robot_mode
+        if mode in _LIMP_MODES:
+            why = f" ({told(status.reflex_reason)})" if any(status.reflex_reason) else ""
+            sentence = f"the robot {tables.ROBOT_MODE_MEANING[mode]}{why}"
+            self._ledger.note(f"mode {mode}", sentence)

@@ -1,0 +1,130 @@
+"""Versions, modes and status codes of the FCI, and a sentence for each.
+
+Numbers: Franka FCI documentation, libfranka 0.9.2 (protocol 5) and 0.21.2 (protocol 10) headers.
+"""
+
+from __future__ import annotations
+
+PANDA, FR3 = 5, 10  # protocol versions
+PORT = 1337  # TCP, fixed by the robot
+
+# Commands that this driver sends, id by version.
+CONNECT = {PANDA: 0, FR3: 0}
+MOVE = {PANDA: 1, FR3: 1}
+STOP_MOVE = {PANDA: 2, FR3: 2}
+RECOVER = {PANDA: 12, FR3: 10}  # AutomaticErrorRecovery
+
+# Modes in a state.
+CONTROLLER_TORQUE, CONTROLLER_NONE = 2, 3
+CONTROLLER_MODES = 4
+GENERATOR_IDLE = 0
+GENERATOR_MODES = {PANDA: 5, FR3: 6}
+RUNNING_GENERATOR = {PANDA: 2, FR3: 5}  # joint velocity (all zero); none
+MOVE_GENERATOR = {PANDA: 1, FR3: 4}  # the same in a Move request
+ROBOT_OTHER, ROBOT_IDLE, ROBOT_MOVE, ROBOT_GUIDING = 0, 1, 2, 3
+ROBOT_REFLEX, ROBOT_USER_STOP, ROBOT_RECOVERY = 4, 5, 6
+ROBOT_MODES = 8  # 7 is read as "other" by the clients
+
+LIBFRANKA = {  # by protocol version
+    5: "libfranka 0.9",
+    6: "libfranka 0.10 to 0.13.2",
+    7: "libfranka 0.13.3",
+    8: "libfranka 0.14",
+    9: "libfranka 0.15",
+    10: "libfranka 0.18 and newer",
+}
+
+MOVE_STATUS = {
+    PANDA: (
+        "success",
+        "motion_started",
+        "preempted",
+        "not_possible",
+        "singular_start",
+        "invalid_argument",
+        "reflex",
+        "user_stop",
+        "input_error",
+        "aborted",
+    ),
+    FR3: (
+        "success",
+        "motion_started",
+        "preempted",
+        "preempted_by_safety",
+        "rejected_by_safety",
+        "not_possible",
+        "singular_start",
+        "invalid_argument",
+        "reflex",
+        "user_stop",
+        "input_error",
+        "aborted",
+    ),
+}
+STOP_STATUS = {
+    PANDA: ("success", "not_possible", "user_stop", "reflex", "aborted"),
+    FR3: ("success", "not_possible", "rejected_by_safety", "user_stop", "reflex", "aborted"),
+}
+RECOVER_STATUS = {
+    PANDA: ("success", "not_possible", "manual_recovery", "reflex", "user_stop", "aborted"),
+    FR3: (
+        "success",
+        "not_possible",
+        "rejected_by_safety",
+        "manual_recovery",
+        "reflex",
+        "user_stop",
+        "aborted",
+    ),
+}
+
+MEANING = {
+    "success": "it says that all is done",
+    "motion_started": "it says that the motion started",
+    "preempted": "the motion was preempted: end the other program or task that moves the arm",
+    "preempted_by_safety": "a safety function ended the motion: look at Desk, clear it",
+    "rejected_by_safety": "a safety function forbids it: look at Desk and clear it",
+    "not_possible": "it is not possible now: unlock the brakes, activate FCI and leave "
+    "programming mode in Desk; after a reflex recover first (?recover=1)",
+    "singular_start": "the arm starts in a singular posture: guide it elsewhere",
+    "invalid_argument": "it takes our request for invalid: check its system version",
+    "reflex": "a reflex stopped the arm: clear the cause, then recover (?recover=1)",
+    "user_stop": "the user stop is pressed: release it when the arm may move",
+    "input_error": "it could not use our commands: check its system version and the network",
+    "aborted": "it aborted: look at Desk for the cause, start again",
+    "manual_recovery": "the error needs hands: open Desk, recover there (joint limits: guide the "
+    "arm back)",
+}
+
+ROBOT_MODE_MEANING = {
+    ROBOT_OTHER: "is not ready: unlock the brakes and activate FCI in Desk",
+    ROBOT_IDLE: "is idle",
+    ROBOT_MOVE: "is moving for another program: end that first",
+    ROBOT_GUIDING: "is being guided by hand: let go and leave the guiding mode",
+    ROBOT_REFLEX: "is in reflex: clear the cause, then recover (?recover=1, or in Desk)",
+    ROBOT_USER_STOP: "has its user stop pressed: release it when the arm may move",
+    ROBOT_RECOVERY: "recovers from an error: wait until it is done",
+    7: "is not ready: unlock the brakes and activate FCI in Desk",
+}
+
+
+def status_name(statuses: tuple[str, ...], status: int) -> str:
+    """Name of a status code; "status N" for a code nobody defined."""
+    return statuses[status] if status < len(statuses) else f"status {status}"
+
+
+def meaning(name: str) -> str:
+    """What a status says and what to do, as the end of a sentence."""
+    return MEANING.get(name, f"it answers {name}, which is not defined: check its system version")
+
+
+def version_trouble(server: int, asked: int) -> str:
+    """Why a robot of this version cannot be talked to, as the end of a sentence."""
+    what = LIBFRANKA.get(server, "no libfranka known here")
+    if server in (PANDA, FR3):
+        return f"speaks FCI protocol {server} ({what}), not {asked}: use ?protocol={server}"
+    return (
+        f"speaks FCI protocol {server} ({what}); supported are 5 (Panda/FER, libfranka 0.9) and "
+        "10 (FR3, libfranka 0.18 and newer): bring its system to one of these"
+    )
