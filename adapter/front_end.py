@@ -12,6 +12,20 @@ from adapter.errors import SettingsError
 from adapter.fast import jit
 from adapter.filters import NEVER, SETTLING_DELAYS, FilterSettings, JointFilter, filter_step
 from adapter.model import SelfModel
+from adapter.plausibility import (
+    AHEAD,
+    DOUBTED,
+    DQ_STEP,
+    JUMPED,
+    OLD_STAMPS,
+    Q_STEP,
+    SEEN,
+    STREAK,
+    TAU_STEP,
+    in_order,
+    new_marks,
+    plausible,
+)
 from adapter.records import Array, StateLayout
 from adapter.twist import TwistSynthesis
 from drivers.interface import JointSample
@@ -20,10 +34,19 @@ from drivers.interface import JointSample
 NON_FINITE, OUT_OF_RANGE, REPEATED = "non_finite", "out_of_range", "repeated"
 TIME_BACKWARDS, SETTLING = "time_backwards", "filter_settling"
 AT_REST, SATURATED = "at_rest", "torque_saturated"
+IMPLAUSIBLE, STUCK = "implausible_step", "stuck_joint"
+ENCODER_JUMP, TIME_AHEAD = "encoder_jump", "time_ahead"
 # What no joint of an arm does, where its documentation is silent: rad, rad/s, N m.
 Q_CAP, DQ_CAP, TAU_CAP = 1e4, 1e3, 1e5
-RESYNC_AFTER = 100  # stamps in a row that lie before the newest: the newest was wrong
-NOTEWORTHY = (NON_FINITE, OUT_OF_RANGE, TIME_BACKWARDS, SATURATED)
+NOTEWORTHY = (
+    NON_FINITE,
+    OUT_OF_RANGE,
+    TIME_BACKWARDS,
+    SATURATED,
+    IMPLAUSIBLE,
+    STUCK,
+    ENCODER_JUMP,
+)
 VERDICTS = (
     "",
     NON_FINITE,
@@ -33,6 +56,10 @@ VERDICTS = (
     SETTLING,
     AT_REST,
     SATURATED,
+    IMPLAUSIBLE,
+    STUCK,
+    ENCODER_JUMP,
+    TIME_AHEAD,
 )
 
 
@@ -94,6 +121,10 @@ def process(
     k2,
     delay_ns,
     last,
+    floor,
+    trail,
+    since,
+    ahead,
     marks,
     times,
     old,
@@ -108,30 +139,60 @@ def process(
     Args:
         stamps: (m,) int64 ns; q, dq, tau: (m, n).
         limits: (4, n) lowest and highest q, highest |dq| and |tau|; effort: (n,) saturation.
-        marks: (3,) int64: stamps saturated until, of the first moving sample; how many samples
-            in a row came with a stamp before the newest.
+        floor: (3, n) change of q, dq, tau from sample to sample that is always believed.
+        trail: (3, 3, n) last good and last doubted readings, squares of their usual changes.
+        since: (n,) int64 stamps at which the joints' readings last changed.
+        ahead: (3 n,) the reading whose stamp lay far ahead.
+        marks: (9,) int64: stamps saturated until, of the first moving sample; how many
+            samples in a row came with a stamp before the newest; newest stamp in order; stamps
+            not confirmed yet (far ahead, a step); joint whose encoder jumped; usual dt, ns.
         last, times, old, y, dy: state, see `judge` and `filter_step`.
         out: (m, size) records, stamp and filtered signals filled where the verdict is 0.
         verdicts: (m,) index into `VERDICTS`; negative where a gap restarted the filter.
-        before: (m,) int64 the stamp before that gap.
+        before: (m, 2) int64 the stamps before and behind that gap.
     """
     n = q.shape[1]
-    u = np.empty(3 * n)
+    u, x = np.empty(3 * n), np.empty((3, n))
     for i in range(stamps.shape[0]):
         stamp = stamps[i]
         verdict = judge(q[i], dq[i], tau[i], last, limits[0], limits[1], limits[2], limits[3])
-        if verdict == 0 and times[0] != NEVER and stamp <= times[0]:
-            marks[2] += 1
-            if marks[2] < RESYNC_AFTER:
-                verdict = 4
+        seen, ahead_ns = marks[SEEN], marks[AHEAD]
+        if verdict == 0:
+            verdict = in_order(stamp, gap_ns, times, marks)
+        if verdict == 11:
+            ahead[:n], ahead[n : 2 * n], ahead[2 * n :] = q[i], dq[i], tau[i]
+        if verdict:
+            verdicts[i] = verdict
+            continue
+        gap = times[0] != NEVER and (
+            stamp <= times[0] or stamp - seen > gap_ns or marks[OLD_STAMPS] >= STREAK
+        )
+        marks[OLD_STAMPS] = 0
+        x[0], x[1], x[2] = q[i], dq[i], tau[i]
+        if times[0] == NEVER or gap:
+            since[:] = stamp
+            marks[JUMPED] = 0
+        elif marks[JUMPED]:
+            verdict = 10
+        else:
+            verdict = plausible(
+                stamp, x, times[0], gap_ns, floor, trail[0], trail[1], trail[2], since, marks
+            )
+            gap = stamp - times[0] > gap_ns
+            if verdict == 10 and stamp - times[1] < SETTLING_DELAYS * delay_ns:
+                verdict, marks[JUMPED], times[0] = 0, 0, NEVER  # it was the first that was wrong
         verdicts[i] = verdict
         if verdict:
             continue
-        gap = times[0] != NEVER and (stamp <= times[0] or stamp - times[0] > gap_ns)
-        marks[2] = 0
+        trail[0] = x
+        marks[DOUBTED] = NEVER
+        marks[AHEAD] = NEVER
         if gap:
-            before[i] = times[0]
+            before[i, 0], before[i, 1] = times[0], stamp
             times[0] = NEVER
+            if ahead_ns != NEVER and 0 < stamp - ahead_ns <= gap_ns:  # it began there
+                before[i, 1] = ahead_ns
+                filter_step(ahead_ns, ahead, k1, k2, SETTLING_DELAYS * delay_ns, times, old, y, dy)
         u[:n], u[n : 2 * n], u[2 * n :] = q[i], dq[i], tau[i]
         settled = filter_step(stamp, u, k1, k2, SETTLING_DELAYS * delay_ns, times, old, y, dy)
         moving, fast = False, False
@@ -191,8 +252,19 @@ class FrontEnd:
             ]
         )
         self._last = np.full((3, n), np.nan)
-        self._marks = np.array([NEVER, NEVER, 0])
-        self._before = np.zeros(1, dtype=np.int64)
+        self._marks = new_marks()
+        self._floor = np.array(
+            [
+                Q_STEP * self.filter.settings.period_s * limits.velocity,
+                DQ_STEP * limits.velocity,
+                TAU_STEP * limits.effort,
+            ]
+        )
+        self._floor[np.isnan(self._floor)] = np.inf  # where nothing is documented
+        self._trail = np.zeros((3, 3, n))
+        self._since = np.zeros(n, dtype=np.int64)
+        self._ahead = np.zeros(3 * n)
+        self._before = np.zeros((1, 2), dtype=np.int64)
         self._record = self.layout.new(1)
         self._verdict = np.zeros(1, dtype=np.int64)
         self.refused: Counter[str] = Counter()
@@ -208,6 +280,16 @@ class FrontEnd:
     def first_moving_ns(self) -> int | None:
         """Stamp of the first sample with any measured |dq| above `rest_dq`."""
         return None if self._marks[1] == NEVER else int(self._marks[1])
+
+    @property
+    def fault(self) -> str | None:
+        """What makes all further samples useless, or None: an encoder that jumped."""
+        joint = int(self._marks[JUMPED])
+        if not joint:
+            return None
+        step = self._trail[1, 0, joint - 1] - self._trail[0, 0, joint - 1]
+        name = self.names[joint - 1]
+        return f"the encoder of {name} jumped by {step:.3g} rad; reference the arm, then run again"
 
     def step(self, sample: JointSample) -> Array | None:
         """The filtered state that this sample completes, or None where it teaches nothing.
@@ -225,7 +307,7 @@ class FrontEnd:
         )
         verdict = self._verdict[0]
         if verdict:
-            self._refuse(verdict, sample, int(self._before[0]))
+            self._refuse(verdict, sample, self._before[0])
             return None
         record = self._record[0]
         self.twist.fill(record, sample)
@@ -247,11 +329,11 @@ class FrontEnd:
         """
         records = self.layout.new(len(q))
         verdicts = np.zeros(len(q), dtype=np.int64)
-        before = np.zeros(len(q), dtype=np.int64)
+        before = np.zeros((len(q), 2), dtype=np.int64)
         self._process(stamp_ns, q, dq, tau, records, verdicts, before)
         for i in np.flatnonzero(verdicts):
             sample = JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i])
-            self._refuse(verdicts[i], sample, int(before[i]))
+            self._refuse(verdicts[i], sample, before[i])
         good = verdicts == 0
         records = records[good]
         self.twist.fill_table(
@@ -287,6 +369,10 @@ class FrontEnd:
             f.k2,
             f.delay_ns,
             self._last,
+            self._floor,
+            self._trail,
+            self._since,
+            self._ahead,
             self._marks,
             f.times,
             f.old,
@@ -297,9 +383,10 @@ class FrontEnd:
             before,
         )
 
-    def _refuse(self, verdict: int, sample: JointSample, before_ns: int) -> None:
+    def _refuse(self, verdict: int, sample: JointSample, hole: NDArray[np.int64]) -> None:
         if verdict < 0:
-            gap_s = 1e-9 * (sample.stamp_ns - before_ns)
+            before_ns, behind_ns = int(hole[0]), int(hole[1])
+            gap_s = 1e-9 * (behind_ns - before_ns)
             if not self.gaps:
                 self.messages.append(
                     f"at {1e-9 * before_ns:.3f} s: {gap_s:.3f} s without a sample; the filter "
@@ -330,4 +417,10 @@ class FrontEnd:
             return f"{at}: a reading is not a finite number; the sample was refused"
         if reason == SATURATED:
             return f"{at}: a torque is at its limit; nothing is learned around it"
+        if reason == IMPLAUSIBLE:
+            return f"{at}: a reading steps further than the arm moves; the sample was refused"
+        if reason == STUCK:
+            return f"{at}: a joint moves, its readings stand still; refused until they move"
+        if reason == ENCODER_JUMP:
+            return f"{at}: {self.fault}"
         return f"{at}: time does not increase; the sample was refused"

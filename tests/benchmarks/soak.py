@@ -1,20 +1,33 @@
-"""A long live run with an eye on its memory: `make soak`.
+"""Long live runs with an eye on memory and on the account of samples: `make soak`.
 
-Runs `adapter run` on the simulated Panda, reads the resident memory of all its processes every
-five seconds, and prints the growth after the first minute beside the run's own figures.
+Runs `adapter run` on a simulated arm, in this process's child (`pybullet`) or behind its wire
+protocol in a process of its own (`fci`, `can`), with faults where asked, reads the resident memory
+of all processes of the run every five seconds, and prints the growth after the first minute, the
+account of every sample and the run's own figures.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+import re
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 EVERY_S, SETTLED_S = 5.0, 60.0
+READY_S = 120.0
+# Faults of the wire that come as a share of the messages, by simulated arm.
+FAULTS = {
+    "fci": ("drop", "late", "repeat", "reorder", "corrupt"),
+    "can": ("drop", "late", "repeat", "reorder", "corrupt"),
+}
+READY = {"fci": re.compile(r"127\.0\.0\.1:\d+"), "can": re.compile(r"can://\S+")}
 
 
 def resident_kb(pid: int) -> int:
@@ -37,38 +50,102 @@ def family(pid: int) -> list[int]:
     return [pid, *(member for child in children for member in family(int(child)))]
 
 
+@contextlib.contextmanager
+def simulated(
+    arm: str, share: float, folder: Path, extra: Sequence[str] = ()
+) -> Iterator[tuple[str, Path]]:
+    """A served arm with faults; gives its driver address and where its summary will be."""
+    summary = folder / "arm.json"
+    command = [sys.executable, "-u", "-m", "adapter", "sim", arm, "--json", str(summary)]
+    command += ["--port", "0"] if arm == "fci" else []
+    command += extra
+    if share:
+        for name in FAULTS[arm]:
+            command += ["--fault", f"{name}={share}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            address = None
+            deadline = time.monotonic() + READY_S
+            while address is None and time.monotonic() < deadline:
+                line = server.stdout.readline()
+                found = READY[arm].search(line)
+                if found is not None:
+                    address = found.group(0) if arm == "can" else f"fci://{found.group(0)}"
+                if not line:
+                    break
+            if address is None:
+                raise SystemExit(f"the simulated {arm} arm did not start")
+            yield address, summary
+        finally:
+            server.terminate()
+            server.wait(READY_S)
+
+
+def watch(command: list[str]) -> tuple[int, list[tuple[float, int]], float]:
+    """Run a command; its exit code, (seconds, private memory in kB) of its family, its end."""
+    began = time.monotonic()
+    process = subprocess.Popen(command, stdout=sys.stderr)
+    memory: list[tuple[float, int]] = []
+    while process.poll() is None:
+        time.sleep(EVERY_S)
+        now = time.monotonic() - began
+        memory.append((now, sum(resident_kb(pid) for pid in family(process.pid))))
+    return process.returncode, memory, time.monotonic() - began
+
+
+def account(figures: dict[str, Any]) -> dict[str, Any]:
+    """Where every message and every sample went, and whether the sums agree."""
+    refused = sum(figures["refused"].values())
+    intake = figures["intake"]
+    return {
+        "intake": intake,
+        "messages_balance": intake["received"] == intake["used"] + sum(intake["refused"].values()),
+        "samples_balance": figures["samples"] == figures["learned"] + refused,
+        "all_recorded": figures["recorded"] == figures["samples"] and not figures["unrecorded"],
+    }
+
+
 def main() -> None:
     """Run, watch, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--driver", choices=("pybullet", "fci", "can"), default="pybullet")
+    parser.add_argument("--faults", type=float, default=0.0, metavar="SHARE")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
-        figures_path = Path(name) / "figures.json"
-        command = [sys.executable, "-m", "adapter", "run", "--driver", "pybullet:panda"]
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        address, summary = "pybullet:panda", None
+        if args.driver != "pybullet":
+            address, summary = stack.enter_context(simulated(args.driver, args.faults, folder))
+        path = folder / "figures.json"
+        command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
         command += ["--duration", str(60 * args.minutes), "--seed", "5", "--quiet"]
-        command += ["--out", name, "--no-report", "--json", str(figures_path)]
-        began = time.monotonic()
-        process = subprocess.Popen(command, stdout=sys.stderr)
-        memory: list[tuple[float, dict[int, int]]] = []
-        while process.poll() is None:
-            time.sleep(EVERY_S)
-            now = time.monotonic() - began
-            memory.append((now, {pid: resident_kb(pid) for pid in family(process.pid)}))
-        if process.returncode:
-            sys.exit(process.returncode)
-        figures = json.loads(figures_path.read_text())
-        size = sum(path.stat().st_size for path in Path(name).glob("*.mcap"))
-    end_s = began + 60 * args.minutes - began
-    steady = [(t, sum(m.values())) for t, m in memory if SETTLED_S + 10 < t < end_s]
-    growth_mb = (steady[-1][1] - steady[0][1]) / 1024 if steady else float("nan")
+        command += ["--out", str(folder), "--no-report", "--json", str(path)]
+        code, memory, ended_s = watch(command)
+        if code:
+            sys.exit(code)
+        figures = json.loads(path.read_text())
+        size = sum(file.stat().st_size for file in folder.glob("*.mcap"))
+        stack.close()
+        served = None if summary is None else json.loads(summary.read_text())
+    steady = [(t, kb) for t, kb in memory if SETTLED_S + 10 < t < ended_s - EVERY_S]
     found = {
+        "driver": address,
         "minutes": args.minutes,
+        "faults": args.faults,
         "memory_mb": steady[-1][1] / 1024 if steady else None,
-        "growth_after_first_minute_mb": growth_mb,
+        "growth_after_first_minute_mb": (
+            (steady[-1][1] - steady[0][1]) / 1024 if steady else float("nan")
+        ),
         "recording_mb": size / 1e6,
+        **account(figures),
         **{key: figures[key] for key in ("samples", "learned", "refused", "missed_deadlines")},
-        **{key: figures[key] for key in ("recorded", "unrecorded", "tick_us", "timing")},
+        **{key: figures[key] for key in ("recorded", "unrecorded", "tick_us", "timing", "ended")},
+        "lambda_converged_s": figures["lambda"]["converged_s"],
+        "theta_converged_s": figures["theta"]["converged_s"],
+        "arm": served,
     }
     text = json.dumps(found, indent=1)
     print(text)

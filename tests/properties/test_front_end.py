@@ -175,14 +175,16 @@ def test_rest_teaches_nothing() -> None:
 
 def test_saturated_torque_is_kept_out_until_the_filter_has_forgotten_it() -> None:
     samples = moving().samples()
-    tau = samples[2000].tau.copy()
-    tau[6] = 12.0
-    samples[2000] = replace(samples[2000], tau=tau)
+    for k in range(2000, 2003):  # one alone would be a spike, refused as such
+        tau = samples[k].tau.copy()
+        tau[6] = 12.0
+        samples[k] = replace(samples[k], tau=tau)
     states, front_end = run(samples)
     wait = front_end.filter.settle_ns / MS
-    assert front_end.refused["torque_saturated"] == pytest.approx(wait, abs=1.5)
+    assert front_end.refused["torque_saturated"] == pytest.approx(wait, abs=4)
+    assert front_end.refused["implausible_step"] <= 2
     stamps = stamps_of(states) + front_end.filter.delay_ns
-    assert not ((stamps >= 2000 * MS) & (stamps <= 2000 * MS + front_end.filter.settle_ns)).any()
+    assert not ((stamps >= 2000 * MS) & (stamps <= 2002 * MS + front_end.filter.settle_ns)).any()
 
 
 def test_link_motion_is_synthesized_where_none_is_measured() -> None:

@@ -1,0 +1,274 @@
+"""Any driver with faults between it and its user: seeded, so that a run can be repeated."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from drivers.faults.alter import SIGNALS, blank, corrupt, corrupt_stamp, frozen, shifted, spike
+from drivers.faults.spec import KINDS, Fault, Faults
+from drivers.interface import Array, Driver, DriverError, EndOfStream, Intake, JointSample
+
+SILENCE_LIMIT_S = 0.1  # an arm that is silent for longer is given up with a DriverError
+
+
+@dataclass
+class Account:
+    """What was made of the samples: taken + repeated = delivered + lost + silenced + waiting.
+
+    Attributes:
+        taken: samples read from the driver behind.
+        delivered: samples given to the user.
+        injected: how often each fault was put in, by name; jump, stuck, clock: samples concerned.
+        waiting: samples held back, for a later read.
+    """
+
+    taken: int = 0
+    delivered: int = 0
+    injected: Counter[str] = field(default_factory=Counter)
+    waiting: int = 0
+
+    @property
+    def balanced(self) -> bool:
+        """Whether nothing got lost but on purpose."""
+        kept_back = self.injected["lost"] + self.injected["silence"] + self.waiting
+        return self.taken + self.injected["repeated"] == self.delivered + kept_back
+
+    def line(self) -> str:
+        """One line for people."""
+        counts = [f"{name} {self.injected[name]}" for name in KINDS if self.injected[name]]
+        return f"faults put into {self.taken} samples: {', '.join(counts) or 'none'}"
+
+
+class FaultyDriver:
+    """A driver with faults; names, period, intake and arrival instants are those of the driver.
+
+    `lost`, `late` and `reordered` make one read take several samples of the driver, so that an
+    arm that moves on by one period a read moves on by several, as a real one would. The same
+    seed, faults and samples give the same faults. Each kind has random numbers of its own:
+    another fault beside it changes nothing about the instants of the first.
+
+    Args:
+        driver: not connected yet.
+        faults: to put in; times count from the first sample after `connect`.
+        seed: of the random numbers.
+
+    Attributes:
+        driver: the one behind.
+        account: what was put in since `connect`.
+        plant_time_ns: sum over the samples that the last `read` took, where the driver says it.
+
+    Raises:
+        DriverError: a fault names a joint that the arm does not have.
+    """
+
+    def __init__(self, driver: Driver, faults: Faults, seed: int = 0) -> None:
+        faults.check_joints(len(driver.joint_names))
+        self.driver, self.faults, self.seed = driver, faults, seed
+        self.plant_time_ns = 0
+        self._shares = faults.by_share()
+        self._lasting = faults.timed("stuck", "jump", "clock")
+        self._ends = faults.timed("silence", "died")
+        self._start()
+
+    def _start(self) -> None:
+        self.account = Account()
+        self._rng = {name: np.random.default_rng([self.seed, k]) for k, name in enumerate(KINDS)}
+        self._first_ns: int | None = None
+        self._last: JointSample | None = None
+        self._held: list[tuple[int, JointSample]] = []  # (read that it is due at, sample)
+        self._stuck: dict[Fault, tuple[float, float, float]] = {}
+        self._reads = 0
+        self._dead: str | None = None
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """As of the driver."""
+        return self.driver.joint_names
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """As of the driver."""
+        return self.driver.link_names
+
+    @property
+    def period_ns(self) -> int:
+        """As of the driver."""
+        return self.driver.period_ns
+
+    @property
+    def paced(self) -> bool:
+        """As of the driver."""
+        return self.driver.paced
+
+    @property
+    def can_move(self) -> bool:
+        """As of the driver."""
+        return self.driver.can_move
+
+    @property
+    def adds_gravity(self) -> bool:
+        """As of the driver."""
+        return self.driver.adds_gravity
+
+    @property
+    def intake(self) -> Intake:
+        """As of the driver; what was put in here is in `account`."""
+        return self.driver.intake
+
+    @property
+    def arrived_ns(self) -> int:
+        """As of the driver: when the newest sample taken had arrived."""
+        return self.driver.arrived_ns
+
+    def connect(self) -> None:
+        """Connect the driver and begin the faults anew. Raises DriverError."""
+        self.driver.connect()
+        self._start()
+
+    def command(self, tau: Array) -> None:
+        """Pass (n,) N m on. Raises DriverError."""
+        if self._dead is not None:
+            raise DriverError(self._dead)
+        self.driver.command(tau)
+
+    def stop(self) -> None:
+        """Stop the driver."""
+        self.driver.stop()
+
+    def close(self) -> None:
+        """Close the driver; what waits is given to nobody."""
+        self.driver.close()
+        self._last = None
+        self._held.clear()
+
+    def read(self) -> JointSample:
+        """The next sample, as the faults leave it. Raises DriverError, also as a fault."""
+        if self._dead is not None:
+            raise DriverError(self._dead)
+        self.plant_time_ns = 0
+        self._reads += 1
+        if self._hits("slow"):
+            time.sleep(self._amount("slow"))
+        if self._last is not None and self._hits("repeated"):
+            sample = self._last
+        elif self._held and self._held[0][0] <= self._reads:
+            sample = self._release()
+        else:
+            sample = self._fresh()
+        self._last = sample
+        self.account.delivered += 1
+        return sample
+
+    def _fresh(self) -> JointSample:
+        """The next sample that is neither lost nor held back."""
+        while True:
+            try:
+                sample = self._altered(self._take())
+            except EndOfStream:
+                if not self._held:
+                    raise
+                return self._release()
+            if self._hits("lost"):
+                continue
+            if self._hits("late"):
+                self._hold(sample, max(1, round(self._amount("late"))))
+            elif self._hits("reordered"):
+                self._hold(sample, 1)
+            else:
+                return sample
+
+    def _hold(self, sample: JointSample, reads: int) -> None:
+        self._held.append((self._reads + reads, sample))
+        self._held.sort(key=lambda entry: entry[0])
+        self.account.waiting += 1
+
+    def _release(self) -> JointSample:
+        self.account.waiting -= 1
+        return self._held.pop(0)[1]
+
+    def _take(self) -> JointSample:
+        """A sample of the driver that no silence swallows. Raises DriverError."""
+        while True:
+            sample = self.driver.read()
+            self.plant_time_ns += getattr(self.driver, "plant_time_ns", 0)
+            self.account.taken += 1
+            if self._first_ns is None:
+                self._first_ns = sample.stamp_ns
+            if not self._swallowed(self._time_s(sample)):
+                return sample
+
+    def _time_s(self, sample: JointSample) -> float:
+        """Seconds since the first sample, on the clock that no fault has touched."""
+        assert self._first_ns is not None
+        return 1e-9 * (sample.stamp_ns - self._first_ns)
+
+    def _swallowed(self, now_s: float) -> bool:
+        """Whether a silence takes this sample. Raises DriverError when it is too long, or dead."""
+        for fault in self._ends:
+            assert fault.at_s is not None
+            if now_s < fault.at_s:
+                continue
+            if fault.name == "died":
+                self.account.injected["died"] += 1
+                self.account.injected["silence"] += 1  # the sample that nobody gets
+                self._dead = "the connection to the arm is gone (fault died); connect again"
+                raise DriverError(self._dead)
+            if fault.amount is not None and now_s < fault.at_s + fault.amount:
+                self.account.injected["silence"] += 1
+                if now_s >= fault.at_s + SILENCE_LIMIT_S:
+                    raise DriverError(
+                        f"nothing heard of the arm for {SILENCE_LIMIT_S} s (fault silence); "
+                        "look at the cable, then connect again"
+                    )
+                return True
+        return False
+
+    def _altered(self, sample: JointSample) -> JointSample:
+        """The sample as stuck joints, jumps, clocks and single wrong numbers leave it."""
+        now_s = self._time_s(sample)
+        for fault in self._lasting:
+            if fault.at_s is not None and now_s >= fault.at_s:
+                sample = self._lasting_fault(fault, sample, now_s)
+        if self._hits("spike"):
+            sample = spike(sample, self._rng["spike"], self._amount("spike"))
+        for name, change in (("corrupt", corrupt), ("nan", blank), ("stamp", corrupt_stamp)):
+            if self._hits(name):
+                sample = change(sample, self._rng[name])
+        return sample
+
+    def _lasting_fault(self, fault: Fault, sample: JointSample, now_s: float) -> JointSample:
+        assert fault.at_s is not None and fault.amount is not None
+        joint = (fault.joint or 1) - 1
+        if fault.name == "stuck":
+            if now_s >= fault.at_s + fault.amount:
+                return sample
+            now = tuple(float(getattr(sample, name)[joint]) for name in SIGNALS)
+            sample = frozen(sample, joint, self._stuck.setdefault(fault, (now[0], now[1], now[2])))
+        elif fault.name == "jump":
+            sample = shifted(sample, joint, fault.amount)
+        else:
+            sample = replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * fault.amount))
+        self.account.injected[fault.name] += 1
+        return sample
+
+    def _hits(self, name: str) -> bool:
+        """Whether the fault strikes now; counts it."""
+        fault = self._shares.get(name)
+        if fault is None or fault.share is None or self._rng[name].random() >= fault.share:
+            return False
+        self.account.injected[name] += 1
+        return True
+
+    def _amount(self, name: str) -> float:
+        amount = self._shares[name].amount
+        assert amount is not None
+        return amount
+
+
+def with_faults(driver: Driver, text: str, seed: int = 0) -> FaultyDriver:
+    """The driver with the faults that a text names, see `Faults.parse`. Raises DriverError."""
+    return FaultyDriver(driver, Faults.parse(text), seed)

@@ -1,0 +1,236 @@
+"""What the hardware drivers cost and lose, against simulated arms: `make bench`.
+
+`fci`: states read at 1 kHz from `adapter sim fci` in a process of its own, a busy Python thread
+beside the loop; age of a sample when the loop has it, processor time of the loop's `read` and of
+the reader process, and every id that did not come. Ids count the states sent, so a gap is a loss;
+the kernel's own drops (SO_RXQ_OVFL) and the milliseconds in which the machine kept the processor
+from the simulated robot are counted apart.
+
+`virtual`, `udp`: seven joints both ways at 1 kHz; processor time of `read` and `command`, without
+that of the simulated motors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from soak import simulated
+
+from adapter.realtime.clock import Clock
+from adapter.realtime.rt import RealTime, split_cores
+
+SHARES = (50, 99, 99.9, 100)
+FRESH_NS = 1_000_000
+
+
+def spread(values_ns: np.ndarray) -> dict[str, float]:
+    """Percentiles of durations, µs."""
+    return {f"p{p:g}": float(np.percentile(values_ns, p)) * 1e-3 for p in SHARES}
+
+
+def process_time_ns(pid: int) -> int:
+    """Processor time that a process has used."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
+
+
+@contextmanager
+def busy_thread(wanted: bool) -> Iterator[None]:
+    """Another Python thread that never rests."""
+    done = threading.Event()
+
+    def spin() -> None:
+        count = 0
+        while not done.is_set():
+            count += 1
+
+    thread = threading.Thread(target=spin, daemon=True)
+    if wanted:
+        thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+
+
+def fci(minutes: float, protocol: int, busy: bool) -> dict[str, Any]:
+    """Only listening, as fast as the robot sends."""
+    from drivers.fci import FciArm
+
+    count = round(60e3 * minutes)
+    ages, used = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    extra = ["--protocol", str(protocol)]
+    with tempfile.TemporaryDirectory() as folder, busy_thread(busy):
+        with simulated("fci", 0.0, Path(folder), extra) as (address, summary):
+            arm = FciArm(address)
+            arm.connect()
+            arm.read()
+            reader_pid = arm.reader_pid
+            assert reader_pid is not None
+            with RealTime(min(split_cores()[0])):
+                while arm.read() and time.monotonic_ns() - arm.arrived_ns > FRESH_NS:
+                    pass  # what came while memory was locked
+                before = process_time_ns(reader_pid)
+                for k in range(count):
+                    begun = time.thread_time_ns()
+                    arm.read()
+                    used[k] = time.thread_time_ns() - begun
+                    ages[k] = time.monotonic_ns() - arm.arrived_ns
+                reader_us = 1e-3 * (process_time_ns(reader_pid) - before) / count
+            drops, intake = arm.kernel_drops, arm.intake
+            arm.close()
+        served = json.loads(summary.read_text())
+    return {
+        "protocol": protocol,
+        "busy_thread": busy,
+        "samples": count,
+        "lost": intake.lost,
+        "dropped_by_the_kernel": drops,
+        "refused": dict(intake.refused),
+        "robot_stalled_ms": served["stalled_ms"],
+        "age_us": spread(ages),
+        "read_us": spread(used),
+        "reader_process_us_mean": reader_us,
+    }
+
+
+def can_on(address: str, read: Callable[[], Any], arm: Any, minutes: float) -> dict[str, Any]:
+    """Hold the arm by torques for so long; `read` lets simulated motors in this process work."""
+    count = round(60e3 * minutes)
+    used = np.zeros(count, np.int64)
+    clock = Clock(arm.period_ns)
+    for _ in range(200):
+        clock.wait()
+        sample = read()
+    q0, tau0 = sample.q, np.nan_to_num(sample.tau)
+    K = 0.3 * np.array([600.0, 700.0, 400.0, 600.0, 40.0, 50.0, 10.0])
+    unusable = 0
+    with RealTime(min(split_cores()[0])):
+        for k in range(count):
+            clock.wait()
+            sample = read()
+            unusable += not np.isfinite(sample.q).all()
+            tau = tau0 + np.nan_to_num(K * (q0 - sample.q) - 0.01 * K * sample.dq)
+            begun = time.thread_time_ns()
+            arm.command(tau)
+            used[k] = time.thread_time_ns() - begun + read.used_ns  # type: ignore[attr-defined]
+    arm.stop()
+    intake = arm.intake
+    return {
+        "address": address,
+        "ticks": count,
+        "unusable": unusable,
+        "missed": clock.missed,
+        "received": intake.received,
+        "lost": intake.lost,
+        "refused": dict(intake.refused),
+        "tick_us": spread(used),
+    }
+
+
+class Reading:
+    """`arm.read`, with the processor time it took; motors of this process work before it."""
+
+    def __init__(self, arm: Any, service: Callable[[], Any] = lambda: None) -> None:
+        self._arm, self._service, self.used_ns = arm, service, 0
+
+    def __call__(self) -> Any:
+        self._service()
+        begun = time.thread_time_ns()
+        sample = self._arm.read()
+        self.used_ns = time.thread_time_ns() - begun
+        return sample
+
+
+def can_virtual(minutes: float) -> dict[str, Any]:
+    """Driver and motors in this process, on python-can's virtual bus."""
+    import can
+
+    from drivers.damiao.arm import DamiaoArm
+    from sim.damiao import Boards, ServedBus
+    from sim.scenarios import build
+
+    far = can.Bus(interface="virtual", channel="bench")
+    near = can.Bus(interface="virtual", channel="bench")
+    boards = Boards(far, build("nominal"))
+    served = ServedBus(near, boards)
+    address = "can://bench?interface=virtual"
+    arm = DamiaoArm(address, allow_motion=True, bus=served)
+    arm.connect()
+    served.serving = False
+
+    def service() -> None:
+        boards.service()
+
+    found = can_on(address, Reading(arm, service), _Serving(arm, served), minutes)
+    arm.close()
+    boards.close()
+    served.shutdown()
+    far.shutdown()
+    return found
+
+
+class _Serving:
+    """An arm whose stop lets the motors of this process work."""
+
+    def __init__(self, arm: Any, bus: Any) -> None:
+        self._arm, self._bus = arm, bus
+        self.command, self.period_ns = arm.command, arm.period_ns
+
+    @property
+    def intake(self) -> Any:
+        return self._arm.intake
+
+    def stop(self) -> None:
+        self._bus.serving = True
+        self._arm.stop()
+
+
+def can_udp(minutes: float) -> dict[str, Any]:
+    """Motors in a process of their own, over udp_multicast."""
+    from drivers.damiao.arm import DamiaoArm
+
+    with tempfile.TemporaryDirectory() as folder:
+        with simulated("can", 0.0, Path(folder)) as (address, _):
+            arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
+            arm.connect()
+            found = can_on(address, Reading(arm), arm, minutes)
+            arm.close()
+    return found
+
+
+def main() -> None:
+    """Measure what was asked for; print and write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    kinds = ("fci", "virtual", "udp")
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(kinds)}")
+    parser.add_argument("--minutes", type=float, default=0.5)
+    parser.add_argument("--protocol", type=int, choices=(5, 10), default=5)
+    parser.add_argument("--quiet-machine", action="store_true", help="no busy thread beside fci")
+    parser.add_argument("--json", type=Path, metavar="FILE")
+    args = parser.parse_args()
+    found: dict[str, Any] = {}
+    for kind in args.kinds or kinds:
+        if kind == "fci":
+            found[kind] = fci(args.minutes, args.protocol, not args.quiet_machine)
+        elif kind == "virtual":
+            found[kind] = can_virtual(args.minutes)
+        elif kind == "udp":
+            found[kind] = can_udp(args.minutes)
+        else:
+            parser.error(f"no kind '{kind}'; have: {', '.join(kinds)}")
+        print(kind, json.dumps(found[kind], indent=1), flush=True)
+    if args.json is not None:
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
