@@ -45,6 +45,7 @@ class ExampleArm:
 
     paced = True
     adds_gravity = False
+    delay_ns = 1_000_000
     link_names: tuple[str, ...] = ()  # no sensors on the links
 
     def __init__(

@@ -110,6 +110,11 @@ class FaultyDriver:
         return self.driver.can_move
 
     @property
+    def delay_ns(self) -> int:
+        """The driver's."""
+        return self.driver.delay_ns
+
+    @property
     def adds_gravity(self) -> bool:
         """As of the driver."""
         return self.driver.adds_gravity

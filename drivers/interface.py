@@ -109,6 +109,13 @@ class Driver(Protocol):
         """Whether the arm carries its own weight; a command is then what comes on top of it."""
 
     @property
+    def delay_ns(self) -> int:
+        """From the instant of a sample to that at which a command given upon it has its effect.
+
+        Feedback has to be gentler where it is long.
+        """
+
+    @property
     def intake(self) -> Intake:
         """The account of what arrived."""
 
@@ -116,7 +123,7 @@ class Driver(Protocol):
     def arrived_ns(self) -> int:
         """CLOCK_MONOTONIC instant at which the last sample read had arrived at this machine.
 
-        0 where that has no meaning (recordings, simulated arms).
+        0 where time stands still between two reads (recordings, simulated arms).
         """
 
     def connect(self) -> None:

@@ -35,6 +35,7 @@ class LogArm:
     can_move = False
     adds_gravity = False
     arrived_ns = 0
+    delay_ns = 0
 
     def __init__(
         self,

@@ -49,6 +49,7 @@ class PyBulletArm:
     can_move = True
     adds_gravity = False
     arrived_ns = 0
+    delay_ns = 1_000_000
 
     def __init__(self, plant: Plant) -> None:
         self.joint_names = plant.joint_names

@@ -56,6 +56,7 @@ class FciArm:
 
     paced = True
     adds_gravity = True
+    delay_ns = 1_000_000  # a command counts from the next tick on
     period_ns = ledger.TICK_NS
     link_names: tuple[str, ...] = ()
 

@@ -37,7 +37,7 @@ class InProcess:
         self._driver = driver = make(self._bus)
         self.joint_names, self.link_names = driver.joint_names, driver.link_names
         self.period_ns, self.adds_gravity = driver.period_ns, driver.adds_gravity
-        self.can_move = driver.can_move
+        self.can_move, self.delay_ns = driver.can_move, driver.delay_ns
         self.plant_time_ns = 0
         self._closed = False
 

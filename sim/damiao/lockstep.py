@@ -24,6 +24,7 @@ class Lockstep:
         self.joint_names, self.link_names = driver.joint_names, driver.link_names
         self.period_ns = driver.period_ns
         self.can_move, self.adds_gravity = driver.can_move, driver.adds_gravity
+        self.delay_ns = driver.delay_ns
         self._next_ns = 0
 
     @property

@@ -199,7 +199,10 @@ def can_arm(world: Any, seed: int) -> Driver:
     line.attach(Boards(line.boards, world, seed, now_ns=line.now_ns))
     names = world.truth.joint_names
     address = "can://line?interface=virtual"
-    return Lockstep(DamiaoArm(address, names, True, bus=line.host, now_ns=line.now_ns), line)
+    return Lockstep(
+        DamiaoArm(address, names, True, bus=line.host, now_ns=line.now_ns, wall_ns=line.now_ns),
+        line,
+    )
 
 
 def wire_trial(job: tuple[str, int]) -> Row:

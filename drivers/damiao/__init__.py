@@ -1,0 +1,1 @@
+"""A CAN arm of Damiao motors in MIT mode, as OpenArm uses them."""

@@ -1,0 +1,304 @@
+"""Replies as they come in: decoded, checked, counted, and brought to one instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from drivers.damiao import codec
+from drivers.damiao.align import NOTHING, Reading, at_instant
+from drivers.damiao.bus import ERROR_FRAME, UNREADABLE, Frame, Wire
+from drivers.damiao.bus_errors import troubles_of
+from drivers.damiao.clock import ArrivalClock
+from drivers.damiao.codec import CODES, FRAME_BYTES, Q_CODES, Limits, temperature
+from drivers.damiao.dialogue import fault_sentence
+from drivers.damiao.motors import DISABLED, ENABLED, HOT_DEGC, WARM_DEGC, fault_of
+from drivers.damiao.settings import BusSettings
+from drivers.interface import DriverError, Intake
+
+REACH_TICKS = 5  # a joint's motion is predicted over so many
+SILENT_NS = 100_000_000
+SILENT_TICKS = 10
+OWN_ID, STRANGER = -1, -2  # in place of a joint's index
+SETTLE_EVERY, SETTLE_TIMES = 16, 8  # ticks; looks after which a missing reply counts as lost
+
+# Why a frame is not used.
+UNREADABLE_FRAME, ERROR, UNKNOWN_ID = "unreadable", "error_frame", "unknown_id"
+OTHER_HOST, WRONG_LENGTH, WRONG_MOTOR = "other_host", "wrong_length", "wrong_motor"
+UNASKED, OUT_OF_ORDER, GUARDIANS = "unasked", "out_of_order", "asked_by_guardian"
+UNCONFIRMED = "unconfirmed_alarm"
+
+# A motor's alarm is believed when it says so so often, not further apart than this: bits can flip.
+ALARMS, ALARM_TICKS = 3, 3
+
+
+class Inbox:
+    """Takes replies off a bus.
+
+    Args:
+        wire: open bus.
+        settings: of it.
+        limits: of each motor.
+        intake: where to count.
+        echoes: the bus hands back what was sent on it.
+        driven: the motors are enabled and must stay so.
+        reply_ns: a reply's time on the wire.
+
+    Attributes:
+        pending: requests to each joint that have no reply yet; the sender adds to it.
+        arrived_ns: when the last reply used had arrived, CLOCK_MONOTONIC.
+        latest: last reading of each joint.
+        clock: for arrivals.
+        others_ask: the guardian is commanding the motors; replies to it are not ours.
+    """
+
+    def __init__(
+        self,
+        wire: Wire,
+        settings: BusSettings,
+        limits: Sequence[Limits],
+        intake: Intake,
+        echoes: bool,
+        driven: bool,
+        reply_ns: int,
+    ) -> None:
+        n = settings.joints
+        self._wire, self._settings, self._intake = wire, settings, intake
+        self._echoes, self._driven, self._reply_ns = echoes, driven, reply_ns
+        self._reach_ns = REACH_TICKS * 1_000_000_000 // settings.rate_hz
+        self._index = dict.fromkeys([*settings.ids, codec.SERVICE_ID], OWN_ID)
+        self._index.update({can_id: j for j, can_id in enumerate(settings.reply_ids)})
+        self._scales = [
+            tuple(
+                part
+                for most, top in ((x.q_max, Q_CODES), (x.dq_max, CODES), (x.tau_max, CODES))
+                for part in (most, 2 * most / top)
+            )
+            for x in limits
+        ]
+        status = ENABLED if driven else DISABLED
+        self._heads = [status << 4 | can_id & 0xF for can_id in settings.ids]
+        self.pending = [0] * n
+        self.latest: list[Reading] = [NOTHING] * n
+        self._before: list[Reading] = [NOTHING] * n
+        self._missed, self._any_missed = [0] * n, False
+        self._alarms, self._alarmed_at = [0] * n, [-ALARM_TICKS - 1] * n
+        self._unsettled, self._looks, self._ticks = [0] * n, 0, 0
+        self._said: set[str] = set()
+        self.arrived_ns = 0
+        self.others_ask = False
+        self.clock = ArrivalClock()
+
+    def note(self, key: str, sentence: str) -> None:
+        """Write a sentence at its kind's first occurrence."""
+        if key not in self._said:
+            self._said.add(key)
+            self._intake.notes.append(sentence)
+
+    def take(
+        self, looked_ns: int, now_ns: int, wall_ns: int, frames: list[Frame], asked_ns: int
+    ) -> None:
+        """Look at a batch of frames.
+
+        Args:
+            looked_ns: before the bus was looked at; now_ns, wall_ns: after it.
+            frames: as `Wire.waiting` gave them.
+            asked_ns: when the last requests were sent; no reply was measured before its request.
+
+        Raises:
+            DriverError: a motor reports a fault or is hot, three times in a row, or the bus is off.
+        """
+        clock, intake, index = self.clock, self._intake, self._index
+        pending, latest, before = self.pending, self.latest, self._before
+        clock.begin(looked_ns, now_ns, wall_ns)
+        first_ns, offset_ns, reply_ns = clock.first_ns, clock.offset_ns, self._reply_ns
+        heads, scales, last_ns, used = self._heads, self._scales, self.arrived_ns, 0
+        for can_id, data, stamp_s, kind in frames:
+            j = index.get(can_id, STRANGER)
+            if j < 0 or kind:
+                self._odd(can_id, data, kind, j)
+                continue
+            if len(data) != FRAME_BYTES:
+                self._refuse(WRONG_LENGTH, f"a reply of {len(data)} bytes came; replies have 8")
+                continue
+            if data[0] != heads[j] and not self._look_at_status(j, data[0]):
+                continue
+            if pending[j] <= 0:
+                self._unasked()
+                continue
+            pending[j] -= 1
+            arrived_ns = int(1e9 * stamp_s) + offset_ns
+            if not first_ns <= arrived_ns <= now_ns:
+                arrived_ns = clock.unusual(stamp_s)
+            at_ns = arrived_ns - reply_ns
+            if at_ns < asked_ns <= arrived_ns:
+                at_ns = asked_ns
+            old = latest[j]
+            if at_ns <= old[0]:
+                self._refuse(OUT_OF_ORDER, "a reply came with a stamp before the last one's")
+                continue
+            code_tau = (data[4] & 0xF) << 8 | data[5]
+            code_dq = data[3] << 4 | data[4] >> 4
+            a, a_step, b, b_step, c, c_step = scales[j]
+            before[j] = old
+            latest[j] = (
+                at_ns,
+                (data[1] << 8 | data[2]) * a_step - a,
+                code_dq * b_step - b,
+                code_tau * c_step - c,
+            )
+            if data[6] >= WARM_DEGC or data[7] >= WARM_DEGC:
+                self._look_at_temperatures(j, data[6], data[7])
+            if not (0 < code_tau < CODES and 0 < code_dq < CODES):
+                self._end_of_scale(j, code_tau in (0, CODES))
+            if arrived_ns > last_ns:
+                last_ns = arrived_ns
+            used += 1
+        self.arrived_ns = last_ns
+        intake.received += used
+        intake.used += used
+        self._ticks += 1
+        if self._ticks % SETTLE_EVERY == 0:
+            self._settle()
+
+    def sample_at(self, stamp_ns: int) -> tuple[list[float], bool]:
+        """(3 n) q, dq and tau of all joints at one instant, and whether all replies are there.
+
+        Raises DriverError, naming it, for a joint that has been silent for `SILENT_NS`.
+        """
+        values, missing = at_instant(stamp_ns, self._before, self.latest, self._reach_ns)
+        if missing:
+            for j in missing:
+                self._missed[j] += 1
+            self._need_signs_of_life(missing, stamp_ns)
+        elif self._any_missed:
+            self._missed = [0] * len(self._missed)
+        self._any_missed = bool(missing)
+        return values, not missing
+
+    def discard(self) -> None:
+        """Throw away what waits: the guardian's replies of a pause, and what came between them."""
+        for can_id, _, _, kind in self._wire.waiting():
+            j = self._index.get(can_id, STRANGER)
+            if j < 0 or kind:
+                continue
+            self.pending[j] = max(self.pending[j] - 1, 0)
+            self._intake.received += 1
+            self._intake.refused[GUARDIANS] += 1
+
+    def finish(self, on_the_way: bool) -> None:
+        """Count what is still missing as lost, but for one reply of each joint `on_the_way`."""
+        self._intake.lost += sum(max(count - on_the_way, 0) for count in self.pending)
+        self.pending = [0] * len(self.pending)
+
+    def _refuse(self, reason: str, sentence: str) -> None:
+        self._intake.received += 1
+        self._intake.refused[reason] += 1
+        self.note(reason, f"{sentence}; it was refused")
+
+    def _unasked(self) -> None:
+        if self.others_ask:
+            self._intake.received += 1
+            self._intake.refused[GUARDIANS] += 1
+        else:
+            self._refuse(UNASKED, "a motor replied without having been asked by this driver")
+
+    def _odd(self, can_id: int, data: bytes | bytearray, kind: int, j: int) -> None:
+        """A frame that is no reply."""
+        if kind == ERROR_FRAME:
+            self._intake.received += 1
+            self._intake.refused[ERROR] += 1
+            for trouble in troubles_of(can_id, data, self._settings.channel):
+                if trouble.fatal:
+                    raise DriverError(trouble.sentence)
+                self.note(trouble.sentence, trouble.sentence)
+        elif can_id == UNREADABLE:
+            self._refuse(UNREADABLE_FRAME, "a datagram that is no CAN frame came")
+        elif j == OWN_ID and not kind:
+            if not self._echoes:
+                self._refuse(
+                    OTHER_HOST,
+                    f"another program sends to these motors (id 0x{can_id:03x}): end it, two "
+                    "cannot drive one arm; its frame is not ours",
+                )
+        else:
+            self._refuse(UNKNOWN_ID, f"a frame with id 0x{can_id:03x} came, which is no motor's")
+
+    def _look_at_status(self, j: int, head: int) -> bool:
+        """Whether a reply with an unusual first byte can be used. Raises DriverError."""
+        can_id = self._settings.ids[j]
+        if head & 0xF != can_id & 0xF:
+            self._refuse(
+                WRONG_MOTOR,
+                f"a reply of motor {j + 1} (id 0x{can_id:02x}) carries another motor's number; "
+                "have two motors the same reply id?",
+            )
+            return False
+        status = head >> 4
+        if fault_of(status) is not None:
+            self._alarm(j, fault_sentence(j, can_id, status))
+        elif status == DISABLED and self._driven:
+            self._alarm(
+                j,
+                f"motor {j + 1} (id 0x{can_id:02x}) is disabled: it lost its power, or another "
+                "program switched it off; support the arm and connect again",
+            )
+        else:
+            self._heads[j] = head
+            return True
+        self.pending[j] = max(self.pending[j] - 1, 0)
+        self._intake.received += 1
+        self._intake.refused[UNCONFIRMED] += 1
+        return False
+
+    def _alarm(self, j: int, sentence: str) -> None:
+        """A motor says that something is wrong: believed when its next replies say so too."""
+        repeated = self._ticks - self._alarmed_at[j] <= ALARM_TICKS
+        self._alarms[j] = self._alarms[j] + 1 if repeated else 1
+        self._alarmed_at[j] = self._ticks
+        if self._alarms[j] >= ALARMS:
+            raise DriverError(sentence)
+
+    def _look_at_temperatures(self, j: int, mosfet: int, rotor: int) -> None:
+        for part, degc in (("MOSFETs", temperature(mosfet)), ("rotor", temperature(rotor))):
+            who = f"motor {j + 1} (id 0x{self._settings.ids[j]:02x}): its {part}"
+            if degc >= HOT_DEGC and self._driven:
+                self._alarm(j, f"{who} are at {degc} deg C; stopped: let it cool")
+            elif degc >= WARM_DEGC:
+                self.note(
+                    f"warm {part} {j}",
+                    f"{who} are at {degc} deg C; the run ends at {HOT_DEGC}: move less or slower",
+                )
+
+    def _end_of_scale(self, j: int, torque: bool) -> None:
+        what = "torque" if torque else "speed"
+        self.note(
+            f"end of scale {what} {j}",
+            f"motor {j + 1}: {what} at the end of its scale; the true value may lie beyond",
+        )
+
+    def _need_signs_of_life(self, missing: Sequence[int], stamp_ns: int) -> None:
+        silent = [
+            j
+            for j in missing
+            if self._missed[j] >= SILENT_TICKS and stamp_ns - self.latest[j][0] >= SILENT_NS
+        ]
+        if not silent:
+            return
+        names = ", ".join(f"{k + 1} (id 0x{self._settings.ids[k]:02x})" for k in silent)
+        raise DriverError(
+            f"motor{'s' * (len(silent) > 1)} {names} silent for {1e-9 * SILENT_NS:g} s: check "
+            "power, cable and bus-off"
+        )
+
+    def _settle(self) -> None:
+        """A reply that was missing at every look of a window is lost."""
+        for j, count in enumerate(self.pending):
+            if self._looks == 0 or count < self._unsettled[j]:
+                self._unsettled[j] = count
+        self._looks += 1
+        if self._looks == SETTLE_TIMES:
+            self._looks = 0
+            for j, count in enumerate(self._unsettled):
+                if count > 0:
+                    self.pending[j] -= count
+                    self._intake.lost += count
