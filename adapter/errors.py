@@ -11,5 +11,9 @@ class ModelWarning(UserWarning):
     """A model was read, but not everything in its file was taken at its word."""
 
 
+class ControlError(RuntimeError):
+    """The controller cannot keep the arm; it has to be stopped by its driver."""
+
+
 class SettingsError(ValueError):
     """A setting has a value or a name that does not fit; the message says what does."""

@@ -5,7 +5,10 @@ ds/dt = r goes from 0 to 1 at the start and back to 0 at a stop (quintic steps),
 
     dq = r q'(s),   ddq = r² q''(s) + r' q'(s),   and r <= 1.
 
-The limits hold for all time because they hold for the sums of |a_i| w_i^k.
+Where it starts slowly, r goes to `slow_share` first and from there to 1 after `slow_s` seconds.
+The limits hold for all time because they hold for the sums of |a_i| w_i^k, and r, a product of
+steps of which at most two move at a time, keeps the bounds on r' and r'' below: with a slow start
+it is r = slow_share r1 + (1 - slow_share) r2 of two such products.
 """
 
 from __future__ import annotations
@@ -17,54 +20,16 @@ import numpy as np
 
 from adapter.errors import SettingsError
 from adapter.fast import jit
-from adapter.model import SelfModel
+from adapter.motion_limits import MotionLimits
 from adapter.records import Array
 
-# Franka Emika Panda, vendor documentation (limits for planning motion): rad/s², rad/s³, N m/s.
-PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
-PANDA_JERK = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
-PANDA_TORQUE_RATE = 1000.0
-# Of an arm whose documentation is silent; modest.
-UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK, UNKNOWN_RANGE = 1.0, 5.0, 1000.0, 0.5
+__all__ = ["ExcitationSettings", "MotionLimits", "RandomMotion", "smooth_step"]
+
+UNKNOWN_RANGE = 0.5  # rad to each side, of a joint whose range nobody documented
 
 # Largest slope and second derivative of the quintic step over one second, and of the product of
 # two that overlap (a stop during the stop before a rest).
 RAMP_SLOPE, RAMP_BEND = 2.4, 12.4
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """What a motion has to keep, (n,) each: rad, rad/s, rad/s², rad/s³, N m, N m/s.
-
-    Attributes:
-        is_panda: whether the arm is known as one.
-    """
-
-    lower: Array
-    upper: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-    effort: Array
-    torque_rate: Array
-    is_panda: bool = False
-
-    @classmethod
-    def of(cls, model: SelfModel) -> MotionLimits:
-        """Limits of a documented arm; modest ones where its documentation is silent."""
-        n, known = model.tree.n, model.limits
-        panda = n == len(PANDA_JERK) and model.name.startswith(("panda", "fer"))
-        velocity = np.where(np.isfinite(known.velocity), known.velocity, UNKNOWN_VELOCITY)
-        return cls(
-            known.lower,
-            known.upper,
-            velocity,
-            np.array(PANDA_ACCELERATION) if panda else np.full(n, UNKNOWN_ACCELERATION),
-            np.array(PANDA_JERK) if panda else np.full(n, UNKNOWN_JERK),
-            np.where(np.isfinite(known.effort), known.effort, np.inf),
-            np.full(n, PANDA_TORQUE_RATE),
-            panda,
-        )
 
 
 @dataclass(frozen=True)
@@ -81,6 +46,9 @@ class ExcitationSettings:
         start_s, stop_s: length of the soft start and of the safe stop.
         rests: (from, to) seconds of motion time in which the arm rests; the stop before and the
             start after each lie behind its first and its second instant.
+        slow_s: seconds of motion time at `slow_share` of the speed, before a smooth step to all
+            of it within `start_s`; 0 for none.
+        slow_share: share of the speed meanwhile.
     """
 
     seed: int = 0
@@ -93,6 +61,8 @@ class ExcitationSettings:
     start_s: float = 1.0
     stop_s: float = 1.0
     rests: tuple[tuple[float, float], ...] = ()
+    slow_s: float = 0.0
+    slow_share: float = 0.1
 
     def __post_init__(self) -> None:
         if self.sines < 1:
@@ -113,6 +83,24 @@ class ExcitationSettings:
         for begin, end in self.rests:
             if end - begin < self.stop_s:
                 raise SettingsError(f"excitation.rests: {begin} to {end} s is shorter than a stop")
+        self._check_slow_start()
+
+    def _check_slow_start(self) -> None:
+        if not 0.0 < self.slow_share <= 1.0:
+            raise SettingsError("excitation.slow_share must be above 0 and at most 1")
+        if not (self.slow_s == 0.0 or self.start_s <= self.slow_s < math.inf):
+            raise SettingsError(
+                f"excitation.slow_s must be 0 or at least start_s ({self.start_s} s), "
+                f"got {self.slow_s}"
+            )
+        quicker = self.slow_s, self.slow_s + self.start_s
+        for begin, end in self.rests if self.slow_s else ():
+            for at, length in ((begin, self.stop_s), (end, self.start_s)):
+                if at < quicker[1] and at + length > quicker[0]:
+                    raise SettingsError(
+                        f"excitation.rests: {begin} to {end} s begins or ends while the motion "
+                        f"becomes quicker, {quicker[0]} to {quicker[1]} s"
+                    )
 
 
 @jit
@@ -200,6 +188,20 @@ class RandomMotion:
         """Motion time, s."""
         return self._t
 
+    def bounds(self) -> tuple[Array, Array, Array, Array, Array]:
+        """What is never left: lowest and highest q, highest |dq|, |ddq| and |jerk|, (n,) each."""
+        reach, speed, acceleration, jerk = (
+            (self.amplitude * self.omega**k).sum(axis=1) for k in range(4)
+        )
+        c1, c2 = _ramp_factors(self.settings)
+        return (
+            self.centre - reach,
+            self.centre + reach,
+            speed,
+            acceleration + c1 * speed,
+            jerk + 3.0 * c1 * acceleration + c2 * speed,
+        )
+
     @property
     def at_rest(self) -> bool:
         """A stop was asked for and is done."""
@@ -210,6 +212,11 @@ class RandomMotion:
         s = self.settings
         rate, slope = smooth_step(t / s.start_s)
         slope /= s.start_s
+        if s.slow_s:
+            up, up_slope = smooth_step((t - s.slow_s) / s.start_s)
+            part = s.slow_share + (1.0 - s.slow_share) * up
+            part_slope = (1.0 - s.slow_share) * up_slope / s.start_s
+            rate, slope = rate * part, slope * part + rate * part_slope
         for begin, end in s.rests:
             down, down_slope = smooth_step((t - begin) / s.stop_s)
             up, up_slope = smooth_step((t - end) / s.start_s)
@@ -238,6 +245,12 @@ def _usable_range(
     return np.minimum(lower + settings.margin, q0), np.maximum(upper - settings.margin, q0)
 
 
+def _ramp_factors(settings: ExcitationSettings) -> tuple[float, float]:
+    """Bounds on the slope, 1/s, and on the second derivative, 1/s², of the path's rate."""
+    ramp = min(settings.start_s, settings.stop_s)
+    return RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+
+
 def _scale(
     relative: Array,
     omega: Array,
@@ -251,8 +264,7 @@ def _scale(
     With ramps of T seconds |ddq| <= A + V c1 / T and |jerk| <= J + 3 A c1 / T + V c2 / T², where
     V, A, J are the sums of |a_i| w_i^k and c1, c2 those of the ramps.
     """
-    ramp = min(settings.start_s, settings.stop_s)
-    c1, c2 = RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+    c1, c2 = _ramp_factors(settings)
     reach, speed, acceleration, jerk = ((relative * omega**k).sum(axis=1) for k in range(4))
     room = settings.range_share * 0.5 * (upper - lower)
     wanted = settings.share * np.array(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import Snapshot
 from adapter.records import MOTION_MEASURED
 
+KEPT_LEARNER, KEPT_MONITOR = "learner.npz", "monitor.pickle"
 STD_EVERY = 50  # publications; the covariance behind the standard deviations takes a millisecond
 
 
@@ -36,7 +39,7 @@ def single_thread_learner(
     learner = make_learner(documented, settings)
     delay_s = make_front_end(documented, settings).delay_s
     tool = None if documented.tool is None else documented.tool.theta()
-    learner.watch = Monitor(documented.tree.n, tool, delay_s, tell if aloud else None)
+    learner.watch = Monitor(documented.tree.n, tool, delay_s, tell if aloud else keep_quiet)
     if resume is not None:
         load_checkpoint(learner, resume)
     return learner
@@ -62,6 +65,8 @@ def learner_job(
         collect=collect,
         publish=Publisher(),
         save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
+        keep=keep_learner,
+        restore=restore_learner,
         effect_names=settings.learner.effects,
     )
 
@@ -69,8 +74,29 @@ def learner_job(
 def tell(line: str) -> None:
     """A line to standard error, over the display's own line in a terminal (it comes back)."""
     clear = "\r\x1b[K" if sys.stderr.isatty() else ""
-    sys.stderr.write(f"{clear}new disagreement: {line}\n")
-    sys.stderr.flush()
+    with suppress(OSError):  # the terminal may be gone; the learner goes on
+        sys.stderr.write(f"{clear}new disagreement: {line}\n")
+        sys.stderr.flush()
+
+
+def keep_quiet(line: str) -> None:
+    """Where nobody wants to hear at once; a function with a name can travel in a file."""
+
+
+def keep_learner(learner: Learner, folder: Path) -> None:
+    """Leave a learner and its monitor to a successor in an empty folder. Raises OSError."""
+    from adapter.checkpoint import save_checkpoint
+
+    save_checkpoint(learner, folder / KEPT_LEARNER, sync=False)
+    (folder / KEPT_MONITOR).write_bytes(pickle.dumps(learner.watch))
+
+
+def restore_learner(learner: Learner, folder: Path) -> None:
+    """Put a fresh learner into the state that its predecessor left in this private folder."""
+    from adapter.checkpoint import load_checkpoint
+
+    load_checkpoint(learner, folder / KEPT_LEARNER)
+    learner.watch = pickle.loads((folder / KEPT_MONITOR).read_bytes())
 
 
 class Publisher:

@@ -183,7 +183,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     theirs = trailing_rms(rows.time_s[early], batch[early] / noise, TORQUE_WINDOW_S)
     at = settled_at(rows.time_s[early], ours <= TORQUE_GOAL * theirs)
     if at is not None and start_s is not None:
-        score["converged_s"] = at - start_s
+        score["converged_s"] = max(at - start_s, 0.0)
     return score
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import pickle
+import signal
 import time
 from dataclasses import replace
 from importlib import resources
@@ -33,16 +35,22 @@ class Digest:
 
     def __init__(self) -> None:
         self.count, self.last_ns, self.in_order = 0, -1, True
-        self._hash = hashlib.sha256()
+        self._chain = b""
 
     def step(self, record) -> None:
         stamp_ns = stamp_of(record)
         self.in_order = self.in_order and stamp_ns > self.last_ns
         self.count, self.last_ns = self.count + 1, stamp_ns
-        self._hash.update(record.tobytes())
+        self._chain = hashlib.sha256(self._chain + record.tobytes()).digest()
 
     def summary(self) -> tuple[int, bool, str]:
-        return self.count, self.in_order, self._hash.hexdigest()
+        return self.count, self.in_order, self._chain.hex()
+
+    def keep(self, folder: Path) -> None:
+        (folder / "state").write_bytes(pickle.dumps(self.__dict__))
+
+    def restore(self, folder: Path) -> None:
+        self.__dict__.update(pickle.loads((folder / "state").read_bytes()))
 
 
 class Dying(Digest):
@@ -52,6 +60,27 @@ class Dying(Digest):
         super().step(record)
         if self.count == DYING_AT:
             os._exit(3)
+
+
+class Mortal(Digest):
+    """A learner that is killed, once each, when it has learned as many states as TEST_DEATHS says.
+
+    Of those that died it is written in the folder TEST_GRAVES.
+    """
+
+    def step(self, record) -> None:
+        super().step(record)
+        if str(self.count) in os.environ["TEST_DEATHS"].split():
+            die_once(str(self.count))
+
+
+def die_once(name: str) -> None:
+    """kill -9 of this process, unless it happened before under this name."""
+    try:
+        (Path(os.environ["TEST_GRAVES"]) / name).touch(exist_ok=False)
+    except FileExistsError:
+        return
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Failing(Digest):
@@ -80,6 +109,11 @@ def learner_job(kind: type[Digest] = Digest, save=None) -> LearnerJob:
     return LearnerJob(kind, Digest.summary, publish, save, publish_s=0.01, save_s=0.5)
 
 
+def lasting_job(kind: type[Digest] = Digest) -> LearnerJob:
+    """The same with successors."""
+    return replace(learner_job(kind), keep=Digest.keep, restore=Digest.restore)
+
+
 def simulated_arm(seed: int = 5, scenario: str = "nominal") -> PyBulletArm:
     return PyBulletArm(build(scenario, seed).plant())
 
@@ -90,14 +124,15 @@ def parts(seed: int = 5):
     return FrontEnd(PANDA), ExcitationController(MotionLimits.of(PANDA), motion)
 
 
-def live_options(duration_s: float | None) -> LiveOptions:
-    return LiveOptions(duration_s, crew=CrewOptions(ring_s=5.0, snapshot_name=None))
+def live_options(duration_s: float | None, ring_s: float = 5.0) -> LiveOptions:
+    return LiveOptions(duration_s, crew=CrewOptions(ring_s=ring_s, snapshot_name=None))
 
 
 class Swinging:
     """An arm that swings by itself and fails, where asked, at a sample or a command."""
 
     paced, can_move, adds_gravity, arrived_ns = False, True, False, 0
+    delay_ns = 1_000_000
     joint_names = tuple(f"panda_joint{j}" for j in range(1, 8))
     link_names: tuple[str, ...] = ()
     period_ns = 1_000_000
@@ -132,9 +167,18 @@ class Swinging:
 
 
 def shared_memory() -> set[str]:
-    """Names of the blocks there are."""
+    """Names of the blocks that no other process uses: ours, and what was left behind."""
     folder = Path("/dev/shm")
-    return {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    names = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        if not names or maps.parent.name == str(os.getpid()):
+            continue
+        try:
+            used = maps.read_text(errors="replace")
+        except OSError:  # it ended, or is somebody else's
+            continue
+        names -= {name for name in names if f"/dev/shm/{name}" in used}
+    return names
 
 
 def wait_for(condition, timeout_s: float = 30.0) -> bool:

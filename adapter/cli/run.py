@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shlex
 import sys
 from functools import partial
@@ -32,16 +33,19 @@ from adapter.front_end import FrontEnd
 from adapter.live import describe_estimate, learner_job
 from adapter.model import SelfModel
 from adapter.model_file import dumps
+from adapter.motion_plan import plan_lines
 from adapter.pipeline import make_front_end
 from adapter.realtime.jobs import RecordingJob, WatchJob
 from adapter.realtime.learned import LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.score import figures, reference_from
+from drivers.faulty import FaultyDriver, with_faults
 from drivers.interface import Driver
-from drivers.registry import open_driver, split_address
+from drivers.registry import HARDWARE, open_driver, split_address
 
 FEEDFORWARD = ("none", "documented", "learned")
 EXIT_ARM, EXIT_LEARNER = 3, 4
+SLOW_S = 10.0  # an arm that may be real moves at a tenth of the speed for so long
 
 
 def add_parser(commands: Any) -> None:
@@ -54,7 +58,16 @@ def add_parser(commands: Any) -> None:
         "4 the learner failed.",
     )
     parser.add_argument(
-        "--driver", default="pybullet:panda", metavar="ADDRESS", help="pybullet:panda, log:FILE"
+        "--driver",
+        default="pybullet:panda",
+        metavar="ADDRESS",
+        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=...",
+    )
+    parser.add_argument(
+        "--allow-motion",
+        action="store_true",
+        help="leave to move an arm that may be real (fci, can): prints the plan, goes at a tenth "
+        "of the speed for 10 s, stops when this terminal closes. Without it, only listen",
     )
     parser.add_argument("--duration", type=float, default=30.0, metavar="S", help="default 30")
     parser.add_argument(
@@ -70,6 +83,9 @@ def add_parser(commands: Any) -> None:
         help="option of the scenario, as in --set mass=0.3 --set noise=none",
     )
     parser.add_argument("--passive", action="store_true", help="only listen; do not move the arm")
+    parser.add_argument(
+        "--fault", metavar="LIST", help="inject faults into the samples, as in lost=0.01,nan=0.001"
+    )
     parser.add_argument(
         "--feedforward",
         choices=FEEDFORWARD,
@@ -92,6 +108,10 @@ def run(args: argparse.Namespace) -> int:
     world = simulation(args.driver, args.scenario, args.set, args.seed or 0)
     default_effects = REAL_ARM_EFFECTS if world is None else world.effects
     config = configure(args, None, default_effects, robot)
+    maybe_real = world is None and scheme in HARDWARE
+    if maybe_real and args.allow_motion and not args.passive and not config.excitation.slow_s:
+        slow = dataclasses.replace(config.excitation, slow_s=SLOW_S)
+        config = dataclasses.replace(config, excitation=slow)
     if world is not None and config.gravity is None:
         robot = world.mounted(robot)
     robot = config.apply(robot)
@@ -99,16 +119,22 @@ def run(args: argparse.Namespace) -> int:
     truth = args.truth or _write_truth(world, folder)
     reference = reference_from(truth, robot)
     builders = {} if world is None else {scheme: world.driver}
-    driver = open_driver(args.driver, builders, robot.tree.joint_names)
+    driver = open_driver(args.driver, builders, robot.tree.joint_names, args.allow_motion)
+    if args.fault is not None:
+        driver = with_faults(driver, args.fault, args.seed or 0)
+    if maybe_real and not driver.can_move:
+        console.print("only listening; --allow-motion lets the arm move")
     front_end = make_front_end(robot, config.pipeline)
-    result = _go(args, config, robot, driver, front_end, folder, truth)
+    result = _go(args, config, robot, driver, front_end, folder, truth, maybe_real)
     for line in result.timing.lines():
         console.print(line)
-    warn(([result.fault] if result.fault else []) + result.troubles)
+    if isinstance(driver, FaultyDriver):
+        console.print(driver.account.line())
+    warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes)
     if result.collected is None:
         console.print("[red]error:[/] the learner ended early; the recording is complete")
         return EXIT_LEARNER
-    _conclude(args, folder, robot, reference, front_end, result)
+    _conclude(args, folder, robot, reference, front_end, result, config.excitation.slow_s)
     return EXIT_ARM if result.fault else 0
 
 
@@ -147,12 +173,19 @@ def _go(
     front_end: FrontEnd,
     folder: Path,
     truth: Path | None,
+    maybe_real: bool,
 ) -> LiveResult:
-    """The live run itself."""
-    recording = None
+    """The live run itself; an arm that may be real shows its plan and has a dead man's switch."""
+    recording, controller = None, _controller(args, config, robot, driver)
+    duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
     if not args.no_record:
         metadata = recording_metadata(
-            config, robot, shlex.join(sys.argv[1:]), driver=args.driver, scenario=args.scenario
+            config,
+            robot,
+            shlex.join(sys.argv[1:]),
+            driver=args.driver,
+            scenario=args.scenario,
+            commands_without_gravity=driver.adds_gravity,
         )
         attachments = {"documented.json": dumps(robot).encode()}
         if truth is not None:
@@ -165,17 +198,25 @@ def _go(
             overwrite=args.record is None,
             describe=describe_estimate,
         )
-    watch = None if args.quiet else WatchJob(partial(make_display, args.duration))
+    watch = None if args.quiet else WatchJob(partial(make_display, duration_s))
+
+    def show_plan() -> None:
+        if maybe_real and controller is not None and controller.reference is not None:
+            names = robot.tree.joint_names
+            lines = plan_lines(controller.reference, controller.limits, names, duration_s)
+            console.print("\n".join(lines), soft_wrap=True)
+
     return run_live(
         driver,
         front_end,
-        controller=_controller(args, config, robot, driver),
+        controller=controller,
         learner=learner_job(
             robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
         ),
         recording=recording,
         watch=watch,
-        options=LiveOptions(duration_s=args.duration),
+        options=LiveOptions(duration_s, deadman=maybe_real and controller is not None),
+        before_motion=show_plan,
         say=lambda line: console.print(line, soft_wrap=True),
     )
 
@@ -187,8 +228,12 @@ def _conclude(
     reference: Any,
     front_end: FrontEnd,
     result: LiveResult,
+    slow_s: float,
 ) -> None:
-    outcome = result.collected
+    """Figures, files, headline; times of convergence count from the end of a slow start."""
+    outcome, first_ns = result.collected, front_end.first_moving_ns
+    if first_ns is not None and result.tracking is not None:
+        first_ns += round(1e9 * slow_s)
     refused = dict(front_end.refused)
     lost = result.unlearned + result.passed_on - outcome.learned
     if lost:
@@ -199,7 +244,7 @@ def _conclude(
         reference,
         samples=result.samples,
         refused=refused,
-        first_moving_ns=front_end.first_moving_ns,
+        first_moving_ns=first_ns,
         tick_us=result.timing.tick_us,
         missed_deadlines=result.timing.missed_deadlines,
         delay_s=front_end.delay_s,
@@ -212,6 +257,10 @@ def _conclude(
         granted=[grant.line for grant in result.grants],
         ended=result.ended,
         fault=result.fault,
+        intake=dataclasses.asdict(result.intake),
+        set_aside=result.set_aside,
+        skipped=result.skipped,
+        restarts=result.restarts,
         recorded=result.recorded,
         unrecorded=result.unrecorded,
         tracking=result.tracking,

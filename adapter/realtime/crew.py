@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from adapter.realtime.bodies import LearnerBody, RecorderBody, WatchBody
+from adapter.realtime.bodies import RecorderBody, WatchBody
 from adapter.realtime.jobs import LearnerJob, RecordingJob, WatchJob
+from adapter.realtime.learner_body import LearnerBody
+from adapter.realtime.nurse import Nurse
+from adapter.realtime.post import RESTARTS, Post
 from adapter.realtime.raw import RawLayout
 from adapter.realtime.ring import Ring, affordable_rows
 from adapter.realtime.rt import split_cores
@@ -38,12 +44,22 @@ class CrewOptions:
 class Crew:
     """Workers and what connects them with the loop. A worker that dies never stops the loop.
 
+    A learner that dies is followed by one that goes on from its last kept state with what the
+    ring holds since; a recorder that dies by one that writes a further file. Three times each.
+
     Args:
         driver: for the names of joints and links and the period.
         state_size: of a filtered state's record.
         learner, recording, watch: what to do; None leaves it.
         options: sizes and names.
         say: takes a line for people.
+
+    Attributes:
+        passed_on: states handed to the learner; unlearned: those that found no room or nobody.
+        skipped: of those passed on, not learned because the ring had lost them when the learner
+            died, known at the end.
+        kept: samples that were to be recorded; recorded: of these, in files, known at the end.
+        troubles: one sentence for each worker that died.
     """
 
     def __init__(
@@ -65,13 +81,19 @@ class Crew:
         self._wanted_rows = max(round(options.ring_s * 1e9 / driver.period_ns), 1)
         self._fewest_rows = max(round(SHORTEST_RING_S * 1e9 / driver.period_ns), 1)
         self._snapshot_name = options.snapshot_name
+        self._cores = split_cores()[1]
+        self._nurse: Nurse | None = None
+        self._folder: Path | None = None
         self.states: Ring | None = None
         self.samples: Ring | None = None
         self.board: SnapshotWriter | None = None
-        self.learner: Worker | None = None
-        self.recorder: Worker | None = None
+        self.learner: Post | None = None
+        self.recorder: Post | None = None
         self.watcher: Worker | None = None
-        self.passed_on = self.unlearned = self.unrecorded = 0
+        self.passed_on = self.unlearned = self.kept = 0
+        self.recorded: int | None = None
+        self.skipped = 0
+        self._result: Any = None
         self.troubles: list[str] = []
 
     def start(self, cancelled: Callable[[], bool] = lambda: False) -> None:
@@ -83,29 +105,65 @@ class Crew:
         """
         learner, recording, watch = self._jobs
         rows = self._rows(learner is not None, recording is not None)
-        board = None
+        self._nurse = Nurse(self._cores)
         if learner is not None:
             self.states = Ring.create(self._sizes[0], rows)
             self.board = SnapshotWriter.create(
                 self._names[0], learner.effect_names, learner.bodies, self._snapshot_name
             )
-            board = self.board.name
+            self._hire_learner(learner, self.states, self.board.name)
+        board = None if self.board is None else self.board.name
         if recording is not None:
             self.samples = Ring.create(self._sizes[1], rows)
-        _, cores = split_cores()
-        if learner is not None and self.states is not None:
-            body = LearnerBody(learner, self.states.name, board)
-            self.learner = Worker("learner process", body, cores)
-        if recording is not None and self.samples is not None:
-            record = RecorderBody(recording, self.samples.name, board, *self._names)
-            self.recorder = Worker("recorder process", record, cores, RECORDER_NICE)
+            self._hire_recorder(recording, self.samples, board)
         shown = self.states or self.samples
         if watch is not None and shown is not None:
             show = WatchBody(watch, shown.name, board)
-            self.watcher = Worker("display process", show, cores, WATCH_NICE)
-        for worker in (self.recorder, self.learner, self.watcher):
+            self.watcher = Worker("display process", show, self._cores, WATCH_NICE)
+        posts = (post.worker for post in (self.recorder, self.learner) if post is not None)
+        for worker in (*posts, self.watcher):
             if worker is not None:
                 worker.wait_ready(cancelled=cancelled)
+
+    def _hire_learner(self, job: LearnerJob, ring: Ring, board: str) -> None:
+        lasting = job.keep is not None and job.restore is not None
+        if lasting:
+            self._folder = Path(tempfile.mkdtemp(prefix="adapter-learner-"))
+        body = LearnerBody(job, ring.name, board, self._folder)
+        assert self._nurse is not None
+        self.learner = Post(
+            "learner process",
+            lambda k: Worker("learner process", body, self._cores),
+            self._nurse,
+            RESTARTS if lasting else 0,
+            self._tell,
+            "the arm goes on, nothing more is learned",
+        )
+
+    def _hire_recorder(self, job: RecordingJob, ring: Ring, board: str | None) -> None:
+        def build(k: int) -> Worker:
+            body = RecorderBody(job.part(k), ring.name, board, *self._names)
+            return Worker("recorder process", body, self._cores, RECORDER_NICE)
+
+        assert self._nurse is not None
+        self.recorder = Post(
+            "recorder process",
+            build,
+            self._nurse,
+            RESTARTS,
+            self._tell,
+            "the arm goes on, nothing more is recorded",
+        )
+
+    @property
+    def restarts(self) -> int:
+        """Learners and recorders that followed one that died."""
+        return sum(post.restarts for post in (self.learner, self.recorder) if post is not None)
+
+    @property
+    def unrecorded(self) -> int:
+        """Samples that are in no file, known at the end."""
+        return 0 if self.recorded is None else self.kept - self.recorded
 
     def _rows(self, learning: bool, recording: bool) -> int:
         sizes = tuple(s for s, on in zip(self._sizes, (learning, recording), strict=True) if on)
@@ -124,76 +182,82 @@ class Crew:
 
     def pass_on(self, record: Array) -> None:
         """Hand a filtered state to the learner; never waits."""
-        if self.learner is not None and self.states is not None and self.states.push(record):
+        if self.learner is None or self.states is None:
+            return
+        if self.learner.held and self.states.push(record):
             self.passed_on += 1
-        elif self._jobs[0] is not None:
+        else:
             self.unlearned += 1
 
     def keep(self, sample: JointSample, command: Array | None) -> None:
         """Hand a sample to the recorder; never waits."""
-        if self.samples is not None and self.recorder is not None:
+        if self.recorder is None or self.samples is None:
+            return
+        self.kept += 1
+        if self.recorder.held:
             self.raw.fill(self._record, sample, command)
-            self.unrecorded += not self.samples.push(self._record)
+            self.samples.push(self._record)
 
     def look_after(self) -> None:
-        """Notice workers that died; each is told once."""
-        if self.learner is not None and not self.learner.alive:
-            self._mourn(self.learner, "the arm goes on, nothing more is learned")
-            self.learner = None
-        if self.recorder is not None and not self.recorder.alive:
-            self._mourn(self.recorder, "the arm goes on, nothing more is recorded")
-            self.recorder = None
+        """Notice workers that died, tell it once and have them followed; never waits."""
+        for post, ring in ((self.learner, self.states), (self.recorder, self.samples)):
+            if post is not None and ring is not None and post.held:
+                post.look_after()
+                if not post.held:
+                    self._abandon(ring)
 
-    def _mourn(self, worker: Worker, consequence: str) -> None:
-        worker.finish(lambda: 0, stall_s=0.0)
-        self._let_go(worker)
-        line = f"{worker.trouble or f'the {worker.name} ended early'}; {consequence}"
+    def _tell(self, line: str) -> None:
         self.troubles.append(line)
         self._say(line)
 
-    def _let_go(self, worker: Worker) -> None:
-        """Empty the ring of a dead worker, which a display may be waiting for."""
-        ring = self.states if worker.name.startswith("learner") else self.samples
-        if ring is not None:
-            ring.release(ring.unread)
+    def _abandon(self, ring: Ring) -> None:
+        """Empty the ring that nobody reads any more, which a display may be waiting for."""
+        if ring is self.samples:
+            self.recorded = ring.released
+        ring.release(ring.unread)
 
-    def finish(self, hurry: Callable[[], bool]) -> tuple[Any, int | None]:
-        """Let the workers drain their rings and end; results of learner and recorder.
+    def finish(self, hurry: Callable[[], bool]) -> Any:
+        """Let the workers drain their rings and end; returns what the learner collected.
 
         Args:
             hurry: true when somebody no longer wants to wait for the learner.
         """
-        self.look_after()
         for ring in (self.states, self.samples):
             if ring is not None:
                 ring.finish()
-        collected, recorded = None, None
-        if self.learner is not None and self.states is not None:
-            states = self.states
-            self.learner.finish(lambda: states.released, hurry=hurry)
-            collected = self._close_book(self.learner)
-        if self.recorder is not None and self.samples is not None:
-            samples = self.samples
-            self.recorder.finish(lambda: samples.released)
-            recorded = self._close_book(self.recorder)
+        collected = None
+        if self.states is not None and self._end(self.learner, self.states, hurry):
+            collected = self._result
+        if self.samples is not None and self._end(self.recorder, self.samples, lambda: False):
+            self.recorded = self.samples.released
+        if self.states is not None:
+            self.skipped = self.states.skipped
         if self.watcher is not None:
             self.watcher.finish(lambda: 0, stall_s=WATCH_STALL_S)
-        return collected, recorded
+        return collected
 
-    def _close_book(self, worker: Worker) -> Any:
-        if worker.trouble is not None:
-            self.troubles.append(worker.trouble)
-            self._say(worker.trouble)
-            self._let_go(worker)
-        return worker.result
+    def _end(self, post: Post | None, ring: Ring, hurry: Callable[[], bool]) -> bool:
+        """Whether a worker came to its end; its result is in `_result`."""
+        if post is None or not post.held:
+            return False
+        worker = post.finish(lambda: ring.taken, hurry)
+        if worker is None:
+            self._abandon(ring)
+            return False
+        self._result = worker.result
+        return True
 
     def close(self) -> None:
         """End what still runs and free all memory; may be called more than once."""
-        for worker in (self.learner, self.recorder, self.watcher):
-            if worker is not None:
-                worker.kill()
+        if self._nurse is not None:
+            self._nurse.close()
+        for post in (self.learner, self.recorder, self.watcher):
+            if post is not None:
+                post.kill()
         for part in (self.states, self.samples, self.board):
             if part is not None:
                 part.close()
                 part.unlink()
         self.states = self.samples = self.board = None
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -27,6 +27,8 @@ class LearnerJob:
         collect: what comes back at the end, picklable.
         publish: the estimate as it stands; None publishes nothing.
         save: writes a checkpoint; None writes none.
+        keep: writes the whole state into an empty folder (learner, folder), for a successor if
+            this process dies; restore: puts a fresh learner into it. Where None, nobody succeeds.
         effect_names: effects in the published estimate.
         bodies: rows of θ in it; one per joint where None.
         publish_s, save_s: how often.
@@ -36,6 +38,8 @@ class LearnerJob:
     collect: Callable[[Any], Any]
     publish: Callable[[Any], Snapshot] | None = None
     save: Callable[[Any], None] | None = None
+    keep: Callable[[Any, Path], None] | None = None
+    restore: Callable[[Any, Path], None] | None = None
     effect_names: tuple[str, ...] = ()
     bodies: int | None = None
     publish_s: float = 0.01
@@ -61,6 +65,13 @@ class RecordingJob:
     overwrite: bool = False
     describe: Callable[[Snapshot], Mapping[str, Any]] | None = None
     estimate_s: float = 0.1
+
+    def part(self, k: int) -> RecordingJob:
+        """The same for the k-th successor of a recorder that died: a file of its own."""
+        if k == 0:
+            return self
+        path = self.path.with_name(f"{self.path.stem}.part{k + 1}{self.path.suffix}")
+        return replace(self, path=path)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ class LockstepResult:
     """What a lockstep run did; fields as in `LiveResult`."""
 
     samples: int
+    set_aside: int
     passed_on: int
     ended: str
     fault: str | None
@@ -62,9 +63,13 @@ def run_lockstep(
     driver.connect()
     session = Session(driver, front_end, controller, learn, keep, duration_s)
     try:
+        if controller is not None:
+            session.get_ready(controller.prepare)
         while session.tick():
             pass
     finally:
         stop_arm(driver, session)
     tracking = None if controller is None else controller.tracking()
-    return LockstepResult(session.samples, passed_on, session.ended, session.fault, tracking)
+    return LockstepResult(
+        session.samples, session.set_aside, passed_on, session.ended, session.fault, tracking
+    )

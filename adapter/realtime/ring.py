@@ -1,8 +1,10 @@
 """A ring of fixed-size records between one producer and one consumer, in shared memory.
 
 The producer never waits and takes no lock. `head` counts records ever written and belongs to
-the producer, `tail` counts records ever released and belongs to the consumer. A full ring
-refuses the new record and counts it in `overruns`: what is unread is never overwritten.
+the producer; `taken` and `tail` count records ever taken and ever given back and belong to the
+consumer. Between the two lies what a consumer has taken but its successor would need again. A
+full ring refuses the new record and counts it in `overruns`: what was not given back is never
+overwritten.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from adapter.realtime.shared import SharedBlock, fence, free_bytes
 from adapter.records import Array
 
 # Places in the header; what different processes write lies in different cache lines.
-HEAD, TAIL, OVERRUNS, FINISHED, ROWS, SIZE = 0, 8, 16, 17, 24, 25
+HEAD, TAIL, TAKEN, SKIPPED, OVERRUNS, FINISHED, ROWS, SIZE = 0, 8, 9, 10, 16, 17, 24, 25
 HEADER_WORDS = 32
 HEADER_BYTES = 8 * HEADER_WORDS
 
@@ -38,7 +40,7 @@ def put(header, table, record):
 @jit
 def unread_rows(header):
     """How many records wait; what the producer wrote of them is visible after this call."""
-    waiting = header[HEAD] - header[TAIL]
+    waiting = header[HEAD] - header[TAKEN]
     fence()
     return waiting
 
@@ -128,20 +130,40 @@ class Ring:
         return done
 
     def peek(self, limit: int | None = None) -> Array:
-        """Consumer: the oldest unread records (m, size), as far as they lie in one piece.
+        """Consumer: the oldest records not taken yet (m, size), as far as they lie in one piece.
 
-        A view of the ring, valid until `release`.
+        A view of the ring, valid until they are given back.
         """
         waiting = int(unread_rows(self._header))
-        start = int(self._header[TAIL]) % self.rows
+        start = int(self._header[TAKEN]) % self.rows
         count = min(waiting, self.rows - start)
         if limit is not None:
             count = min(count, limit)
         return self._table[start : start + count]
 
+    def take(self, count: int) -> None:
+        """Consumer: the next `peek` begins `count` records later; they are kept for a successor."""
+        set_after(self._header, TAKEN, self._header[TAKEN] + count)
+
+    def give_back(self) -> None:
+        """Consumer: nobody needs again what was taken."""
+        set_after(self._header, TAIL, self._header[TAKEN])
+
     def release(self, count: int) -> None:
-        """Consumer: give back the `count` oldest records."""
-        set_after(self._header, TAIL, self._header[TAIL] + count)
+        """Consumer: take `count` records and give back all that was taken."""
+        self.take(count)
+        self.give_back()
+
+    def resume(self, index: int) -> int:
+        """Consumer: begin with record number `index`, as the successor of one that died.
+
+        Returns how many records from there on are gone; they are added to `skipped`.
+        """
+        start = min(max(index, int(self._header[TAIL])), self.pushed)
+        gone = max(start - index, 0)
+        self._header[SKIPPED] += gone
+        set_after(self._header, TAKEN, start)
+        return gone
 
     @property
     def pushed(self) -> int:
@@ -154,9 +176,24 @@ class Ring:
         return int(self._header[TAIL])
 
     @property
+    def taken(self) -> int:
+        """Records ever taken."""
+        return int(self._header[TAKEN])
+
+    @property
+    def kept(self) -> int:
+        """Records taken and not given back."""
+        return self.taken - self.released
+
+    @property
+    def skipped(self) -> int:
+        """Records that no consumer could take because they were gone when one died."""
+        return int(self._header[SKIPPED])
+
+    @property
     def unread(self) -> int:
-        """Records that wait."""
-        return self.pushed - self.released
+        """Records that wait to be taken."""
+        return self.pushed - self.taken
 
     @property
     def overruns(self) -> int:

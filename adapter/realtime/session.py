@@ -7,12 +7,17 @@ from collections.abc import Callable
 from typing import Protocol
 
 from adapter.controller import ControlError, Controller
+from adapter.errors import SettingsError
+from adapter.pace import Pace
 from adapter.records import Array, StateLayout
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
 DURATION, INTERRUPTED = "duration", "interrupted"
-DRIVER_ERROR, END_OF_STREAM = "driver_error", "end_of_stream"
+DRIVER_ERROR, END_OF_STREAM, OPERATOR_GONE = "driver_error", "end_of_stream", "operator_gone"
 STOP_LIMIT_S = 5.0  # a safe stop that takes longer is left to the driver
+LEAP_NS = 1_000_000_000  # a longer step of the stamps is a clock that was set, not time gone by
+CATCH_UP_READS, FRESH_READS = 5000, 3  # at most, and at least: a driver may look one tick back
+START_READS = 200  # samples among which there has to be one that a motion can start from
 
 
 class FrontEndLike(Protocol):
@@ -37,11 +42,13 @@ class Session:
 
     Attributes:
         samples: read so far.
-        elapsed_s: on the arm's own stamps.
-        ended: why the run came to its end, one of the four constants above.
+        set_aside: read to get ready, before the first tick; nobody else saw them.
+        elapsed_s: on the arm's own stamps; one that leaps by more than a second counts a period.
+        ended: why the run came to its end, one of the five constants above.
         fault: what the driver or the controller said, or None.
-        began_ns, stepped_ns: instants (CLOCK_MONOTONIC) of the begin of the last tick's compute
-            and of its filtered state.
+        began_ns, had_ns, stepped_ns: instants (CLOCK_MONOTONIC) of the begin of the last tick's
+            compute, of its sample being there and of its filtered state.
+        stopped: the driver was told to stop.
     """
 
     def __init__(
@@ -55,17 +62,62 @@ class Session:
     ) -> None:
         self._driver, self._front_end, self._controller = driver, front_end, controller
         self._pass_on, self._keep, self._duration_s = pass_on, keep, duration_s
-        self.samples, self.elapsed_s = 0, 0.0
+        self.samples, self.set_aside, self.elapsed_s = 0, 0, 0.0
         self.ended = DURATION
         self.fault: str | None = None
-        self.began_ns = self.stepped_ns = 0
-        self._first_ns: int | None = None
+        self.began_ns = self.had_ns = self.stepped_ns = 0
+        self.stopped = False
+        self._elapsed_ns, self._pace = 0, Pace(driver.period_ns, LEAP_NS)
         self._stopping_at_s: float | None = None
         self._ready_sample: JointSample | None = None
+        if controller is not None:
+            controller.attend(driver)
 
-    def start_with(self, sample: JointSample) -> None:
-        """Let the first tick take this sample, already read, instead of reading one."""
-        self._ready_sample = sample
+    def get_ready(self, prepare: Callable[[JointSample], None]) -> JointSample:
+        """Read until a sample will do and prepare with it; where the arm waits for its next
+        command, the first tick takes that sample.
+
+        Args:
+            prepare: raises SettingsError for a sample that will not do.
+
+        Raises:
+            SettingsError: no sample would do.
+            DriverError: as the driver says.
+        """
+        driver = self._driver
+        for left in reversed(range(START_READS)):
+            sample = driver.read()
+            try:
+                prepare(sample)
+            except SettingsError:
+                self.set_aside += 1
+                if not left:
+                    raise
+                continue
+            if driver.paced:
+                self.set_aside += 1
+            else:
+                self._ready_sample = sample
+            return sample
+        raise AssertionError("unreachable")
+
+    def catch_up(self) -> None:
+        """Let pass what came in while nobody read, so that the first tick's sample is a new one.
+
+        Where time stands still between two reads nothing came. Raises DriverError.
+        """
+        driver = self._driver
+        if not driver.arrived_ns:
+            return
+        self._ready_sample = None
+        for k in range(CATCH_UP_READS):
+            if not driver.paced:
+                time.sleep(1e-9 * driver.period_ns)
+            driver.read()
+            self.set_aside += 1
+            new = time.monotonic_ns() - driver.arrived_ns < 2 * driver.period_ns
+            if new and k >= FRESH_READS:
+                return
 
     def tick(self) -> bool:
         """Read, filter, pass on, control, record; false where the run has come to its end."""
@@ -77,8 +129,9 @@ class Session:
             return self._end(END_OF_STREAM, str(end))
         except DriverError as error:
             return self._end(DRIVER_ERROR, str(error))
+        self.had_ns = time.monotonic_ns()
         if driver.paced:
-            self.began_ns = time.monotonic_ns()  # until here it waited for the arm
+            self.began_ns = self.had_ns  # until here it waited for the arm
         record = self._front_end.step(sample)
         self.stepped_ns = time.monotonic_ns()
         self.samples += 1
@@ -94,7 +147,8 @@ class Session:
         if self._controller is None:
             return None, None
         try:
-            tau = self._controller.step(sample)
+            # Where time goes on between two reads, the instant of this one says how far.
+            tau = self._controller.step(sample, self.had_ns if self._driver.arrived_ns else 0)
             self._driver.command(tau)
         except (ControlError, DriverError) as error:
             return None, str(error)
@@ -108,9 +162,8 @@ class Session:
                 self._controller.begin_stop()
 
     def _goes_on(self, stamp_ns: int) -> bool:
-        if self._first_ns is None:
-            self._first_ns = stamp_ns
-        self.elapsed_s = 1e-9 * (stamp_ns - self._first_ns)
+        self._elapsed_ns += self._pace.step(stamp_ns)
+        self.elapsed_s = 1e-9 * self._elapsed_ns
         if self._duration_s is not None and self.elapsed_s >= self._duration_s:
             self.begin_stop(DURATION)
         if self._stopping_at_s is None:
@@ -125,9 +178,13 @@ class Session:
 
 
 def stop_arm(driver: Driver, session: Session | None) -> None:
-    """Let the driver bring the arm to a stand; a failure to do so is told as the fault."""
+    """Let the driver bring the arm to a stand, once; a failure is told as the fault."""
+    if session is not None:
+        if session.stopped:
+            return
+        session.stopped = True
     try:
         driver.stop()
-    except DriverError as error:
+    except Exception as error:  # whatever it is, the files still have to be closed
         if session is not None and session.fault is None:
-            session.ended, session.fault = DRIVER_ERROR, str(error)
+            session.ended, session.fault = DRIVER_ERROR, str(error) or type(error).__name__

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numba import types
@@ -117,6 +118,19 @@ class SharedBlock:
     def unlink(self) -> None:
         """Remove the block's name; processes that are attached keep it. Missing is fine."""
         remove(self.name)
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+def leave(orphaned: bool, names: Sequence[str], *parts: _Closable | None) -> None:
+    """Let go of memory; remove these names where nobody else is left to do so."""
+    for part in parts:
+        if part is not None:
+            part.close()
+    for name in names if orphaned else ():
+        remove(name)
 
 
 def remove(name: str) -> None:

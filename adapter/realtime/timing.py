@@ -68,6 +68,8 @@ class TimingReport:
         plant_us: what a simulated arm took for its physics, in neither of the two above.
         lateness_us: begin of the tick after its deadline; empty where the source sets the pace.
         period_us: between the begins of two ticks, with mean.
+        age_us: from a sample's arrival at this machine to the loop having it; empty where the
+            driver does not tell.
     """
 
     ticks: int
@@ -78,6 +80,7 @@ class TimingReport:
     plant_us: dict[str, float | None]
     lateness_us: dict[str, float | None]
     period_us: dict[str, float | None]
+    age_us: dict[str, float | None]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -91,6 +94,7 @@ class TimingReport:
             "physics of the simulated arm": self.plant_us,
             "lateness": self.lateness_us,
             "period": self.period_us,
+            "age of a sample when the loop has it": self.age_us,
         }
         out = [
             f"{self.ticks} ticks, {self.missed_deadlines} deadlines missed "
@@ -108,11 +112,14 @@ class Timing:
 
     def __init__(self) -> None:
         self._tick, self._loop, self._plant = Histogram(), Histogram(), Histogram()
-        self._late, self._period = Histogram(), Histogram()
+        self._late, self._period, self._age = Histogram(), Histogram(), Histogram()
         self._began: int | None = None
 
-    def add(self, began: int, stepped: int, ended: int, plant_ns: int) -> None:
-        """One tick: instants (ns) of its begin, of the filtered state, of its end; physics time."""
+    def add(
+        self, began: int, stepped: int, ended: int, plant_ns: int, age_ns: int | None = None
+    ) -> None:
+        """One tick: instants (ns) of its begin, of the filtered state, of its end; physics time;
+        age of its sample when the loop had it, None where that has no meaning."""
         if self._began is not None:
             self._period.add(began - self._began)
         self._began = began
@@ -120,6 +127,8 @@ class Timing:
         self._loop.add(ended - began - plant_ns)
         if plant_ns:
             self._plant.add(plant_ns)
+        if age_ns is not None:
+            self._age.add(age_ns)
 
     def late(self, ns: int) -> None:
         """A tick began this long after its deadline."""
@@ -138,4 +147,5 @@ class Timing:
             self._plant.summary_us(),
             self._late.summary_us(),
             period,
+            self._age.summary_us(),
         )

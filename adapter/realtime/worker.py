@@ -20,6 +20,8 @@ START_TIMEOUT_S = 180.0  # a first start compiles
 STALL_S = 30.0  # a worker that does nothing for so long at the end is given up
 KILL_WAIT_S = 5.0
 POLL_S = 0.05
+IDLE_S = 1e-3  # a worker without work looks again after so long
+ROWS_AT_ONCE = 16  # records between two looks at the clock
 READY, DONE, FAILED, REFUSED = "ready", "done", "failed", "refused"
 
 Body = Callable[["Port"], Any]
@@ -48,7 +50,7 @@ class Port:
 def main(connection: Connection, parent: int, cores: set[int], nice: int, body: Body) -> None:
     """What a worker process runs: `body`, and its result or its error back through the pipe."""
     # Ctrl-C and `kill` reach the whole process group; a worker ends when the loop says so.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     with suppress(OSError):  # only wishes; the loop reports its own grants
         os.sched_setaffinity(0, cores)
@@ -77,12 +79,16 @@ class Worker:
     Attributes:
         trouble: why it ended without a result, or None.
         result: what it returned.
+        mortal: it failed in a way that a successor need not: it died or had an error, and was
+            not refused what it needs, nor given up.
     """
 
     def __init__(self, name: str, body: Body, cores: set[int], nice: int = 0) -> None:
         self.name = name
         self.trouble: str | None = None
         self.result: Any = None
+        self.mortal = False
+        self._is_ready = False
         self._finished = False
         context = multiprocessing.get_context("spawn")
         self._connection, there = context.Pipe()
@@ -116,6 +122,7 @@ class Worker:
                 raise WorkerError(f"the {self.name} was not ready within {timeout_s:.0f} s")
         kind, value = self._receive()
         if kind == READY:
+            self._is_ready = True
             return
         if kind == REFUSED:
             raise DriverError(value)
@@ -133,22 +140,36 @@ class Worker:
         """
         if self._finished:
             return
+        if not self._await_end(progress, stall_s, hurry):
+            self.trouble = f"the {self.name} did not come to an end and was stopped"
+            self.kill()
+            return
+        kind, value = self._receive()
+        if kind == READY:  # nobody waited for it
+            self._is_ready = True
+            self.finish(progress, stall_s, hurry)
+            return
+        if kind == DONE:
+            self.result = value
+        else:
+            self.trouble = f"the {self.name} failed: {value}"
+            self.mortal = kind == FAILED
+        self.process.join(KILL_WAIT_S)
+        self.kill()
+
+    def _await_end(
+        self, progress: Callable[[], int], stall_s: float, hurry: Callable[[], bool]
+    ) -> bool:
+        """Whether something came through the pipe before it took too long."""
         seen, since = progress(), time.monotonic()
         while not self._connection.poll(POLL_S):
             now, count = time.monotonic(), progress()
             if count != seen:
                 seen, since = count, now
-            if now - since > stall_s or hurry():
-                self.trouble = f"the {self.name} did not come to an end and was stopped"
-                self.kill()
-                return
-        kind, value = self._receive()
-        if kind == DONE:
-            self.result = value
-        else:
-            self.trouble = f"the {self.name} failed: {value}"
-        self.process.join(KILL_WAIT_S)
-        self.kill()
+            limit_s = stall_s if self._is_ready else max(stall_s, START_TIMEOUT_S)
+            if now - since > limit_s or hurry():
+                return False
+        return True
 
     def kill(self) -> None:
         """End the process now, whatever it does; may be called more than once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import resources
 
 import numpy as np
@@ -13,6 +14,7 @@ from adapter.controller import ControlError, ControlSettings, ExcitationControll
 from adapter.errors import SettingsError
 from adapter.excitation import ExcitationSettings, MotionLimits, RandomMotion
 from adapter.feedforward import ModelFeedforward
+from adapter.motion_plan import plan_lines
 from adapter.urdf import read_urdf
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
@@ -21,6 +23,8 @@ from sim.scenarios import build
 PANDA = read_urdf(resources.files("adapter") / "robots" / "panda.urdf")
 LIMITS = MotionLimits.of(PANDA)
 DT = 2e-3
+READY = build("nominal").truth.ready
+NUMBERS = r"([+-][\d.]+) \.\. ([+-][\d.]+) rad .* at first ([\d.]+), then ([\d.]+) rad/s"
 
 
 def _starts(draw_share):
@@ -37,11 +41,17 @@ shares = st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7)
     share=shares,
     stop_s=st.floats(0.0, 8.0),
     rest=st.one_of(st.none(), st.floats(0.0, 3.0)),
+    slow=st.one_of(st.just(0.0), st.floats(1.0, 4.0)),
+    slow_share=st.floats(0.01, 1.0),
 )
-def test_keeps_every_limit_for_every_seed_start_and_stop(seed, share, stop_s, rest):
-    rests = () if rest is None else ((rest, rest + 1.5),)
+def test_keeps_every_limit_for_every_seed_start_and_stop(
+    seed, share, stop_s, rest, slow, slow_share
+):
+    shift = 0.0 if slow == 0.0 else slow + 1.0  # no rest while it becomes quicker
+    rests = () if rest is None else ((shift + rest, shift + rest + 1.5),)
     start = _starts(share)
-    motion = RandomMotion(LIMITS, start, ExcitationSettings(seed=seed, rests=rests))
+    how = ExcitationSettings(seed=seed, rests=rests, slow_s=slow, slow_share=slow_share)
+    motion = RandomMotion(LIMITS, start, how)
     q, dq, ddq = [start], [np.zeros(7)], [np.zeros(7)]
     while not motion.at_rest:
         if motion.time_s >= stop_s:
@@ -59,6 +69,47 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(seed, share, stop_s, re
     np.testing.assert_allclose(np.diff(q, axis=0) / DT, 0.5 * (dq[1:] + dq[:-1]), atol=1e-4)
     np.testing.assert_allclose(np.diff(dq, axis=0) / DT, 0.5 * (ddq[1:] + ddq[:-1]), atol=2e-2)
     assert (dq[-1] == 0.0).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), slow_share=st.floats(0.05, 0.5))
+def test_a_slow_start_takes_the_same_path_at_a_share_of_the_speed(seed, slow_share):
+    how = ExcitationSettings(seed=seed, slow_s=3.0, slow_share=slow_share)
+    slow, full = (RandomMotion(LIMITS, READY, h) for h in (how, ExcitationSettings(seed=seed)))
+    most = slow_share * full.bounds()[2]
+    while slow.time_s < 3.0:
+        slow.advance(DT)
+        assert (np.abs(slow.dq) <= most + 1e-12).all()
+    for _ in range(1000):
+        slow.advance(DT)
+    # At full speed it moves along the path of a motion that never was slow.
+    gap = full._s - slow._s
+    while gap < -1e-12:
+        full.advance(min(-gap, DT) if full.time_s > 1.0 else DT)
+        gap = full._s - slow._s
+    np.testing.assert_allclose(full.q, slow.q, atol=1e-9)
+    np.testing.assert_allclose(full.dq, slow.dq, atol=1e-9)
+
+
+def test_a_plan_says_how_far_how_fast_and_how_to_stop():
+    how = ExcitationSettings(seed=4, slow_s=10.0)
+    motion = RandomMotion(LIMITS, READY, how)
+    lines = plan_lines(motion, LIMITS, PANDA.tree.joint_names, 30.0)
+    assert "7 joints, for 30 s and 1 s of coming to rest" in lines[0]
+    assert "first 10 s go at 10% of the speed" in lines[1] and "Ctrl-C" in lines[-1]
+    lowest, highest, fastest = np.full(7, np.inf), np.full(7, -np.inf), np.zeros(7)
+    for _ in range(20_000):
+        motion.advance(5e-3)
+        lowest, highest = np.minimum(lowest, motion.q), np.maximum(highest, motion.q)
+        fastest = np.maximum(fastest, np.abs(motion.dq))
+    for j, name in enumerate(PANDA.tree.joint_names):
+        (line,) = (line for line in lines if line.startswith(name))
+        low, high, slow, fast = map(float, re.findall(NUMBERS, line)[0])
+        assert low - 5e-4 <= lowest[j] and highest[j] <= high + 5e-4
+        assert fastest[j] <= fast + 5e-4 and abs(slow - 0.1 * fast) < 2e-3
+        assert high - low < 1.3 * (highest[j] - lowest[j]) and fast < 1.5 * fastest[j]
+    endless = plan_lines(RandomMotion(LIMITS, READY), LIMITS, PANDA.tree.joint_names)
+    assert "until somebody stops it" in endless[0] and "speed" not in endless[1]
 
 
 def test_is_rich_and_does_not_repeat():
@@ -82,6 +133,11 @@ def test_settings_and_starts_that_cannot_be_are_refused():
         ExcitationSettings(rests=((1.0, 1.2),))
     with pytest.raises(SettingsError, match="low_hz"):
         ExcitationSettings(low_hz=2.0)
+    for wrong in ({"slow_s": 0.5}, {"slow_s": -1.0}, {"slow_share": 0.0}, {"slow_share": 2.0}):
+        with pytest.raises(SettingsError, match="slow_s"):
+            ExcitationSettings(**wrong)
+    with pytest.raises(SettingsError, match=r"becomes quicker, 10\.0 to 11\.0 s"):
+        ExcitationSettings(slow_s=10.0, rests=((10.5, 12.0),))
     with pytest.raises(SettingsError, match="7 joints"):
         ExcitationController(LIMITS, control=ControlSettings(stiffness=(1.0, 2.0)))
 
