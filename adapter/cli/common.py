@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,17 @@ from adapter.learner import MODES
 from adapter.model import SelfModel
 from adapter.robots import documented
 
-console = Console(stderr=True, highlight=False)
+
+class PatientConsole(Console):
+    """Goes on where the terminal is gone: results are still written."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As rich does, without an error."""
+        with suppress(OSError):
+            super().print(*objects, **options)
+
+
+console = PatientConsole(stderr=True, highlight=False)
 
 
 class UsageError(ValueError):

@@ -257,7 +257,7 @@ def _conclude(
         granted=[grant.line for grant in result.grants],
         ended=result.ended,
         fault=result.fault,
-        intake=dataclasses.asdict(result.intake),
+        intake={**vars(result.intake), "refused": dict(result.intake.refused)},
         set_aside=result.set_aside,
         skipped=result.skipped,
         restarts=result.restarts,

@@ -198,12 +198,14 @@ def can_udp(minutes: float) -> dict[str, Any]:
     """Motors in a process of their own, over udp_multicast."""
     from drivers.damiao.arm import DamiaoArm
 
-    with tempfile.TemporaryDirectory() as folder:
-        with simulated("can", 0.0, Path(folder)) as (address, _):
-            arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
-            arm.connect()
-            found = can_on(address, Reading(arm), arm, minutes)
-            arm.close()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        simulated("can", 0.0, Path(folder)) as (address, _),
+    ):
+        arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
+        arm.connect()
+        found = can_on(address, Reading(arm), arm, minutes)
+        arm.close()
     return found
 
 
