@@ -16,6 +16,7 @@ STREAK = 10  # so many old stamps in a row are a clock put back, not late sample
 # every period between them, these shares of documented speed and effort; a position, beyond what
 # its speed explains, by this share of a period's way at full speed.
 USUAL_STEPS, Q_STEP, DQ_STEP, TAU_STEP = 6.0, 0.5, 0.02, 0.02
+PLAY_RAD = 0.012  # a motor crosses the play of its gear in no time: no step of an encoder
 USUAL_OVER = 200.0  # samples that "usual" looks back on
 JUMP_CONFIRMED = 3  # samples in a row that confirm a step of position
 STUCK_RAD = 3e-3  # a joint's readings stand still while its speed would have brought it so far
@@ -62,6 +63,7 @@ def steps(x, reference, dt_ns, usual, floor, usual_dt_ns):
     for s in range(3):
         for j in range(x.shape[1]):
             most = USUAL_STEPS * math.sqrt(usual[s, j]) + ratio * floor[s, j]
+            most += PLAY_RAD if s == 0 else 0.0
             if off(s, j, x, reference, dt_ns) > most:
                 found = max(found, 2 if s == 0 else 1)
     return found

@@ -25,7 +25,7 @@ from drivers.damiao.settings import VIRTUAL, BusSettings
 from drivers.damiao.speed_check import SpeedCheck
 from drivers.interface import Array, DriverError, Intake, JointSample
 
-WATCHDOG_S = 0.2  # without a command for so long a motor lets go: a last resort, own choice
+WATCHDOG_S = 0.5  # without a command for so long a motor lets go: a last resort, own choice
 FIRST_ROUNDS, ROUND_TIMEOUT_S = 2, 0.1  # replies that the first sample lies between
 CARRIED_SHARE = 0.02  # of each tick's torque in the mean that carries a braked arm: 50 ms
 # The torque command of each code, with nothing else: q, dq, kp, kd zero. The same for all types.

@@ -706,7 +706,7 @@ def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     arm.close()
     assert not gone(first)
     q0 = bank.q.copy()
-    time.sleep(0.6)  # three of the motors' time-outs
+    time.sleep(1.5)  # three of the motors' time-outs
     assert bank.status == [1] * N
     listener = DamiaoArm(address)
     listener.connect()

@@ -73,7 +73,11 @@ def start(tmp_path):
     def go(*arguments: str, size: int = RUNNING, **how):
         with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
             command = [sys.executable, str(script), str(path), *arguments]
-            process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, **how)
+            before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the suite may run under nohup
+            try:
+                process = subprocess.Popen(command, stdout=out, stderr=err, env=environment, **how)
+            finally:
+                signal.signal(signal.SIGHUP, before)
         started.append(process)
         assert tools.wait_for(lambda: path.exists() and path.stat().st_size > size, 120.0)
         return process
