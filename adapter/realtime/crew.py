@@ -18,7 +18,7 @@ from adapter.realtime.raw import RawLayout
 from adapter.realtime.ring import Ring, affordable_rows
 from adapter.realtime.rt import split_cores
 from adapter.realtime.shared import SharedMemoryError
-from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotWriter
+from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWriter
 from adapter.realtime.worker import Worker
 from adapter.records import Array
 from drivers.interface import Driver, JointSample
@@ -34,7 +34,7 @@ class CrewOptions:
 
     Attributes:
         ring_s: how much the rings hold; less where shared memory is short (it is said).
-        snapshot_name: under which other processes find the estimate; None for any free name.
+        snapshot_name: under which other processes find the estimate, if it is free; None for any.
     """
 
     ring_s: float = 60.0
@@ -108,9 +108,7 @@ class Crew:
         self._nurse = Nurse(self._cores)
         if learner is not None:
             self.states = Ring.create(self._sizes[0], rows)
-            self.board = SnapshotWriter.create(
-                self._names[0], learner.effect_names, learner.bodies, self._snapshot_name
-            )
+            self.board = self._new_board(learner)
             self._hire_learner(learner, self.states, self.board.name)
         board = None if self.board is None else self.board.name
         if recording is not None:
@@ -164,6 +162,18 @@ class Crew:
     def unrecorded(self) -> int:
         """Samples that are in no file, known at the end."""
         return 0 if self.recorded is None else self.kept - self.recorded
+
+    def _new_board(self, learner: LearnerJob) -> SnapshotWriter:
+        """Where the estimate is published; under another name where another run has the usual."""
+        parts = self._names[0], learner.effect_names, learner.bodies
+        try:
+            return SnapshotWriter.create(*parts, self._snapshot_name)
+        except SnapshotError as error:
+            if self._snapshot_name is None:
+                raise
+            board = SnapshotWriter.create(*parts, None)
+            self._say(f"{error}; this run publishes its estimate as '{board.name}'")
+            return board
 
     def _rows(self, learning: bool, recording: bool) -> int:
         sizes = tuple(s for s, on in zip(self._sizes, (learning, recording), strict=True) if on)

@@ -109,7 +109,7 @@ def allocate(size: int, name: str | None) -> SharedBlock:
     old.close()
     if kind != MAGIC or _alive(owner):
         who = f"process {owner}" if kind == MAGIC else "another program"
-        raise SnapshotError(f"'{name}' is in use by {who}; choose another snapshot name")
+        raise SnapshotError(f"'{name}' is in use by {who}")
     old.unlink()
     return SharedBlock.create(size, name)
 

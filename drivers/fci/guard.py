@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
@@ -16,6 +17,9 @@ TORQUE_STEP = 0.99
 
 
 SETTLE_TICKS = 3  # an accepted torque that stays for so long is not on its way to ours
+OWN_COMMANDS = 32  # an accepted torque is one of so many that were sent last
+SAME = 1e-3  # N m; rounding of an f32 and some
+STRANGE_TICKS = 3  # a torque that is none of ours is believed when it comes so often in a row
 
 
 class Guard:
@@ -37,26 +41,33 @@ class Guard:
     def __init__(self) -> None:
         self.last = [0.0] * JOINTS
         self.cut = 0
-        self._fresh, self._waited = True, 0
+        self._fresh, self._waited, self._strange = True, 0, 0
         self._seen: list[float] = self.last
+        self._accepted: list[float] = self.last
+        self._sent: deque[list[float]] = deque(maxlen=OWN_COMMANDS)
 
     def reset(self) -> None:
         """A new motion begins; its first step counts from what the robot then drives with."""
-        self.last, self._fresh, self._waited = [0.0] * JOINTS, True, 0
+        self.last, self._fresh = [0.0] * JOINTS, True
+        self._waited = self._strange = 0
+        self._sent.clear()
 
     def pass_on(self, tau: list[float], accepted: list[float]) -> list[float] | None:
         """The command that may go out for a wanted one; None where none should.
 
         Args:
             tau: 7 torques, N m, wanted, finite.
-            accepted: 7 torques, N m, that the robot accepted last; those that are not finite
-                count as the ones sent last.
+            accepted: 7 torques, N m, that the robot says it accepted last.
         """
-        if not all(map(math.isfinite, accepted)):
-            pairs = zip(accepted, self.last, strict=True)
-            accepted = [own if math.isfinite(own) else last for own, last in pairs]
         if self._fresh:
-            self.last, self._fresh = accepted, False
+            finite = all(map(math.isfinite, accepted))
+            self.last = self._accepted = accepted if finite else self.last
+            self._fresh = False
+        believed = self._believed(accepted)
+        if believed is None:
+            self.cut += 1
+            return None
+        accepted = self._accepted = believed
         if self._apart(accepted):
             if not self._settled(accepted):
                 self.cut += 1
@@ -69,7 +80,19 @@ class Guard:
             out.append(min(max(want, low, -limit), high, limit))
         self.cut += out != tau
         self.last = out
+        self._sent.append(out)
         return out
+
+    def _believed(self, accepted: list[float]) -> list[float] | None:
+        """The torque that the robot drives with: one of ours. None for any other: bits can flip."""
+        for known in (self._accepted, *reversed(self._sent)):
+            if all(abs(own - other) <= SAME for own, other in zip(accepted, known, strict=True)):
+                self._strange = 0
+                return known
+        self._strange += 1
+        if self._strange < STRANGE_TICKS or not all(map(math.isfinite, accepted)):
+            return None
+        return accepted
 
     def _apart(self, accepted: list[float]) -> bool:
         return any(
