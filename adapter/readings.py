@@ -14,6 +14,7 @@ from adapter.records import Array
 JUMP = 0.005  # rad, beyond what the measured speeds say: noise, steps of the encoder
 DRIFT = 0.25  # of the documented speed, by which the measured one may be wrong or late
 FASTER = 1.5  # of the documented speed is more than a joint does
+HARDER = 100.0  # rad/s² is more than an arm does, five times what a Panda may
 STUCK_EFFORT = 0.1  # of the effort limit that the spring winds up on a reading that stands still
 STUCK_WAY = 0.02  # rad that the measured speed makes meanwhile
 
@@ -44,6 +45,10 @@ def judge_reading(q, dq, q_ref, least_s, most_s, velocity, wind, last_q, last_dq
         speed = 0.5 * (dq[j] + last_dq[j])
         low, high = min(speed * least_s, speed * most_s), max(speed * least_s, speed * most_s)
         room = JUMP + DRIFT * velocity[j] * most_s
+        if abs(dq[j]) > FASTER * velocity[j]:
+            return 2, j
+        if abs(dq[j] - last_dq[j]) > DRIFT * velocity[j] + HARDER * most_s:
+            return 2, j
         if abs(moved) > JUMP + FASTER * velocity[j] * most_s:
             return 2, j
         if moved < low - room or moved > high + room:

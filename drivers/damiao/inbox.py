@@ -252,18 +252,22 @@ class Inbox:
 
     def _alarm(self, j: int, sentence: str) -> None:
         """A motor says that something is wrong: believed when its next replies say so too."""
-        repeated = self._ticks - self._alarmed_at[j] <= ALARM_TICKS
-        self._alarms[j] = self._alarms[j] + 1 if repeated else 1
-        self._alarmed_at[j] = self._ticks
-        if self._alarms[j] >= ALARMS:
+        if self._repeats(j):
             raise DriverError(sentence)
+
+    def _repeats(self, j: int) -> bool:
+        """Count an unusual reply of a motor; whether there were as many in a row as it takes."""
+        in_a_row = self._ticks - self._alarmed_at[j] <= ALARM_TICKS
+        self._alarms[j] = self._alarms[j] + 1 if in_a_row else 1
+        self._alarmed_at[j] = self._ticks
+        return self._alarms[j] >= ALARMS
 
     def _look_at_temperatures(self, j: int, mosfet: int, rotor: int) -> None:
         for part, degc in (("MOSFETs", temperature(mosfet)), ("rotor", temperature(rotor))):
             who = f"motor {j + 1} (id 0x{self._settings.ids[j]:02x}): its {part}"
             if degc >= HOT_DEGC and self._driven:
                 self._alarm(j, f"{who} are at {degc} deg C; stopped: let it cool")
-            elif degc >= WARM_DEGC:
+            elif degc >= WARM_DEGC and self._repeats(j):
                 self.note(
                     f"warm {part} {j}",
                     f"{who} are at {degc} deg C; the run ends at {HOT_DEGC}: move less or slower",

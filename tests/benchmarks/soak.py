@@ -114,8 +114,8 @@ def main() -> None:
     parser.add_argument("--faults", type=float, default=0.0, metavar="SHARE")
     parser.add_argument("--json", type=Path, metavar="FILE")
     args = parser.parse_args()
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as stack:
+        folder = Path(name)
         address, summary = "pybullet:panda", None
         if args.driver != "pybullet":
             address, summary = stack.enter_context(simulated(args.driver, args.faults, folder))
