@@ -34,9 +34,12 @@ trials: $(STAMP)
 
 soak: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --driver fci --faults 0.01 --minutes 30
+	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --driver can --faults 0.01 --minutes 30
 
 bench: $(STAMP)
 	$(BIN)/adapter bench
+	$(BIN)/python tests/benchmarks/wires.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info

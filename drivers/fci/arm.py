@@ -144,7 +144,7 @@ class FciArm:
         state = self._state
         if state is None:
             raise DriverError("no state was read yet; a command answers one")
-        motion.command(tau, state, stream.answered(state.message_id))
+        motion.command(tau, state, *stream.answered(state))
 
     def stop(self) -> None:
         """Brake the arm and end the motion, if there is one. Raises DriverError."""

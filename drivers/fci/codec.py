@@ -201,6 +201,11 @@ class StateDecoder:
             self._rate.unpack_from(data, start + self._status_to)[0],
         )
 
+    def accepted(self, data: memoryview, start: int) -> Array:
+        """(7,) the torque command that the robot accepted last, N m, of the state at `start`."""
+        at = start + self._numbers + JOINTS * self._wire.itemsize
+        return np.frombuffer(data, self._wire, JOINTS, at).astype(np.float64)
+
 
 def _status(data: bytes, version: int) -> Status:
     """Modes and errors from the 85 bytes that hold them. Raises WireError."""

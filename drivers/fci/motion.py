@@ -16,6 +16,7 @@ from drivers.fci.channel import Channel
 from drivers.fci.codec import CommandEncoder, State, Status, WireError
 from drivers.fci.flags import raised, told
 from drivers.fci.guard import TORQUE_STEP, Guard
+from drivers.fci.reader import SLOTS
 from drivers.interface import Array, DriverError
 
 START_LIMIT_S = 2.0  # from Move to the running modes
@@ -51,7 +52,7 @@ class Motion:
         self._version, self._channel, self._send = version, channel, send
         self._encoder, self.guard = CommandEncoder(version), Guard()
         self._phase, self._move_id, self._deadline = _IDLE, -1, 0.0
-        self._accepted, self._ticks = False, 0
+        self._accepted, self._ticks, self._answered = False, 0, -SLOTS
         self._status: Status | None = None
         self.fault: str | None = None
         self.sent = 0
@@ -61,13 +62,14 @@ class Motion:
         """A motion was asked for and has not ended."""
         return self._phase != _IDLE
 
-    def command(self, tau: Array, state: State, message_id: int) -> None:
+    def command(self, tau: Array, state: State, message_id: int, accepted: Array) -> None:
         """Drive with (7,) N m; the first command starts the motion and is kept back itself.
 
         Args:
             tau: wanted, checked.
             state: read last.
-            message_id: of the state to answer.
+            message_id: of the state to answer, which may be a later one.
+            accepted: (7,) what the robot had accepted there, N m.
 
         Raises:
             DriverError: the motion has ended or cannot be asked for.
@@ -77,7 +79,7 @@ class Motion:
         if self._phase == _IDLE:
             self._begin(state.status.robot_mode)
         elif self._phase == _RUNNING:
-            self._drive(tau.tolist(), state, message_id)
+            self._drive(tau.tolist(), accepted, message_id)
 
     def _begin(self, robot_mode: int) -> None:
         if robot_mode != tables.ROBOT_IDLE:
@@ -87,11 +89,16 @@ class Motion:
         self._phase, self._accepted = _STARTING, False
         self._deadline = time.monotonic() + START_LIMIT_S
         self.guard.reset()
+        self._answered = -SLOTS
 
     def _drive(
-        self, tau: list[float], state: State, message_id: int, finished: bool = False
+        self, tau: list[float], accepted: Array, message_id: int, finished: bool = False
     ) -> None:
-        allowed = tau if finished else self.guard.pass_on(tau, state.tau_J_d.tolist())
+        """Answer a state, each one once: two steps must not fall into one tick of the robot."""
+        if 0 <= self._answered - message_id < SLOTS:
+            return
+        self._answered = message_id
+        allowed = tau if finished else self.guard.pass_on(tau, accepted.tolist())
         if allowed is not None:
             self._send(self._encoder.encode(message_id, allowed, finished))
             self.sent += 1
@@ -198,7 +205,7 @@ class Motion:
             moving = np.isfinite(state.dq).all() and np.abs(state.dq).max() > AT_REST
             brakes = moving and time.monotonic() - begin < BRAKE_S
             tau = -BRAKE_DAMPING * state.dq if brakes else np.zeros_like(state.dq)
-            self._drive(tau.tolist(), state, state.message_id)
+            self._drive(tau.tolist(), state.tau_J_d, state.message_id)
             if not brakes and max(map(abs, self.guard.last)) < TORQUE_STEP:
                 return
 
@@ -216,7 +223,7 @@ class Motion:
                     self._channel.wait(self._move_id, END_LIMIT_S)
                     self._phase = _IDLE
                 return
-            self._drive(self.guard.last, state, state.message_id, finished=True)
+            self._drive(self.guard.last, state.tau_J_d, state.message_id, finished=True)
 
     def _stop_move(self, next_state: NextState) -> None:
         """End the motion by request; what cannot be confirmed becomes a fault."""

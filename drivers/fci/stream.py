@@ -10,7 +10,7 @@ from drivers.fci.codec import State, WireError, id_at
 from drivers.fci.handshake import Link
 from drivers.fci.ledger import Ledger
 from drivers.fci.reader import SLOTS
-from drivers.interface import DriverError
+from drivers.interface import Array, DriverError
 
 
 class StateStream:
@@ -67,17 +67,19 @@ class StateStream:
                     f"{self._last_refused}: check ?protocol and the network, connect again"
                 )
 
-    def answered(self, message_id: int) -> int:
-        """The id that a command computed from this state answers.
+    def answered(self, state: State) -> tuple[int, Array]:
+        """What a command computed from this state answers: an id, and the torque accepted there.
 
         Where later states wait already, the robot is past this one and drops an answer to it;
         the command is the best there is for the newest of them.
         """
-        start = self._link.feed.newest()
-        if start is None:
-            return message_id
-        newest = id_at(self._link.feed.data, start)
-        return newest if 0 < newest - message_id <= SLOTS + ledger.SLACK_TICKS else message_id
+        feed = self._link.feed
+        start = feed.newest()
+        if start is not None:
+            newest = id_at(feed.data, start)
+            if 0 < newest - state.message_id <= SLOTS + ledger.SLACK_TICKS:
+                return newest, self._link.decoder.accepted(feed.data, start)
+        return state.message_id, state.tau_J_d
 
     def send(self, datagram: bytearray) -> None:
         """Send a command to where the last state came from."""
