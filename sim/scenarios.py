@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,6 +137,23 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         levels_of(options.get("noise", "real"), **options.get("levels", {})),
         links,
     )
+
+
+def options_of(texts: Sequence[str]) -> dict[str, Any]:
+    """Options of a scenario from KEY=VALUE texts; values are JSON, or text as it stands.
+
+    Raises ValueError for a text without a key.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ValueError(f"--set takes KEY=VALUE, got '{text}'")
+        try:
+            found[key] = json.loads(value)
+        except json.JSONDecodeError:
+            found[key] = value
+    return found
 
 
 def _size(name: str, key: str, value: Any) -> float:

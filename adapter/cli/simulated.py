@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -96,9 +95,12 @@ def simulation(
         return None
     if scheme == "pybullet" and arm not in ARMS:
         raise UsageError(f"no simulated arm '{arm}'; have: {', '.join(ARMS)}")
-    from sim.scenarios import build  # brings PyBullet, which the workers have no use for
+    from sim.scenarios import (  # brings PyBullet, which the workers have no use for
+        build,
+        options_of,
+    )
 
-    chosen = dict(_option(text) for text in options)
+    chosen = options_of(options)
     world = build(scenario or DEFAULT_SCENARIO, seed, **chosen)
     return Simulation(address, world, scenario is not None, seed)
 
@@ -109,13 +111,3 @@ def _on_virtual_bus(address: str) -> bool:
     from drivers.damiao.settings import OPTIONS
 
     return Address.of(address, OPTIONS).options.get("interface") == "virtual"
-
-
-def _option(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise UsageError(f"--set takes KEY=VALUE, got '{text}'")
-    try:
-        return key, json.loads(value)
-    except json.JSONDecodeError:
-        return key, value

@@ -21,7 +21,7 @@ from sim.damiao.open_bus import (
     check_alone,
     open_bus,
 )
-from sim.scenarios import SCENARIOS, build
+from sim.scenarios import SCENARIOS, build, options_of
 
 
 class Ending:
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve until a signal comes or the time is over. Raises ValueError for wrong options."""
     if any(text.startswith("enobufs") for text in args.fault):
         raise ValueError("fault 'enobufs' strikes a host's own controller, not the boards")
-    options = dict(_option(text) for text in args.set)
+    options = options_of(args.set)
     scenario = build(args.scenario, args.seed, **options)
     noise = scenario.noise if options.keys() & {"noise", "levels"} else None
     fd = bool(args.fd)
@@ -137,13 +137,3 @@ _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{key} {count}" for key, count in counts.items()) or "none"
-
-
-def _option(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"--set takes K=V, got '{text}'")
-    try:
-        return key, json.loads(value)
-    except json.JSONDecodeError:
-        return key, value

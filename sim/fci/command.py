@@ -9,11 +9,11 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from sim.fci.faults import describe
 from sim.fci.layout import VERSIONS
 from sim.fci.server import HOST, PORT, FciServer
+from sim.scenarios import options_of
 
 EXIT_OK, EXIT_USAGE = 0, 2
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
             args.scenario,
             args.seed,
             args.fault,
-            dict(_option(text) for text in args.set),
+            options_of(args.set),
             args.core,
         )
     except (ValueError, OSError) as error:
@@ -75,16 +75,6 @@ def _stopper(duration_s: float | None) -> Callable[[], bool]:
         signal.signal(number, lambda got, frame: asked.append(got))
     end = None if duration_s is None else time.monotonic() + duration_s
     return lambda: bool(asked) or (end is not None and time.monotonic() > end)
-
-
-def _option(text: str) -> tuple[str, Any]:
-    key, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"--set takes KEY=VALUE, got {text!r}")
-    try:
-        return key, json.loads(value)
-    except json.JSONDecodeError:
-        return key, value
 
 
 def _sentence(error: Exception, port: int) -> str:
