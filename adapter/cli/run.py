@@ -112,7 +112,8 @@ def run(args: argparse.Namespace) -> int:
     default_effects = REAL_ARM_EFFECTS if world is None else world.effects
     config = configure(args, None, default_effects, robot)
     maybe_real = world is None and scheme in HARDWARE
-    if maybe_real and args.allow_motion and not args.passive and not config.excitation.slow_s:
+    may_move = args.allow_motion and not args.passive
+    if maybe_real and may_move and not config.excitation.slow_s:
         share = min(config.excitation.share, REAL_SHARE)
         gentle = dataclasses.replace(config.excitation, slow_s=SLOW_S, share=share)
         config = dataclasses.replace(config, excitation=gentle)
@@ -123,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
     truth = args.truth or _write_truth(world, folder)
     reference = reference_from(truth, robot)
     builders = {} if world is None else {scheme: world.driver}
-    driver = open_driver(args.driver, builders, robot.tree.joint_names, args.allow_motion)
+    driver = open_driver(args.driver, builders, robot.tree.joint_names, may_move)
     if args.fault is not None:
         driver = with_faults(driver, args.fault, args.seed or 0)
     if maybe_real and not driver.can_move:
@@ -205,6 +206,7 @@ def _go(
     watch = None if args.quiet else WatchJob(partial(make_display, duration_s))
 
     def show_plan() -> None:
+        warn(driver.intake.notes)  # who holds the arm, say; again with what came later at the end
         if maybe_real and controller is not None and controller.reference is not None:
             names = robot.tree.joint_names
             lines = plan_lines(controller.reference, controller.limits, names, duration_s)
