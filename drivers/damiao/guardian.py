@@ -21,6 +21,7 @@ import fcntl
 import json
 import os
 import signal
+import stat
 import sys
 import tempfile
 import time
@@ -85,6 +86,8 @@ class Guardian:
                 continue
             if self._braker is None or mode != self._mode:
                 self._begin(mode, alive)
+            if not alive:
+                leave_pipe()
             if self.ended:
                 self._let_down()
                 return
@@ -171,6 +174,14 @@ class Guardian:
             print(f"guardian {os.getpid()}: {sentence}", file=sys.stderr, flush=True)
         except OSError:
             return  # the terminal is gone
+
+
+def leave_pipe() -> None:
+    """Whoever reads the ended program's output through a pipe is not to wait for us."""
+    if stat.S_ISFIFO(os.fstat(2).st_mode):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)
+        os.close(nowhere)
 
 
 def open_lock(settings: BusSettings) -> int:

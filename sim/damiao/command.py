@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--set",
         action="append",
         default=[],
-        metavar="K=V",
+        metavar="KEY=VALUE",
         help="option of the scenario; noise=real adds a Panda's sensor noise to the quantisation",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the arm, noise and faults")

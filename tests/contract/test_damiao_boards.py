@@ -501,7 +501,7 @@ def test_a_process_ends_by_itself_after_its_duration() -> None:
     ("options", "says"),
     [
         (["--channel", "10.0.0.1"], "no multicast address; try 239.74.163.2"),
-        (["--set", "mass"], "--set takes K=V"),
+        (["--set", "mass"], "--set takes KEY=VALUE"),
         (["--scenario", "moon"], "no scenario 'moon'; have: nominal"),
         (["--fault", "fire"], "no fault 'fire'; have: drop"),
         (["--fault", "enobufs=0.1"], "host's own controller"),
