@@ -1,0 +1,118 @@
+"""What a tree-structured robot measures: joint signals, its base's motion, its links' motion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from adapter.errors import ModelError
+from adapter.kinematics import Motion
+from adapter.spatial import Array
+from adapter.tree import Tree
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """Motion of one body (m, 3) or of several (m, bodies, 3), each in its own frame.
+
+    Attributes:
+        w: angular velocity, rad/s.
+        a: acceleration of the frame's origin with gravity (an accelerometer there reads it), m/s².
+        dw: angular acceleration, rad/s².
+        v: velocity of the frame's origin, m/s; None where nothing measures it.
+    """
+
+    w: Array
+    a: Array
+    dw: Array
+    v: Array | None = None
+
+    def take(self, rows: ArrayLike | slice) -> BodyMotion:
+        """Some of the samples."""
+        return BodyMotion(*(None if x is None else x[rows] for x in self._parts()))  # type: ignore[arg-type, index]
+
+    def _parts(self) -> tuple[Array | None, ...]:
+        return self.w, self.a, self.dw, self.v
+
+    def torch(self) -> Motion:
+        """As the networks take it; a velocity that nothing measures is zero there."""
+        v = np.zeros_like(self.w) if self.v is None else self.v
+        return Motion(
+            *(torch.from_numpy(np.ascontiguousarray(x)) for x in (v, self.w, self.a, self.dw))
+        )
+
+
+@dataclass(frozen=True)
+class TreeData:
+    """Samples of a tree; row k of everything belongs to one instant.
+
+    Attributes:
+        tree: N and A.
+        q, dq, ddq: (m, n) rad, rad/s, rad/s².
+        tau: (m, rows) N m; with a floating base the wrench [f; m] on the base, in its frame,
+            comes first (zero in free fall).
+        base: motion of the base, (m, 3) each.
+        links: measured motion of every moving link, (m, n, 3) each; None where not measured.
+
+    Raises:
+        ModelError: shapes that don't fit the tree or each other.
+    """
+
+    tree: Tree
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    base: BodyMotion
+    links: BodyMotion | None = None
+
+    def __post_init__(self) -> None:
+        m, n = len(self.q), self.tree.n
+        wanted = {"q": (m, n), "dq": (m, n), "ddq": (m, n), "tau": (m, self.tree.rows)}
+        for name, shape in wanted.items():
+            if getattr(self, name).shape != shape:
+                raise ModelError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
+        for name, motion, shape in (("base", self.base, (m, 3)), ("links", self.links, (m, n, 3))):
+            for part in () if motion is None else (motion.w, motion.a, motion.dw, motion.v):
+                if part is not None and part.shape != shape:
+                    raise ModelError(f"{name} must have shape {shape}, got {part.shape}")
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def take(self, rows: ArrayLike | slice) -> TreeData:
+        """Some of the samples, in this order."""
+        signals = (x[rows] for x in (self.q, self.dq, self.ddq, self.tau))  # type: ignore[index]
+        links = None if self.links is None else self.links.take(rows)
+        return TreeData(self.tree, *signals, self.base.take(rows), links)
+
+    def joint_signals(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """q, dq, ddq as the networks take them."""
+        q, dq, ddq = (
+            torch.from_numpy(np.ascontiguousarray(x)) for x in (self.q, self.dq, self.ddq)
+        )
+        return q, dq, ddq
+
+
+def stacked(parts: Sequence[TreeData]) -> TreeData:
+    """Several sets of samples of one tree, one after the other. Raises ModelError for none."""
+    if not parts:
+        raise ModelError("no samples to put together")
+
+    def motion(all_of: Sequence[BodyMotion | None]) -> BodyMotion | None:
+        some = [x for x in all_of if x is not None]
+        if len(some) < len(all_of):
+            return None
+        speeds = [x.v for x in some if x.v is not None]
+        v = np.concatenate(speeds) if len(speeds) == len(some) else None
+        w, a, dw = (np.concatenate([getattr(x, k) for x in some]) for k in ("w", "a", "dw"))
+        return BodyMotion(w, a, dw, v)
+
+    base = motion([part.base for part in parts])
+    assert base is not None
+    signals = (np.concatenate([getattr(p, k) for p in parts]) for k in ("q", "dq", "ddq", "tau"))
+    return TreeData(parts[0].tree, *signals, base, motion([part.links for part in parts]))
