@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from adapter.errors import ModelError
 from adapter.kinematics import Motion
@@ -31,12 +31,10 @@ class BodyMotion:
     dw: Array
     v: Array | None = None
 
-    def take(self, rows: ArrayLike | slice) -> BodyMotion:
+    def take(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> BodyMotion:
         """Some of the samples."""
-        return BodyMotion(*(None if x is None else x[rows] for x in self._parts()))  # type: ignore[arg-type, index]
-
-    def _parts(self) -> tuple[Array | None, ...]:
-        return self.w, self.a, self.dw, self.v
+        w, a, dw = (x[rows] for x in (self.w, self.a, self.dw))
+        return BodyMotion(w, a, dw, None if self.v is None else self.v[rows])
 
     def torch(self) -> Motion:
         """As the networks take it; a velocity that nothing measures is zero there."""
@@ -84,11 +82,11 @@ class TreeData:
     def __len__(self) -> int:
         return len(self.q)
 
-    def take(self, rows: ArrayLike | slice) -> TreeData:
+    def take(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> TreeData:
         """Some of the samples, in this order."""
-        signals = (x[rows] for x in (self.q, self.dq, self.ddq, self.tau))  # type: ignore[index]
+        q, dq, ddq, tau = (x[rows] for x in (self.q, self.dq, self.ddq, self.tau))
         links = None if self.links is None else self.links.take(rows)
-        return TreeData(self.tree, *signals, self.base.take(rows), links)
+        return TreeData(self.tree, q, dq, ddq, tau, self.base.take(rows), links)
 
     def joint_signals(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """q, dq, ddq as the networks take them."""
@@ -114,5 +112,7 @@ def stacked(parts: Sequence[TreeData]) -> TreeData:
 
     base = motion([part.base for part in parts])
     assert base is not None
-    signals = (np.concatenate([getattr(p, k) for p in parts]) for k in ("q", "dq", "ddq", "tau"))
-    return TreeData(parts[0].tree, *signals, base, motion([part.links for part in parts]))
+    q, dq, ddq, tau = (
+        np.concatenate([getattr(p, k) for p in parts]) for k in ("q", "dq", "ddq", "tau")
+    )
+    return TreeData(parts[0].tree, q, dq, ddq, tau, base, motion([part.links for part in parts]))
