@@ -74,10 +74,10 @@ class TreeData:
         for name, shape in wanted.items():
             if getattr(self, name).shape != shape:
                 raise ModelError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
-        for name, motion, shape in (("base", self.base, (m, 3)), ("links", self.links, (m, n, 3))):
+        for name, motion, bodies in (("base", self.base, ()), ("links", self.links, (n,))):
             for part in () if motion is None else (motion.w, motion.a, motion.dw, motion.v):
-                if part is not None and part.shape != shape:
-                    raise ModelError(f"{name} must have shape {shape}, got {part.shape}")
+                if part is not None and part.shape != (m, *bodies, 3):
+                    raise ModelError(f"{name} must be {(m, *bodies, 3)}, got {part.shape}")
 
     def __len__(self) -> int:
         return len(self.q)
