@@ -148,7 +148,7 @@ def panda() -> Truth:
         link_names=tuple(j["link"] for j in joints),
         R=np.array([from_rpy(j["rpy"]) for j in joints]),
         p=np.array([j["xyz"] for j in joints]),
-        theta=np.array([_theta(j["mass"], j["com"], j["inertia"]) for j in joints]),
+        theta=np.array([theta_of(j["mass"], j["com"], j["inertia"]) for j in joints]),
         limits=Limits(*(np.array([j[k] for j in joints]) for k in Limits.__slots__)),
         gravity=np.array(facts["robot"]["gravity"]),
         ready=np.array(facts["robot"]["ready"]),
@@ -172,7 +172,7 @@ def body_of(theta: Array) -> tuple[float, Array, Array]:
     return m, c, about_origin - m * (c @ c * np.eye(3) - np.outer(c, c))
 
 
-def _theta(m: float, com: list[float], inertia: list[float]) -> Array:
+def theta_of(m: float, com: list[float], inertia: list[float]) -> Array:
     """(10,) about the frame's origin, from mass, centre and inertia about the centre."""
     c = np.array(com)
     shift = m * (c @ c * np.eye(3) - np.outer(c, c))

@@ -19,18 +19,18 @@ def urdf(truth: Truth, carried: int = 0) -> str:
         truth: the arm.
         carried: how many of its payload events are in force; the others' links weigh nothing.
     """
-    parts = ['<robot name="arm">', _link("base", 1.0, np.zeros(3), np.eye(3))]
+    parts = ['<robot name="arm">', link_text("base", 1.0, np.zeros(3), np.eye(3))]
     parent = "base"
     for j, name in enumerate(truth.link_names):
-        parts.append(_link(name, *body_of(truth.theta[j])))
-        parts.append(_joint(truth.joint_names[j], parent, name, truth.p[j], truth.R[j]))
+        parts.append(link_text(name, *body_of(truth.theta[j])))
+        parts.append(joint_text(truth.joint_names[j], parent, name, truth.p[j], truth.R[j]))
         parent = name
     for k, event in enumerate(truth.events):
         moments, axes = principal(event.inertia)
         weighs = float(k < carried)
         body = weighs * event.m, np.zeros(3), weighs * np.diag(moments)
-        parts.append(_link(payload_link(k), *body))
-        parts.append(_joint(f"hold_{k}", parent, payload_link(k), event.com, axes, "fixed"))
+        parts.append(link_text(payload_link(k), *body))
+        parts.append(joint_text(f"hold_{k}", parent, payload_link(k), event.com, axes, "fixed"))
     return "\n".join([*parts, "</robot>"])
 
 
@@ -60,7 +60,8 @@ def _origin(p: Array, R: Array) -> str:
     return f'<origin xyz="{_numbers(p)}" rpy="{_numbers(to_rpy(R))}"/>'
 
 
-def _link(name: str, m: float, com: Array, inertia: Array) -> str:
+def link_text(name: str, m: float, com: Array, inertia: Array) -> str:
+    """A link of mass m (kg), centre (3,) and inertia (3, 3) about the centre, kg m²."""
     (xx, yy, zz), axes = principal(inertia)
     return (
         f'<link name="{name}"><inertial>{_origin(com, axes)}<mass value="{m!r}"/>'
@@ -69,7 +70,10 @@ def _link(name: str, m: float, com: Array, inertia: Array) -> str:
     )
 
 
-def _joint(name: str, parent: str, child: str, p: Array, R: Array, kind: str = "continuous") -> str:
+def joint_text(
+    name: str, parent: str, child: str, p: Array, R: Array, kind: str = "continuous"
+) -> str:
+    """A joint at p (3,) m, turned by R (3, 3), about its own z."""
     return (
         f'<joint name="{name}" type="{kind}">{_origin(p, R)}<parent link="{parent}"/>'
         f'<child link="{child}"/><axis xyz="0 0 1"/></joint>'
