@@ -95,13 +95,16 @@ class PandaResults:
 
     Attributes:
         tree: of the arm.
-        time_s: (t,) since the motion began.
+        time_s: (t,) s since the first motion, of `lam`.
         lam: (t, n, 6) as learned.
         lam_true: (n, 6).
         lam_shown: (n, 6) bool, what the data can show.
-        theta: (t, n, 10) as learned.
-        theta_start_s: when θ's learning began.
-        torque_error: (t,) held-out torque error over that of batch least squares.
+        theta_time_s: (u,) likewise.
+        theta: (u, n, 10) as learned.
+        theta_start_s: when θ's learning began; not a number where it never did.
+        torque_time_s: (k,) likewise.
+        torque_error: (k,) torque error of a sample before it was learned from, over that of batch
+            least squares on all samples.
         stated: figures beside the paper's.
         numbers: everything for the JSON file.
     """
@@ -111,8 +114,10 @@ class PandaResults:
     lam: Array
     lam_true: Array
     lam_shown: np.ndarray
+    theta_time_s: Array
     theta: Array
     theta_start_s: float
+    torque_time_s: Array
     torque_error: Array
     stated: list[Stated]
     numbers: dict[str, Any]

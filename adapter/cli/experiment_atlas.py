@@ -1,0 +1,105 @@
+"""The paper's humanoid (section IV.A): simulated data, learned, judged and compared."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+
+from adapter.cli.common import console
+from adapter.experiment.atlas import judge, learn_body, noisy_trial
+from adapter.experiment.atlas_figures import numbers_of, stated
+from adapter.experiment.comparison import arm_tables, compare
+from adapter.experiment.results import AtlasResults
+from adapter.experiment.trajectories import gathered, split
+from adapter.offline.signals import Measured, smoothed_data
+from adapter.tree import Tree
+from adapter.tree_data import BodyMotion, TreeData
+from sim.free_fall_data import FallData, data_set
+from sim.tree_links import link_tables
+
+ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
+
+
+class Fall:
+    """Simulated trajectories as samples for learners."""
+
+    def __init__(self, exact: FallData, noisy: FallData) -> None:
+        self._exact, self._noisy = exact, noisy
+        self.truth = truth = exact.truth
+        self.tree = Tree(truth.parent, True, truth.joint_names, truth.link_names, truth.base_name)
+
+    def __len__(self) -> int:
+        return len(self._exact)
+
+    def exact(self, k: int) -> TreeData:
+        """Trajectory k without noise."""
+        record = self._exact.exact(k)
+        base = (record.base_v, record.base_w, record.base_a, record.base_dw)
+        links = link_tables(self.truth, record.q, record.dq, record.ddq, base)
+        free = np.zeros((len(record.q), 6))  # nothing pushes a falling base
+        return TreeData(
+            self.tree,
+            record.q,
+            record.dq,
+            record.ddq,
+            np.hstack([free, record.tau]),
+            BodyMotion(record.base_w, record.base_a, record.base_dw, record.base_v),
+            BodyMotion(links.w, links.a, links.dw, links.v),
+        )
+
+    def measured(self, k: int) -> TreeData:
+        """Trajectory k as its sensors show it, filtered alike."""
+        return smoothed_data(self.tree, Measured(**self._noisy[k]))
+
+
+def run_atlas(args: argparse.Namespace) -> AtlasResults:
+    """The whole experiment; says what it is at."""
+
+    def say(line: str) -> None:
+        console.print(f"[dim]{line}[/]", soft_wrap=True)
+
+    began = time.perf_counter()
+    say(f"simulating {args.trajectories} trajectories of 10 s where they are not kept from before")
+    options: dict[str, Any] = {
+        "trajectories": args.trajectories, "seed": args.seed, "folder": args.cache,
+    }  # fmt: skip
+    source = Fall(data_set("atlas", **options), data_set("atlas", noise=True, **options))
+    truth, tree = source.truth, source.tree
+    parts = split([len(source.exact(k)) for k in range(len(source))], args.seed)
+    data = gathered(source, parts, parts.learned, noisy=False)
+    simulated_s = time.perf_counter() - began
+    say(f"learning λ and θ from {len(data)} samples")
+    body = learn_body(data, args.seed)
+    say("judging all samples")
+    judged = judge(body, data, source, parts)
+    say("learning from noisy sensors")
+    noisy_parts = split([len(source.measured(k)) for k in range(len(source))], args.seed)
+    noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
+    learners = [judged.learned]
+    if not args.no_baselines:
+        joints = [tree.joint_names[j] for j in ARM]
+        carrier = tree.link_names[tree.parent[ARM[0]]]
+        tables = arm_tables(source, parts, joints, carrier)
+        learners += compare(tables, tree, truth.lam, joints, carrier, args.full, args.seed, say)
+    numbers = numbers_of(body, judged, noise, learners, parts, data, tree, simulated_s)
+    return AtlasResults(
+        tree=tree,
+        true_lam=truth.lam,
+        arm=ARM,
+        snapshots=snapshots(body.networks.snapshots),
+        cost=body.networks.loss,
+        error_edges=np.log10(judged.training.edges),
+        error_counts=judged.training.histogram,
+        learners=learners,
+        stated=stated(numbers),
+        numbers=numbers,
+    )
+
+
+def snapshots(kept: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """λ by label, the last one called final."""
+    last = max(kept)
+    return [("final" if epoch == last else f"epoch {epoch}", kept[epoch]) for epoch in sorted(kept)]

@@ -1,0 +1,111 @@
+"""The humanoid's figures: all for the JSON file, the stated ones beside the paper's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from adapter.experiment.atlas import Body, Judged
+from adapter.experiment.results import Learned, Stated
+from adapter.experiment.trajectories import Split
+from adapter.tree import Tree
+from adapter.tree_data import TreeData
+
+BASELINES = ("FFNN", "ELM", "GPR")  # the paper's
+
+
+def numbers_of(
+    body: Body,
+    judged: Judged,
+    noise: dict[str, Any],
+    learners: list[Learned],
+    parts: Split,
+    data: TreeData,
+    tree: Tree,
+    simulated_s: float,
+) -> dict[str, Any]:
+    """Every number of the experiment under a key of its own."""
+    ours = judged.learned
+    paper = [x for x in learners if x.name in BASELINES]
+    best = min(paper, key=lambda x: x.median["control"], default=None)
+    arm = next((x for x in learners if x.name == "FOPnet"), ours)
+    return {
+        "joints": tree.n,
+        "trajectories": len(parts.lengths) + len(parts.control),
+        "control_trajectories": len(parts.control),
+        "train_samples": len(parts.train),
+        "test_samples": len(parts.test),
+        "learned_samples": len(data),
+        "simulated_s": simulated_s,
+        "kinematic_error_max": judged.kinematics.largest,
+        "kinematic_error_max_networks": judged.networks.largest,
+        "kinematic_error_max_training": judged.training.largest,
+        "torque_relative_error_median": ours.median,
+        "torque_relative_error_p99": ours.p99,
+        "torque_rmse_nm": ours.rmse,
+        "min_pseudo_inertia_eigenvalue": body.theta.min_eigenvalue,
+        "base_parameters": body.theta.rank,
+        "sub_problems": [
+            {"name": stage.name, "bodies": len(stage.bodies), "rank": stage.rank,
+             "parameters": stage.parameters, "wall_s": stage.wall_s}
+            for stage in body.theta.stages
+        ],
+        "learning_s": body.learning_s,
+        "schema_networks_s": body.schema_s,
+        "schema_moments_s": body.moments_s,
+        "theta_s": body.theta_s,
+        "noise": noise,
+        "learners": {
+            x.name: {"median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "train_s": x.train_s}
+            for x in learners
+        },
+        "best_baseline": None if best is None else best.name,
+        "control_error_ratio_to_best_baseline": (
+            None if best is None else best.median["control"] / max(arm.median["control"], 1e-300)
+        ),
+    }  # fmt: skip
+
+
+def stated(numbers: dict[str, Any]) -> list[Stated]:
+    """What the paper's text states, beside ours."""
+    kinematics = max(numbers["kinematic_error_max"].values())
+    networks = max(numbers["kinematic_error_max_networks"].values())
+    branches = [x["name"] for x in numbers["sub_problems"]]
+    ratio = numbers["control_error_ratio_to_best_baseline"]
+    return [
+        Stated("joints", "degrees of freedom", "30", numbers["joints"]),
+        Stated("trajectories", "random trajectories of 10 s, 1 kHz", "63", numbers["trajectories"]),
+        Stated("control_trajectories", "of them control", "13", numbers["control_trajectories"]),
+        Stated(
+            "samples", "samples for training and test", "500 000",
+            numbers["train_samples"] + numbers["test_samples"],
+        ),
+        Stated(
+            "train_samples", "of them for training", "75 %", numbers["train_samples"], "",
+            "the paper prints 75 %/25 % as test/train",
+        ),
+        Stated("learned_samples", "samples for λ and θ", "1 % of training",
+               numbers["learned_samples"]),
+        Stated("minibatch", "samples of a mini-batch; cycles", "10; 10", "10; 10"),
+        Stated("solver", "solver of θ", "interior point (fmincon)",
+               "interior point and Gauss-Newton (scipy)"),
+        Stated(
+            "kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
+            "", "in m/s, rad/s, m/s² and rad/s², λ from moments",
+        ),
+        Stated(
+            "kinematic_error_max_networks", "the same, λ from mini-batches", "negligible",
+            networks,
+        ),
+        Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches)),
+        *(
+            Stated(f"torque_median_{name}", f"median error by eq. 20, {name} set", "minimal",
+                   numbers["torque_relative_error_median"][name], "", "where |τ| > 0.1 N m")
+            for name in ("train", "test", "control")
+        ),
+        Stated("control_error_ratio", "best baseline's median error over ours, control set",
+               "not stated", ratio, "times"),
+        Stated("learning_s", "time to learn λ and θ", "not stated", numbers["learning_s"], "s",
+               "without simulating the data"),
+        Stated("noise_ratio", "torque error with noise over least squares with true λ",
+               "not stated", numbers["noise"]["ratio"], "", "control set"),
+    ]  # fmt: skip

@@ -1,0 +1,72 @@
+"""The learners that the FOP networks are compared with, on the right arm (Fig. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from adapter.baselines.features import Columns, arm_problem, sub_chain, sub_parents
+from adapter.baselines.presets import learners
+from adapter.experiment.atlas import Errors, Say
+from adapter.experiment.results import Learned
+from adapter.experiment.trajectories import SETS, Split, Trajectories, sets_of
+from adapter.spatial import Array
+from adapter.tree import Tree
+
+Tables = dict[str, tuple[Array, Array]]  # by set: inputs X and torques Y
+
+
+def arm_tables(source: Trajectories, parts: Split, joints: Sequence[str], carrier: str) -> Tables:
+    """Inputs and torques of the arm for every set; the training set in its shuffled order."""
+    found: dict[str, list[tuple[Array, Array]]] = {name: [] for name in SETS}
+    for _, data, rows in sets_of(source, parts):
+        x, y = arm_problem(data, joints, carrier)
+        for name, own in rows.items():
+            found[name].append((x[own], y[own]))
+    tables = {name: _joined(pairs) for name, pairs in found.items()}
+    order = np.argsort(np.argsort(parts.train))
+    x, y = tables["train"]
+    tables["train"] = x[order], y[order]
+    return tables
+
+
+def _joined(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
+    x, y = zip(*pairs, strict=True)
+    return np.concatenate(x), np.concatenate(y)
+
+
+def compare(
+    tables: Tables,
+    tree: Tree,
+    lam: Array,
+    joints: Sequence[str],
+    carrier: str,
+    full: bool,
+    seed: int,
+    say: Say,
+) -> list[Learned]:
+    """Train every learner on the training set and judge it on all three.
+
+    Args:
+        tables: of `arm_tables`.
+        tree, lam: body schema, for least squares alone.
+        joints, carrier: the arm.
+        full: the paper's sizes.
+        seed: of every random choice.
+        say: takes a sentence on progress.
+    """  # fmt: skip
+    index = sub_chain(tree, joints, carrier)
+    found = []
+    for choice in learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed):
+        say(f"training: {choice.title}")
+        choice.learner.fit(*tables["train"], progress=say)
+        errors = Errors(len(index))
+        for name, (x, y) in tables.items():
+            errors.add(name, y, choice.learner.predict(x))
+        facts = choice.learner.facts()
+        sizes = ", ".join(f"{value:g} {what}" for what, value in facts.sizes.items())
+        learned = Learned(choice.key, choice.title, train_s=facts.train_s)
+        learned.tuning = [sizes, *facts.tuning]
+        found.append(errors.into(learned))
+    return found

@@ -1,0 +1,100 @@
+"""Trajectories split as the paper does: shuffled train and test samples, and a control set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.tree_data import TreeData, stacked
+
+# Section IV.A: 63 trajectories, 50 of them for training and test, the other 13 as control set.
+PAPER_TRAJECTORIES, PAPER_TRAINED = 63, 50
+TRAIN_SHARE = 0.75  # the paper's 75/25, read as 75 % train (reading notes)
+LEARN_SHARE = 0.01  # of the training set, all that the FOP networks are given
+SETS = ("train", "test", "control")
+
+
+class Trajectories(Protocol):
+    """Where samples come from, one trajectory at a time."""
+
+    def __len__(self) -> int:
+        """Their number."""
+        ...
+
+    def exact(self, k: int) -> TreeData:
+        """Trajectory k as it is, with the motion of the links."""
+        ...
+
+    def measured(self, k: int) -> TreeData:
+        """Trajectory k as sensors show it, filtered."""
+        ...
+
+
+@dataclass(frozen=True)
+class Split:
+    """Which samples of which trajectory belong to which set.
+
+    Attributes:
+        lengths: samples of each trajectory of the train-and-test part.
+        control: numbers of the control trajectories.
+        train, test: rows in the trajectories of that part, one after the other; shuffled.
+    """
+
+    lengths: tuple[int, ...]
+    control: tuple[int, ...]
+    train: np.ndarray
+    test: np.ndarray
+
+    @property
+    def learned(self) -> np.ndarray:
+        """The rows that λ and θ are learned from."""
+        return self.train[: max(1, round(LEARN_SHARE * len(self.train)))]
+
+    def rows_in(self, rows: np.ndarray, k: int) -> np.ndarray:
+        """Those of the given rows that lie in trajectory k, counted from its start, in order."""
+        start = sum(self.lengths[:k])
+        return np.sort(rows[(rows >= start) & (rows < start + self.lengths[k])]) - start
+
+
+def split(lengths: list[int], seed: int) -> Split:
+    """Split trajectories of these lengths: about four fifths train and test, as the paper.
+
+    Raises:
+        ModelError: fewer than 5 trajectories.
+    """
+    count = len(lengths)
+    if count < 5:
+        raise ModelError(f"the experiment needs at least 5 trajectories, got {count}")
+    used = round(count * PAPER_TRAINED / PAPER_TRAJECTORIES)
+    order = np.random.default_rng(seed).permutation(sum(lengths[:used]))
+    cut = round(TRAIN_SHARE * len(order))
+    control = tuple(range(used, count))
+    return Split(tuple(lengths[:used]), control, order[:cut], order[cut:])
+
+
+def gathered(source: Trajectories, parts: Split, rows: np.ndarray, noisy: bool) -> TreeData:
+    """Samples at these rows of the train-and-test part."""
+    found = []
+    for k in range(len(parts.lengths)):
+        own = parts.rows_in(rows, k)
+        if len(own):
+            data = source.measured(k) if noisy else source.exact(k)
+            found.append(data.take(own))
+    return stacked(found)
+
+
+def sets_of(
+    source: Trajectories, parts: Split, noisy: bool = False
+) -> Iterator[tuple[int, TreeData, dict[str, np.ndarray]]]:
+    """Every trajectory with its rows by set."""
+    for k in range(len(source)):
+        data = source.measured(k) if noisy else source.exact(k)
+        if k in parts.control:
+            yield k, data, {"control": np.arange(len(data))}
+        else:
+            rows = {"train": parts.rows_in(parts.train, k), "test": parts.rows_in(parts.test, k)}
+            yield k, data, rows

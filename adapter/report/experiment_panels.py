@@ -1,0 +1,275 @@
+"""Panels of the body schema's errors and of the learners' (paper, Figs. 4f and 5a-d)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+from adapter.experiment.results import BOX_PERCENTILES, AtlasResults, Learned
+from adapter.outcome import frame_errors
+from adapter.report.experiment_tree import STRETCH
+from adapter.report.experiment_words import OURS, SETS, baselines, fopnet, letter
+from adapter.report.style import (
+    ACCENT,
+    GOAL,
+    MUTED,
+    SIZES,
+    STAND_IN,
+    Drawing,
+    Panel,
+    joint_color,
+    log_axis,
+    mark,
+    power_of_ten,
+    thin,
+    time_axis,
+)
+from adapter.spatial import Array
+
+KINEMATIC_GOAL = 1e-6  # of |k - k_hat| in SI units; ours, the paper states none
+KINDS = {
+    "v": ("velocity", "m/s"),
+    "w": ("angular velocity", "rad/s"),
+    "a": ("acceleration", "m/s²"),
+    "dw": ("angular acceleration", "rad/s²"),
+}
+SET_NAMES = {"train": "muted", "test": "accent", "control": "goal"}  # the page's colours
+SET_COLORS = {name: STAND_IN[color] for name, color in SET_NAMES.items()}
+MOST_JOINTS = 16  # in one panel of boxes
+LARGEST = 2.0  # of eq. 20: torques of opposite sign
+SMALLEST = 1e-16  # of a relative error in double precision; an exact zero is drawn here
+ROOM = 1.2  # times, between what is shown and the end of a logarithmic axis
+PERCENT = 100.0
+
+
+def histogram_panel(atlas: AtlasResults, which: str) -> Panel | None:
+    """How large the kinematic errors are, by kind (Fig. 4f); None where there are none."""
+    edges = np.asarray(atlas.error_edges, dtype=float)
+    counts = {kind: np.asarray(c, dtype=float) for kind, c in atlas.error_counts.items()}
+    for kind, values in counts.items():
+        if len(values) != len(edges) - 1:
+            raise ValueError(f"{len(edges)} edges need {len(edges) - 1} counts of '{kind}'")
+    counts = {kind: values for kind, values in counts.items() if values.sum() > 0.0}
+    if not counts:
+        return None
+    drawing = Drawing("third", stretch=STRETCH)
+    ax = drawing.axes[0]
+    for k, (kind, values) in enumerate(counts.items()):
+        name, unit = KINDS.get(kind, (kind, ""))
+        share = PERCENT * values / values.sum()
+        label, color = f"{name} {kind}, {unit}".rstrip(", "), joint_color(k)
+        ax.stairs(share, 10.0**edges, color=color, fill=True, alpha=0.18)
+        ax.stairs(share, 10.0**edges, color=color, linewidth=1.2, label=label)
+    _magnitudes(ax, edges, sum(counts.values(), np.zeros(len(edges) - 1)))
+    ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend
+    ax.legend(
+        frameon=False,
+        labelcolor=MUTED,
+        fontsize=SIZES["third"][2],
+        loc="upper left",
+        ncols=1,
+        handlelength=1.2,
+        borderaxespad=0.1,
+    )
+    mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
+    time_axis(drawing, "size of the error, in the unit of its kind")
+    samples = int(max(values.sum() for values in counts.values()))
+    note = f"up to {samples:,} numbers of a kind".replace(",", "\u202f")
+    return drawing.panel(f"({which}) Kinematic errors |k − k̂|", "% of their kind", note)
+
+
+def _magnitudes(ax: Axes, edges: Array, counts: Array) -> None:
+    """A logarithmic x axis around what is counted, with the goal in it."""
+    used = np.flatnonzero(counts)
+    low, high = edges[used[0]], edges[used[-1] + 1]
+    ax.set_xscale("log")
+    ax.set_xlim(10.0 ** (low - 0.5), max(10.0 ** (high + 0.5), 4.0 * KINEMATIC_GOAL))
+    ax.xaxis.set_major_locator(LogLocator(10, numticks=7))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+
+
+def schema_panels(atlas: AtlasResults) -> list[Panel]:
+    """λ's cost while it is learned, and its error at the epochs of the pictures."""
+    panels = []
+    cost = np.asarray(atlas.cost, dtype=float)
+    good = np.isfinite(cost) & (cost > 0.0)
+    if good.sum() > 1:
+        drawing = Drawing("half")
+        ax = drawing.axes[0]
+        ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
+        log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
+        ax.set_xlim(0.0, 1.04 * len(cost))
+        time_axis(drawing, "step of the optimiser")
+        panels.append(drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints"))
+    if atlas.snapshots:
+        panels.append(_epoch_errors(atlas))
+    return panels
+
+
+def _epoch_errors(atlas: AtlasResults) -> Panel:
+    """One dot per joint: how far its frame is from the actual one in its parent's."""
+    n = atlas.tree.n
+    lam = np.stack([lam for _, lam in atlas.snapshots])
+    every = np.tile(np.eye(6), (n, 1, 1))
+    kinds = zip(("turn, rad", "shift, m"), frame_errors(lam, atlas.true_lam, every), strict=True)
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
+    shown = []
+    for k, (name, errors) in enumerate(kinds):
+        errors = np.maximum(errors, SMALLEST)
+        shown.append(errors)
+        side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
+        ax.plot(
+            (at + side).ravel(),
+            errors.ravel(),
+            linestyle="none",
+            marker="o",
+            markersize=2.6,
+            color=color,
+            alpha=0.75,
+            label=name,
+        )
+    low, high = np.min(shown), np.max(shown)
+    log_axis(ax, 0.3 * low, 5.0 * high)
+    _categories(ax, [label for label, _ in atlas.snapshots])
+    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="best")
+    return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
+
+
+def _categories(ax: Axes, names: Sequence[str]) -> None:
+    ax.set_xlim(-0.5, len(names) - 0.5)
+    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
+    ax.grid(False, axis="x")
+
+
+def arm_rows(atlas: AtlasResults, learner: Learned) -> dict[str, Array]:
+    """By set the boxes (arm joints, 5) of a learner of the whole tree or of the arm alone.
+
+    Raises:
+        ValueError: boxes of another number of joints or percentiles.
+    """
+    found = {}
+    for name in SETS:
+        if name not in learner.boxes:
+            continue
+        boxes = np.asarray(learner.boxes[name], dtype=float)
+        wanted = {(joints, len(BOX_PERCENTILES)) for joints in (atlas.tree.n, len(atlas.arm))}
+        if boxes.shape not in wanted:
+            raise ValueError(
+                f"{learner.name}, {name}: boxes have shape {boxes.shape}; have: "
+                + " or ".join(map(str, sorted(wanted)))
+            )
+        whole = len(boxes) == atlas.tree.n
+        found[name] = boxes[list(atlas.arm)] if whole else boxes
+    return found
+
+
+def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:
+    """Relative errors of the arm's joints, a panel per learner: the paper's four, then others."""
+    shared = _limits(*(box for x in baselines(atlas) for box in arm_rows(atlas, x).values()))
+    paper: list[tuple[str, Panel]] = []
+    others: list[Panel] = []
+    for learner in atlas.learners:
+        rows = arm_rows(atlas, learner)
+        which = letter(learner)
+        limits = shared if which in ("a", "b", "c") else _limits(*rows.values())
+        if limits is None:
+            continue
+        drawing = _boxes(rows, atlas.arm, limits)
+        if which:
+            title, note = f"({which}) {learner.name}", learner.title
+            paper.append((which, drawing.panel(title, "relative error, %", note)))
+        else:
+            others.append(drawing.panel(learner.name, "relative error, %", learner.title))
+    return [panel for _, panel in sorted(paper, key=lambda x: x[0])], others
+
+
+def whole_panels(atlas: AtlasResults) -> list[Panel]:
+    """FOPnet's relative errors of all joints, in as many panels as they need."""
+    ours = fopnet(atlas)
+    if ours is None or any(len(ours.boxes.get(s, ())) == len(atlas.arm) for s in SETS):
+        return []
+    limits = _limits(*ours.boxes.values())
+    if limits is None:
+        return []
+    count = -(-atlas.tree.n // MOST_JOINTS)
+    panels = []
+    for joints in np.array_split(np.arange(atlas.tree.n), count):
+        part = joints.tolist()
+        drawing = _boxes({s: ours.boxes[s][part] for s in SETS if s in ours.boxes}, part, limits)
+        title = f"(d) {OURS}, joints {part[0] + 1} to {part[-1] + 1}"
+        panels.append(drawing.panel(title, "relative error, %"))
+    return panels
+
+
+def side_by_side(atlas: AtlasResults) -> Panel | None:
+    """Median and 99th percentile of every learner on one scale; None without any."""
+    known = [x for x in atlas.learners if any(s in x.median for s in SETS)]
+    values = [v for x in known for v in (*x.median.values(), *x.p99.values())]
+    limits = _limits(np.array(values))
+    if limits is None:
+        return None
+    drawing = Drawing("half", stretch=STRETCH)
+    ax = drawing.axes[0]
+    for k, learner in enumerate(known):
+        for side, name in zip((-0.2, 0.0, 0.2), SETS, strict=True):
+            middle, high = _shown(learner.median.get(name)), _shown(learner.p99.get(name))
+            color = SET_COLORS[name]
+            ax.plot([k + side] * 2, [middle, high], color=color, linewidth=2.0, alpha=0.45)
+            ax.plot([k + side], [middle], "o", color=color, markersize=4.5)
+            ax.plot([k + side], [high], "_", color=color, markersize=7)
+    log_axis(ax, *limits)
+    _categories(ax, [x.name for x in known])
+    note = "dot: median; bar up to the 99th percentile, over all joints that the learner has"
+    return drawing.panel("All learners on one scale", "relative error, %", note)
+
+
+def _shown(fraction: float | None) -> float:
+    return PERCENT * max(np.nan if fraction is None else fraction, SMALLEST)
+
+
+def _limits(*tables: Array) -> tuple[float, float] | None:
+    """Whole decades in per cent, with some room, around all finite values; None without any."""
+    values = np.concatenate([np.ravel(x) for x in tables]) if tables else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    low = PERCENT * max(float(values.min()), SMALLEST) / ROOM
+    high = PERCENT * min(max(float(values.max()), SMALLEST), LARGEST) * ROOM
+    top = 10.0 ** np.ceil(np.log10(high))
+    return 10.0 ** np.floor(np.log10(low)), min(top, ROOM * PERCENT * LARGEST)
+
+
+def _boxes(
+    rows: Mapping[str, Array], joints: Sequence[int], limits: tuple[float, float]
+) -> Drawing:
+    """Boxes (joints, 5) of each set beside each other, joint by joint."""
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    width = 0.72 / len(SETS)
+    log_axis(ax, *limits)
+    for k, name in enumerate(SETS):
+        if name not in rows:
+            continue
+        whisker, first, middle, third, end = PERCENT * np.maximum(rows[name], SMALLEST).T
+        x = np.arange(len(joints)) + (k - 1.0) * width
+        color = SET_COLORS[name]
+        ax.vlines(x, whisker, end, color=color, linewidth=0.9)
+        ax.bar(x, third - first, 0.82 * width, first, color=color, alpha=0.4, linewidth=0, zorder=2)
+        ax.hlines(middle, x - 0.41 * width, x + 0.41 * width, color=color, linewidth=1.6, zorder=3)
+    ax.set_ylim(*limits)
+    ax.set_xlim(-0.6, len(joints) - 0.4)
+    ax.xaxis.set_major_locator(FixedLocator(range(len(joints))))
+    names = [str(int(j) + 1) for j in joints]
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: names[round(x)]))
+    ax.grid(False, axis="x")
+    for before, _ in itertools.pairwise(range(len(joints))):
+        ax.axvline(before + 0.5, color=STAND_IN["grid"], linewidth=0.6, zorder=0)
+    time_axis(drawing, "joint")
+    return drawing
