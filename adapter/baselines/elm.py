@@ -1,0 +1,140 @@
+"""A committee of extreme learning machines (Huang et al. 2006), the paper's second baseline.
+
+A machine is a hidden layer of random tanh units that are never trained and output weights by
+ridge regression. Each has its own units and its own random part of the samples; the committee's
+answer is the mean. All in float64: with so weak a ridge the units' Gram matrix is not positive
+definite in float32.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg
+
+from adapter.baselines.learner import (
+    Facts,
+    Progress,
+    Scale,
+    at_least,
+    checked,
+    positive,
+    unfitted,
+)
+from adapter.errors import ModelError
+from adapter.spatial import Array
+
+MEMBERS, UNITS, POINTS = 50, 4000, 10_000  # the paper's
+PREDICTED_AT_ONCE = 5_000  # samples, so that the hidden layer stays below 160 MB
+
+
+@dataclass(frozen=True)
+class _Machine:
+    """One member: units tanh(x weights + biases), then the output weights."""
+
+    weights: Array
+    biases: Array
+    output: Array
+
+    def __call__(self, x: Array) -> Array:
+        y: Array = np.tanh(x @ self.weights + self.biases) @ self.output
+        return y
+
+
+class ElmCommittee:
+    """Committee of extreme learning machines on standardised inputs and outputs."""
+
+    def __init__(
+        self,
+        members: int = MEMBERS,
+        units: int = UNITS,
+        points: int = POINTS,
+        spread: float = 0.2,
+        ridge: float = 1e-9,
+        seed: int = 0,
+    ) -> None:
+        """Settings found on the right arm of ATLAS are the defaults.
+
+        Args:
+            members: machines in the committee.
+            units: tanh units of each.
+            points: samples of each, drawn without repetition from all (fewer where there are
+                not so many).
+            spread: deviation of a unit's input for standardised, independent x. Small ones keep
+                the units close to their linear part, so that their sums are low polynomials.
+            ridge: added to the mean Gram matrix of the units.
+            seed: of weights and parts.
+
+        Raises:
+            ModelError: sizes below 1, or a spread or ridge that is not positive.
+        """
+        at_least(1, members=members, units=units, points=points)
+        positive(spread=spread, ridge=ridge)
+        self.members, self.units, self.points = members, units, points
+        self.spread, self.ridge, self.seed = spread, ridge, seed
+        self._machines: list[_Machine] = []
+        self._facts: Facts | None = None
+
+    def fit(self, X: Array, Y: Array, progress: Progress | None = None) -> None:
+        """Train every member on its own part. Raises ModelError, also for too weak a ridge."""
+        begin = time.perf_counter()
+        X = checked(X, Y)
+        self._in, self._out = Scale.of(X), Scale.of(Y)
+        self._machines = []
+        points = min(self.points, len(X))
+        for member in range(self.members):
+            rng = np.random.default_rng([self.seed, member])
+            rows = rng.choice(len(X), points, replace=False)
+            self._machines.append(self._machine(self._in(X[rows]), self._out(Y[rows]), rng))
+            if progress is not None:
+                progress(f"committee: machine {member + 1} of {self.members}")
+        self._facts = self._told(points, X.shape[1], time.perf_counter() - begin)
+
+    def _machine(self, x: Array, y: Array, rng: np.random.Generator) -> _Machine:
+        weights = rng.normal(size=(x.shape[1], self.units)) * self.spread / np.sqrt(x.shape[1])
+        biases = rng.uniform(-1.0, 1.0, self.units)
+        hidden = np.tanh(x @ weights + biases)
+        gram = hidden.T @ hidden
+        gram[np.diag_indices(self.units)] += self.ridge * len(x)
+        try:
+            factor = linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
+        except linalg.LinAlgError:
+            raise ModelError(
+                f"the units' Gram matrix is singular in float64; take a ridge above {self.ridge:g}"
+            ) from None
+        output = linalg.cho_solve(factor, hidden.T @ y, check_finite=False)
+        return _Machine(weights, biases, output)
+
+    def predict(self, X: Array) -> Array:
+        """Torques (m, n), N m: the mean over the committee."""
+        if not self._machines:
+            raise unfitted()
+        x = self._in(checked(X, width=len(self._in.mean)))
+        parts = []
+        for k in range(0, len(x), PREDICTED_AT_ONCE):
+            some = x[k : k + PREDICTED_AT_ONCE]
+            parts.append(sum(machine(some) for machine in self._machines) / len(self._machines))
+        return self._out.undo(np.concatenate(parts))
+
+    def facts(self) -> Facts:
+        """Sizes, tuning and training time."""
+        if self._facts is None:
+            raise unfitted()
+        return self._facts
+
+    def _told(self, points: int, inputs: int, train_s: float) -> Facts:
+        sizes = {
+            "members": self.members,
+            "units": self.units,
+            "points": points,
+            "inputs": inputs,
+        }
+        tuning = (
+            f"Random input weights with deviation {self.spread:g} / sqrt({inputs}) on standardised "
+            "inputs, biases uniform in -1 to 1.",
+            f"Output weights by ridge regression, ridge {self.ridge:g} on the mean Gram matrix, "
+            "float64 (float32 is not positive definite there).",
+        )
+        return Facts({k: float(v) for k, v in sizes.items()}, tuning, train_s)
