@@ -1,0 +1,141 @@
+"""`adapter discover`: which joint moves which link, and who is whose parent."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from rich.tree import Tree as Shown
+
+from adapter.cli.common import console, warn, write_json
+from adapter.discovery import Discovery, Edge, discover
+from adapter.discovery.learned import Learned, learn, self_model
+from adapter.discovery.recorded import CUTOFF_HZ
+from adapter.discovery.verdict import DECIDED
+from adapter.errors import ModelError
+from drivers.mcap_file import read_log
+
+
+def add_parser(commands: Any) -> None:
+    """Declare the subcommand."""
+    parser = commands.add_parser(
+        "discover",
+        help="find the tree of a robot from the motion of its links",
+        description="From joint signals and link motion in unknown order find which joint moves "
+        "which link and who is whose parent, each with a confidence; say what the data leave "
+        "open; then learn λ, and θ where torques were recorded.",
+    )
+    parser.add_argument("log", type=Path, metavar="LOG", help="MCAP recording with link motion")
+    parser.add_argument(
+        "--cutoff", type=float, default=CUTOFF_HZ, metavar="HZ", help="of the filter, default 20"
+    )
+    parser.add_argument("--model", type=Path, metavar="FILE", help="write the self model (.json)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    log = read_log(args.log)
+    warn(log.warnings)
+    found = discover(log, args.cutoff)
+    warn(list(found.recorded.notes))
+    _print_tree(found)
+    for sentence in found.undecided:
+        console.print(f"[yellow]undecided:[/] {sentence}", soft_wrap=True)
+    figures = found.as_dict()
+    try:
+        learned = learn(found)
+    except ModelError as error:
+        if args.model is not None:
+            raise
+        warn([f"λ is not learned: {error}"])
+    else:
+        figures["lambda"] = _lambda_figures(learned)
+        _print_lambda(learned)
+        if args.model is not None:
+            figures.update(_write_model(args, found, learned))
+    write_json(args.json, figures)
+    return 0
+
+
+def _print_tree(found: Discovery) -> None:
+    recorded = found.recorded
+    console.print(
+        f"{len(recorded.joint_names)} joints, {len(recorded.link_names)} links; "
+        f"{recorded.duration_s:.1f} s of {', '.join(recorded.measured)} at "
+        f"{recorded.rate_hz:.0f} Hz"
+    )
+    carried = {edge.link for edge in found.edges}
+    parents = [edge.parent for edge in found.edges if edge.parent is not None]
+    roots = dict.fromkeys(
+        [name for name in recorded.link_names if name not in carried]
+        + [name for name in parents if name not in recorded.link_names]
+    )
+    for root in roots:
+        top = Shown(f"[bold]{root}[/]")
+        _hang(top, root, found.edges)
+        console.print(top)
+
+
+def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
+    for edge in edges:
+        if edge.parent == parent:
+            style = "green" if edge.confidence >= DECIDED else "yellow"
+            by = edge.joint if edge.joint is not None else "(no joint)"
+            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(edge.confidence)}[/]"
+            _hang(on.add(label), edge.link, edges)
+
+
+def _shown(confidence: float) -> str:
+    """Never rounded up to certainty."""
+    return f"{min(confidence, 0.9999):.4f}" if confidence >= DECIDED else f"{confidence:.2f}"
+
+
+def _print_lambda(learned: Learned) -> None:
+    tree, schema = learned.data.tree, learned.schema
+    table = Table(box=None, pad_edge=False)
+    for heading in ("joint", "α β γ rad", "p m", "shown", "± rad, m"):
+        table.add_column(heading, no_wrap=True)
+    for j, name in enumerate(tree.joint_names):
+        turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in _halves(schema.lam[j]))
+        spread = " ".join(_worst(part) for part in _halves(_known(learned)[j]))
+        table.add_row(name, turn, place, f"{schema.ranks[j]}/6", spread)
+    console.print(table)
+
+
+def _halves(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return row[:3], row[3:]
+
+
+def _known(learned: Learned) -> np.ndarray:
+    """Standard deviations (n, 6), NaN where a single turn or shift is not shown."""
+    return np.where(learned.schema.observable, learned.schema.std, np.nan)
+
+
+def _worst(part: np.ndarray) -> str:
+    return f"{np.nanmax(part):.1g}" if np.isfinite(part).any() else "-"
+
+
+def _lambda_figures(learned: Learned) -> dict[str, Any]:
+    tree, schema = learned.data.tree, learned.schema
+    return {
+        "joint_names": list(tree.joint_names),
+        "link_names": list(tree.link_names),
+        "lam": schema.lam,
+        "std": _known(learned),
+        "shown": list(schema.ranks),
+    }
+
+
+def _write_model(args: argparse.Namespace, found: Discovery, learned: Learned) -> dict[str, Any]:
+    model, left = self_model(found, learned, args.log.stem)
+    model.save(args.model)
+    what = "λ alone (no torques, or no accelerations with gravity)"
+    if left is not None:
+        what = f"λ and θ; torque left unexplained {left.max():.2g} N m rms at the worst joint"
+    console.print(f"{args.model}: {what}")
+    return {"model": str(args.model), "torque_rmse_nm": left}

@@ -1,0 +1,143 @@
+"""The most likely tree: every link one option, no joint twice, nobody his own ancestor.
+
+Without the last demand it is a linear assignment of links to joints. Where its solution has a
+cycle, one of the cycle's options must go: the problem splits into as many, each with one option
+forbidden, and the best bound is looked at first, so the first solution without a cycle is the best.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from adapter.discovery.bodies import NO_JOINT
+from adapter.discovery.hypotheses import FREE, LOST, Option
+from adapter.spatial import Array
+
+NEVER = -1e12  # score of what is not possible
+MOST_SPLITS = 3000  # of the search for the tree; more ambiguity than that is left undecided
+MOST_RIVAL_SPLITS = 30  # of the search for a rival, which else counts with its bound
+MOST_RIVALS = 30  # options of one link that are tried one by one
+
+Key = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Structure:
+    """One option for every link, and their scores' sum."""
+
+    chosen: tuple[Option, ...]
+    score: float
+
+
+def key_of(option: Option) -> Key:
+    """What tells options apart."""
+    return option.link, option.joint, option.parent
+
+
+class Search:
+    """Finds the best structure, also with one link's option given.
+
+    Args:
+        options: by link, best first, a free one among them.
+        joints: how many there are.
+    """
+
+    def __init__(self, options: tuple[tuple[Option, ...], ...], joints: int) -> None:
+        self._options, self._joints = options, joints
+        self._columns = joints + len(options)  # a column of its own for each link without joint
+
+    def best(self) -> Structure | None:
+        """The best structure; None where the search was given up."""
+        structure, _ = self._search(None, MOST_SPLITS)
+        return structure
+
+    def _search(self, given: Option | None, splits: int) -> tuple[Structure | None, float]:
+        """The best structure with one option given, and its score; or None and a bound on it."""
+        # Of equals the newest is looked at first, so that a search among ties gets to an end.
+        tie, seen = count(0, -1), set()
+        first = self._assign(frozenset(), given)
+        if first is None:
+            return None, NEVER
+        heap: list[tuple[float, int, frozenset[Key], Structure]] = []
+        heapq.heappush(heap, (-first.score, next(tie), frozenset(), first))
+        for _ in range(splits):
+            if not heap:
+                return None, NEVER
+            _, _, forbidden, structure = heapq.heappop(heap)
+            ring = cycle(structure.chosen)
+            if not ring:
+                return structure, structure.score
+            for option in ring:
+                if given is not None and option.link == given.link:
+                    continue
+                more = forbidden | {key_of(option)}
+                if more in seen:
+                    continue
+                seen.add(more)
+                split = self._assign(more, given)
+                if split is not None:
+                    heapq.heappush(heap, (-split.score, next(tie), more, split))
+        return None, -heap[0][0] if heap else NEVER
+
+    def _assign(self, forbidden: frozenset[Key], given: Option | None) -> Structure | None:
+        scores: Array = np.full((len(self._options), self._columns), NEVER)
+        best: dict[tuple[int, int], Option] = {}
+        for link, options in enumerate(self._options):
+            allowed = (given,) if given is not None and given.link == link else options
+            for option in allowed:
+                if key_of(option) in forbidden:
+                    continue
+                column = self._joints + link if option.joint == NO_JOINT else option.joint
+                if option.score > scores[link, column]:
+                    scores[link, column] = option.score
+                    best[link, column] = option
+        rows, columns = linear_sum_assignment(scores, maximize=True)
+        total = float(scores[rows, columns].sum())
+        if total <= NEVER / 2:
+            return None
+        pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+        return Structure(tuple(best[pair] for pair in pairs), total)
+
+    def posterior(self, structure: Structure) -> list[list[tuple[Option, float]]]:
+        """For every link its options and their probabilities, most likely first.
+
+        The probability of an option is that of the best structure with it, over the sum of the
+        same of all options.
+        """
+        tops = np.array([options[0].score for options in self._options])
+        out = []
+        for link, options in enumerate(self._options):
+            others = tops.sum() - tops[link]
+            own = structure.chosen[link]
+            scores = {own: structure.score}
+            near = [o for o in options if others + o.score >= structure.score - LOST]
+            for option in near[:MOST_RIVALS]:
+                if option != own:
+                    _, scores[option] = self._search(option, MOST_RIVAL_SPLITS)
+            top = max(scores.values())
+            weights = {o: float(np.exp(s - top)) for o, s in scores.items()}
+            total = sum(weights.values())
+            ranked = sorted(weights.items(), key=lambda item: (-item[1], item[0] != own))
+            out.append([(o, w / total) for o, w in ranked])
+        return out
+
+
+def cycle(chosen: tuple[Option, ...]) -> list[Option]:
+    """Options of a ring of links that hang on one another; [] where there is none."""
+    done: set[int] = set()
+    for option in chosen:
+        path: list[int] = []
+        link = option.link
+        while 0 <= link < len(chosen) and link not in done:
+            if link in path:
+                return [chosen[k] for k in path[path.index(link) :]]
+            path.append(link)
+            parent = chosen[link].parent
+            link = parent if parent != FREE else len(chosen)
+        done.update(path)
+    return []

@@ -1,0 +1,166 @@
+"""From a discovered tree to λ, and to θ where torques were recorded.
+
+Once N and A are known, body schema and dynamics are the paper's problems (eqs. 18, 19), solved by
+`adapter.offline` from the same filtered samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adapter.discovery.bodies import NO_JOINT
+from adapter.discovery.hypotheses import Option
+from adapter.discovery.inertias import neutral_theta, theta_of
+from adapter.discovery.verdict import UNSEEN_BASE, Discovery
+from adapter.errors import ModelError
+from adapter.model import LAMBDA_MEASURED, SelfModel, gravity_down
+from adapter.offline.moments import LinkNoise
+from adapter.offline.schema import SchemaResult, SchemaSettings, schema_from_moments
+from adapter.spatial import Array
+from adapter.tree import BASE, Tree
+from adapter.tree_data import BodyMotion, TreeData
+
+CHANNEL_NOISE_FLOOR = 1e-9  # rad/s, m/s, ...: keeps a link at rest from infinite weight
+
+
+@dataclass(frozen=True)
+class Learned:
+    """λ of a discovered tree.
+
+    Attributes:
+        data: the samples, joints and links in the tree's order.
+        schema: λ, its spread, what of it the data show.
+    """
+
+    data: TreeData
+    schema: SchemaResult
+
+
+def learn(discovery: Discovery) -> Learned:
+    """λ of the most likely tree.
+
+    Raises:
+        ModelError: the tree has more than one root, or joints that move no link of it.
+    """
+    data = tree_data(discovery)
+    recorded = discovery.recorded
+    excess = discovery.hypotheses.excess
+    noise = dict.fromkeys(("w", "v", "a", "dw"), 0.0)
+    for k, variance in discovery.bodies.noise.items():
+        moving = variance[variance > 0.0]
+        size = np.median(moving) if len(moving) else 0.0
+        noise[k] = float(np.sqrt(size * excess.get(k, 1.0))) + CHANNEL_NOISE_FLOOR
+    schema = schema_from_moments(data, SchemaSettings(noise=LinkNoise(**noise)))
+    # neighbouring samples share their noise: the filter leaves fewer independent ones
+    gain = np.sqrt(max(1.0, recorded.samples / recorded.noise_samples))
+    return Learned(data, _with_std(schema, gain))
+
+
+def _with_std(schema: SchemaResult, gain: float) -> SchemaResult:
+    return replace(schema, std=schema.std * gain)
+
+
+def tree_data(discovery: Discovery) -> TreeData:
+    """The recording's filtered samples, in the order of the discovered tree.
+
+    Raises:
+        ModelError: the tree has more than one root, or joints that move no link of it.
+    """
+    order, root = _order(discovery)
+    recorded, motion = discovery.recorded, discovery.bodies.motion
+    number = {option.link: k for k, option in enumerate(order)}
+    parent = tuple(number.get(option.parent, BASE) for option in order)
+    links = [option.link for option in order]
+    joints = [option.joint for option in order]
+    names = recorded.link_names
+    unseen = root == discovery.bodies.unseen_base
+    floating = not unseen and not bool(discovery.bodies.at_rest[root])
+    tree = Tree(
+        parent,
+        floating,
+        tuple(recorded.joint_names[s] for s in joints),
+        tuple(names[k] for k in links),
+        UNSEEN_BASE if unseen else names[root],
+    )
+    m = len(recorded.q)
+    tau: Array = np.zeros((m, tree.rows))
+    if recorded.tau is not None:
+        tau[:, tree.rows - tree.n :] = recorded.tau[:, joints]
+
+    def part(bodies: list[int] | int) -> BodyMotion:
+        nothing = np.zeros_like(motion["w"][:, bodies])
+        return BodyMotion(
+            motion["w"][:, bodies],
+            motion["a"][:, bodies] if "a" in motion else nothing,
+            motion["dw"][:, bodies],
+            motion["v"][:, bodies] if "v" in motion else None,
+        )
+
+    signals = (recorded.q[:, joints], recorded.dq[:, joints], recorded.ddq[:, joints])
+    return TreeData(tree, *signals, tau, part(root), part(links))
+
+
+def _order(discovery: Discovery) -> tuple[list[Option], int]:
+    """Options with a joint, parents first, and the body that is the root."""
+    bodies, chosen = discovery.bodies, discovery.structure.chosen
+    if discovery.root is None:
+        raise ModelError("more than one link is carried by nothing: no tree to learn λ of")
+    rigid = [bodies.recorded.link_names[o.link] for o in chosen if o.joint == NO_JOINT]
+    jointed = [o for o in chosen if o.joint != NO_JOINT]
+    names = bodies.recorded.link_names
+    root = names.index(discovery.root) if discovery.root in names else bodies.unseen_base
+    assert root is not None
+    if len(jointed) < len(bodies.recorded.joint_names) or len(chosen) - len(jointed) > (
+        root != bodies.unseen_base
+    ):
+        raise ModelError(
+            f"{len(jointed)} of {len(bodies.recorded.joint_names)} joints move a link of the tree "
+            f"and links without a joint are {', '.join(rigid) or 'none'}: no tree to learn λ of"
+        )
+    placed = {root}
+    order: list[Option] = []
+    while len(order) < len(jointed):
+        ready = [o for o in jointed if o.parent in placed and o.link not in placed]
+        order += ready
+        placed |= {o.link for o in ready}
+    return order, root
+
+
+def self_model(discovery: Discovery, learned: Learned, name: str) -> tuple[SelfModel, Array | None]:
+    """The self model of a discovered tree, and the torque (n,), N m rms, left unexplained.
+
+    θ is learned where torques and accelerations with gravity were recorded; else it is that of
+    neutral bodies, the second result is None and the provenance says so.
+
+    Args:
+        name: of the robot.
+    """
+    data, schema = learned.data, learned.schema
+    tree = data.tree
+    with_torque = discovery.recorded.tau is not None and "a" in discovery.bodies.motion
+    left = None
+    theta = neutral_theta(tree.bodies)
+    if with_torque and np.abs(data.tau).max() > 0.0:
+        theta, left = theta_of(data, schema.lam)
+    gravity = gravity_down()
+    if not tree.floating and "a" in discovery.bodies.motion:
+        gravity = -data.base.a.mean(axis=0)
+    return SelfModel(
+        name=name,
+        tree=tree,
+        lam=schema.lam,
+        theta=theta,
+        gravity=gravity,
+        lam_std=np.where(schema.observable, schema.std, np.nan),
+        lam_identifiable=schema.observable,
+        lambda_source=LAMBDA_MEASURED,
+        provenance={
+            "discovered": {
+                "confidence": {e.link: e.confidence for e in discovery.edges},
+                "undecided": list(discovery.undecided),
+                "theta": "learned from joint torques" if left is not None else "not learned",
+            }
+        },
+    ), left
