@@ -22,6 +22,7 @@ from drivers.interface import Array, DriverError
 START_LIMIT_S = 2.0  # from Move to the running modes
 END_LIMIT_S = 0.1  # for the second answer once the modes are left; TCP may hold it back 40 ms
 LOOK_EVERY = 100  # states between two looks at the TCP channel
+ENDED_AFTER = 2  # states in a row that say so; a single one may be a damaged datagram
 BRAKE_S, EASE_S, FINISH_S, STOP_MOVE_S = 0.3, 0.2, 0.3, 0.5
 QUIET_S = 0.1  # without a state for so long, a motion is stopped over TCP
 # N m s/rad, damping of a Panda's joints that an ordinary 1 kHz loop keeps stable.
@@ -54,6 +55,7 @@ class Motion:
         self._phase, self._move_id, self._deadline = _IDLE, -1, 0.0
         self._accepted, self._ticks, self._answered = False, 0, -SLOTS
         self._status: Status | None = None
+        self._odd = self._odd_tick = 0  # states in a row that say the motion is over; the last
         self.fault: str | None = None
         self.sent = 0
 
@@ -111,15 +113,23 @@ class Motion:
                 self._look_at_start(state)
             elif self._phase == _RUNNING:
                 if state.status is not self._status:
-                    self._status = state.status
-                    if not self._runs(state.status):
-                        self._ended(state)
+                    self._look_at_change(state)
                 elif self._ticks % LOOK_EVERY == 0:
                     self._channel.poll()
                     if self._channel.closed:
                         self._fail("the robot cut the connection; it brakes by itself: see Desk")
         except WireError as error:
             self._fail(f"the robot answers on TCP with {error}: connect again")
+
+    def _look_at_change(self, state: State) -> None:
+        """A status that is not that of the running motion, or another that is."""
+        if self._runs(state.status):
+            self._status, self._odd = state.status, 0
+            return
+        self._odd = self._odd + 1 if self._ticks == self._odd_tick + 1 else 1
+        self._odd_tick = self._ticks
+        if self._odd >= ENDED_AFTER:
+            self._ended(state)
 
     def _runs(self, status: Status) -> bool:
         return (

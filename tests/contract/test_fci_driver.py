@@ -626,6 +626,23 @@ def test_a_reflex_names_its_reason(peer, connected):
         arm.command(TAU)
 
 
+def test_one_state_with_a_damaged_mode_ends_no_motion(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    last = quiet(arm, peer)
+    for modes in ((0, 3, 4), peer.modes, (0, 2, 2), peer.modes):  # every other one is damaged
+        last += 1
+        peer.send(peer.state(last, modes=modes))
+        arm.read()
+        arm.command(TAU)
+    for _ in range(2):
+        last += 1
+        peer.send(peer.state(last, modes=(0, 3, 4)))
+        arm.read()
+    with pytest.raises(DriverError, match="a reflex stopped the arm"):
+        arm.command(TAU)
+
+
 @pytest.mark.parametrize(
     ("mode", "statuses", "why"),
     [
