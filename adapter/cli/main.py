@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from adapter.cli import bench, files, gap, replay, run, sim
+from adapter.cli import bench, discover, experiment, files, gap, replay, run, sim
 from adapter.cli.common import UsageError, console, program_version
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.realtime.shared import SharedMemoryError
@@ -28,7 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=program_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for part in (run, replay, gap, sim):
+    for part in (run, replay, gap, discover, experiment, sim):
         part.add_parser(commands)
     files.add_parsers(commands)
     bench.add_parser(commands)

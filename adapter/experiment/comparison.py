@@ -15,6 +15,7 @@ from adapter.spatial import Array
 from adapter.tree import Tree
 
 Tables = dict[str, tuple[Array, Array]]  # by set: inputs X and torques Y
+JUDGED = 30_000  # random samples of each set; all of them would take a committee half an hour
 
 
 def arm_tables(source: Trajectories, parts: Split, joints: Sequence[str], carrier: str) -> Tables:
@@ -57,16 +58,23 @@ def compare(
         say: takes a sentence on progress.
     """  # fmt: skip
     index = sub_chain(tree, joints, carrier)
+    judged = {name: _some(table, seed) for name, table in tables.items()}
     found = []
     for choice in learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed):
         say(f"training: {choice.title}")
         choice.learner.fit(*tables["train"], progress=say)
         errors = Errors(len(index))
-        for name, (x, y) in tables.items():
+        for name, (x, y) in judged.items():
             errors.add(name, y, choice.learner.predict(x))
         facts = choice.learner.facts()
-        sizes = ", ".join(f"{value:g} {what}" for what, value in facts.sizes.items())
+        sizes = ", ".join(f"{value:,.6g} {what}" for what, value in facts.sizes.items())
         learned = Learned(choice.key, choice.title, train_s=facts.train_s)
         learned.tuning = [sizes, *facts.tuning]
         found.append(errors.into(learned))
     return found
+
+
+def _some(table: tuple[Array, Array], seed: int) -> tuple[Array, Array]:
+    """Random samples of a set, all of a small one."""
+    rows = np.random.default_rng(seed).permutation(len(table[0]))[:JUDGED]
+    return table[0][rows], table[1][rows]

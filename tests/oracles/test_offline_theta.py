@@ -1,0 +1,222 @@
+"""θ learned in batch: Pinocchio's torques back, possible bodies, wrenches, noise, signals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from robot_models import random_urdf, shared
+from test_offline_schema import samples
+
+from adapter.dynamics import wrenches
+from adapter.errors import ModelError
+from adapter.identifiability import base_parameters
+from adapter.inertia import is_consistent, min_eigenvalue, theta_from_log_cholesky
+from adapter.kinematics import link_motion
+from adapter.offline.branches import branches
+from adapter.offline.interior_point import interior_point
+from adapter.offline.kinematic_errors import kinematic_errors
+from adapter.offline.schema import schema_from_moments
+from adapter.offline.signals import Measured, SmoothingSettings, smoothed_data
+from adapter.offline.theta import ThetaSettings, learn_theta
+from adapter.offline.theta_factors import row_factors, scales, system
+from adapter.offline.theta_solvers import adam_theta, least_squares_theta, random_bodies
+from adapter.offline.torque_errors import predicted_torques, relative_error, torque_errors
+from adapter.tree_data import TreeData
+
+
+def link_wrenches(data: TreeData, lam: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Total wrench on every body, (m, bodies, 6)."""
+    q, dq, ddq = data.joint_signals()
+    frames, bodies = torch.from_numpy(lam), torch.from_numpy(theta)
+    k = link_motion(data.tree, frames, q, dq, ddq, data.base.torch())
+    return wrenches(data.tree, frames, bodies, q, k).numpy()
+
+
+@pytest.mark.parametrize("floating", [True, False])
+@pytest.mark.parametrize(("links", "seed"), [(5, 11), (8, 12), (12, 13)])
+def test_possible_bodies_explain_torques_to_rounding(links: int, seed: int, floating: bool) -> None:
+    text = random_urdf(links, seed)
+    model, data = samples(text, floating, 300, seed)
+    _, control = samples(text, floating, 60, seed + 100)
+    lam = schema_from_moments(data).lam
+    found = learn_theta(data, lam, seed)
+    assert found.rank == base_parameters(model.tree, model.lam, model.gravity).rank
+    assert found.min_eigenvalue > 0.0 and is_consistent(found.theta)
+    error = torque_errors(control, lam, found.theta)
+    assert error.median < 1e-9 and error.p99 < 1e-6
+    names = [branch.name for branch in branches(model.tree)]
+    assert [s.name for s in found.stages][: len(names)] == names
+    for stage, branch in zip(found.stages, branches(model.tree), strict=False):
+        if floating:
+            assert stage.rank == 7 * len(branch.joints) < stage.parameters
+
+
+def test_least_squares_stays_at_the_prior_where_nothing_shows() -> None:
+    text = random_urdf(6, 14)
+    model, data = samples(text, True, 200, 14)
+    prior = model.theta + np.random.default_rng(0).normal(size=model.theta.shape)
+    settings = ThetaSettings(solver="least squares", prior=prior, rounds=0)
+    found = learn_theta(data, model.lam, 0, settings)
+    assert torque_errors(data, model.lam, found.theta).p99 < 1e-8
+    base = base_parameters(model.tree, model.lam, model.gravity)
+    assert base.distance(found.theta, model.theta) < 1e-8 < base.distance(prior, model.theta)
+    rows = row_factors(data, model.lam)
+    r, b = system(rows, scales(rows), tuple(range(7)))
+    exact = least_squares_theta(r, b, model.theta)  # a prior that fits is left alone
+    np.testing.assert_allclose(exact.theta, model.theta, atol=1e-9)
+
+
+@pytest.mark.parametrize("supervision", ["wrenches", "both"])
+@pytest.mark.parametrize("floating", [True, False])
+def test_wrenches_show_what_torques_do_not(supervision: str, floating: bool) -> None:
+    """Eq. 17: with every link's wrench known, no mass is hidden on a moving base."""
+    text = random_urdf(6, 15)
+    model, data = samples(text, floating, 150, 15)
+    measured = link_wrenches(data, model.lam, model.theta)
+    first = int(floating)
+    np.testing.assert_allclose(measured[:, first:, 5], data.tau[:, 6 * first :], atol=1e-9)
+    settings = ThetaSettings(supervision=supervision, solver="least squares", rounds=0)
+    found = learn_theta(data, model.lam, 0, settings, measured)
+    assert found.rank > base_parameters(model.tree, model.lam, model.gravity).rank
+    if floating:
+        assert found.rank == 10 * model.tree.bodies
+        np.testing.assert_allclose(found.theta, model.theta, atol=1e-8)
+    possible = learn_theta(
+        data, model.lam, 0, ThetaSettings(supervision=supervision, rounds=0), measured
+    )
+    np.testing.assert_allclose(link_wrenches(data, model.lam, possible.theta), measured, atol=1e-6)
+
+
+def test_rows_weigh_and_sum_as_the_samples_do() -> None:
+    """|Y θ - τ| by the factors is that of the samples, for any θ."""
+    model, data = samples(random_urdf(5, 16), True, 90, 16)
+    rows = row_factors(data, model.lam)
+    theta = theta_from_log_cholesky(random_bodies(6, np.random.default_rng(1)))
+    gap = predicted_torques(data, model.lam, theta) - data.tau
+    joints = [row.residual(theta) for row in rows if row.kind == "torque"]
+    np.testing.assert_allclose(joints, np.sqrt(np.mean(gap[:, 6:] ** 2, axis=0)), rtol=1e-9)
+    (force,) = [row for row in rows if row.kind == "force"]
+    assert force.residual(theta) == pytest.approx(np.sqrt(np.mean(gap[:, :3] ** 2)))
+    std = np.arange(1.0, 1.0 + len(rows))
+    r, b = system(rows, std, tuple(range(6)))
+    weighted = sum(
+        (row.residual(theta) / s) ** 2 * row.count for row, s in zip(rows, std, strict=True)
+    )
+    assert np.sum((r @ theta.ravel() - b) ** 2) == pytest.approx(weighted)
+
+
+def test_the_start_does_not_matter_and_adam_gets_close() -> None:
+    model, data = samples(random_urdf(7, 17), True, 200, 17)
+    rows = row_factors(data, model.lam)
+    r, b = system(rows, scales(rows), tuple(range(8)))
+    ends = []
+    for seed in range(4):
+        start = theta_from_log_cholesky(random_bodies(8, np.random.default_rng(seed)))
+        theta, _, _ = interior_point(r, b, start)
+        assert is_consistent(theta)
+        ends.append(theta)
+    np.testing.assert_allclose(ends[1:], np.stack(ends[:1] * 3), rtol=1e-4, atol=1e-4)
+    start = random_bodies(8, np.random.default_rng(4))
+    slow = adam_theta(r, b, start, steps=1500)
+    before = r @ theta_from_log_cholesky(start).ravel() - b
+    assert is_consistent(slow.theta) and slow.cost < 1e-3 * 0.5 * float(before @ before)
+
+
+def test_impossible_least_squares_are_kept_out() -> None:
+    """Noise makes least squares leave what can exist; possible bodies fit as well as they can."""
+    model, data = samples(random_urdf(6, 18), True, 60, 18)
+    rng = np.random.default_rng(3)
+    noisy = replace(data, tau=data.tau + 5.0 * rng.normal(size=data.tau.shape))
+    free = learn_theta(noisy, model.lam, 0, ThetaSettings(solver="least squares"))
+    held = learn_theta(noisy, model.lam, 0)
+    assert min_eigenvalue(free.theta).min() < 0.0 < held.min_eigenvalue
+    truth = [
+        np.sqrt(np.mean((predicted_torques(data, model.lam, x) - data.tau) ** 2))
+        for x in (held.theta, free.theta)
+    ]
+    assert truth[0] < truth[1]  # what is known to be possible keeps noise out
+
+
+def test_atlas_from_one_percent_of_samples() -> None:
+    text = shared("models/atlas_v5.urdf").read_text()
+    _, data = samples(text, True, 300, 19)
+    _, control = samples(text, True, 40, 20)
+    lam = schema_from_moments(data).lam
+    largest = kinematic_errors(control, lam).largest
+    assert max(largest.values()) < 1e-6, largest
+    found = learn_theta(data, lam, 5)
+    error = torque_errors(control, lam, found.theta)
+    assert error.median < 1e-6 and error.p99 < 1e-3
+    assert found.rank == 220 and found.min_eigenvalue > 0.0
+    ranks = {s.name: (s.rank, s.parameters) for s in found.stages}
+    assert ranks["right leg"] == ranks["left leg"] == (42, 60)
+    assert ranks["upper body"] == (126, 180) and ranks["pelvis"] == (10, 10)
+    assert ranks["whole tree"] == (220, 310)
+
+
+def test_relative_error_is_that_of_the_paper() -> None:
+    measured, predicted = np.array([2.0, -1.0, 0.0, 1.0]), np.array([1.0, -2.0, 0.0, -1.0])
+    np.testing.assert_allclose(relative_error(measured, predicted), [0.5, 0.5, 0.0, 2.0])
+
+
+def arm_signals(model, rng, seconds: float):  # type: ignore[no-untyped-def]
+    """Smooth motion of a fixed-base robot at 1 kHz, torques and link motion by the networks."""
+    t = np.arange(0.0, seconds, 1e-3)
+    speed = 2.0 * np.pi * rng.uniform(0.2, 1.0, (3, 1, model.tree.n))
+    phase = rng.uniform(0.0, 2.0 * np.pi, speed.shape)
+    size = rng.uniform(0.2, 0.6, speed.shape)
+    angle = speed * t[:, None] + phase
+    q = (size * np.sin(angle)).sum(axis=0)
+    dq = (size * speed * np.cos(angle)).sum(axis=0)
+    ddq = -(size * speed**2 * np.sin(angle)).sum(axis=0)
+    lam, gravity = torch.from_numpy(model.lam), torch.from_numpy(model.gravity)
+    k = link_motion(model.tree, lam, *(torch.from_numpy(x) for x in (q, dq, ddq)), gravity)
+    tau = wrenches(model.tree, lam, torch.from_numpy(model.theta), torch.from_numpy(q), k)
+    return q, dq, ddq, tau[..., 5].numpy(), k
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
+    """Control torque error of learned λ and θ against weighted least squares with the true λ."""
+    model, _ = samples(random_urdf(5, seed), False, 2, seed)
+    rng = np.random.default_rng(seed)
+    clean, parts = [], []
+    for _ in range(3):
+        q, dq, ddq, tau, k = arm_signals(model, rng, 6.0)
+        noise = {"q": 2e-5, "dq": 2e-3, "tau": 0.1, "link_w": 2e-3, "link_a": 0.02}
+        true = {"q": q, "dq": dq, "tau": tau, "link_w": k.w.numpy(), "link_a": k.a.numpy()}
+        read = {name: x + noise[name] * rng.normal(size=x.shape) for name, x in true.items()}
+        parts.append(smoothed_data(model.tree, Measured(**read), gravity=model.gravity))
+        exact = smoothed_data(model.tree, Measured(**true), gravity=model.gravity)
+        cut = slice(200, -200)
+        assert np.abs(exact.ddq - ddq[cut]).max() < 2e-2 * np.abs(ddq).max()
+        clean.append(exact)
+    learn, control = parts[0].take(slice(None, None, 3)), clean[2]
+    schema = schema_from_moments(learn)
+    found = learn_theta(learn, schema.lam, 0)
+    best = learn_theta(learn, model.lam, 0, ThetaSettings(solver="least squares"))
+    ours = torque_errors(control, schema.lam, found.theta).rmse
+    theirs = torque_errors(control, model.lam, best.theta).rmse
+    assert np.linalg.norm(ours) <= 1.1 * np.linalg.norm(theirs)
+    assert found.min_eigenvalue > 0.0
+
+
+def test_bad_input_is_named() -> None:
+    model, data = samples(random_urdf(5, 23), True, 30, 23)
+    with pytest.raises(ModelError, match=r"torques.*wrenches.*both"):
+        learn_theta(data, model.lam, 0, ThetaSettings(supervision="forces"))
+    with pytest.raises(ModelError, match="needs wrenches"):
+        learn_theta(data, model.lam, 0, ThetaSettings(supervision="both"))
+    with pytest.raises(ModelError, match="least squares"):
+        ThetaSettings(solver="magic")
+    with pytest.raises(ModelError, match="not finite"):
+        row_factors(replace(data, tau=data.tau * np.nan), model.lam)
+    with pytest.raises(ModelError, match="std"):
+        learn_theta(data, model.lam, 0, ThetaSettings(std=(1.0,)))
+    with pytest.raises(ModelError, match="gravity"):
+        fixed = Measured(data.q, data.dq, data.tau[:, 6:])
+        tree = replace(data.tree, floating=False)
+        smoothed_data(tree, fixed, SmoothingSettings(cut_s=0.0, order=1))
