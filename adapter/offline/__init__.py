@@ -1,0 +1,1 @@
+"""λ and θ of any tree, learned in batch from recorded samples (paper, sections III and IV)."""

@@ -1,0 +1,255 @@
+"""θ of a whole tree: the branches that the topology dictates, the base, then all together.
+
+With λ known and the base's motion measured, the joint torques of a branch depend on its own
+bodies alone (paper, section III-B). They leave three combinations of each link open, which act
+on the link below and in the end on the base, so the base is solved with the branches known, and
+a last solve over all bodies makes what the branches left open fit one possible robot.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.inertia import (
+    is_consistent,
+    log_cholesky_from_theta,
+    min_eigenvalue,
+    theta_from_log_cholesky,
+)
+from adapter.offline.branches import branches
+from adapter.offline.theta_factors import (
+    PER_BODY,
+    RowFactor,
+    qr_factor,
+    row_factors,
+    scales,
+    system,
+)
+from adapter.offline.theta_solvers import (
+    Solution,
+    adam_theta,
+    consistent_theta,
+    least_squares_theta,
+    random_bodies,
+)
+from adapter.spatial import Array
+from adapter.tree_data import TreeData
+
+SOLVERS = ("consistent", "least squares", "adam")
+# Residuals are not trusted below this share of a row's size when they set its weight.
+RESIDUAL_FLOOR = 1e-6
+
+
+@dataclass(frozen=True)
+class ThetaSettings:
+    """How θ is found.
+
+    Attributes:
+        solver: "consistent" (possible bodies; interior point, then Gauss-Newton), "least squares"
+            (base parameters, nearest to the prior), or "adam" (possible bodies, by descent).
+        supervision: "torques", "wrenches" or "both" (eq. 17).
+        std: standard deviation of every row of `row_factors`, N or N m. None: the size of its
+            signal first, then what the first solve leaves of it.
+        rounds: of weighting by what is left, where `std` is None.
+        whole: whether all bodies are solved together in the end.
+        prior: (bodies, 10), for "least squares"; zeros where None.
+        adam_steps: for "adam".
+    """
+
+    solver: str = "consistent"
+    supervision: str = "torques"
+    std: tuple[float, ...] | None = None
+    rounds: int = 1
+    whole: bool = True
+    prior: Array | None = None
+    adam_steps: int = 5000
+
+    def __post_init__(self) -> None:
+        if self.solver not in SOLVERS:
+            raise ModelError(f"no solver '{self.solver}'; have: {', '.join(SOLVERS)}")
+        if self.std is not None and not all(0.0 < s < np.inf for s in self.std):
+            raise ModelError("every standard deviation must be above zero and finite")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One solved sub-problem.
+
+    Attributes:
+        name: of the branch, "base" or "whole tree".
+        bodies: rows of θ that it solved.
+        rank: base parameters that its rows show; parameters: 10 per body.
+        cost: half the weighted sum of squares left; steps: of the solver.
+        wall_s: time it took.
+    """
+
+    name: str
+    bodies: tuple[int, ...]
+    rank: int
+    parameters: int
+    cost: float
+    steps: int
+    wall_s: float
+
+
+@dataclass(frozen=True)
+class ThetaResult:
+    """θ and how it came about.
+
+    Attributes:
+        theta: (bodies, 10), base first if it floats.
+        rank: base parameters that all rows together show.
+        stages: in the order they were solved.
+        residual: by name of row, root mean square of what is left, N or N m.
+        std: the weights' standard deviations by row.
+        min_eigenvalue: smallest of all pseudo-inertias; above zero: every body is possible.
+        factors_s: time that building the factors took.
+    """
+
+    theta: Array
+    rank: int
+    stages: tuple[Stage, ...]
+    residual: dict[str, float]
+    std: dict[str, float]
+    min_eigenvalue: float
+    factors_s: float
+
+
+def learn_theta(
+    data: TreeData,
+    lam: Array,
+    seed: int = 0,
+    settings: ThetaSettings | None = None,
+    wrenches: Array | None = None,
+) -> ThetaResult:
+    """θ from samples, from random bodies.
+
+    Args:
+        data: joint signals, torques, and the base's motion (rest and -gravity where it is fixed).
+        lam: (n, 6) λ.
+        seed: of the random start.
+        settings: see `ThetaSettings`.
+        wrenches: (m, bodies, 6), where they are measured (eq. 15).
+
+    Raises:
+        ModelError: unknown names, shapes that don't fit, numbers that are not finite.
+    """
+    settings = settings or ThetaSettings()
+    began = time.perf_counter()
+    rows = row_factors(data, lam, settings.supervision, wrenches)
+    solve = _Solve(data, rows, settings, np.random.default_rng(seed))
+    factors_s = time.perf_counter() - began
+    solve.run()
+    for _ in range(settings.rounds if settings.std is None else 0):
+        solve.reweigh()
+        solve.again()
+    names = [row.name for row in rows]
+    left = [row.residual(solve.theta) for row in rows]
+    return ThetaResult(
+        theta=solve.theta,
+        rank=solve.rank(tuple(range(data.tree.bodies))),
+        stages=tuple(solve.stages),
+        residual=dict(zip(names, left, strict=True)),
+        std=dict(zip(names, solve.std.tolist(), strict=True)),
+        min_eigenvalue=float(min_eigenvalue(solve.theta).min()),
+        factors_s=factors_s,
+    )
+
+
+class _Solve:
+    """The sub-problems of one tree, and the θ that they fill."""
+
+    def __init__(
+        self,
+        data: TreeData,
+        rows: list[RowFactor],
+        settings: ThetaSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.tree, self.rows, self.settings = data.tree, rows, settings
+        self.std = scales(rows) if settings.std is None else np.array(settings.std)
+        if len(self.std) != len(rows):
+            raise ModelError(f"{len(rows)} rows need as many std, got {len(self.std)}")
+        self.start = random_bodies(self.tree.bodies, rng)
+        self.theta = theta_from_log_cholesky(self.start)
+        if settings.solver == "least squares":
+            prior = np.zeros_like(self.theta) if settings.prior is None else settings.prior
+            if prior.shape != self.theta.shape:
+                raise ModelError(f"the prior of θ must have shape {self.theta.shape}")
+            self.theta = np.array(prior, dtype=float)
+        self.stages: list[Stage] = []
+
+    def run(self) -> None:
+        """Branches, base, whole."""
+        first = int(self.tree.floating)
+        for branch in branches(self.tree):
+            self._stage(branch.name, tuple(j + first for j in branch.joints))
+        if self.tree.floating:
+            self._stage(self.tree.base_name, (0,))
+        self.again()
+
+    def again(self) -> None:
+        """All bodies together, from where they are."""
+        if self.settings.whole:
+            self._stage("whole tree", tuple(range(self.tree.bodies)))
+
+    def reweigh(self) -> None:
+        """Every row's weight by what the solution leaves of it."""
+        floor = RESIDUAL_FLOOR * scales(self.rows)
+        self.std = np.maximum([row.residual(self.theta) for row in self.rows], floor)
+
+    def rank(self, bodies: tuple[int, ...]) -> int:
+        """Base parameters that the rows of these bodies show."""
+        r, b = self._system(bodies)
+        return least_squares_theta(r, b, self.theta[list(bodies)]).rank or 0
+
+    def _system(self, bodies: tuple[int, ...]) -> tuple[Array, Array]:
+        """R θ = b of some bodies, all others being as they are now.
+
+        A row counts where it sees one of the bodies and was not solved with another branch.
+        """
+        chosen, own = set(bodies), []
+        for row, sigma in zip(self.rows, self.std, strict=True):
+            if set(row.bodies) <= chosen:
+                own.append((row, sigma))
+            elif chosen == {0} and 0 in row.bodies:
+                own.append((_known(row, bodies, self.theta), sigma))
+        if not own:
+            raise ModelError("no row shows these bodies")
+        return system([row for row, _ in own], np.array([s for _, s in own]), bodies)
+
+    def _stage(self, name: str, bodies: tuple[int, ...]) -> None:
+        began = time.perf_counter()
+        r, b = self._system(bodies)
+        at = list(bodies)
+        found = self._solve(r, b, self.theta[at], self.start[at])
+        self.theta[at] = found.theta
+        rank = found.rank if found.rank is not None else self.rank(bodies)
+        wall = time.perf_counter() - began
+        self.stages.append(
+            Stage(name, bodies, rank, PER_BODY * len(bodies), found.cost, found.steps, wall)
+        )
+
+    def _solve(self, r: Array, b: Array, now: Array, start: Array) -> Solution:
+        if self.settings.solver == "least squares":
+            return least_squares_theta(r, b, now)
+        vectors = log_cholesky_from_theta(now) if is_consistent(now) else start
+        if self.settings.solver == "adam":
+            return adam_theta(r, b, vectors, self.settings.adam_steps)
+        return consistent_theta(r, b, vectors)
+
+
+def _known(row: RowFactor, bodies: Sequence[int], theta: Array) -> RowFactor:
+    """The same row with all bodies but these known: their part moves to the measured side."""
+    columns = np.arange(len(row.r) - 1).reshape(-1, PER_BODY)
+    free = np.array([body in bodies for body in row.bodies])
+    others = [body for body in row.bodies if body not in bodies]
+    known = row.r[:, columns[~free].ravel()] @ theta[others].ravel()
+    kept = np.column_stack([row.r[:, columns[free].ravel()], row.r[:, -1] - known])
+    seen = tuple(body for body in row.bodies if body in bodies)
+    return RowFactor(row.name, row.kind, seen, qr_factor(kept), row.count)
