@@ -35,6 +35,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--trajectories", type=int, default=63, metavar="N", help="atlas: default 63"
     )
+    parser.add_argument(
+        "--seconds", type=float, default=10.0, metavar="S", help="atlas: of each; default 10"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
     parser.add_argument(
         "--cache", type=Path, metavar="FOLDER", help="where simulated data are kept"

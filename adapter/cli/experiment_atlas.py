@@ -62,13 +62,15 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         console.print(f"[dim]{line}[/]", soft_wrap=True)
 
     began = time.perf_counter()
-    say(f"simulating {args.trajectories} trajectories of 10 s where they are not kept from before")
+    say(f"simulating {args.trajectories} falls of {args.seconds:g} s, where none are kept")
     options: dict[str, Any] = {
-        "trajectories": args.trajectories, "seed": args.seed, "folder": args.cache,
+        "trajectories": args.trajectories, "seconds": args.seconds, "seed": args.seed,
+        "folder": args.cache,
     }  # fmt: skip
     source = Fall(data_set("atlas", **options), data_set("atlas", noise=True, **options))
     truth, tree = source.truth, source.tree
-    parts = split([len(source.exact(k)) for k in range(len(source))], args.seed)
+    count = len(source)  # trajectories, all of one length
+    parts = split(count * [len(source.exact(0))], args.seed)
     data = gathered(source, parts, parts.learned, noisy=False)
     simulated_s = time.perf_counter() - began
     say(f"learning λ and θ from {len(data)} samples")
@@ -76,7 +78,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say("judging all samples")
     judged = judge(body, data, source, parts)
     say("learning from noisy sensors")
-    noisy_parts = split([len(source.measured(k)) for k in range(len(source))], args.seed)
+    noisy_parts = split(count * [len(source.measured(0))], args.seed)
     noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
     learners = [judged.learned]
     if not args.no_baselines:

@@ -246,7 +246,7 @@ class _Solve:
 
 def _known(row: RowFactor, bodies: Sequence[int], theta: Array) -> RowFactor:
     """The same row with all bodies but these known: their part moves to the measured side."""
-    columns = np.arange(len(row.r) - 1).reshape(-1, PER_BODY)
+    columns = np.arange(row.r.shape[1] - 1).reshape(-1, PER_BODY)
     free = np.array([body in bodies for body in row.bodies])
     others = [body for body in row.bodies if body not in bodies]
     known = row.r[:, columns[~free].ravel()] @ theta[others].ravel()
