@@ -6,10 +6,13 @@ STAMP := $(VENV)/.ready
 # Tests without a real-time loop, which may share the machine with each other.
 TIMELESS := tests/oracles tests/properties tests/recovery
 
-.PHONY: run test setup lint trials soak bench clean
+.PHONY: run test experiment setup lint trials soak bench clean
 
 run: $(STAMP)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
+
+experiment: $(STAMP)
+	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
 test: $(STAMP) lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 $(TIMELESS)
@@ -34,6 +37,7 @@ trials: $(STAMP)
 	mkdir -p runs
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/discover_trials.py --hard --json runs/discover_trials.json
 
 soak: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10
@@ -43,6 +47,7 @@ soak: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/adapter bench
 	$(BIN)/python tests/benchmarks/wires.py
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/tree_rate.py --json runs/tree_rate.json
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -11,7 +11,7 @@ import numpy as np
 from adapter.cli.common import console
 from adapter.experiment.atlas import judge, learn_body, noisy_trial
 from adapter.experiment.atlas_figures import numbers_of, stated
-from adapter.experiment.comparison import arm_tables, compare
+from adapter.experiment.comparison import arm_tables, choices, compare
 from adapter.experiment.results import AtlasResults
 from adapter.experiment.trajectories import gathered, split
 from adapter.offline.signals import Measured, smoothed_data
@@ -85,7 +85,8 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         joints = [tree.joint_names[j] for j in ARM]
         carrier = tree.link_names[tree.parent[ARM[0]]]
         tables = arm_tables(source, parts, joints, carrier)
-        learners += compare(tables, tree, truth.lam, joints, carrier, args.full, args.seed, say)
+        chosen = choices(tree, truth.lam, joints, carrier, args.full, args.seed)
+        learners += compare(tables, chosen, args.seed, say)
     numbers = numbers_of(body, judged, noise, learners, parts, data, tree, simulated_s)
     return AtlasResults(
         tree=tree,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.baselines.presets import learners
+from adapter.baselines.presets import Choice, learners
 from adapter.experiment.atlas import Errors, Say
 from adapter.experiment.results import Learned
 from adapter.experiment.trajectories import SETS, Split, Trajectories, sets_of
@@ -37,33 +37,29 @@ def _joined(pairs: list[tuple[Array, Array]]) -> tuple[Array, Array]:
     return np.concatenate(x), np.concatenate(y)
 
 
-def compare(
-    tables: Tables,
-    tree: Tree,
-    lam: Array,
-    joints: Sequence[str],
-    carrier: str,
-    full: bool,
-    seed: int,
-    say: Say,
-) -> list[Learned]:
-    """Train every learner on the training set and judge it on all three.
+def choices(
+    tree: Tree, lam: Array, joints: Sequence[str], carrier: str, full: bool, seed: int
+) -> tuple[Choice, ...]:
+    """The learners, not yet trained; the body schema λ (n, 6) is for least squares alone."""
+    index = sub_chain(tree, joints, carrier)
+    return learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed)
+
+
+def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> list[Learned]:
+    """Train every learner on the training set and judge it on all three sets.
 
     Args:
         tables: of `arm_tables`.
-        tree, lam: body schema, for least squares alone.
-        joints, carrier: the arm.
-        full: the paper's sizes.
-        seed: of every random choice.
+        chosen: of `choices`.
+        seed: of the samples that are judged.
         say: takes a sentence on progress.
-    """  # fmt: skip
-    index = sub_chain(tree, joints, carrier)
+    """
     judged = {name: _some(table, seed) for name, table in tables.items()}
     found = []
-    for choice in learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed):
+    for choice in chosen:
         say(f"training: {choice.title}")
         choice.learner.fit(*tables["train"], progress=say)
-        errors = Errors(len(index))
+        errors = Errors(tables["train"][1].shape[1])
         for name, (x, y) in judged.items():
             errors.add(name, y, choice.learner.predict(x))
         facts = choice.learner.facts()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from adapter.config import read_config
+from adapter.model import SelfModel
 from adapter.realtime import SnapshotWriter
 from drivers.mcap_file import read_log
 
@@ -69,6 +70,16 @@ def test_the_gap(toured: Path) -> None:
     code = next(block for block in blocks("python") if "analyse" in block)
     short = ROOT / "recordings" / "panda_nominal_6s.mcap"
     exec(code.replace("runs/friction/recording.mcap", str(short)), {})
+
+
+def test_the_paper_s_experiments(toured: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PANDA_ADAPTER_CACHE", str(toured / "cache"))
+    section = README.split("## The paper's experiments")[1].split("\n## ")[0]
+    for shell in re.findall(r"```sh\n(.*?)```", section, re.DOTALL):
+        for line in commands(shell):
+            give(line, toured)
+    assert (toured / "runs" / "small" / "experiment.html").exists()
+    assert SelfModel.load(toured / "runs" / "found.json").tree.parent == (-1, 0, 1, 2, 3, 4, 5)
 
 
 def test_your_own_log(toured: Path) -> None:

@@ -1,0 +1,89 @@
+"""`adapter experiment` from simulation to page, on fewer and shorter falls than the paper's."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.baselines.elm import ElmCommittee
+from adapter.baselines.presets import Choice
+from adapter.cli.experiment_panda import run_panda
+from adapter.cli.main import main
+from adapter.experiment.comparison import compare
+from adapter.experiment.trajectories import split
+
+CHANNELS = {"w", "v", "a", "dw"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a small experiment left its results."""
+    place = tmp_path_factory.mktemp("experiment")
+    small = ["--trajectories", "5", "--seconds", "2", "--no-baselines", "--seed", "4"]
+    where = ["--cache", str(place / "cache"), "--out", str(place), "--json", str(place / "e.json")]
+    assert main(["experiment", "atlas", *small, *where]) == 0
+    return place
+
+
+def test_numbers_of_the_humanoid(folder: Path) -> None:
+    found = json.loads((folder / "e.json").read_text())["atlas"]
+    assert found["joints"] == 30 and found["learned_samples"] == 60
+    errors = found["kinematic_error_max"]
+    assert set(errors) == CHANNELS and max(errors.values()) < 1e-6
+    for name in ("train", "test", "control"):
+        assert found["torque_relative_error_median"][name] < 1e-6
+        assert found["torque_relative_error_p99"][name] < 1e-3
+    assert found["min_pseudo_inertia_eigenvalue"] > 0.0
+    assert found["base_parameters"] == 220
+    names = {stage["name"] for stage in found["sub_problems"]}
+    assert {"left leg", "right leg", "upper body"} <= names
+    assert 0.5 < found["noise"]["ratio"] < 1.5
+    assert found["best_baseline"] is None
+
+
+def test_page_of_the_humanoid(folder: Path) -> None:
+    page = (folder / "experiment.html").read_text()
+    assert page.count("<svg") > 6
+    assert "500 000" in page and "epoch 50" in page
+
+
+def test_the_arm_learns_as_the_paper_s_and_sooner() -> None:
+    found = run_panda(seed=1, duration_s=9.0)
+    assert 0.0 < found.numbers["lambda_converged_s"] < 5.0
+    assert found.numbers["rate_hz"] == pytest.approx(1000.0, rel=1e-3)
+    assert found.lam.shape[1:] == (7, 6) and found.theta.shape[1:] == (7, 10)
+    assert found.numbers["min_pseudo_inertia_eigenvalue"] > 0.0
+
+
+def test_learners_are_compared_on_every_set() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(600, 4))
+    y = np.stack([np.sin(x[:, 0]) + 2.0, x[:, 1] * x[:, 2] + 3.0], axis=1)
+    tables = {name: (x[k::3], y[k::3]) for k, name in enumerate(("train", "test", "control"))}
+    said: list[str] = []
+    small = Choice("ELM", "A small committee", True, ElmCommittee(members=2, units=60, points=150))
+    (learned,) = compare(tables, [small], 0, said.append)
+    assert said[0] == "training: A small committee"
+    for name in tables:
+        assert learned.boxes[name].shape == (2, 5)
+        assert learned.median[name] < 0.2
+        assert (learned.rmse[name] < 0.5 * y.std(axis=0) + 0.3).all()
+
+
+def test_split_is_the_paper_s() -> None:
+    parts = split(63 * [10_000], seed=3)
+    assert len(parts.lengths) == 50 and len(parts.control) == 13
+    assert len(parts.train) == 375_000 and len(parts.test) == 125_000
+    assert len(parts.learned) == 3750
+    assert len(np.intersect1d(parts.train, parts.test)) == 0
+    own = parts.rows_in(parts.train, 7)
+    assert np.isin(own + 70_000, parts.train).all() and own.max() < 10_000
+
+
+def test_too_few_falls_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    few = ["--trajectories", "2", "--seconds", "0.5", "--cache", str(tmp_path)]
+    assert main(["experiment", "atlas", *few, "--out", str(tmp_path)]) == 2
+    assert "at least 5 trajectories" in "".join(capsys.readouterr())
