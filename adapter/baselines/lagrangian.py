@@ -30,9 +30,9 @@ from adapter.baselines.learner import (
     positive,
     unfitted,
 )
-from adapter.baselines.scores import LEAST_TORQUE
 from adapter.errors import ModelError
 from adapter.kinematics import Motion
+from adapter.offline.torque_errors import LEAST_TORQUE
 from adapter.spatial import Array
 
 BASE_ROWS = 6  # [v; w] of the carrier come before the joints in x

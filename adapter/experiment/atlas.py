@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from adapter.baselines.scores import relative_errors
 from adapter.experiment.results import BOX_PERCENTILES, Learned
 from adapter.experiment.trajectories import SETS, Split, Trajectories, gathered, sets_of
 from adapter.offline.kinematic_errors import KinematicErrors, kinematic_errors
 from adapter.offline.schema import schema_from_moments
 from adapter.offline.schema_networks import NetworkResult, schema_by_networks
 from adapter.offline.theta import ThetaResult, ThetaSettings, learn_theta
-from adapter.offline.torque_errors import predicted_torques
+from adapter.offline.torque_errors import predicted_torques, relative_errors
 from adapter.spatial import Array
 from adapter.tree_data import TreeData
 

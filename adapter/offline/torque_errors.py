@@ -8,12 +8,13 @@ import numpy as np
 import torch
 
 from adapter.dynamics import inverse_dynamics
+from adapter.errors import ModelError
 from adapter.kinematics import DTYPE
 from adapter.spatial import Array
 from adapter.tree_data import TreeData
 
 CHUNK = 4096  # samples predicted at a time
-SMALLEST_TORQUE = 0.1  # N m; the relative error of less than this says nothing (issue)
+LEAST_TORQUE = 0.1  # N m; the relative error of a smaller torque says nothing (our choice)
 
 
 @dataclass(frozen=True)
@@ -45,11 +46,20 @@ def predicted_torques(data: TreeData, lam: Array, theta: Array) -> Array:
     return out
 
 
-def relative_error(measured: Array, predicted: Array) -> Array:
-    """Eq. 20: |τ - τ̂| / max(|τ|, |τ̂|); zero where both are."""
-    larger = np.maximum(np.abs(measured), np.abs(predicted))
-    gap = np.abs(measured - predicted)
-    return np.asarray(np.divide(gap, larger, out=np.zeros_like(gap), where=larger > 0.0))
+def relative_errors(tau: Array, estimate: Array) -> Array:
+    """Eq. 20 by sample and joint, (m, n), in 0 to 2; NaN where |tau| is at most `LEAST_TORQUE`.
+
+    Raises:
+        ModelError: tables of different shapes, or an estimate that is not finite.
+    """
+    if tau.shape != estimate.shape or tau.ndim != 2:
+        raise ModelError(f"torques {tau.shape} and estimates {estimate.shape} must be like tables")
+    if not np.isfinite(estimate).all():
+        raise ModelError("the estimated torques are not all finite")
+    judged = np.abs(tau) > LEAST_TORQUE
+    larger = np.maximum(np.abs(tau), np.abs(estimate))
+    error = np.abs(tau - estimate) / np.where(judged, larger, 1.0)
+    return np.where(judged, error, np.nan)
 
 
 def torque_errors(data: TreeData, lam: Array, theta: Array) -> TorqueErrors:
@@ -57,8 +67,8 @@ def torque_errors(data: TreeData, lam: Array, theta: Array) -> TorqueErrors:
     first = data.tree.rows - data.tree.n
     measured = data.tau[:, first:]
     predicted = predicted_torques(data, lam, theta)[:, first:]
-    error, counts = relative_error(measured, predicted), np.abs(measured) > SMALLEST_TORQUE
-    by_joint = tuple(np.sort(error[counts[:, j], j]) for j in range(data.tree.n))
+    error = relative_errors(measured, predicted)
+    by_joint = tuple(np.sort(column[~np.isnan(column)]) for column in error.T)
     every = np.concatenate(by_joint)
     median, p99 = (
         (float(np.quantile(every, q)) for q in (0.5, 0.99)) if len(every) else (np.nan, np.nan)

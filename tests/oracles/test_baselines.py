@@ -17,7 +17,6 @@ from adapter.baselines.learner import Baseline, Scale
 from adapter.baselines.least_squares import RegressorLeastSquares
 from adapter.baselines.network import FeedForward
 from adapter.baselines.presets import DEFAULT_MEMBERS, learners
-from adapter.baselines.scores import BOX_PERCENTILES, score
 from adapter.dynamics import inverse_dynamics
 from adapter.errors import ModelError
 from adapter.inertia import theta_from_log_cholesky
@@ -271,24 +270,6 @@ def test_scale_guards_constant_columns() -> None:
     assert np.abs(scaled[:, 0]).max() < 1e-12
     assert scaled[:, 1].std() == pytest.approx(1.0)
     np.testing.assert_allclose(scale.undo(scaled), table)
-
-
-def test_scores_by_hand() -> None:
-    tau = np.array([[1.0, 0.05], [-2.0, 0.1], [4.0, -0.02], [0.1, 0.0], [5.0, 0.0]])
-    estimate = np.array([[1.0, 0.04], [-1.0, 0.0], [8.0, 0.0], [9.0, 0.0], [-5.0, 0.0]])
-    found = score(tau, estimate)
-    errors = [0.0, 0.5, 0.5, 2.0]  # the fourth sample is not judged: not above 0.1 N m
-    assert found.judged.tolist() == [4, 0]
-    assert BOX_PERCENTILES == (5.0, 25.0, 50.0, 75.0, 95.0)
-    np.testing.assert_allclose(found.boxes[0], [0.075, 0.375, 0.5, 0.875, 1.775])
-    assert np.isnan(found.boxes[1]).all()
-    assert found.median == 0.5 and found.p99 == pytest.approx(np.percentile(errors, 99))
-    squares = [0.0 + 1.0 + 16.0 + 8.9**2 + 100.0, 0.01**2 + 0.1**2 + 0.02**2]
-    np.testing.assert_allclose(found.rmse, np.sqrt(np.array(squares) / 5))
-    with pytest.raises(ModelError, match="not all finite"):
-        score(tau, np.full_like(tau, np.nan))
-    with pytest.raises(ModelError, match="like tables"):
-        score(tau, estimate[:2])
 
 
 def test_the_experiments_learners_have_the_papers_sizes() -> None:

@@ -23,7 +23,7 @@ from adapter.offline.signals import Measured, SmoothingSettings, smoothed_data
 from adapter.offline.theta import ThetaSettings, learn_theta
 from adapter.offline.theta_factors import row_factors, scales, system
 from adapter.offline.theta_solvers import adam_theta, least_squares_theta, random_bodies
-from adapter.offline.torque_errors import predicted_torques, relative_error, torque_errors
+from adapter.offline.torque_errors import predicted_torques, relative_errors, torque_errors
 from adapter.tree_data import TreeData
 
 
@@ -158,8 +158,13 @@ def test_atlas_from_one_percent_of_samples() -> None:
 
 
 def test_relative_error_is_that_of_the_paper() -> None:
-    measured, predicted = np.array([2.0, -1.0, 0.0, 1.0]), np.array([1.0, -2.0, 0.0, -1.0])
-    np.testing.assert_allclose(relative_error(measured, predicted), [0.5, 0.5, 0.0, 2.0])
+    measured = np.array([[2.0, -1.0, 0.05, 1.0]])
+    predicted = np.array([[1.0, -2.0, 0.0, -1.0]])
+    np.testing.assert_allclose(relative_errors(measured, predicted), [[0.5, 0.5, np.nan, 2.0]])
+    with pytest.raises(ModelError, match="not all finite"):
+        relative_errors(measured, predicted * np.nan)
+    with pytest.raises(ModelError, match="like tables"):
+        relative_errors(measured, predicted[:, :2])
 
 
 def arm_signals(model, rng, seconds: float):  # type: ignore[no-untyped-def]

@@ -12,7 +12,9 @@ from adapter.baselines.elm import ElmCommittee
 from adapter.baselines.presets import Choice
 from adapter.cli.experiment_panda import run_panda
 from adapter.cli.main import main
+from adapter.experiment.atlas import Errors
 from adapter.experiment.comparison import compare
+from adapter.experiment.results import Learned
 from adapter.experiment.trajectories import split
 
 CHANNELS = {"w", "v", "a", "dw"}
@@ -71,6 +73,23 @@ def test_learners_are_compared_on_every_set() -> None:
         assert learned.boxes[name].shape == (2, 5)
         assert learned.median[name] < 0.2
         assert (learned.rmse[name] < 0.5 * y.std(axis=0) + 0.3).all()
+
+
+def test_errors_by_hand() -> None:
+    tau = np.array([[1.0, 0.05], [-2.0, 0.1], [4.0, -0.02], [0.1, 0.0], [5.0, 0.0]])
+    estimate = np.array([[1.0, 0.04], [-1.0, 0.0], [8.0, 0.0], [9.0, 0.0], [-5.0, 0.0]])
+    errors = Errors(2)
+    errors.add("test", tau[:2], estimate[:2])
+    errors.add("test", tau[2:], estimate[2:])
+    found = errors.into(Learned("x", "x"))
+    # Relative errors 0, 0.5, 0.5, 2: the fourth sample is not above 0.1 N m.
+    np.testing.assert_allclose(found.boxes["test"][0], [0.075, 0.375, 0.5, 0.875, 1.775])
+    assert np.isnan(found.boxes["test"][1]).all()
+    assert found.median["test"] == 0.5
+    assert found.p99["test"] == pytest.approx(np.percentile([0.0, 0.5, 0.5, 2.0], 99))
+    squares = [0.0 + 1.0 + 16.0 + 8.9**2 + 100.0, 0.01**2 + 0.1**2 + 0.02**2]
+    np.testing.assert_allclose(found.rmse["test"], np.sqrt(np.array(squares) / 5))
+    assert "train" not in found.median
 
 
 def test_split_is_the_paper_s() -> None:
