@@ -93,6 +93,7 @@ class Session:
                 self.set_aside += 1
                 if not left:
                     raise
+                self._let_pass()
                 continue
             if driver.paced:
                 self.set_aside += 1
@@ -100,6 +101,11 @@ class Session:
                 self._ready_sample = sample
             return sample
         raise AssertionError("unreachable")
+
+    def _let_pass(self) -> None:
+        """Wait until there can be another sample, where the driver does not and time goes on."""
+        if self._driver.arrived_ns and not self._driver.paced:
+            time.sleep(1e-9 * self._driver.period_ns)
 
     def catch_up(self) -> None:
         """Let pass what came in while nobody read, so that the first tick's sample is a new one.
@@ -111,8 +117,7 @@ class Session:
             return
         self._ready_sample = None
         for k in range(CATCH_UP_READS):
-            if not driver.paced:
-                time.sleep(1e-9 * driver.period_ns)
+            self._let_pass()
             driver.read()
             self.set_aside += 1
             new = time.monotonic_ns() - driver.arrived_ns < 2 * driver.period_ns

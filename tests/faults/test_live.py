@@ -6,15 +6,18 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import live_tools as tools
+import numpy as np
 import pytest
 
 from adapter.realtime.clock import sleep_until
 from adapter.realtime.jobs import WatchJob
 from adapter.realtime.lockstep import run_lockstep
 from adapter.realtime.loop import run_live
+from adapter.realtime.session import Session
 from adapter.realtime.worker import WorkerError
 from drivers.interface import DriverError
 from drivers.mcap_file import read_estimates, read_log
@@ -149,6 +152,29 @@ def test_every_sample_is_accounted_for_and_its_age_is_told():
     assert any("age of a sample" in line for line in result.timing.lines())
     unpaced = run_live(tools.Swinging(), tools.parts()[0], options=tools.live_options(0.2))
     assert unpaced.timing.age_us["p50"] is None and unpaced.set_aside == 0
+
+
+class Waking(tools.Swinging):
+    """An arm whose torques are there 20 ms after it was first read, and which never waits."""
+
+    def read(self):
+        sample = super().read()
+        self.arrived_ns = time.monotonic_ns()
+        self._first_ns = min(getattr(self, "_first_ns", self.arrived_ns), self.arrived_ns)
+        if self.arrived_ns - self._first_ns < 20_000_000:
+            return replace(sample, tau=np.full(7, np.nan))
+        return sample
+
+
+def test_a_motion_starts_with_the_first_whole_sample():
+    """As of a CAN arm, whose next replies need a tick: reading faster finds nothing new."""
+    arm = Waking()
+    front_end, controller = tools.parts()
+    arm.connect()
+    session = Session(arm, front_end, controller, lambda record: None, lambda *kept: None, 1.0)
+    sample = session.get_ready(controller.prepare)
+    assert np.isfinite(sample.tau).all()
+    assert 0 < session.set_aside < 30
 
 
 @pytest.mark.parametrize(("kind", "said"), [(tools.Dying, "exit code 3"), (tools.Failing, "a bug")])
