@@ -145,7 +145,10 @@ class DeepLagrangian:
         self._facts: Facts | None = None
 
     def fit(self, X: Array, Y: Array, progress: Progress | None = None) -> None:
-        """Train in float32. Raises ModelError where Y has not one column by joint."""
+        """Train in float32, on a GPU where there is one.
+
+        Raises ModelError where Y has not one column by joint.
+        """
         begin = time.perf_counter()
         X = checked(X, Y, self.columns.width)
         if Y.shape[1] != self.columns.n:
@@ -153,14 +156,14 @@ class DeepLagrangian:
         torque = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), LEAST_TORQUE)
         weight = 1.0 / torque
         sizes = torch.from_numpy(self._sizes(X, torque)).float()
-        mass = MassNetwork(sizes, self.hidden, self.seed)
-        x, y = torch.from_numpy(X).float(), torch.from_numpy(Y * weight).float()
-        weight_t = torch.from_numpy(weight).float()
+        place = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        mass = MassNetwork(sizes, self.hidden, self.seed).to(place)
+        x, y, weight_t = (torch.from_numpy(t).float().to(place) for t in (X, Y * weight, weight))
         adam = torch.optim.Adam(mass.parameters(), lr=self.rate)
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps)
         generator = torch.Generator().manual_seed(self.seed)
         for step in range(self.steps):
-            rows = torch.randint(len(x), (min(self.batch, len(x)),), generator=generator)
+            rows = torch.randint(len(x), (min(self.batch, len(x)),), generator=generator).to(place)
             loss = torch.mean((self._torque(mass, x[rows]) * weight_t - y[rows]) ** 2)
             adam.zero_grad()
             loss.backward()
@@ -194,9 +197,10 @@ class DeepLagrangian:
         """Torques (m, n), N m."""
         if self._mass is None:
             raise unfitted()
-        x = torch.from_numpy(checked(X, width=self.columns.width)).float()
+        place = self._mass.last.weight.device
+        x = torch.from_numpy(checked(X, width=self.columns.width)).float().to(place)
         parts = [self._torque(self._mass, part).detach() for part in x.split(PREDICTED_AT_ONCE)]
-        return torch.cat(parts).double().numpy()
+        return torch.cat(parts).double().cpu().numpy()
 
     def facts(self) -> Facts:
         """Sizes, tuning and training time."""
