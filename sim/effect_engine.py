@@ -11,9 +11,10 @@ import weakref
 import numpy as np
 import pybullet as bullet
 
+from sim.bare import make_bare
 from sim.effect_forces import Losses, add_up, bend, losses_at, rows_of, step
 from sim.effects import ENCODER, TORQUE, WRENCH
-from sim.engine import NO_CAP, PERIOD_S, SUBSTEPS
+from sim.engine import PERIOD_S, SUBSTEPS
 from sim.links import flange_torque
 from sim.stages import Stage, load, rigid_truths
 from sim.truth import Array, Truth
@@ -180,18 +181,7 @@ def acts_on_motion(truth: Truth) -> bool:
 def _prepare(stage: Stage, n: int, h: float) -> None:
     """Switch off whatever PyBullet adds on its own account."""
     arm, client = stage.arm, stage.client
-    for link in range(-1, n):
-        bullet.changeDynamics(
-            arm,
-            link,
-            linearDamping=0.0,
-            angularDamping=0.0,
-            jointDamping=0.0,
-            lateralFriction=0.0,
-            maxJointVelocity=NO_CAP,
-            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-            physicsClientId=client,
-        )
+    make_bare(arm, client)
     bullet.setJointMotorControlArray(
         arm, list(range(n)), bullet.VELOCITY_CONTROL, forces=[0.0] * n, physicsClientId=client
     )

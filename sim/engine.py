@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import pybullet as bullet
 
+from sim.bare import make_bare
 from sim.truth import Array, Truth
 from sim.urdf_writer import payload_moments, urdf
 
@@ -26,7 +27,6 @@ SUBSTEPS = 4
 H_S = PERIOD_S / SUBSTEPS  # 0.25 ms
 MIDDLES = ((np.arange(SUBSTEPS) + 0.5) / SUBSTEPS)[:, None]  # of the sub-steps, in parts of a tick
 COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
-NO_CAP = 1e6  # rad/s, in place of PyBullet's velocity cap of 100
 
 
 class Engine:
@@ -54,18 +54,7 @@ class Engine:
     def _prepare(self) -> None:
         """Switch off whatever PyBullet adds on its own account."""
         arm, world = self._arm, self._world
-        for link in range(-1, bullet.getNumJoints(arm, physicsClientId=world)):
-            bullet.changeDynamics(
-                arm,
-                link,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-                lateralFriction=0.0,
-                maxJointVelocity=NO_CAP,
-                activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=world,
-            )
+        make_bare(arm, world)
         bullet.setJointMotorControlArray(
             arm,
             self._joints,

@@ -18,12 +18,12 @@ import numpy as np
 import pybullet as bullet
 
 from sim.babbling import Babbling, plan
+from sim.bare import make_bare
 from sim.tree_truth import TreeTruth
 from sim.truth import Array, body_of
 from sim.urdf_writer import joint_text, link_text, principal
 
 RATE_HZ = 1000.0
-NO_CAP = 1e6  # rad/s and m/s, in place of PyBullet's velocity cap of 100
 PUSH = 1.0  # N m, by which the controller's designer feels a joint's inertia
 BANDWIDTH = 2 * np.pi * 15.0  # rad/s, of the feedback on a joint whose neighbours are free
 DAMPING = 1.0  # ratio, likewise
@@ -90,18 +90,7 @@ class FreeFall:
 
     def _prepare(self) -> None:
         """Switch off whatever PyBullet adds on its own account."""
-        for link in range(-1, self.truth.n):
-            bullet.changeDynamics(
-                self._robot,
-                link,
-                linearDamping=0.0,
-                angularDamping=0.0,
-                jointDamping=0.0,
-                lateralFriction=0.0,
-                maxJointVelocity=NO_CAP,
-                activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
-                physicsClientId=self._world,
-            )
+        make_bare(self._robot, self._world)
         self._command(bullet.VELOCITY_CONTROL, np.zeros(self.truth.n))
         bullet.setTimeStep(self.h_s, physicsClientId=self._world)
         bullet.setGravity(*self.truth.gravity.tolist(), physicsClientId=self._world)
