@@ -10,8 +10,8 @@ import pytest
 
 from adapter.baselines.elm import ElmCommittee
 from adapter.baselines.presets import Choice
+from adapter.cli import main
 from adapter.cli.experiment_panda import run_panda
-from adapter.cli.main import main
 from adapter.experiment.atlas import Errors
 from adapter.experiment.comparison import compare
 from adapter.experiment.results import Learned
