@@ -280,7 +280,6 @@ def test_states_of_strangers_are_refused(peer5, connected):
 
 
 def test_a_loop_that_was_away_gets_fresh_states_and_an_exact_account(peer5, connected):
-    peer5.period_s = 7e-4  # ids may run up to twice as fast as the time, not faster
     arm = connected(peer5)
     first = quiet(arm, peer5)
     before = arm.intake.received
