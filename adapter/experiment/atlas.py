@@ -114,7 +114,7 @@ def judge(body: Body, learned_from: TreeData, source: Trajectories, parts: Split
     """Torques on every sample, link motion on the control set."""
     n = learned_from.tree.n
     errors, kinematics, networks = Errors(n), [], []
-    for _, data, rows in sets_of(source, parts):
+    for data, rows in sets_of(source, parts):
         estimate = predicted_torques(data, body.lam, body.theta.theta)[:, -n:]
         for name, own in rows.items():
             errors.add(name, data.tau[own][:, -n:], estimate[own])

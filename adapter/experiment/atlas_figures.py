@@ -27,7 +27,6 @@ def numbers_of(
     ours = judged.learned
     paper = [x for x in learners if x.name in BASELINES]
     best = min(paper, key=lambda x: x.median["control"], default=None)
-    arm = next((x for x in learners if x.name == "FOPnet"), ours)
     return {
         "joints": tree.n,
         "trajectories": len(parts.lengths) + len(parts.control),
@@ -60,7 +59,7 @@ def numbers_of(
         },
         "best_baseline": None if best is None else best.name,
         "control_error_ratio_to_best_baseline": (
-            None if best is None else best.median["control"] / max(arm.median["control"], 1e-300)
+            None if best is None else best.median["control"] / max(ours.median["control"], 1e-300)
         ),
     }  # fmt: skip
 

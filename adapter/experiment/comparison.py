@@ -21,7 +21,7 @@ JUDGED = 30_000  # random samples of each set; all of them would take a committe
 def arm_tables(source: Trajectories, parts: Split, joints: Sequence[str], carrier: str) -> Tables:
     """Inputs and torques of the arm for every set; the training set in its shuffled order."""
     found: dict[str, list[tuple[Array, Array]]] = {name: [] for name in SETS}
-    for _, data, rows in sets_of(source, parts):
+    for data, rows in sets_of(source, parts):
         x, y = arm_problem(data, joints, carrier)
         for name, own in rows.items():
             found[name].append((x[own], y[own]))

@@ -87,14 +87,12 @@ def gathered(source: Trajectories, parts: Split, rows: np.ndarray, noisy: bool) 
     return stacked(found)
 
 
-def sets_of(
-    source: Trajectories, parts: Split, noisy: bool = False
-) -> Iterator[tuple[int, TreeData, dict[str, np.ndarray]]]:
-    """Every trajectory with its rows by set."""
+def sets_of(source: Trajectories, parts: Split) -> Iterator[tuple[TreeData, dict[str, np.ndarray]]]:
+    """Every trajectory without noise, with its rows by set."""
     for k in range(len(source)):
-        data = source.measured(k) if noisy else source.exact(k)
+        data = source.exact(k)
         if k in parts.control:
-            yield k, data, {"control": np.arange(len(data))}
+            yield data, {"control": np.arange(len(data))}
         else:
             rows = {"train": parts.rows_in(parts.train, k), "test": parts.rows_in(parts.test, k)}
-            yield k, data, rows
+            yield data, rows
