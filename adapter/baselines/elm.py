@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg
 
+from adapter.baselines.dense import gram, solve_positive
 from adapter.baselines.learner import (
     Facts,
     Progress,
@@ -96,15 +97,14 @@ class ElmCommittee:
         weights = rng.normal(size=(x.shape[1], self.units)) * self.spread / np.sqrt(x.shape[1])
         biases = rng.uniform(-1.0, 1.0, self.units)
         hidden = np.tanh(x @ weights + biases)
-        gram = hidden.T @ hidden
-        gram[np.diag_indices(self.units)] += self.ridge * len(x)
+        normal = gram(hidden)
+        normal[np.diag_indices(self.units)] += self.ridge * len(x)
         try:
-            factor = linalg.cho_factor(gram, overwrite_a=True, check_finite=False)
+            output = solve_positive(normal, hidden.T @ y)
         except linalg.LinAlgError:
             raise ModelError(
                 f"the units' Gram matrix is singular in float64; take a ridge above {self.ridge:g}"
             ) from None
-        output = linalg.cho_solve(factor, hidden.T @ y, check_finite=False)
         return _Machine(weights, biases, output)
 
     def predict(self, X: Array) -> Array:

@@ -13,6 +13,7 @@ import time
 import numpy as np
 from scipy import linalg, optimize
 
+from adapter.baselines.dense import solve_positive
 from adapter.baselines.learner import Facts, Progress, Scale, at_least, checked, unfitted
 from adapter.errors import ModelError
 from adapter.spatial import Array
@@ -150,9 +151,7 @@ def _solved(kept: Array, y: Array, noise: float) -> tuple[Array, float]:
         gram = kernel(kept, kept)
         gram[np.diag_indices(len(gram))] += noise
         try:
-            factor = linalg.cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
+            return solve_positive(gram, y), noise
         except linalg.LinAlgError:
             noise *= RAISE
-            continue
-        return np.asarray(linalg.cho_solve(factor, y, check_finite=False)), noise
     raise ModelError(f"the kernel of the points is singular even with {noise:.1e} of noise")

@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from adapter.baselines.dense import accelerator
 from adapter.baselines.features import Columns
 from adapter.baselines.learner import (
     Facts,
@@ -156,7 +157,7 @@ class DeepLagrangian:
         torque = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), LEAST_TORQUE)
         weight = 1.0 / torque
         sizes = torch.from_numpy(self._sizes(X, torque)).float()
-        place = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        place = accelerator() or torch.device("cpu")
         mass = MassNetwork(sizes, self.hidden, self.seed).to(place)
         x, y, weight_t = (torch.from_numpy(t).float().to(place) for t in (X, Y * weight, weight))
         adam = torch.optim.Adam(mass.parameters(), lr=self.rate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,10 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--seconds", type=float, default=10.0, metavar="S", help="atlas: of each; default 10"
     )
+    parser.add_argument(
+        "--seeds", type=int, default=20, metavar="N",
+        help="recordings whose tree is to be found, N and A unknown; default 20",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, help="of every random choice")
     parser.add_argument(
         "--cache", type=Path, metavar="FOLDER", help="where simulated data are kept"
@@ -60,10 +65,10 @@ def run(args: argparse.Namespace) -> int:
     if "panda" in args.names:
         from adapter.cli.experiment_panda import run_panda
 
-        panda = run_panda(args.seed, PANDA_S)
+        panda = run_panda(args.seed, PANDA_S, args.seeds)
         print_stated("Panda, section IV.B", panda.stated)
     figures = {
-        name: results.numbers
+        name: {**results.numbers, "stated": [asdict(row) for row in results.stated]}
         for name, results in (("atlas", atlas), ("panda", panda))
         if results is not None
     }

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from adapter.cli.common import console
+from adapter.cli.experiment_topology import fall_logs
 from adapter.experiment.atlas import judge, learn_body, noisy_trial
 from adapter.experiment.atlas_figures import numbers_of, stated
 from adapter.experiment.comparison import arm_tables, choices, compare
+from adapter.experiment.online import noisy, online_trial, without_velocity
 from adapter.experiment.results import AtlasResults
+from adapter.experiment.topology import topology_trials
 from adapter.experiment.trajectories import gathered, split
 from adapter.offline.signals import Measured, smoothed_data
 from adapter.tree import Tree
@@ -20,6 +24,7 @@ from adapter.tree_data import BodyMotion, TreeData
 from sim.free_fall_data import FallData, data_set
 from sim.tree_links import link_tables
 
+ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
 
@@ -27,7 +32,7 @@ class Fall:
     """Simulated trajectories as samples for learners."""
 
     def __init__(self, exact: FallData, noisy: FallData) -> None:
-        self._exact, self._noisy = exact, noisy
+        self._exact, self.noisy = exact, noisy
         self.truth = truth = exact.truth
         self.tree = Tree(truth.parent, True, truth.joint_names, truth.link_names, truth.base_name)
 
@@ -52,7 +57,7 @@ class Fall:
 
     def measured(self, k: int) -> TreeData:
         """Trajectory k as its sensors show it, filtered alike."""
-        return smoothed_data(self.tree, Measured(**self._noisy[k]))
+        return smoothed_data(self.tree, Measured(**self.noisy[k]))
 
 
 def run_atlas(args: argparse.Namespace) -> AtlasResults:
@@ -76,7 +81,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     say(f"learning λ and θ from {len(data)} samples")
     body = learn_body(data, args.seed)
     say("judging all samples")
-    judged = judge(body, data, source, parts)
+    judged = judge(body, data, source, parts, ARM)
     say("learning from noisy sensors")
     noisy_parts = split(count * [len(source.measured(0))], args.seed)
     noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
@@ -87,7 +92,17 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         tables = arm_tables(source, parts, joints, carrier)
         chosen = choices(tree, truth.lam, joints, carrier, args.full, args.seed)
         learners += compare(tables, chosen, args.seed, say)
-    numbers = numbers_of(body, judged, noise, learners, parts, data, tree, simulated_s)
+    say("learning online, sample by sample")
+    online = online_numbers(source, parts.control)
+    say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
+    found = topology_trials(fall_logs(source.noisy, args.seeds), tree, args.seed)
+    numbers = {
+        **numbers_of(body, judged, noise, learners, parts, data, tree),
+        "online": online,
+        "discover": found,
+        "simulated_s": simulated_s,
+        "wall_s": time.perf_counter() - began,
+    }
     return AtlasResults(
         tree=tree,
         true_lam=truth.lam,
@@ -100,6 +115,13 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         stated=stated(numbers),
         numbers=numbers,
     )
+
+
+def online_numbers(source: Fall, control: Sequence[int]) -> dict[str, Any]:
+    """The online learner on falls with noise, judged on one that it never sees."""
+    used = [k for k in range(len(source)) if k not in control][:ONLINE_FALLS]
+    motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
+    return online_trial(motions, source.exact(control[0]), source.truth.lam)[0]
 
 
 def snapshots(kept: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:

@@ -6,10 +6,12 @@ import tempfile
 from pathlib import Path
 
 from adapter.cli.common import plain
+from adapter.cli.experiment_topology import panda_logs
 from adapter.controller import ExcitationController
 from adapter.excitation import ExcitationSettings, MotionLimits
 from adapter.experiment.panda import panda_results
 from adapter.experiment.results import PandaResults
+from adapter.experiment.topology import topology_trials
 from adapter.learner import LearnerSettings
 from adapter.outcome import collect
 from adapter.pipeline import PipelineSettings, make_front_end, make_learner
@@ -22,8 +24,14 @@ from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
 
-def run_panda(seed: int, duration_s: float) -> PandaResults:
-    """Learn for some seconds of arm time from the first motion on; λ starts near zero."""
+def run_panda(seed: int, duration_s: float, topologies: int) -> PandaResults:
+    """Learn for some seconds of arm time from the first motion on; λ starts near zero.
+
+    Args:
+        seed: of everything random.
+        duration_s: of the learning.
+        topologies: how many other recordings are shuffled, for discovery to find their tree.
+    """
     robot, world = documented("panda"), build("nominal", seed)
     settings = PipelineSettings(learner=LearnerSettings(seed=seed))
     front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
@@ -62,4 +70,5 @@ def run_panda(seed: int, duration_s: float) -> PandaResults:
         delay_s=front_end.delay_s,
         first_moving_ns=front_end.first_moving_ns,
     )
-    return panda_results(run, (len(stamps) - 1) / (1e-9 * (stamps[-1] - stamps[0])))
+    found = topology_trials(panda_logs(topologies, seed), robot.tree, seed)
+    return panda_results(run, (len(stamps) - 1) / (1e-9 * (stamps[-1] - stamps[0])), found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,24 +100,30 @@ class Judged:
 
     Attributes:
         learned: torque errors of all joints, as a learner of the comparison.
+        arm: the same of the joints alone that the others learn.
         kinematics: on the control set; training: on the samples learned from.
         networks: on the control set, with λ as the networks left it.
     """
 
     learned: Learned
+    arm: Learned
     kinematics: KinematicErrors
     training: KinematicErrors
     networks: KinematicErrors
 
 
-def judge(body: Body, learned_from: TreeData, source: Trajectories, parts: Split) -> Judged:
-    """Torques on every sample, link motion on the control set."""
-    n = learned_from.tree.n
-    errors, kinematics, networks = Errors(n), [], []
+def judge(
+    body: Body, learned_from: TreeData, source: Trajectories, parts: Split, arm: Sequence[int]
+) -> Judged:
+    """Torques on every sample, of all joints and of an arm's; link motion on the control set."""
+    n, some = learned_from.tree.n, list(arm)
+    errors, arm_errors, kinematics, networks = Errors(n), Errors(len(some)), [], []
     for data, rows in sets_of(source, parts):
         estimate = predicted_torques(data, body.lam, body.theta.theta)[:, -n:]
         for name, own in rows.items():
-            errors.add(name, data.tau[own][:, -n:], estimate[own])
+            tau = data.tau[own][:, -n:]
+            errors.add(name, tau, estimate[own])
+            arm_errors.add(name, tau[:, some], estimate[own][:, some])
         if "control" in rows:
             kinematics.append(kinematic_errors(data, body.lam))
             networks.append(kinematic_errors(data, body.networks.lam))
@@ -129,7 +135,8 @@ def judge(body: Body, learned_from: TreeData, source: Trajectories, parts: Split
         f"{body.theta_s:.1f} s",
     ]
     training = kinematic_errors(learned_from, body.lam)
-    return Judged(errors.into(learned), worst(kinematics), training, worst(networks))
+    of_arm = arm_errors.into(Learned("FOPnet, arm", learned.title, train_s=body.learning_s))
+    return Judged(errors.into(learned), of_arm, worst(kinematics), training, worst(networks))
 
 
 def worst(parts: list[KinematicErrors]) -> KinematicErrors:

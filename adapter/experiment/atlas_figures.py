@@ -21,10 +21,9 @@ def numbers_of(
     parts: Split,
     data: TreeData,
     tree: Tree,
-    simulated_s: float,
 ) -> dict[str, Any]:
     """Every number of the experiment under a key of its own."""
-    ours = judged.learned
+    ours, arm = judged.learned, judged.arm
     paper = [x for x in learners if x.name in BASELINES]
     best = min(paper, key=lambda x: x.median["control"], default=None)
     return {
@@ -34,7 +33,6 @@ def numbers_of(
         "train_samples": len(parts.train),
         "test_samples": len(parts.test),
         "learned_samples": len(data),
-        "simulated_s": simulated_s,
         "kinematic_error_max": judged.kinematics.largest,
         "kinematic_error_max_networks": judged.networks.largest,
         "kinematic_error_max_training": judged.training.largest,
@@ -55,13 +53,25 @@ def numbers_of(
         "noise": noise,
         "learners": {
             x.name: {"median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "train_s": x.train_s}
-            for x in learners
+            for x in (*learners, arm)
         },
         "best_baseline": None if best is None else best.name,
         "control_error_ratio_to_best_baseline": (
-            None if best is None else best.median["control"] / max(ours.median["control"], 1e-300)
+            None if best is None else best.median["control"] / max(arm.median["control"], 1e-300)
         ),
     }  # fmt: skip
+
+
+def found_trees(trials: dict[str, Any]) -> Stated:
+    """Of how many recordings discovery found the whole tree."""
+    return Stated(
+        "discover",
+        "N and A unknown: trees found",
+        "future work",
+        f"{trials['right']} of {trials['trials']}" if trials["trials"] else None,
+        "",
+        f"from {trials['motion_s']:.0f} s of {trials['measured']} of shuffled, renamed links",
+    )
 
 
 def stated(numbers: dict[str, Any]) -> list[Stated]:
@@ -107,4 +117,7 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
                "without simulating the data"),
         Stated("noise_ratio", "torque error with noise over least squares with true λ",
                "not stated", numbers["noise"]["ratio"], "", "control set"),
+        Stated("online_samples_per_second", "samples that the online learner takes",
+               "1 kHz (Panda)", numbers["online"]["samples_per_second"], "1/s", "on one core"),
+        found_trees(numbers["discover"]),
     ]  # fmt: skip

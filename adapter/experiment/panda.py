@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from adapter.experiment.atlas_figures import found_trees
 from adapter.experiment.results import PandaResults, Stated
 from adapter.run_folder import RunData
 from adapter.score import TORQUE_WINDOW_S, trailing_rms
@@ -12,12 +15,13 @@ from adapter.spatial import Array
 PAPER_SCHEMA_S, PAPER_THETA_START_S = 40.0, 100.0  # of the paper's own experiment
 
 
-def panda_results(run: RunData, rate_hz: float) -> PandaResults:
+def panda_results(run: RunData, rate_hz: float, discovered: dict[str, Any]) -> PandaResults:
     """What a run over a simulated or real Panda shows beside the paper's Fig. 6.
 
     Args:
         run: as a run folder holds it.
         rate_hz: samples a second of arm time.
+        discovered: of `topology_trials` on recordings of such arms.
     """
     n = run.n
     theta_time = run.times(run.theta_trace)
@@ -37,6 +41,7 @@ def panda_results(run: RunData, rate_hz: float) -> PandaResults:
         "theta_torque_rmse_nm": theta["torque_rmse_nm"],
         "theta_torque_ratio_at_end": float(ratio[-1]) if len(ratio) else None,
         "min_pseudo_inertia_eigenvalue": theta["min_pseudo_inertia_eigenvalue"],
+        "discover": discovered,
     }
     reference = run.documented.lam if run.reference is None else run.reference
     return PandaResults(
@@ -68,7 +73,7 @@ def torque_ratio(run: RunData) -> tuple[Array, Array]:
     return time_s, ours / np.maximum(best, 1e-300)
 
 
-def stated(numbers: dict[str, object]) -> list[Stated]:
+def stated(numbers: dict[str, Any]) -> list[Stated]:
     """The figures that the paper's text gives, beside ours."""
 
     def ours(key: str) -> float | int | str | None:
@@ -110,4 +115,5 @@ def stated(numbers: dict[str, object]) -> list[Stated]:
             "",
             "above zero: every link is a possible body in every step",
         ),
+        found_trees(numbers["discover"]),
     ]

@@ -66,7 +66,10 @@ class _Path:
     def centre(self, x: Array, most: int) -> tuple[Array, int, bool]:
         """Newton's method from x: where it got, in how many steps, whether it is centred."""
         for count in range(most):
-            step, decrement = self.newton(x)
+            try:
+                step, decrement = self.newton(x)
+            except np.linalg.LinAlgError:  # a body at the edge of what is possible
+                return x, count, False
             if not np.isfinite(decrement):
                 return x, count, False
             if decrement < CENTRED:

@@ -263,6 +263,27 @@ def test_too_weak_a_ridge_is_said() -> None:
         ElmCommittee(1, 50, 20, ridge=1e-30).fit(np.ones((20, 2)), np.ones((20, 1)))
 
 
+@pytest.mark.parametrize(
+    "learner", [ElmCommittee(2, 40, 60), GaussianProcess(points=60, tuned_on=30, steps=10)]
+)
+def test_a_gpu_s_way_through_torch_gives_the_same(
+    learner: ElmCommittee | GaussianProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Torch's way on whatever device there is, here mostly the CPU, against numpy's."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(80, 3))
+    y = np.column_stack([np.sin(x[:, 0]), x[:, 1] * x[:, 2]])
+    answers = []
+    for place in (None, torch.device("cuda" if torch.cuda.is_available() else "cpu")):
+        monkeypatch.setattr("adapter.baselines.dense.accelerator", lambda place=place: place)
+        learner.fit(x, y)
+        answers.append(learner.predict(x))
+    np.testing.assert_allclose(answers[1], answers[0], rtol=1e-4, atol=1e-6)
+    weak = ElmCommittee(1, 50, 20, ridge=1e-30)
+    with pytest.raises(ModelError, match="take a ridge above 1e-30"):
+        weak.fit(np.ones((20, 2)), np.ones((20, 1)))
+
+
 def test_scale_guards_constant_columns() -> None:
     table = np.column_stack([np.full(9, 0.1) * 3, np.arange(9.0)])
     scale = Scale.of(table)

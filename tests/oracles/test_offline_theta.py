@@ -140,6 +140,13 @@ def test_impossible_least_squares_are_kept_out() -> None:
     assert truth[0] < truth[1]  # what is known to be possible keeps noise out
 
 
+def test_a_body_at_the_edge_ends_the_path_and_not_the_program() -> None:
+    rng = np.random.default_rng(5)
+    r, nothing = rng.normal(size=(30, 10)), np.zeros((1, 10))
+    found, _, close = interior_point(r, r @ np.ones(10), nothing)
+    assert (found == nothing).all() and not close
+
+
 def test_atlas_from_one_percent_of_samples() -> None:
     text = shared("models/atlas_v5.urdf").read_text()
     _, data = samples(text, True, 300, 19)

@@ -24,7 +24,8 @@ CHANNELS = {"w", "v", "a", "dw"}
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where a small experiment left its results."""
     place = tmp_path_factory.mktemp("experiment")
-    small = ["--trajectories", "5", "--seconds", "2", "--no-baselines", "--seed", "4"]
+    small = ["--trajectories", "5", "--seconds", "2", "--no-baselines"]
+    small += ["--seed", "4", "--seeds", "3"]
     where = ["--cache", str(place / "cache"), "--out", str(place), "--json", str(place / "e.json")]
     assert main(["experiment", "atlas", *small, *where]) == 0
     return place
@@ -44,6 +45,11 @@ def test_numbers_of_the_humanoid(folder: Path) -> None:
     assert {"left leg", "right leg", "upper body"} <= names
     assert 0.5 < found["noise"]["ratio"] < 1.5
     assert found["best_baseline"] is None
+    assert found["online"]["samples_per_second"] > 0.0
+    trees = found["discover"]
+    assert trees["right"] == trees["trials"] == 3 and trees["measured"] == "w, a"
+    assert trees["most_confidence_wrong"] == 0.0 < 0.9 < trees["least_confidence_right"]
+    assert {row["key"] for row in found["stated"]} > {"joints", "discover", "noise_ratio"}
 
 
 def test_page_of_the_humanoid(folder: Path) -> None:
@@ -53,9 +59,10 @@ def test_page_of_the_humanoid(folder: Path) -> None:
 
 
 def test_the_arm_learns_as_the_paper_s_and_sooner() -> None:
-    found = run_panda(seed=1, duration_s=9.0)
+    found = run_panda(seed=1, duration_s=9.0, topologies=1)
     assert 0.0 < found.numbers["lambda_converged_s"] < 5.0
     assert found.numbers["rate_hz"] == pytest.approx(1000.0, rel=1e-3)
+    assert found.numbers["discover"]["right"] == 1
     assert found.lam.shape[1:] == (7, 6) and found.theta.shape[1:] == (7, 10)
     assert found.numbers["min_pseudo_inertia_eigenvalue"] > 0.0
 
