@@ -16,6 +16,7 @@ import pickle
 import subprocess
 import sys
 import tempfile
+import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -31,6 +32,8 @@ from sim.tree_truth import TreeTruth, atlas
 from sim.truth import Array
 
 TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
+PART = ".part"  # of files that are being written
+ABANDONED_S = 3600.0  # after which such a file is a killed run's
 FORMAT = 1  # of the files; a new one whenever what they hold is computed otherwise
 ROBOTS = {"atlas": atlas}
 CACHE_VARIABLE = "PANDA_ADAPTER_CACHE"  # environment variable, folder
@@ -56,7 +59,7 @@ class _Job:
         """Simulate the trajectory and write its file."""
         rng = np.random.default_rng([self.seed, MOTION, self.number])
         record = babble(self.truth, self.seconds, rng, self.babbling, self.rate_hz)
-        handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=".part")
+        handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=PART)
         try:
             with os.fdopen(handle, "wb") as file:
                 np.savez(file, **{key: getattr(record, key) for key in SIGNALS})
@@ -65,6 +68,15 @@ class _Job:
             Path(name).unlink(missing_ok=True)
             raise
         return record
+
+    def check(self, record: FallRecord) -> None:
+        """Raises ValueError where a record is not of this job's length and tree."""
+        rows = round(self.seconds * self.rate_hz)
+        joints = {"q", "dq", "ddq", "tau"}
+        for key in SIGNALS:
+            wanted = rows, self.truth.n if key in joints else 3
+            if getattr(record, key).shape != wanted:
+                raise ValueError(f"{self.path}: {key} must have shape {wanted}")
 
 
 @dataclass(frozen=True)
@@ -105,7 +117,9 @@ class FallData:
         job = self.jobs[k]
         try:
             with np.load(job.path, allow_pickle=False) as file:
-                return FallRecord(**{key: file[key] for key in SIGNALS})
+                record = FallRecord(**{key: file[key] for key in SIGNALS})
+            job.check(record)
+            return record
         except UNREADABLE:
             return job.make()
 
@@ -135,7 +149,7 @@ def data_set(
         babbling: how the robot moves.
 
     Raises:
-        ValueError: an unknown robot, a count or length that is not above 0.
+        ValueError: an unknown robot, a count or length that is not above 0, a seed below 0.
         RuntimeError: a motion that leaves the joints' ranges, or a worker process that failed;
             what it said is in the message.
     """
@@ -143,10 +157,13 @@ def data_set(
         if robot not in ROBOTS:
             raise ValueError(f"no robot {robot!r}; have: {', '.join(ROBOTS)}, or a TreeTruth")
         robot = ROBOTS[robot]()
-    if trajectories < 1 or processes < 1 or not seconds * rate_hz >= 1:
+    if trajectories < 1 or processes < 1 or not 1 <= seconds * rate_hz < np.inf:
         raise ValueError("trajectories, processes and seconds * rate_hz must be 1 or more")
+    if seed < 0:
+        raise ValueError(f"seed must be 0 or more, got {seed}")
     place = cache_folder() if folder is None else Path(folder)
     place.mkdir(parents=True, exist_ok=True)
+    _sweep(place)
     levels = (TreeNoise() if noise else None) if isinstance(noise, bool) else noise
     settings = babbling or Babbling()
     key = _key(robot, seconds, rate_hz, seed, settings)
@@ -179,6 +196,14 @@ def _key(truth: TreeTruth, seconds: float, rate_hz: float, seed: int, settings: 
         "run": [seconds, rate_hz, seed],
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _sweep(place: Path) -> None:
+    """Remove what a killed run left behind; nobody writes at one file for so long."""
+    for left in place.glob(f"*{PART}"):
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                left.unlink()
 
 
 def _sound(path: Path) -> bool:

@@ -164,6 +164,16 @@ def write_json(path: Path | None, figures: Any) -> None:
         path.write_text(json.dumps(plain(figures), indent=1, ensure_ascii=False) + "\n")
 
 
+def check_writable(path: Path | None) -> None:
+    """Before long work: raises OSError where a file that was asked for cannot be written."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        there = path.exists()
+        path.open("a").close()
+        if not there:
+            path.unlink()
+
+
 def warn(lines: list[str]) -> None:
     """Warnings, one line each."""
     for line in lines:

@@ -100,6 +100,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         **numbers_of(body, judged, noise, learners, parts, data, tree),
         "online": online,
         "discover": found,
+        "trajectory_s": args.seconds,
         "simulated_s": simulated_s,
         "wall_s": time.perf_counter() - began,
     }

@@ -41,12 +41,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         return int(args.run(args))
-    except (UsageError, SettingsError, ModelError, DriverError, ValueError) as error:
-        console.print(f"[red]error:[/] {error}", soft_wrap=True)
-        return EXIT_WRONG_USE
     except (SharedMemoryError, SnapshotError, WorkerError) as error:
         console.print(f"[red]error:[/] {error}", soft_wrap=True)
         return EXIT_NO_MEANS
+    except (UsageError, SettingsError, ModelError, DriverError, ValueError, OSError) as error:
+        # an OSError names the file or folder that cannot be read or written
+        console.print(f"[red]error:[/] {error}", soft_wrap=True)
+        return EXIT_WRONG_USE
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
 

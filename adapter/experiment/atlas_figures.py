@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from adapter.experiment.atlas import Body, Judged
-from adapter.experiment.results import Learned, Stated
+from adapter.experiment.results import BOX_PERCENTILES, Learned, Stated
 from adapter.experiment.trajectories import Split
 from adapter.tree import Tree
 from adapter.tree_data import TreeData
@@ -26,6 +26,7 @@ def numbers_of(
     ours, arm = judged.learned, judged.arm
     paper = [x for x in learners if x.name in BASELINES]
     best = min(paper, key=lambda x: x.median["control"], default=None)
+    worst = max(paper, key=lambda x: x.median["control"], default=None)
     return {
         "joints": tree.n,
         "trajectories": len(parts.lengths) + len(parts.control),
@@ -52,14 +53,40 @@ def numbers_of(
         "theta_s": body.theta_s,
         "noise": noise,
         "learners": {
-            x.name: {"median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "train_s": x.train_s}
+            x.name: {
+                "median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "boxes": x.boxes,
+                "train_s": x.train_s, "sizes": x.sizes, "tuning": x.tuning,
+            }
             for x in (*learners, arm)
         },
+        "box_percentiles": BOX_PERCENTILES,
         "best_baseline": None if best is None else best.name,
+        "worst_baseline": None if worst is None else worst.name,
         "control_error_ratio_to_best_baseline": (
             None if best is None else best.median["control"] / max(arm.median["control"], 1e-300)
         ),
     }  # fmt: skip
+
+
+def baselines(learners: dict[str, dict[str, Any]]) -> list[Stated]:
+    """The sizes of the paper's three."""
+
+    def size(learner: str, what: str) -> int | None:
+        sizes = learners.get(learner, {}).get("sizes", {})
+        return round(sizes[what]) if what in sizes else None
+
+    members, points = size("ELM", "members"), size("ELM", "points")
+    return [
+        Stated("arm", "joints of the right arm", "24 to 30", "24 to 30"),
+        Stated("ffnn_units", "network: tanh units", "1000", size("FFNN", "units")),
+        Stated("elm_members", "committee: machines", "50", members, "", "50 with --full"),
+        Stated("elm_units", "committee: tanh units of each", "4000", size("ELM", "units")),
+        Stated("elm_points", "committee: samples of each", "10 000", points),
+        Stated("elm_samples", "committee: samples in all", "50 000",
+               None if members is None or points is None else members * points, "",
+               "the paper's 50 times 10 000 would be 500 000"),
+        Stated("gpr_points", "Gaussian process: samples", "10 000", size("GPR", "points")),
+    ]  # fmt: skip
 
 
 def found_trees(trials: dict[str, Any]) -> Stated:
@@ -80,9 +107,11 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
     networks = max(numbers["kinematic_error_max_networks"].values())
     branches = [x["name"] for x in numbers["sub_problems"]]
     ratio = numbers["control_error_ratio_to_best_baseline"]
+    seconds = numbers["trajectory_s"]
     return [
         Stated("joints", "degrees of freedom", "30", numbers["joints"]),
-        Stated("trajectories", "random trajectories of 10 s, 1 kHz", "63", numbers["trajectories"]),
+        Stated("trajectories", "random trajectories", "63", numbers["trajectories"]),
+        Stated("trajectory_s", "length of each, at 1 kHz", "10 s", seconds, "s"),
         Stated("control_trajectories", "of them control", "13", numbers["control_trajectories"]),
         Stated(
             "samples", "samples for training and test", "500 000",
@@ -96,7 +125,8 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
                numbers["learned_samples"]),
         Stated("minibatch", "samples of a mini-batch; cycles", "10; 10", "10; 10"),
         Stated("solver", "solver of θ", "interior point (fmincon)",
-               "interior point and Gauss-Newton (scipy)"),
+               "interior point, then Gauss-Newton",
+               "", "the interior point is ours, the Gauss-Newton scipy's"),
         Stated(
             "kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
             "", "in m/s, rad/s, m/s² and rad/s², λ from moments",
@@ -105,12 +135,16 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
             "kinematic_error_max_networks", "the same, λ from mini-batches", "negligible",
             networks,
         ),
-        Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches)),
+        Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches), "",
+               "found from A; the whole tree once more with each row's own weight"),
         *(
             Stated(f"torque_median_{name}", f"median error by eq. 20, {name} set", "minimal",
                    numbers["torque_relative_error_median"][name], "", "where |τ| > 0.1 N m")
             for name in ("train", "test", "control")
         ),
+        *baselines(numbers["learners"]),
+        Stated("worst_baseline", "worst of the three, control set", "GPR",
+               numbers["worst_baseline"]),
         Stated("control_error_ratio", "best baseline's median error over ours, control set",
                "not stated", ratio, "times"),
         Stated("learning_s", "time to learn λ and θ", "not stated", numbers["learning_s"], "s",

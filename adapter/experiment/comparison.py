@@ -65,7 +65,8 @@ def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> li
         facts = choice.learner.facts()
         sizes = ", ".join(f"{value:,.6g} {what}" for what, value in facts.sizes.items())
         learned = Learned(choice.key, choice.title, train_s=facts.train_s)
-        learned.tuning = [sizes, *facts.tuning]
+        learned.sizes = dict(facts.sizes)
+        learned.tuning = [sizes, *facts.tuning, *([choice.chosen] if choice.chosen else [])]
         found.append(errors.into(learned))
     return found
 

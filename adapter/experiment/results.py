@@ -49,6 +49,7 @@ class Learned:
         p99: by set, 99th percentile of them.
         train_s: seconds of training.
         tuning: sentences.
+        sizes: numbers of units, samples, ... by name.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Learned:
     p99: dict[str, float] = field(default_factory=dict)
     train_s: float = 0.0
     tuning: list[str] = field(default_factory=list)
+    sizes: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass

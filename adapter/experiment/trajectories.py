@@ -15,6 +15,7 @@ from adapter.tree_data import TreeData, stacked
 PAPER_TRAJECTORIES, PAPER_TRAINED = 63, 50
 TRAIN_SHARE = 0.75  # the paper's 75/25, read as 75 % train (reading notes)
 LEARN_SHARE = 0.01  # of the training set, all that the FOP networks are given
+LEAST_TRAJECTORIES = 5  # four to learn from and one as control set
 SETS = ("train", "test", "control")
 
 
@@ -52,12 +53,22 @@ class Split:
     @property
     def learned(self) -> np.ndarray:
         """The rows that λ and θ are learned from."""
-        return self.train[: max(1, round(LEARN_SHARE * len(self.train)))]
+        return self.train[: round(LEARN_SHARE * len(self.train))]
 
     def rows_in(self, rows: np.ndarray, k: int) -> np.ndarray:
         """Those of the given rows that lie in trajectory k, counted from its start, in order."""
         start = sum(self.lengths[:k])
         return np.sort(rows[(rows >= start) & (rows < start + self.lengths[k])]) - start
+
+
+def _used(count: int) -> int:
+    """Trajectories for training and test of so many."""
+    return round(count * PAPER_TRAINED / PAPER_TRAJECTORIES)
+
+
+def learned_samples(count: int, length: int) -> int:
+    """How many samples λ and θ are learned from, of `count` trajectories of `length` samples."""
+    return round(LEARN_SHARE * round(TRAIN_SHARE * _used(count) * length))
 
 
 def split(lengths: list[int], seed: int) -> Split:
@@ -67,9 +78,11 @@ def split(lengths: list[int], seed: int) -> Split:
         ModelError: fewer than 5 trajectories.
     """
     count = len(lengths)
-    if count < 5:
-        raise ModelError(f"the experiment needs at least 5 trajectories, got {count}")
-    used = round(count * PAPER_TRAINED / PAPER_TRAJECTORIES)
+    if count < LEAST_TRAJECTORIES:
+        raise ModelError(
+            f"the experiment needs at least {LEAST_TRAJECTORIES} trajectories, got {count}"
+        )
+    used = _used(count)
     order = np.random.default_rng(seed).permutation(sum(lengths[:used]))
     cut = round(TRAIN_SHARE * len(order))
     control = tuple(range(used, count))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,6 +72,23 @@ def test_files_are_kept_and_broken_ones_made_again(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_files_of_killed_runs_are_swept_and_those_at_work_are_not(tmp_path: Path) -> None:
+    old, new = tmp_path / "a.part", tmp_path / "b.part"
+    for path in (old, new):
+        path.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    data_set(TREE, 1, 0.2, folder=tmp_path, processes=1)
+    assert new.exists() and not old.exists()
+
+
+def test_a_file_of_other_shape_is_made_again(tmp_path: Path) -> None:
+    data = data_set(TREE, 1, 0.2, folder=tmp_path, processes=1)
+    whole = data.exact(0)
+    short = {key: getattr(whole, key)[:10] for key in SIGNALS}
+    np.savez(data.jobs[0].path, **short)
+    np.testing.assert_array_equal(data.exact(0).q, whole.q)
+
+
 def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
     options = {"seconds": 4.0, "trajectories": 1, "folder": tmp_path}
     clean = data_set(TREE, **options).exact(0)
@@ -108,7 +126,14 @@ def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
 def test_requests_that_cannot_be_met_say_why(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="have: atlas"):
         data_set("talos", folder=tmp_path)
-    for wrong in ({"trajectories": 0}, {"seconds": 0.0}, {"processes": 0}, {"rate_hz": np.nan}):
+    for wrong in (
+        {"trajectories": 0},
+        {"seconds": 0.0},
+        {"processes": 0},
+        {"rate_hz": np.nan},
+        {"seed": -1},
+        {"seconds": np.inf},
+    ):
         with pytest.raises(ValueError, match="must be"):
             data_set(TREE, folder=tmp_path, **wrong)
     for wrong in ({"sines": 0}, {"share": 1.5}, {"high_hz": np.nan}, {"tumble": -1.0}):

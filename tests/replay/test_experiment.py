@@ -109,7 +109,23 @@ def test_split_is_the_paper_s() -> None:
     assert np.isin(own + 70_000, parts.train).all() and own.max() < 10_000
 
 
-def test_too_few_falls_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    few = ["--trajectories", "2", "--seconds", "0.5", "--cache", str(tmp_path)]
-    assert main(["experiment", "atlas", *few, "--out", str(tmp_path)]) == 2
-    assert "at least 5 trajectories" in "".join(capsys.readouterr())
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["--trajectories", "2"], "at least 5"),
+        (["--trajectories", "5", "--seconds", "0.5"], "raise --trajectories or --seconds"),
+        (["--seconds", "inf"], "above 0 and finite"),
+        (["--seconds", "-1"], "above 0 and finite"),
+        (["--seed", "-1"], "--seed and --seeds must be 0 or more"),
+        (["--json", "/dev/null/e.json"], "/dev/null"),
+        (["--out", "/dev/null/results"], "/dev/null"),
+        (["--cache", "/dev/null/falls"], "/dev/null"),
+    ],
+)
+def test_what_would_end_it_is_said_before_the_work(
+    wrong: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    usual = ["--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]
+    assert main(["experiment", "atlas", *usual, *wrong]) == 2
+    assert said in "".join(capsys.readouterr())
+    assert not list(tmp_path.glob("cache/*"))  # nothing was simulated
