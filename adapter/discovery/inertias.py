@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.inertia import (
-    log_cholesky_from_theta,
-    pseudo_inertia,
-    theta_from_body,
-    theta_from_pseudo_inertia,
-)
+from adapter.inertia import theta_from_body
 from adapter.offline.theta_factors import row_factors, scales, system
 from adapter.offline.theta_solvers import consistent_theta, least_squares_theta
 from adapter.spatial import Array
@@ -17,10 +12,6 @@ from adapter.theta_settings import NEUTRAL_INERTIA, NEUTRAL_MASS, PRIOR_STD
 from adapter.tree_data import TreeData
 
 ROUNDS = 3  # of weighting
-STEPS = 15  # evaluations of the solver, which starts close
-PROJECTIONS = 300  # by then they have settled on a 30-joint tree
-LENGTH = 0.2  # m, of a link's radius of gyration
-LEAST_EIGENVALUE = 1e-3  # kg, of the pseudo-inertia in those units that the solver starts from
 LEAST_TORQUE = 1e-4  # N m; no joint is trusted to be explained better
 
 
@@ -49,31 +40,9 @@ def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
         r, b = system(rows, std, bodies)
         theta[first:] = least_squares_theta(r, b, theta[first:]).theta
         std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
-    start = _possible(*system(rows, std, bodies))
     r, b = _with_prior(*system(rows, std, bodies), neutral_theta(len(bodies)))
-    theta[first:] = consistent_theta(r, b, log_cholesky_from_theta(start), STEPS).theta
+    theta[first:] = consistent_theta(r, b).theta
     return theta, np.array([row.residual(theta) for row in rows])
-
-
-def _possible(r: Array, b: Array) -> Array:
-    """Possible bodies (bodies, 10) that fit about as well as any: projections in turn.
-
-    Onto what fits and onto bodies of positive pseudo-inertia, both convex, and both in the same
-    norm: that of the pseudo-inertia with lengths in units of `LENGTH`.
-    """
-    bodies = r.shape[1] // 10
-    scale = np.array([1.0 / LENGTH] * 3 + [1.0])
-    norm = (pseudo_inertia(np.eye(10)) * np.outer(scale, scale)).reshape(10, 16).T
-    held = np.kron(np.eye(bodies), norm / PRIOR_STD[0])
-    onto = np.linalg.pinv(np.vstack([r, held]))
-    theta = neutral_theta(bodies)
-    for _ in range(PROJECTIONS):
-        theta = (onto @ np.r_[b, held @ theta.ravel()]).reshape(-1, 10)
-        values, vectors = np.linalg.eigh(pseudo_inertia(theta) * np.outer(scale, scale))
-        raised = np.maximum(values, LEAST_EIGENVALUE)
-        near = np.einsum("bik,bk,bjk->bij", vectors, raised, vectors) / np.outer(scale, scale)
-        theta = theta_from_pseudo_inertia(near)
-    return theta
 
 
 def _with_prior(r: Array, b: Array, centre: Array) -> tuple[Array, Array]:

@@ -50,7 +50,7 @@ class ThetaSettings:
     """How θ is found.
 
     Attributes:
-        solver: "consistent" (possible bodies; interior point, then Gauss-Newton), "least squares"
+        solver: "consistent" (possible bodies, by a conic interior point), "least squares"
             (base parameters, nearest to the prior), or "adam" (possible bodies, by descent).
         supervision: "torques", "wrenches" or "both" (eq. 17).
         std: standard deviation of every row of `row_factors`, N or N m. None: the size of its
@@ -127,12 +127,12 @@ def learn_theta(
     settings: ThetaSettings | None = None,
     wrenches: Array | None = None,
 ) -> ThetaResult:
-    """θ from samples, from random bodies.
+    """θ from samples.
 
     Args:
         data: joint signals, torques, and the base's motion (rest and -gravity where it is fixed).
         lam: (n, 6) λ.
-        seed: of the random start.
+        seed: of the random bodies that "adam" starts from.
         settings: see `ThetaSettings`.
         wrenches: (m, bodies, 6), where they are measured (eq. 15).
 
@@ -238,10 +238,10 @@ class _Solve:
     def _solve(self, r: Array, b: Array, now: Array, start: Array) -> Solution:
         if self.settings.solver == "least squares":
             return least_squares_theta(r, b, now)
+        if self.settings.solver == "consistent":
+            return consistent_theta(r, b)
         vectors = log_cholesky_from_theta(now) if is_consistent(now) else start
-        if self.settings.solver == "adam":
-            return adam_theta(r, b, vectors, self.settings.adam_steps)
-        return consistent_theta(r, b, vectors)
+        return adam_theta(r, b, vectors, self.settings.adam_steps)
 
 
 def _known(row: RowFactor, bodies: Sequence[int], theta: Array) -> RowFactor:

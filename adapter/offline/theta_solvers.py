@@ -1,7 +1,4 @@
-"""Solvers of R θ = b: least squares in base parameters, and two over bodies that can exist.
-
-Any log-Cholesky vector is a possible body, so the last two need no constraints.
-"""
+"""Solvers of R θ = b: least squares in base parameters, and two over bodies that can exist."""
 
 from __future__ import annotations
 
@@ -9,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import least_squares
 
 from adapter.dynamics import theta_from_log_cholesky_torch
-from adapter.inertia import is_consistent, log_cholesky_from_theta, theta_from_log_cholesky
-from adapter.offline.interior_point import interior_point
-from adapter.offline.theta_factors import PER_BODY
+from adapter.inertia import theta_from_log_cholesky
+from adapter.offline.possible_bodies import possible_theta
 from adapter.spatial import Array
 
 # Singular values below this, relative to the largest, with columns of equal length: combinations
@@ -22,7 +17,6 @@ from adapter.spatial import Array
 RANK_TOLERANCE = 1e-10
 # Random bodies to start from: masses (kg), distance of the centre and radii of gyration (m).
 START_MASS, START_REACH, START_RADIUS, START_SPREAD = (0.5, 10.0), 0.1, 0.1, 0.3
-TOLERANCE = 1e-15  # of Gauss-Newton, relative: rounding
 
 
 @dataclass(frozen=True)
@@ -49,56 +43,38 @@ def least_squares_theta(r: Array, b: Array, prior: Array) -> Solution:
         r: (k, 10 bodies); b: (k,) from `theta_factors.system`.
         prior: (bodies, 10).
     """
+    scale, u, values, vt = _decomposed(r)
+    left = b - r @ prior.ravel()
+    change = (vt[: len(values)].T @ ((u.T @ left) / values)) / scale
+    theta = prior + change.reshape(prior.shape)
+    return Solution(theta, _cost(r, b, theta), 1, len(values))
+
+
+def consistent_theta(r: Array, b: Array) -> Solution:
+    """Least squares over possible bodies, see `possible_bodies`.
+
+    Raises:
+        ModelError: the solver gave up.
+    """
+    scale, u, values, vt = _decomposed(r)
+    shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
+    hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
+    theta, steps = possible_theta(r, b, shown, hidden)
+    return Solution(theta, _cost(r, b, theta), steps, len(values))
+
+
+def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
+    """Column scale s (inf for a column of zeros) and the singular values of R / s that count.
+
+    Returns:
+        s (10 bodies,), U (k, rank), values (rank,), Vᵀ (10 bodies, 10 bodies): rows beyond the
+        rank are directions of θ s that R does not show.
+    """
     scale = np.linalg.norm(r, axis=0)
     scale = np.where(scale > RANK_TOLERANCE * scale.max(initial=1e-300), scale, np.inf)
-    u, values, vt = np.linalg.svd(r / scale, full_matrices=False)
-    shown = values > RANK_TOLERANCE * values[0]
-    left = b - r @ prior.ravel()
-    change = (vt[shown].T @ ((u[:, shown].T @ left) / values[shown])) / scale
-    theta = prior + change.reshape(prior.shape)
-    return Solution(theta, _cost(r, b, theta), 1, int(np.count_nonzero(shown)))
-
-
-def consistent_theta(r: Array, b: Array, start: Array, steps: int = 200) -> Solution:
-    """Least squares over possible bodies: an interior point's path, then scipy's Gauss-Newton.
-
-    The path is convex and finds its way from any start; where the data leave next to nothing
-    unexplained, a trust-region Gauss-Newton on log-Cholesky vectors (Jacobian by the chain rule)
-    takes the barrier's last trace away.
-
-    Args:
-        r, b: as above.
-        start: (bodies, 10) log-Cholesky vectors.
-        steps: of Gauss-Newton at most.
-    """
-    bodies = len(start)
-    theta, count, close = interior_point(r, b, theta_from_log_cholesky(start))
-    if close:
-        return Solution(theta, _cost(r, b, theta), count)
-    blocks = r.reshape(len(r), bodies, PER_BODY)
-
-    def residual(x: Array) -> Array:
-        return np.asarray(r @ theta_from_log_cholesky(x.reshape(bodies, PER_BODY)).ravel() - b)
-
-    def jacobian(x: Array) -> Array:
-        inner = _log_cholesky_jacobian(x.reshape(bodies, PER_BODY))
-        return np.asarray(np.einsum("kbi,bij->kbj", blocks, inner).reshape(len(r), -1))
-
-    first = log_cholesky_from_theta(theta).ravel()
-    found = least_squares(
-        residual,
-        first,
-        jacobian,
-        method="trf",
-        ftol=TOLERANCE,
-        xtol=TOLERANCE,
-        gtol=TOLERANCE,
-        max_nfev=steps,
-    )
-    best = theta_from_log_cholesky(found.x.reshape(bodies, PER_BODY))
-    if not is_consistent(best) or found.cost > _cost(r, b, theta):
-        return Solution(theta, _cost(r, b, theta), count)
-    return Solution(best, float(found.cost), count + int(found.nfev))
+    u, values, vt = np.linalg.svd(r / scale, full_matrices=True)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
+    return scale, u[:, :rank], values[:rank], vt
 
 
 def adam_theta(
@@ -110,7 +86,13 @@ def adam_theta(
     last_rate: float = 1e-4,
     betas: tuple[float, float] = (0.97, 0.99),
 ) -> Solution:
-    """ADAM on the moments R^T R over possible bodies, as the online learner descends them."""
+    """ADAM on the moments R^T R over possible bodies, as the online learner descends them.
+
+    Any log-Cholesky vector is a possible body, so no constraint is needed.
+
+    Args:
+        start: (bodies, 10) log-Cholesky vectors.
+    """
     x = torch.from_numpy(start.copy()).requires_grad_()
     power = float(b @ b) or 1.0
     factor, right = (torch.from_numpy(np.ascontiguousarray(a / np.sqrt(power))) for a in (r, b))
@@ -133,12 +115,6 @@ def random_bodies(count: int, rng: np.random.Generator) -> Array:
     sides = START_RADIUS * START_SPREAD * rng.normal(size=(count, 3))
     centre = START_REACH * rng.normal(size=(count, 3))
     return np.concatenate([0.5 * np.log(mass)[:, None], radii, sides, centre], axis=1)
-
-
-def _log_cholesky_jacobian(x: Array) -> Array:
-    """d theta / d x (bodies, 10, 10)."""
-    every = torch.func.vmap(torch.func.jacrev(theta_from_log_cholesky_torch))
-    return np.asarray(every(torch.from_numpy(np.ascontiguousarray(x))).numpy())
 
 
 def _cost(r: Array, b: Array, theta: Array) -> float:
