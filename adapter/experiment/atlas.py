@@ -102,7 +102,8 @@ class Judged:
         learned: torque errors of all joints, as a learner of the comparison.
         arm: the same of the joints alone that the others learn.
         kinematics: on the control set; training: on the samples learned from.
-        networks: on the control set, with λ as the networks left it.
+        networks: on the control set, with λ as the networks left it; networks_training: that λ
+            on the samples learned from.
     """
 
     learned: Learned
@@ -110,6 +111,7 @@ class Judged:
     kinematics: KinematicErrors
     training: KinematicErrors
     networks: KinematicErrors
+    networks_training: KinematicErrors
 
 
 def judge(
@@ -136,7 +138,10 @@ def judge(
     ]
     training = kinematic_errors(learned_from, body.lam)
     of_arm = arm_errors.into(Learned("FOPnet, arm", learned.title, train_s=body.learning_s))
-    return Judged(errors.into(learned), of_arm, worst(kinematics), training, worst(networks))
+    of_networks = kinematic_errors(learned_from, body.networks.lam)
+    return Judged(
+        errors.into(learned), of_arm, worst(kinematics), training, worst(networks), of_networks
+    )
 
 
 def worst(parts: list[KinematicErrors]) -> KinematicErrors:

@@ -97,7 +97,7 @@ def found_trees(trials: dict[str, Any]) -> Stated:
         "future work",
         f"{trials['right']} of {trials['trials']}" if trials["trials"] else None,
         "",
-        f"from {trials['motion_s']:.0f} s of {trials['measured']} of shuffled, renamed links",
+        f"from at most {trials['motion_s']:.1f} s; links and joints shuffled and renamed",
     )
 
 
@@ -105,7 +105,7 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
     """What the paper's text states, beside ours."""
     kinematics = max(numbers["kinematic_error_max"].values())
     networks = max(numbers["kinematic_error_max_networks"].values())
-    branches = [x["name"] for x in numbers["sub_problems"]]
+    branches = dict.fromkeys(x["name"] for x in numbers["sub_problems"])
     ratio = numbers["control_error_ratio_to_best_baseline"]
     seconds = numbers["trajectory_s"]
     return [
@@ -124,9 +124,7 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
         Stated("learned_samples", "samples for λ and θ", "1 % of training",
                numbers["learned_samples"]),
         Stated("minibatch", "samples of a mini-batch; cycles", "10; 10", "10; 10"),
-        Stated("solver", "solver of θ", "interior point (fmincon)",
-               "interior point, then Gauss-Newton",
-               "", "the interior point is ours, the Gauss-Newton scipy's"),
+        Stated("solver", "solver of θ", "interior point (fmincon)", "interior point (Clarabel)"),
         Stated(
             "kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
             "", "in m/s, rad/s, m/s² and rad/s², λ from moments",
@@ -136,7 +134,8 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
             networks,
         ),
         Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches), "",
-               "found from A; the whole tree once more with each row's own weight"),
+               "found from A; then the base, then all bodies together twice, the second time "
+               "weighted by what the first left"),
         *(
             Stated(f"torque_median_{name}", f"median error by eq. 20, {name} set", "minimal",
                    numbers["torque_relative_error_median"][name], "", "where |τ| > 0.1 N m")
@@ -145,7 +144,7 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
         *baselines(numbers["learners"]),
         Stated("worst_baseline", "worst of the three, control set", "GPR",
                numbers["worst_baseline"]),
-        Stated("control_error_ratio", "best baseline's median error over ours, control set",
+        Stated("control_error_ratio", "right arm, control set: best baseline's error over ours",
                "not stated", ratio, "times"),
         Stated("learning_s", "time to learn λ and θ", "not stated", numbers["learning_s"], "s",
                "without simulating the data"),

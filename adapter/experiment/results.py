@@ -73,10 +73,14 @@ class AtlasResults:
         snapshots: (label, (n, 6)) λ at epochs 0, 50, 100 and final.
         cost: (steps,) of λ's training by eq. 18, mean over the joints.
         error_edges: (bins + 1,) log10 of |k - k_hat|.
-        error_counts: by kind (v, w, a, dw), (bins,).
+        error_counts: by kind (v, w, a, dw), (bins,), of the λ that the mini-batch networks end
+            with (the last of `snapshots`), on the samples they learned from.
         learners: FOPnet first.
         stated: figures beside the paper's.
         numbers: everything for the JSON file.
+        moments_error_counts: as `error_counts`, of λ from the moments of the same samples.
+        not_converged: names of the joints whose networks did not converge.
+        full: whether the baselines had the paper's sizes.
     """
 
     tree: Tree
@@ -89,6 +93,9 @@ class AtlasResults:
     learners: list[Learned]
     stated: list[Stated]
     numbers: dict[str, Any]
+    moments_error_counts: dict[str, Array] = field(default_factory=dict)
+    not_converged: tuple[str, ...] = ()
+    full: bool = False
 
 
 @dataclass

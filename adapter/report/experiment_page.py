@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import math
-import string
 from pathlib import Path
 from typing import Any
 
 from adapter.experiment.results import AtlasResults, PandaResults
+from adapter.offline.torque_errors import LEAST_TORQUE
 from adapter.report import experiment_convergence as convergence
 from adapter.report import experiment_panels as panels
+from adapter.report import experiment_schema as schema
 from adapter.report import experiment_tables as tables
 from adapter.report import experiment_tree as trees
+from adapter.report.experiment_beyond import beyond
 from adapter.report.experiment_words import (
     ATLAS_LEFT_OUT,
     OURS,
     PANDA_LEFT_OUT,
     advantage,
+    baselines,
     best_baseline,
     fopnet,
+    grouped,
     headline,
     last_ratio,
     letter,
+    listed,
     measured,
     percent,
     scientific,
@@ -30,6 +35,7 @@ from adapter.report.experiment_words import (
 from adapter.report.html import fill, write_whole
 from adapter.report.page import Tile
 from adapter.report.style import JOINT_COLORS
+from adapter.report.words import NARROW
 
 TEMPLATE = "experiment.html"
 PAPER_LEARNERS = (
@@ -78,6 +84,7 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
         "left_out": reasons,
         "atlas": None if atlas is None else _atlas(atlas),
         "panda": None if panda is None else _panda(panda),
+        "beyond": beyond(atlas, panda),
         "sets": list(panels.SET_NAMES.items()),
         "written": written,
     }
@@ -94,7 +101,13 @@ def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
         value = percent(best.median["control"])
         found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
     if times is not None:
-        found.append(Tile("Advantage", scientific(times), "times smaller, of the two medians"))
+        found.append(
+            Tile(
+                "Advantage",
+                scientific(times),
+                f"times smaller on the arm, joints {arm_joints(atlas)}",
+            )
+        )
     return found
 
 
@@ -102,34 +115,67 @@ def panda_tiles(panda: PandaResults) -> list[Tile]:
     """Key figures of section IV.B, those that there are."""
     after, ratio = measured(panda.stated, "lambda_converged_s"), last_ratio(panda)
     value = "not reached" if after is None else with_unit(after, "s", 3)
-    found = [Tile("λ of the Panda converged", value, "after the first motion")]
+    found = [Tile("λ of the simulated Panda converged", value, "after the first motion")]
     if ratio is not None:
         found.append(
-            Tile("Torque error at the end", scientific(ratio, 3), "times batch least squares")
+            Tile("Its torque error at the end", scientific(ratio, 3), "times batch least squares")
         )
     return found
 
 
 def _atlas(atlas: AtlasResults) -> dict[str, Any]:
-    letters = string.ascii_lowercase
-    skeletons = trees.epoch_panels(atlas, letters)
-    histogram = panels.histogram_panel(atlas, letters[max(len(skeletons), trees.PAPER_EPOCHS + 1)])
+    histogram, moments = schema.histogram_panels(atlas)
     paper, others = panels.arm_panels(atlas)
     summary = panels.side_by_side(atlas)
     return {
         "n": atlas.tree.n,
         "limbs": trees.limb_key(atlas.tree),
-        "schema": [*skeletons, *([histogram] if histogram else [])],
-        "schema_more": panels.schema_panels(atlas),
+        "schema": [*trees.epoch_panels(atlas), *([histogram] if histogram else [])],
+        "schema_more": [*([moments] if moments else []), *schema.schema_panels(atlas)],
+        "not_converged": _not_converged(atlas),
         "paper": paper,
         "whole": panels.whole_panels(atlas),
         "others": others,
         "last": [trees.arm_panel(atlas), *([summary] if summary else [])],
-        "arm": f"{atlas.arm[0] + 1} to {atlas.arm[-1] + 1}",
+        "arm": arm_joints(atlas),
+        "not_judged": _not_judged(atlas),
+        "compared": bool(baselines(atlas)),
+        "full": atlas.full,
         "stated": tables.stated_table(atlas.stated),
         "learners": tables.learner_table(atlas),
         "tuning": tables.tuning_rows(atlas),
     }
+
+
+def arm_joints(atlas: AtlasResults) -> str:
+    """The joints that the baselines learn, numbered from 1."""
+    return f"{atlas.arm[0] + 1} to {atlas.arm[-1] + 1}"
+
+
+def _not_converged(atlas: AtlasResults) -> str:
+    """Which networks of Fig. 4 did not find their joint's frame; empty where all did."""
+    names, samples = atlas.not_converged, atlas.numbers.get("learned_samples")
+    if not names:
+        return ""
+    few = "too few samples" if samples is None else f"too few samples ({grouped(samples)})"
+    if len(names) == atlas.tree.n:
+        return f"None of the {atlas.tree.n} joints had converged; {few}."
+    whose = f"{len(names)} joint{'' if len(names) == 1 else 's'} had not converged"
+    return f"{whose}: {', '.join(names)}; {few}."
+
+
+def _not_judged(atlas: AtlasResults) -> str:
+    """Why some joints have no box in Fig. 5; empty where all have one."""
+    joints = panels.not_judged(atlas)
+    if not joints:
+        return ""
+    names = listed([f"{j + 1} ({atlas.tree.joint_names[j]})" for j in joints])
+    which = f"Joint {names} has" if len(joints) == 1 else f"Joints {names} have"
+    least = f"{LEAST_TORQUE:g} N m".replace(" ", NARROW)
+    return (
+        f"{which} no box: eq. 20 is judged only where |τ| > {least} (our choice, since relative "
+        "errors of less say nothing), which is never exceeded there."
+    )
 
 
 def _panda(panda: PandaResults) -> dict[str, Any]:
@@ -146,8 +192,12 @@ def _panda(panda: PandaResults) -> dict[str, Any]:
 def _atlas_reasons(atlas: AtlasResults) -> list[str]:
     """What of Figs. 4 and 5 is missing, and why."""
     reasons = []
+    kept = {label for label, _ in atlas.snapshots}
     if not atlas.snapshots:
         reasons.append("Fig. 4a-d: no epochs of λ's training were kept.")
+    for label, which in trees.EPOCH_LETTERS.items():
+        if kept and label not in kept:
+            reasons.append(f"Fig. 4{which}: λ's training has no {label}, it ended before.")
     if not any(sum(counts) for counts in atlas.error_counts.values()):
         reasons.append("Fig. 4f: no kinematic errors were counted.")
     have = {letter(learner) for learner in atlas.learners if learner.boxes}

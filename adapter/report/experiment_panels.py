@@ -1,4 +1,4 @@
-"""Panels of the body schema's errors and of the learners' (paper, Figs. 4f and 5a-d)."""
+"""Panels of the learners' torque errors (paper, Fig. 5a-d)."""
 
 from __future__ import annotations
 
@@ -7,36 +7,20 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from adapter.experiment.results import BOX_PERCENTILES, AtlasResults, Learned
-from adapter.outcome import frame_errors
 from adapter.report.experiment_tree import STRETCH
 from adapter.report.experiment_words import OURS, SETS, baselines, fopnet, letter
 from adapter.report.style import (
-    ACCENT,
-    GOAL,
-    MUTED,
-    SIZES,
     STAND_IN,
     Drawing,
     Panel,
-    joint_color,
     log_axis,
-    mark,
-    power_of_ten,
-    thin,
     time_axis,
 )
 from adapter.spatial import Array
 
-KINEMATIC_GOAL = 1e-6  # of |k - k_hat| in SI units; ours, the paper states none
-KINDS = {
-    "v": ("velocity", "m/s"),
-    "w": ("angular velocity", "rad/s"),
-    "a": ("acceleration", "m/s²"),
-    "dw": ("angular acceleration", "rad/s²"),
-}
 SET_NAMES = {"train": "muted", "test": "accent", "control": "goal"}  # the page's colours
 SET_COLORS = {name: STAND_IN[color] for name, color in SET_NAMES.items()}
 MOST_JOINTS = 16  # in one panel of boxes
@@ -44,108 +28,6 @@ LARGEST = 2.0  # of eq. 20: torques of opposite sign
 SMALLEST = 1e-16  # of a relative error in double precision; an exact zero is drawn here
 ROOM = 1.2  # times, between what is shown and the end of a logarithmic axis
 PERCENT = 100.0
-
-
-def histogram_panel(atlas: AtlasResults, which: str) -> Panel | None:
-    """How large the kinematic errors are, by kind (Fig. 4f); None where there are none."""
-    edges = np.asarray(atlas.error_edges, dtype=float)
-    counts = {kind: np.asarray(c, dtype=float) for kind, c in atlas.error_counts.items()}
-    for kind, values in counts.items():
-        if len(values) != len(edges) - 1:
-            raise ValueError(f"{len(edges)} edges need {len(edges) - 1} counts of '{kind}'")
-    counts = {kind: values for kind, values in counts.items() if values.sum() > 0.0}
-    if not counts:
-        return None
-    drawing = Drawing("third", stretch=STRETCH)
-    ax = drawing.axes[0]
-    for k, (kind, values) in enumerate(counts.items()):
-        name, unit = KINDS.get(kind, (kind, ""))
-        share = PERCENT * values / values.sum()
-        label, color = f"{name} {kind}, {unit}".rstrip(", "), joint_color(k)
-        ax.stairs(share, 10.0**edges, color=color, fill=True, alpha=0.18)
-        ax.stairs(share, 10.0**edges, color=color, linewidth=1.2, label=label)
-    _magnitudes(ax, edges, sum(counts.values(), np.zeros(len(edges) - 1)))
-    ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend
-    ax.legend(
-        frameon=False,
-        labelcolor=MUTED,
-        fontsize=SIZES["third"][2],
-        loc="upper left",
-        ncols=1,
-        handlelength=1.2,
-        borderaxespad=0.1,
-    )
-    mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
-    time_axis(drawing, "size of the error, in the unit of its kind")
-    samples = int(max(values.sum() for values in counts.values()))
-    note = f"up to {samples:,} numbers of a kind".replace(",", "\u202f")
-    return drawing.panel(f"({which}) Kinematic errors |k − k̂|", "% of their kind", note)
-
-
-def _magnitudes(ax: Axes, edges: Array, counts: Array) -> None:
-    """A logarithmic x axis around what is counted, with the goal in it."""
-    used = np.flatnonzero(counts)
-    low, high = edges[used[0]], edges[used[-1] + 1]
-    ax.set_xscale("log")
-    ax.set_xlim(10.0 ** (low - 0.5), max(10.0 ** (high + 0.5), 4.0 * KINEMATIC_GOAL))
-    ax.xaxis.set_major_locator(LogLocator(10, numticks=7))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
-
-
-def schema_panels(atlas: AtlasResults) -> list[Panel]:
-    """λ's cost while it is learned, and its error at the epochs of the pictures."""
-    panels = []
-    cost = np.asarray(atlas.cost, dtype=float)
-    good = np.isfinite(cost) & (cost > 0.0)
-    if good.sum() > 1:
-        drawing = Drawing("half")
-        ax = drawing.axes[0]
-        ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
-        log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
-        ax.set_xlim(0.0, 1.04 * len(cost))
-        time_axis(drawing, "step of the optimiser")
-        panels.append(drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints"))
-    if atlas.snapshots:
-        panels.append(_epoch_errors(atlas))
-    return panels
-
-
-def _epoch_errors(atlas: AtlasResults) -> Panel:
-    """One dot per joint: how far its frame is from the actual one in its parent's."""
-    n = atlas.tree.n
-    lam = np.stack([lam for _, lam in atlas.snapshots])
-    every = np.tile(np.eye(6), (n, 1, 1))
-    kinds = zip(("turn, rad", "shift, m"), frame_errors(lam, atlas.true_lam, every), strict=True)
-    drawing = Drawing("half")
-    ax = drawing.axes[0]
-    at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
-    shown = []
-    for k, (name, errors) in enumerate(kinds):
-        errors = np.maximum(errors, SMALLEST)
-        shown.append(errors)
-        side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
-        ax.plot(
-            (at + side).ravel(),
-            errors.ravel(),
-            linestyle="none",
-            marker="o",
-            markersize=2.6,
-            color=color,
-            alpha=0.75,
-            label=name,
-        )
-    low, high = np.min(shown), np.max(shown)
-    log_axis(ax, 0.3 * low, 5.0 * high)
-    _categories(ax, [label for label, _ in atlas.snapshots])
-    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="best")
-    return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
-
-
-def _categories(ax: Axes, names: Sequence[str]) -> None:
-    ax.set_xlim(-0.5, len(names) - 0.5)
-    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
-    ax.grid(False, axis="x")
 
 
 def arm_rows(atlas: AtlasResults, learner: Learned) -> dict[str, Array]:
@@ -190,6 +72,17 @@ def arm_panels(atlas: AtlasResults) -> tuple[list[Panel], list[Panel]]:
     return [panel for _, panel in sorted(paper, key=lambda x: x[0])], others
 
 
+def not_judged(atlas: AtlasResults) -> list[int]:
+    """Joints (from 0) that no learner has a box of in any set: their torques are too small."""
+    judged = np.zeros((2, atlas.tree.n), dtype=bool)  # some learner has the joint; has a box of it
+    for learner in atlas.learners:
+        for boxes in learner.boxes.values():
+            joints = slice(None) if len(boxes) == atlas.tree.n else list(atlas.arm)
+            judged[0, joints] = True
+            judged[1, joints] |= np.isfinite(boxes).any(axis=1)
+    return np.flatnonzero(judged[0] & ~judged[1]).tolist()
+
+
 def whole_panels(atlas: AtlasResults) -> list[Panel]:
     """FOPnet's relative errors of all joints, in as many panels as they need."""
     ours = fopnet(atlas)
@@ -225,9 +118,16 @@ def side_by_side(atlas: AtlasResults) -> Panel | None:
             ax.plot([k + side], [middle], "o", color=color, markersize=4.5)
             ax.plot([k + side], [high], "_", color=color, markersize=7)
     log_axis(ax, *limits)
-    _categories(ax, [x.name for x in known])
+    categories(ax, [x.name for x in known])
     note = "dot: median; bar up to the 99th percentile, over all joints that the learner has"
     return drawing.panel("All learners on one scale", "relative error, %", note)
+
+
+def categories(ax: Axes, names: Sequence[str]) -> None:
+    """Names along x, at 0, 1, 2, ..."""
+    ax.set_xlim(-0.5, len(names) - 0.5)
+    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
+    ax.grid(False, axis="x")
 
 
 def _shown(fraction: float | None) -> float:

@@ -7,7 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.experiment.results import AtlasResults, Learned, Stated
-from adapter.report.experiment_words import SETS, ours_text, percent, scientific, with_unit
+from adapter.report.experiment_words import (
+    SETS,
+    ours_text,
+    percent,
+    scientific,
+    sentences,
+    with_unit,
+)
 from adapter.report.tables import Table
 from adapter.report.words import JOIN, NARROW, NOTHING
 
@@ -46,7 +53,7 @@ def learner_table(atlas: AtlasResults) -> Table | None:
 
 def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
     """Name, title and how it was tuned, of each learner."""
-    return [(x.name, x.title.rstrip("."), " ".join(x.tuning)) for x in atlas.learners]
+    return [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners]
 
 
 def _joints(learner: Learned) -> str:

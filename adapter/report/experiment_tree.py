@@ -26,7 +26,8 @@ from adapter.tree import BASE, Tree
 
 TURN, LIFT = np.radians(-28.0), np.radians(14.0)  # seen from the front, its right, and above
 STRETCH = 1.3  # a skeleton's height, of the usual
-PAPER_EPOCHS = 4  # pictures before the actual robot's: epochs 0, 50, 100 and final
+# The paper's letters, by label: a run too short for an epoch must not move the others' letters.
+EPOCH_LETTERS = {"epoch 0": "a", "epoch 50": "b", "epoch 100": "c", "final": "d"}
 MARGIN = 1.12  # times what is shown
 SCALES_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 SCALE_SHARE = 0.25  # of a picture's height that a scale may take
@@ -99,11 +100,11 @@ def skeleton(tree: Tree, lam: Array) -> Skeleton:
     return Skeleton(p, R[:, :, 2], {})
 
 
-def epoch_panels(atlas: AtlasResults, letters: Sequence[str]) -> list[Panel]:
-    """λ of each epoch kept, then the actual one; `letters` are the figure's."""
+def epoch_panels(atlas: AtlasResults) -> list[Panel]:
+    """λ of each epoch kept, then the actual one (Fig. 4a-e)."""
     tree, actual = atlas.tree, skeleton(atlas.tree, atlas.true_lam)
     panels = []
-    for which, (label, lam) in zip(letters, atlas.snapshots, strict=False):
+    for label, lam in atlas.snapshots:
         shown = skeleton(tree, lam)
         off = float(np.linalg.norm(shown.p - actual.p, axis=1).max())
         drawing = Drawing("third", bare=True, stretch=STRETCH)
@@ -111,12 +112,13 @@ def epoch_panels(atlas: AtlasResults, letters: Sequence[str]) -> list[Panel]:
         _bones(drawing.axes[0], tree, shown)
         _frame(drawing, [shown, actual])
         note = f"joint origins off by up to {with_unit(off, 'm')}; grey: the actual ones"
-        panels.append(drawing.panel(f"({which}) {label[:1].upper()}{label[1:]}", "", note))
+        which = EPOCH_LETTERS.get(label)
+        title = f"{label[:1].upper()}{label[1:]}"
+        panels.append(drawing.panel(f"({which}) {title}" if which else title, "", note))
     drawing = Drawing("third", bare=True, stretch=STRETCH)
     _bones(drawing.axes[0], tree, actual)
     _frame(drawing, [actual])
-    which = letters[max(len(atlas.snapshots), PAPER_EPOCHS)]
-    return [*panels, drawing.panel(f"({which}) Actual {tree.n}-joint robot", "", "true λ")]
+    return [*panels, drawing.panel(f"(e) Actual {tree.n}-joint robot", "", "true λ")]
 
 
 def arm_panel(atlas: AtlasResults) -> Panel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -45,6 +46,50 @@ def percent(fraction: float | None, digits: int = 2) -> str:
     return with_unit(None if fraction is None else 100.0 * fraction, "%", digits)
 
 
+def grouped(value: int) -> str:
+    """A whole number, in groups of three from five digits on.
+
+    >>> grouped(1500), grouped(375_000).split()
+    ('1500', ['375', '000'])
+    """
+    return str(value) if abs(value) < PLAIN_TO else count(value)
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a sentence lists them.
+
+    >>> listed(["a"]), listed(["a", "b", "c"])
+    ('a', 'a, b and c')
+    """
+    return " and ".join([part for part in (", ".join(words[:-1]), *words[-1:]) if part])
+
+
+def sentences(pieces: Sequence[str]) -> str:
+    """Pieces of text as sentences, their numbers in readable form.
+
+    >>> sentences(["1,500 tuned_on, 30 inputs", "up to 3e+02.", "θ is next"])
+    'Tuned on 1500, 30 inputs. Up to 300. θ is next.'
+    """
+    return " ".join(_sentence(piece) for piece in pieces if piece.strip())
+
+
+def _sentence(piece: str) -> str:
+    said = piece.strip().rstrip(".")
+    said = re.sub(r"([\d,]*\d) (tuned_on|rank)\b", r"\2 \1", said).replace("_", " ")
+    said = re.sub(r"\b\d{1,3}(?:,\d{3})+\b", lambda x: grouped(int(x[0].replace(",", ""))), said)
+    said = re.sub(r"\b\d{5,}\b", lambda x: grouped(int(x[0])), said)
+    said = re.sub(r"(\d)%", rf"\1{NARROW}%", said)
+    said = re.sub(r"\b\d+(?:\.(\d+))?e[+-]\d+\b", _plain, said)
+    said = re.sub(r"(?<![\w.])-(?=\d)", "−", said)
+    first = said[:1]
+    return f"{first.upper() if first.isascii() else first}{said[1:]}."  # θ stays small
+
+
+def _plain(power: re.Match[str]) -> str:
+    """A number with an exponent, as `scientific` writes it, with as many digits."""
+    return scientific(float(power[0]), 1 + len(power[1] or ""))
+
+
 def ours_text(item: Stated) -> str:
     """What we measured, with its unit; words where it was not run."""
     value = item.ours
@@ -55,7 +100,7 @@ def ours_text(item: Stated) -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, int) or (value.is_integer() and abs(value) < PLAIN_TO):
-        return f"{count(int(value))} {item.unit}".replace(" ", NARROW).rstrip(NARROW)
+        return f"{grouped(int(value))} {item.unit}".replace(" ", NARROW).rstrip(NARROW)
     return with_unit(value, item.unit, 3)
 
 
@@ -75,19 +120,17 @@ def baselines(atlas: AtlasResults) -> list[Learned]:
     return [x for x in atlas.learners if letter(x) in ("a", "b", "c")]
 
 
-def best_baseline(atlas: AtlasResults, which: str = "control") -> Learned | None:
-    """Of the paper's three the one with the smallest median error on a set."""
-    known = [x for x in baselines(atlas) if math.isfinite(x.median.get(which, math.nan))]
-    return min(known, key=lambda x: x.median[which]) if known else None
+def best_baseline(atlas: AtlasResults) -> Learned | None:
+    """Of the paper's three the one with the smallest median error on the control set."""
+    name = atlas.numbers.get("best_baseline")
+    return next((x for x in baselines(atlas) if x.name == name), None)
 
 
 def advantage(atlas: AtlasResults) -> float | None:
-    """How many times smaller FOPnet's median control error is than the best baseline's."""
-    ours, best = fopnet(atlas), best_baseline(atlas)
-    error = math.nan if ours is None else ours.median.get("control", math.nan)
-    if best is None or not math.isfinite(error) or error <= 0.0:
-        return None
-    return best.median["control"] / error
+    """How many times smaller FOPnet's median control error is than the best baseline's, both of
+    the joints that the baselines learn."""
+    ratio = atlas.numbers.get("control_error_ratio_to_best_baseline")
+    return ratio if ratio is not None and math.isfinite(ratio) and ratio > 0.0 else None
 
 
 def of(items: Sequence[Stated], key: str) -> Stated | None:
@@ -132,9 +175,10 @@ def atlas_sentence(atlas: AtlasResults | None) -> str:
         return f"{said}; the baselines were not run."
     theirs = f"{best.name}, {percent(best.median['control'])}"
     if times is None:
-        return f"{said}; the best of the paper's baselines has more ({theirs})."
+        return f"{said}; the best of the paper's baselines has {theirs}."
     held = f"{scientific(max(times, 1.0 / times))} times {'smaller' if times >= 1.0 else 'larger'}"
-    return f"{said}, {held} than the best of the paper's baselines ({theirs})."
+    where = f"on the arm ({len(atlas.arm)} joints)"
+    return f"{said}; {where} it is {held} than that of the paper's best baseline ({theirs})."
 
 
 def panda_sentence(panda: PandaResults | None) -> str:
@@ -144,12 +188,15 @@ def panda_sentence(panda: PandaResults | None) -> str:
     at = of(panda.stated, "lambda_converged_s")
     after = measured(panda.stated, "lambda_converged_s")
     if after is None:
-        said = "The Panda's λ did not converge"
+        said = "The simulated Panda's λ did not converge"
     else:
         theirs = (
-            f" (the paper: {at.paper.replace(' ', NARROW)})" if at is not None and at.paper else ""
+            f" (the paper's real arm: {at.paper.replace(' ', NARROW)})"
+            if at is not None and at.paper
+            else ""
         )
-        said = f"The Panda's λ converges {with_unit(after, 's')} after the first motion{theirs}"
+        after_s = with_unit(after, "s")
+        said = f"The simulated Panda's λ converges {after_s} after the first motion{theirs}"
     ratio = last_ratio(panda)
     if ratio is None or not math.isfinite(panda.theta_start_s):
         return f"{said}; its θ was not learned."

@@ -12,11 +12,13 @@ import pytest
 from browser import Links, screenshot
 
 from adapter.experiment.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.report.experiment_beyond import beyond
 from adapter.report.experiment_convergence import logarithmic, turns_and_shifts
 from adapter.report.experiment_page import render_experiment, write_experiment
-from adapter.report.experiment_panels import arm_panels, whole_panels
+from adapter.report.experiment_panels import arm_panels, not_judged, whole_panels
+from adapter.report.experiment_schema import histogram_panels
 from adapter.report.experiment_tree import epoch_panels, limbs, skeleton
-from adapter.report.experiment_words import SETS, headline, scientific
+from adapter.report.experiment_words import SETS, headline, scientific, sentences
 from adapter.run_folder import RunFolderError
 from adapter.tree import Tree
 
@@ -33,6 +35,32 @@ MEDIANS = {
     "GPR": (0.00012, 0.14, 0.55),
     "Lagrangian": (0.011, 0.013, 0.052),
     "Regressor": (1.7e-12, 1.8e-12, 1.9e-12),
+}
+DISCOVERED = {
+    "trials": 20,
+    "right": 20,
+    "least_confidence_right": 0.98765,
+    "most_confidence_wrong": 0.0,
+    "motion_s": 9.908,
+    "measured": "w, a",
+}
+ONLINE = {
+    "joints": 7,
+    "lambda_rank": 41,
+    "lambda_settled_s": 1.021,
+    "step_p50_us": 417.3,
+    "step_p99_us": 5400.9,
+    "samples_per_second": 1269.1,
+    "history": [
+        {
+            "seconds": seconds,
+            "turn_rad": 1e-3 / seconds,
+            "shift_m": 1e-2 / seconds,
+            "over_least_squares": 1.0 + 1.0 / seconds,
+            "worst_joint_over_least_squares": 1.0 + 4.0 / seconds,
+        }
+        for seconds in (5.0, 10.0, 15.0)
+    ],
 }
 MOST_BYTES = 2_000_000
 
@@ -73,7 +101,14 @@ def atlas() -> AtlasResults:
             Stated("k", "largest kinematic error", "negligible", 3.14e-8, "m/s"),
             Stated("full", "full size", "", None, "s"),
         ],
-        numbers={},
+        numbers={
+            "learned_samples": 1234,
+            "best_baseline": "FFNN",
+            "control_error_ratio_to_best_baseline": 0.26 / 1.2e-9,
+            "discover": DISCOVERED | {"right": 19, "most_confidence_wrong": 0.31259},
+            "online": ONLINE,
+        },
+        moments_error_counts={kind: rng.multinomial(500, np.full(20, 0.05)) for kind in KINDS},
     )
 
 
@@ -98,7 +133,20 @@ def panda() -> PandaResults:
             Stated("lambda_converged_s", "λ converged after", "40 s", 2.87, "s"),
             Stated("rate_hz", "rate", "1 kHz", 1000.0, "Hz"),
         ],
-        numbers={},
+        numbers={"discover": DISCOVERED},
+    )
+
+
+def few_panels() -> AtlasResults:
+    """Results that are drawn quickly: where a test is about words."""
+    full = atlas()
+    return replace(
+        full,
+        snapshots=[],
+        cost=np.zeros(0),
+        moments_error_counts={},
+        learners=full.learners[:2],
+        numbers=full.numbers | {"online": {}},
     )
 
 
@@ -118,7 +166,7 @@ def sections(page: str) -> list[str]:
 
 
 def test_page_stands_alone(page: str) -> None:
-    assert sections(page) == ["stated", "fig4", "fig5", "fig6", "provenance"]
+    assert sections(page) == ["stated", "fig4", "fig5", "fig6", "beyond", "provenance"]
     assert page.startswith("<!doctype html>")
     assert len(page.encode()) < MOST_BYTES
     links = Links()
@@ -136,13 +184,15 @@ def test_every_figure_is_there(page: str) -> None:
     # Figs. 4 and 6, in the order of the paper; of Fig. 5 the learners it has not come between.
     assert found == [
         "(a) Epoch 0", "(b) Epoch 50", "(c) Epoch 100", "(d) Final", "(e) Actual 7-joint robot",
-        "(f) Kinematic errors |k − k̂|", "Cost of λ, eq. 18", "Error of λ in the pictures",
+        "(f) Kinematic errors |k − k̂|",
+        "λ from moments: errors |k − k̂|", "Cost of λ, eq. 18", "Error of λ in the pictures",
         "(a) FFNN", "(b) ELM committee", "(c) GPR", "(d) FOPnet", "Lagrangian", "Regressor",
         "(e) What the baselines learn: joints 4 to 5", "All learners on one scale",
         "(d) FOPnet, joints 1 to 7",
         "(a) λ: orientation of the joint frames", "(a) λ: position of the joint frames",
         "(b) θ: mass", "(b) θ: first moments mX mY mZ", "(b) θ: inertia XX to ZZ",
         "Torque error while learning",
+        "ATLAS online: torque error", "ATLAS online: error of λ",
     ]  # fmt: skip
     assert page.count("<svg") == len(found)
     assert "θ starts" in page
@@ -153,7 +203,7 @@ def test_every_number_is_there(page: str) -> None:
     for said in (
         "random trajectories 63 of 10 s 63", "500 000 500 000", "38.2 s on 2 cores",
         "negligible 3.14 × 10⁻⁸ m/s", "full size not stated not run", "40 s 2.87 s",
-        "1 kHz 1 000 Hz", "12.5 s", "Regressor was tuned. Twice.", "back and neck", "right arm",
+        "1 kHz 1000 Hz", "12.5 s", "Regressor was tuned. Twice.", "back and neck", "right arm",
     ):  # fmt: skip
         assert said in text, said
     for one in atlas().learners:
@@ -167,17 +217,24 @@ def test_every_number_is_there(page: str) -> None:
 def test_headline_follows_the_numbers() -> None:
     assert text_of(headline(atlas(), panda())) == (
         "On control trajectories FOPnet predicts the joint torques of ATLAS (7 joints) with a "
-        "median relative error of 1.3 × 10⁻⁷ %, 2.0 × 10⁸ times smaller than the best of the "
-        "paper's baselines (FFNN, 26 %). The Panda's λ converges 2.9 s after the first motion "
-        "(the paper: 40 s), and its torque error is 1.04 times that of batch least squares."
+        "median relative error of 1.3 × 10⁻⁷ %; on the arm (2 joints) it is 2.2 × 10⁸ times "
+        "smaller than that of the paper's best baseline (FFNN, 26 %). "
+        "The simulated Panda's λ converges 2.9 s after the first motion "
+        "(the paper's real arm: 40 s), and its torque error is 1.04 times that of batch least "
+        "squares."
     )
     worse, slow = atlas(), panda()
     worse.learners[0].median["control"] = 0.52
+    worse.numbers["control_error_ratio_to_best_baseline"] = 0.5
     slow.stated = [replace(slow.stated[0], ours=None)]
-    assert "error of 52 %, 2.0 times larger than" in text_of(headline(worse, slow))
-    assert "The Panda's λ did not converge; in the end its torque error is 1.04" in headline(
-        worse, slow
+    said = text_of(headline(worse, slow))
+    assert "error of 52 %; on the arm (2 joints) it is 2.0 times larger than" in said
+    assert "λ did not" in text_of(headline(worse, slow))
+    assert (
+        "The simulated Panda's λ did not converge; in the end its torque error is 1.04"
+        in headline(worse, slow)
     )
+    worse.numbers["best_baseline"] = None
     worse.learners = worse.learners[:1] + worse.learners[4:]  # those of the paper left out
     said = headline(worse, replace(slow, theta_start_s=float("nan")))
     assert "the baselines were not run." in said
@@ -187,8 +244,8 @@ def test_headline_follows_the_numbers() -> None:
 @pytest.mark.parametrize(
     ("with_atlas", "with_panda", "shown", "reasons"),
     [
-        (True, False, "stated fig4 fig5 provenance", ["Section IV.B was not run"]),
-        (False, True, "stated fig6 provenance", ["Section IV.A was not run"]),
+        (True, False, "stated fig4 fig5 beyond provenance", ["Section IV.B was not run"]),
+        (False, True, "stated fig6 beyond provenance", ["Section IV.A was not run"]),
         (False, False, "provenance", ["Section IV.A was not run", "Section IV.B was not run"]),
     ],
 )
@@ -214,6 +271,86 @@ def test_parts_that_are_missing_are_named() -> None:
     assert "(e) Actual" in found  # keeps the paper's letter
     assert "(c) GPR" in found
     assert "Torque error while learning" not in found
+
+
+def test_letters_follow_the_epochs_and_not_their_number(page: str) -> None:
+    """Too few samples for epoch 100, and for all joints to converge: both are said."""
+    kept = [x for x in atlas().snapshots if x[0] != "epoch 100"]
+    short = replace(few_panels(), not_converged=("r_arm_x", "neck_y"), snapshots=kept)
+    found = render_experiment(short, None, "")
+    titles = re.findall(r"<figcaption><b>(.*?)</b>", found)
+    assert titles[:4] == ["(a) Epoch 0", "(b) Epoch 50", "(d) Final", "(e) Actual 7-joint robot"]
+    assert titles[4].startswith("(f) ")
+    assert "Fig. 4c: λ's training has no epoch 100, it ended before." in text_of(found)
+    said = "2 joints had not converged: r_arm_x, neck_y; too few samples (1234)."
+    assert said in text_of(found)
+    none = replace(few_panels(), not_converged=NAMES)
+    assert "None of the 7 joints had converged;" in render_experiment(none, None, "")
+    assert 'id="not-converged"' not in page
+
+
+def test_each_histogram_shows_its_own_errors() -> None:
+    networks, moments = np.zeros(20), np.zeros(20)
+    networks[14], moments[2] = 40.0, 60.0  # at 10⁻⁷ and at 10⁻¹³
+    shown = replace(
+        atlas(), error_counts={"v": networks}, moments_error_counts={"v": moments, "w": 0 * moments}
+    )
+    paper, other = histogram_panels(shown)
+    assert paper is not None
+    assert other is not None
+    assert "40 numbers of a kind" in paper.note
+    assert "60 numbers of a kind" in other.note
+    assert not re.search(">10⁻¹[⁰²⁴]<", paper.svg)
+    assert re.search(">10⁻¹[⁰²⁴]<", other.svg)
+    assert histogram_panels(replace(shown, moments_error_counts={}))[1] is None
+
+
+def test_a_joint_without_boxes_is_explained() -> None:
+    assert not_judged(atlas()) == []
+    shown = few_panels()
+    for one in shown.learners:
+        for boxes in one.boxes.values():
+            boxes[len(boxes) - 1 if len(boxes) == len(ARM) else ARM[-1]] = np.nan
+    assert not_judged(shown) == [ARM[-1]]
+    said = "Joint 5 (r_arm_y) has no box: eq. 20 is judged only where |τ| > 0.1 N m"
+    assert said in text_of(render_experiment(shown, None, ""))
+
+
+@pytest.mark.parametrize(
+    ("full", "said"), [(False, "This run is a reduced one"), (True, "This run had them")]
+)
+def test_the_size_of_the_learners_is_said(full: bool, said: str) -> None:
+    assert said in render_experiment(replace(few_panels(), full=full), None, "")
+    alone = replace(few_panels(), full=full, learners=atlas().learners[:1])
+    assert "The paper's sizes" not in render_experiment(alone, None, "")
+
+
+def test_tuning_reads_as_sentences() -> None:
+    pieces = [
+        "1,500 tuned_on, 49 rank, 375,000 samples",
+        "θ by 35% to 3e+02, noise 1.0e-09",
+        "-1 to 1.",
+    ]
+    assert text_of(sentences(pieces)) == (
+        "Tuned on 1500, rank 49, 375 000 samples. θ by 35 % to 300, noise 1.0 × 10⁻⁹. −1 to 1."
+    )
+
+
+def test_beyond_the_paper_is_told_with_its_confidences(page: str) -> None:
+    said = text_of(page)
+    for row in (
+        "ATLAS Panda trees found, every edge right 19 of 20 20 of 20",
+        "least confidence in a right edge 0.9876 0.9876",
+        "most confidence in a wrong edge 0.3125 none was reported",
+        "longest recording 9.91 s 9.91 s",
+        "angular velocity and acceleration angular velocity and acceleration",
+        "samples a second, on one core 1269 1/s", "99th percentile 5.40 ms", "median 417 µs",
+        "θ begins after 1.02 s", "41 of 42",
+    ):  # fmt: skip
+        assert row in said, row
+    shown = atlas()
+    shown.numbers.clear()
+    assert beyond(shown, replace(panda(), numbers={})) is None
 
 
 def test_skeleton_hangs_together() -> None:
@@ -242,7 +379,7 @@ def test_pictures_say_how_far_off_they_are() -> None:
     moved = shown.true_lam.copy()
     moved[0, 3:] += [0.0, 0.3, 0.4]  # the back and all that hangs on it, by half a metre
     shown.snapshots = [("epoch 0", moved)]
-    assert "up to 0.50 m" in text_of(epoch_panels(shown, "abcde")[0].note)
+    assert "up to 0.50 m" in text_of(epoch_panels(shown)[0].note)
 
 
 def test_boxes_stand_where_their_numbers_are() -> None:
@@ -273,9 +410,10 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
     shown.learners[1].boxes["test"] = np.ones((3, 5))
     with pytest.raises(ValueError, match=r"FFNN, test: .*\(3, 5\); have: \(2, 5\) or \(7, 5\)"):
         arm_panels(shown)
-    shown = replace(atlas(), error_counts={"v": np.ones(3)})
-    with pytest.raises(ValueError, match="21 edges need 20 counts of 'v'"):
-        render_experiment(shown, None, "")
+    for field in ("error_counts", "moments_error_counts"):
+        shown = replace(atlas(), **{field: {"v": np.ones(3)}})
+        with pytest.raises(ValueError, match="21 edges need 20 counts of 'v'"):
+            render_experiment(shown, None, "")
 
 
 def test_true_turn_is_the_one_beside_the_learned() -> None:
