@@ -34,6 +34,23 @@ class Structure:
     score: float
 
 
+@dataclass(frozen=True)
+class Belief:
+    """Probabilities of one link's options.
+
+    Attributes:
+        ranked: options and probabilities, most likely first, without those below.
+        reversed: probability that the chosen joint connects the same links the other way round.
+    """
+
+    ranked: tuple[tuple[Option, float], ...]
+    reversed: float
+
+    def of(self, option: Option) -> float:
+        """Probability of an option."""
+        return dict(self.ranked)[option]
+
+
 def key_of(option: Option) -> Key:
     """What tells options apart."""
     return option.link, option.joint, option.parent
@@ -55,6 +72,17 @@ class Search:
         """The best structure; None where the search was given up."""
         structure, _ = self._search(None, MOST_SPLITS)
         return structure
+
+    def rooted_at(self, link: int) -> Structure | None:
+        """The best structure in which nothing carries a link."""
+        return self._search(self._free(link), MOST_RIVAL_SPLITS)[0]
+
+    def score_of_root(self, link: int) -> float:
+        """The score of that structure, or a bound on it."""
+        return self._search(self._free(link), MOST_RIVAL_SPLITS)[1]
+
+    def _free(self, link: int) -> Option:
+        return next(o for o in self._options[link] if o.parent == FREE)
 
     def _search(self, given: Option | None, splits: int) -> tuple[Structure | None, float]:
         """The best structure with one option given, and its score; or None and a bound on it."""
@@ -103,8 +131,8 @@ class Search:
         pairs = zip(rows.tolist(), columns.tolist(), strict=True)
         return Structure(tuple(best[pair] for pair in pairs), total)
 
-    def posterior(self, structure: Structure) -> list[list[tuple[Option, float]]]:
-        """For every link its options and their probabilities, most likely first.
+    def posterior(self, structure: Structure) -> list[Belief]:
+        """What is believed of every link.
 
         The probability of an option is that of the best structure with it, over the sum of the
         same of all options.
@@ -114,17 +142,28 @@ class Search:
         for link, options in enumerate(self._options):
             others = tops.sum() - tops[link]
             own = structure.chosen[link]
-            scores = {own: structure.score}
+            found: dict[Option, tuple[float, bool]] = {own: (structure.score, False)}
             near = [o for o in options if others + o.score >= structure.score - LOST]
             for option in near[:MOST_RIVALS]:
                 if option != own:
-                    _, scores[option] = self._search(option, MOST_RIVAL_SPLITS)
-            top = max(scores.values())
-            weights = {o: float(np.exp(s - top)) for o, s in scores.items()}
-            total = sum(weights.values())
-            ranked = sorted(weights.items(), key=lambda item: (-item[1], item[0] != own))
-            out.append([(o, w / total) for o, w in ranked])
+                    rival, score = self._search(option, MOST_RIVAL_SPLITS)
+                    found[option] = score, rival is not None and reversed_in(own, rival)
+            top = max(score for score, _ in found.values())
+            weight = {o: float(np.exp(score - top)) for o, (score, _) in found.items()}
+            total = sum(weight.values())
+            ranked = sorted(weight.items(), key=lambda item: (-item[1], item[0] != own))
+            back = sum(weight[o] for o, (_, turned) in found.items() if turned) / total
+            kept = tuple((o, w / total) for o, w in ranked if not found[o][1])
+            out.append(Belief(kept, back))
         return out
+
+
+def reversed_in(own: Option, other: Structure) -> bool:
+    """Whether a structure has the same joint between the same links, the other way round."""
+    if not 0 <= own.parent < len(other.chosen) or own.joint == NO_JOINT:
+        return False
+    there = other.chosen[own.parent]
+    return there.joint == own.joint and there.parent == own.link
 
 
 def cycle(chosen: tuple[Option, ...]) -> list[Option]:
