@@ -5,6 +5,7 @@ Names and orders are shuffled; what is true is handed along.
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -26,6 +27,7 @@ ATLAS = SHARED / "models" / "atlas_v5.urdf"
 ENCODER_STEP = 2 * np.pi / 2**19  # rad
 GYRO = np.radians(0.007)  # rad/s/√Hz
 ACCELEROMETER = 150e-6 * 9.81  # m/s²/√Hz
+DRAWN_KEPT = 8  # motions kept for other noise, mountings or channels
 DQ_NOISE, V_NOISE, DW_NOISE, TAU_NOISE = 1e-3, 1e-3, 0.05, 0.1  # rad/s, m/s, rad/s², N m
 
 
@@ -181,6 +183,24 @@ def _seen(
     return twists, accels
 
 
+_DRAWN: dict[tuple[int, Motion, int], tuple[SelfModel, tuple[np.ndarray, ...], np.random.Generator]]
+_DRAWN = {}
+
+
+def _drawn(
+    model: SelfModel, motion: Motion, seed: int
+) -> tuple[tuple[np.ndarray, ...], np.random.Generator]:
+    """The motion of a seed, and its generator as that left it; the latest few are kept."""
+    key = id(model), motion, seed
+    if key not in _DRAWN:
+        while len(_DRAWN) >= DRAWN_KEPT:
+            del _DRAWN[next(iter(_DRAWN))]
+        rng = np.random.default_rng([seed, 17])
+        _DRAWN[key] = model, _moved(model, motion, rng), rng
+    _, moved, rng = _DRAWN[key]
+    return moved, copy.deepcopy(rng)
+
+
 def record(
     model: SelfModel,
     motion: Motion,
@@ -199,8 +219,8 @@ def record(
         parts: "t" with twists, "a" with accelerations.
         mounts: (rotation, place) of the sensor of each body, the base first, in its joint frame.
     """
-    rng = np.random.default_rng([seed, 17])
-    q, dq, _, tau, twists, accels = _moved(model, motion, rng)
+    moved, rng = _drawn(model, motion, seed)
+    q, dq, _, tau, twists, accels = moved
     twists, accels = _seen(twists, accels, mounts)
     root = np.sqrt(motion.rate_hz / 2)
     q = np.round(q / ENCODER_STEP) * ENCODER_STEP

@@ -61,4 +61,4 @@ def axes_of(bodies: Bodies, variance: dict[str, Array]) -> Axes:
         left = power - 2.0 * np.sum(found * b, axis=1) + np.sum(found * (block @ found), axis=1)
         misfit[k] = np.maximum(left, 0.0).T.reshape(n, links, count) / m
     axis = found[:, :3].transpose(2, 0, 1).reshape(n, links, count, 3)
-    return Axes(axis, misfit)
+    return Axes(np.asarray(axis), misfit)

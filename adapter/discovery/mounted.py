@@ -16,7 +16,6 @@ from adapter.discovery.axes import Axes, axes_of
 from adapter.discovery.bodies import LEVER_M, Bodies
 from adapter.discovery.hypotheses import (
     LOST,
-    Fits,
     Hypotheses,
     Option,
     Ruler,
@@ -117,7 +116,6 @@ def _add_mounted(
     found: list[list[Option]], ruler: Ruler, pairs: _Pairs, fits: dict[Pair, Mounted]
 ) -> None:
     """Options of both ends of each pair; with its bound where it was not fitted."""
-    bodies = ruler.bodies
     worst = ruler.free_score() - LOST
     bound = ruler.total(pairs.ratio)
     for s, j, i in zip(*np.nonzero(bound >= worst), strict=True):

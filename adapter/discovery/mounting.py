@@ -122,7 +122,7 @@ class _Problem:
         self._own = {k: bodies.motion[k][:, link] for k in bodies.motion}
         self._z = {k: bodies.motion[k][:, body] for k in bodies.channels}
         self._weight = {k: 1.0 / max(variance[k], 1e-30) for k in bodies.channels}
-        linear = [k for k in ("v", "a") if k in bodies.channels]
+        linear = [k for k in bodies.channels if k in ("v", "a")]
         self._arm = {k: lever(bodies.motion, k, link) for k in linear}
         self._far = {k: lever(bodies.motion, k, body) for k in linear}
         self._prior = np.repeat([PRIOR_RAD**-2, PRIOR_M**-2], [5, 6])

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from adapter.discovery.arborescence import Search, Structure
 from adapter.discovery.bodies import NO_JOINT, Bodies, bodies_of
+from adapter.discovery.channels import listed
 from adapter.discovery.doubts import Verdicts, doubts_of
 from adapter.discovery.hypotheses import (
     FREE,
@@ -21,6 +24,7 @@ from adapter.discovery.mounted import mounted_hypotheses
 from adapter.discovery.mounting import Mounting
 from adapter.discovery.recorded import CUTOFF_HZ, Recorded, prepare
 from adapter.discovery.roots import central, component, floating_roots, rootings
+from adapter.discovery.start import with_start
 from adapter.errors import ModelError
 from drivers.mcap_file import Log
 
@@ -93,8 +97,10 @@ class Discovery:
         """What was done to the data and what they were taken for, one sentence each."""
         if not self.mountings:
             return self.recorded.notes
+        names = self.recorded.link_names
+        found = listed(names, np.array([name in self.mountings for name in names]))
         note = (
-            f"frames of links {', '.join(self.mountings)} do not turn about their z with the "
+            f"frames of links {found} do not turn about their z with the "
             "origin on the axis: the axes were found, and λ is that of frames on them"
         )
         return (*self.recorded.notes, note)
@@ -144,7 +150,7 @@ def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) ->
             f"choose from {', '.join(log.link_names)}"
         )
     number = None if base is None else log.link_names.index(base)
-    bodies = bodies_of(prepare(log, cutoff_hz), number)
+    bodies = bodies_of(with_start(prepare(log, cutoff_hz), number), number)
     if bodies.resting.all():
         raise ModelError(
             f"{log.path}: no joint moves ({', '.join(log.joint_names)}); nothing can be told"

@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from adapter.model import SelfModel
 from tests.discovery_data import Case, Motion, anyhow, atlas, panda, record
 
 TRUSTED = 0.9  # no wrong edge may have more confidence than that
-ROBOTS: dict[str, Callable[[], SelfModel]] = {"panda": panda, "atlas": atlas}
+ROBOTS: dict[str, Callable[[], SelfModel]] = {"panda": cache(panda), "atlas": cache(atlas)}
 
 
 @dataclass(frozen=True)
@@ -192,17 +193,22 @@ def main() -> None:
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     console, rows = Console(width=150), []
+    kinds = [
+        kind
+        for kind in (*USUAL, *(HARD if asked.hard else ()))
+        if not asked.kind or any(part in kind.name for part in asked.kind)
+    ]
     for robot in asked.robot or ("panda", "atlas"):
-        for kind in (*USUAL, *(HARD if asked.hard else ())):
-            if asked.kind and not any(part in kind.name for part in asked.kind):
-                continue
-            for seed in range(asked.first, asked.first + asked.trials):
-                rows.append(trial(robot, kind, seed, asked.rate))
-            _print(console, summary(rows)[-1:])
-    table = summary(rows)
-    _print(console, table)
-    if asked.json:
-        asked.json.write_text(json.dumps({"summary": table, "rows": rows}, indent=1) + "\n")
+        for seed in range(asked.first, asked.first + asked.trials):  # kinds share their motions
+            rows += [trial(robot, kind, seed, asked.rate) for kind in kinds]
+            console.print(f"{robot}: seed {seed}", end="\r")
+            if asked.json:
+                _write(asked.json, rows)
+    _print(console, summary(rows))
+
+
+def _write(path: Path, rows: list[dict[str, Any]]) -> None:
+    path.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
