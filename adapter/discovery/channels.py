@@ -82,8 +82,9 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
     if mute.any():
         whole = ", ".join(k for k in CHANNELS if k in lacking and not lacking[k].any())
         raise SettingsError(
-            f"{log.path}: has neither angular velocity nor angular acceleration of every link "
-            f"({listed(log.link_names, mute)}); has: {whole or 'nothing'} of {', '.join(log.link_names)}"
+            f"{log.path}: has neither angular velocity nor angular acceleration of every link; of "
+            f"all links it has: {whole or 'nothing'}; links with neither: "
+            f"{listed(log.link_names, mute)}"
         )
     for name in ("v", "a"):
         if name in heard and lacking[name].any():
@@ -94,9 +95,9 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
     if not {"w", "dw"} & set(measured):
         measured = ("dw", *measured)
         notes.append(
-            f"angular velocity is not recorded of links {listed(log.link_names, lacking['w'])}, angular "
-            f"acceleration not of {listed(log.link_names, lacking['dw'])}: links are compared by the latter, "
-            "from measured velocity where need be"
+            f"of links {listed(log.link_names, lacking['w'])} no angular velocity is recorded, of "
+            f"{listed(log.link_names, lacking['dw'])} no angular acceleration: links are compared "
+            "by the latter, differentiated where need be"
         )
     if not {"v", "a"} & set(measured):
         notes.append(

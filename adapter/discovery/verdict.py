@@ -156,18 +156,13 @@ def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) ->
             f"{log.path}: no joint moves ({', '.join(log.joint_names)}); nothing can be told"
         )
     misfit = convention_misfit(bodies)
-    structure = None
+    structure: Structure | None = None
     if keeps_convention(bodies, misfit):
         hypotheses = hypotheses_of(bodies, misfit)
         structure = Search(hypotheses.options, len(log.joint_names)).best()
     if structure is None or _unexplained(hypotheses, structure):
         hypotheses = mounted_hypotheses(bodies, misfit)
         structure = Search(hypotheses.options, len(log.joint_names)).best()
-    if structure is None:
-        raise ModelError(
-            f"{log.path}: so much is undecided that no tree stands out; record more motion, of "
-            "every joint and not all alike"
-        )
     return _discovery(hypotheses, structure)
 
 
