@@ -8,6 +8,7 @@ forbidden, and the best bound is looked at first, so the first solution without 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import count
 
@@ -24,6 +25,7 @@ MOST_RIVAL_SPLITS = 30  # of the search for a rival, which else counts with its 
 MOST_RIVALS = 30  # options of one link that are tried one by one
 
 Key = tuple[int, int, int]
+Ranked = list[tuple[Option, float]]
 
 
 @dataclass(frozen=True)
@@ -32,23 +34,6 @@ class Structure:
 
     chosen: tuple[Option, ...]
     score: float
-
-
-@dataclass(frozen=True)
-class Belief:
-    """Probabilities of one link's options.
-
-    Attributes:
-        ranked: options and probabilities, most likely first, without those below.
-        reversed: probability that the chosen joint connects the same links the other way round.
-    """
-
-    ranked: tuple[tuple[Option, float], ...]
-    reversed: float
-
-    def of(self, option: Option) -> float:
-        """Probability of an option."""
-        return dict(self.ranked)[option]
 
 
 def key_of(option: Option) -> Key:
@@ -165,39 +150,32 @@ class Search:
                 taken.add(option.joint)
         return Structure(tuple(chosen), sum(option.score for option in chosen))
 
-    def posterior(self, structure: Structure) -> list[Belief]:
-        """What is believed of every link.
+    def posterior(self, structure: Structure, roots: Collection[int] = ()) -> list[Ranked]:
+        """For every link its options and their probabilities, most likely first.
 
         The probability of an option is that of the best structure with it, over the sum of the
-        same of all options.
+        same of all options. `roots` are taken for certain.
         """
-        tops = np.array([options[0].score for options in self._options])
+        given = tuple(
+            (self._free(link),) if link in roots else own for link, own in enumerate(self._options)
+        )
+        search = Search(given, self._joints)
+        tops = np.array([options[0].score for options in given])
         out = []
-        for link, options in enumerate(self._options):
+        for link, options in enumerate(given):
             others = tops.sum() - tops[link]
             own = structure.chosen[link]
-            found: dict[Option, tuple[float, bool]] = {own: (structure.score, False)}
+            scores = {own: structure.score}
             near = [o for o in options if others + o.score >= structure.score - LOST]
             for option in near[:MOST_RIVALS]:
                 if option != own:
-                    rival, score = self._search(option, MOST_RIVAL_SPLITS)
-                    found[option] = score, rival is not None and reversed_in(own, rival)
-            top = max(score for score, _ in found.values())
-            weight = {o: float(np.exp(score - top)) for o, (score, _) in found.items()}
-            total = sum(weight.values())
-            ranked = sorted(weight.items(), key=lambda item: (-item[1], item[0] != own))
-            back = sum(weight[o] for o, (_, turned) in found.items() if turned) / total
-            kept = tuple((o, w / total) for o, w in ranked if not found[o][1])
-            out.append(Belief(kept, back))
+                    _, scores[option] = search._search(option, MOST_RIVAL_SPLITS)
+            top = max(scores.values())
+            weights = {o: float(np.exp(s - top)) for o, s in scores.items()}
+            total = sum(weights.values())
+            ranked = sorted(weights.items(), key=lambda item: (-item[1], item[0] != own))
+            out.append([(o, w / total) for o, w in ranked])
         return out
-
-
-def reversed_in(own: Option, other: Structure) -> bool:
-    """Whether a structure has the same joint between the same links, the other way round."""
-    if not 0 <= own.parent < len(other.chosen) or own.joint == NO_JOINT:
-        return False
-    there = other.chosen[own.parent]
-    return there.joint == own.joint and there.parent == own.link
 
 
 def cycle(chosen: tuple[Option, ...]) -> list[Option]:

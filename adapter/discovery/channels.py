@@ -108,7 +108,8 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
 
 
 def listed(names: tuple[str, ...], which: np.ndarray) -> str:
-    """Names of some links, or "all" and their number."""
-    if which.all():
-        return f"(all {len(names)})"
+    """Names of some links; where most are meant, of those that are not."""
+    rest = [name for name, there in zip(names, which, strict=True) if not there]
+    if len(rest) <= 2 < len(names) - len(rest):
+        return f"(all {len(names)}{''.join(f', not {name}' for name in rest)})"
     return ", ".join(name for name, there in zip(names, which, strict=True) if there)

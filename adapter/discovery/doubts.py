@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.discovery.arborescence import Belief, Structure
+from adapter.discovery.arborescence import Ranked, Structure
 from adapter.discovery.bodies import NO_JOINT, Bodies
 from adapter.discovery.hypotheses import FREE, Option
 
@@ -33,7 +33,7 @@ class Verdicts:
 
 
 def doubts_of(
-    bodies: Bodies, structure: Structure, beliefs: Sequence[Belief], verdicts: Verdicts
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
 ) -> list[str]:
     """All that is undecided, one sentence each."""
     return [
@@ -41,7 +41,7 @@ def doubts_of(
         *_idle(bodies, structure),
         *_roots(bodies, structure, verdicts.names),
         *_either_way(verdicts),
-        *_undecided(bodies, structure, beliefs, verdicts),
+        *_undecided(bodies, structure, posterior, verdicts),
     ]
 
 
@@ -100,11 +100,10 @@ def _either_way(verdicts: Verdicts) -> Iterator[str]:
 
 
 def _undecided(
-    bodies: Bodies, structure: Structure, beliefs: Sequence[Belief], verdicts: Verdicts
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
 ) -> Iterator[str]:
     joints, names = bodies.recorded.joint_names, verdicts.names
-    for own, belief, sure in zip(structure.chosen, beliefs, verdicts.confidence, strict=True):
-        ranked = belief.ranked
+    for own, ranked, sure in zip(structure.chosen, posterior, verdicts.confidence, strict=True):
         if sure >= verdicts.decided or own.link in verdicts.roots:
             continue
         told = [(o, p) for o, p in ranked if p >= TOLD or o == own][:MOST_TOLD]

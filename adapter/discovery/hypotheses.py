@@ -211,7 +211,8 @@ class Ruler:
     def learn_excess(self, ratios: dict[str, Array]) -> None:
         """Take for noise what the best explanations of most links leave over alike.
 
-        Such a misfit is no white noise, so each sample counts the less, the larger it is.
+        Such a misfit (of late sensors, say) is no white noise, so each sample, of all channels,
+        counts the less, the larger it is.
         """
         for k, x in ratios.items():
             self.excess[k] = max(1.0, float(np.median(x[np.isfinite(x)])))
@@ -219,7 +220,7 @@ class Ruler:
     def score(self, channel: str, ratio: Array) -> Array:
         """Log likelihood (...) of ratios (...) of misfit to expected variance."""
         beyond = np.maximum(ratio / (self.excess[channel] * self.tolerance), 1.0)
-        return np.asarray(-0.5 * self._worth(channel) * np.log(beyond))
+        return np.asarray(-0.5 * self._worth() * np.log(beyond))
 
     def total(self, ratios: Mapping[str, Array | float]) -> Array:
         """Log likelihood (...) of all channels together."""
@@ -228,7 +229,8 @@ class Ruler:
     def free_score(self) -> float:
         """What a link costs that nothing carries."""
         beyond = np.log(max(FREE_RATIO / self.tolerance, 1.5))
-        return -0.5 * float(sum(self._worth(k) for k in self.excess) * beyond)
+        return -0.5 * float(len(self.excess) * self._worth() * beyond)
 
-    def _worth(self, channel: str) -> float:
-        return self._samples / self.excess[channel]
+    def _worth(self) -> float:
+        """Independent samples of a channel; what is no noise in one reaches into the others."""
+        return self._samples / max(self.excess.values())

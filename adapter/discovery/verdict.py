@@ -188,16 +188,13 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         structure = central(search, bodies, structure)
         for root in floating_roots(bodies, structure):
             shares[root] = rootings(search, structure, root)
-    either_way = {link for root in shares for link in component(structure, root)}
-    beliefs = search.posterior(structure)
+    posterior = search.posterior(structure, shares)
     names = body_names(bodies)
     edges, confidence = [], []
     roots: dict[str, float] = {}
-    for option, belief in zip(structure.chosen, beliefs, strict=True):
-        share = belief.of(option)
-        open_end = option.link in either_way and share < DECIDED * (share + belief.reversed)
-        if open_end:
-            share += belief.reversed
+    for option, ranked in zip(structure.chosen, posterior, strict=True):
+        way = _direction(structure, shares, option.link)
+        share = dict(ranked)[option] * (way if way >= DECIDED else 1.0)
         if option.link in shares:
             share = roots[names[option.link]] = shares[option.link][option.link]
         elif option.parent == FREE:
@@ -205,9 +202,9 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         elif option.parent == bodies.unseen_base:
             roots[names[option.parent]] = max(share, roots.get(names[option.parent], 0.0))
         confidence.append(share)
-        others = [(o, p) for o, p in belief.ranked if o != option and p >= WORTH_TELLING]
+        others = [(o, p) for o, p in ranked if o != option and p >= WORTH_TELLING]
         rival = _edge(bodies, *others[0]) if others else None
-        edges.append(replace(_edge(bodies, option, share, rival), directed=not open_end))
+        edges.append(replace(_edge(bodies, option, share, rival), directed=way >= DECIDED))
     order = {name: k for k, name in enumerate(bodies.recorded.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
@@ -217,12 +214,27 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         root_confidence=next(iter(roots.values())) if single else 0.0,
         edges=kept,
         undecided=tuple(
-            doubts_of(bodies, structure, beliefs, Verdicts(names, confidence, shares, DECIDED))
+            doubts_of(bodies, structure, posterior, Verdicts(names, confidence, shares, DECIDED))
         ),
         bodies=bodies,
         structure=structure,
         hypotheses=hypotheses,
     )
+
+
+def _direction(structure: Structure, shares: dict[int, dict[int, float]], link: int) -> float:
+    """Probability that a link is carried by its parent, not the other way round.
+
+    The likeliest root that does not hang on the link is held against the likeliest that does: the
+    number of links on either side of a joint says nothing.
+    """
+    below = set(component(structure, link))
+    for root, share in shares.items():
+        if link != root and link in share:
+            inside = max(share[k] for k in below)
+            outside = max(p for k, p in share.items() if k not in below)
+            return outside / (inside + outside)
+    return 1.0
 
 
 def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = None) -> Edge:

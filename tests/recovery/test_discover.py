@@ -231,7 +231,10 @@ def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         (lambda log: {"twists": None, "accels": None, "link_names": ()}, "has no motion of links"),
-        (lambda log: {"twists": np.full_like(log.twists, np.nan), "accels": None}, "it has: nothing"),
+        (
+            lambda log: {"twists": np.full_like(log.twists, np.nan), "accels": None},
+            "it has: nothing",
+        ),
         (lambda log: {"twists": None, "accels": _no_turning(log.accels)}, "neither angular"),
         (lambda log: {"stamp_ns": log.stamp_ns // 1000}, "lasts 0.00 s"),
         (lambda log: {"q": np.full_like(log.q, np.nan)}, "at the same time"),
