@@ -22,6 +22,7 @@ FREE = -1  # parent of a link that nothing in the recording carries
 ALLOWANCE = 1.3  # misfit over expected variance that noise levels known so roughly may show ...
 DEVIATIONS = 4.0  # ... and so many standard deviations of a mean square of the noise
 FREE_RATIO = 4.0  # a link goes free where all explain it worse than by so many noise variances
+FREE_PRIOR = -5.0  # log odds of a link whose carrier is not in the recording
 RIGID_PRIOR = -5.0  # log odds of a link without a joint of its own
 MOST_FITTED = 48  # hypotheses of a link whose frame is fitted; with more of them nothing is decided
 MOST_KEPT = 200  # options of a link
@@ -229,7 +230,7 @@ class Ruler:
     def free_score(self) -> float:
         """What a link costs that nothing carries."""
         beyond = np.log(max(FREE_RATIO / self.tolerance, 1.5))
-        return -0.5 * float(len(self.excess) * self._worth() * beyond)
+        return FREE_PRIOR - 0.5 * float(len(self.excess) * self._worth() * beyond)
 
     def _worth(self) -> float:
         """Independent samples of a channel; what is no noise in one reaches into the others."""
