@@ -5,8 +5,10 @@ Names and orders are shuffled; what is true is handed along.
 
 from __future__ import annotations
 
+import copy
 import warnings
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ import pinocchio as pin
 from adapter.errors import ModelWarning
 from adapter.model import SelfModel
 from adapter.robots import documented
-from adapter.spatial import matrix_from_zxz
+from adapter.spatial import exp_rotation, matrix_from_zxz
 from adapter.tree import BASE
 from adapter.urdf import read_urdf
 from drivers.mcap_file import Log
@@ -25,6 +27,7 @@ ATLAS = SHARED / "models" / "atlas_v5.urdf"
 ENCODER_STEP = 2 * np.pi / 2**19  # rad
 GYRO = np.radians(0.007)  # rad/s/√Hz
 ACCELEROMETER = 150e-6 * 9.81  # m/s²/√Hz
+DRAWN_KEPT = 8  # motions kept for other noise, mountings or channels
 DQ_NOISE, V_NOISE, DW_NOISE, TAU_NOISE = 1e-3, 1e-3, 0.05, 0.1  # rad/s, m/s, rad/s², N m
 
 
@@ -48,12 +51,19 @@ class Motion:
 
 @dataclass(frozen=True)
 class Case:
-    """A recording and the truth about it: (joint, link, parent or "base") names, recorded ones."""
+    """A recording and the truth about it: (joint, link, parent or "base") names, recorded ones.
+
+    Attributes:
+        body: body of the robot (0 the base) by recorded link name.
+        mounts: (rotation, place) of each body's sensor in its joint frame.
+    """
 
     log: Log
     edges: frozenset[tuple[str, str, str]]
     root: str
     model: SelfModel
+    body: dict[str, int] = field(default_factory=dict)
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
 
 def panda() -> SelfModel:
@@ -133,6 +143,64 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
     return q, dq, ddq, tau, twists, accels
 
 
+def anyhow(
+    seed: int,
+    bodies: Collection[int],
+    count: int,
+    *,
+    turned: bool = True,
+    shifted: bool = True,
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Mountings (rotation, place in m) of `count` bodies, random for those named, else none."""
+    rng = np.random.default_rng([seed, 29])
+    mounts = []
+    for b in range(count):
+        axis, angle = rng.normal(size=3), rng.uniform(0.5, np.pi)
+        place = rng.uniform(-0.15, 0.15, 3)
+        own_turn = exp_rotation(axis / np.linalg.norm(axis) * angle)
+        mounts.append(
+            (
+                own_turn if turned and b in bodies else np.eye(3),
+                place if shifted and b in bodies else np.zeros(3),
+            )
+        )
+    return tuple(mounts)
+
+
+def _seen(
+    twists: np.ndarray,
+    accels: np.ndarray,
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What sensors mounted so see of motion given in joint frames (m, bodies, 6)."""
+    twists, accels = twists.copy(), accels.copy()
+    for b, (rotation, place) in enumerate(mounts):
+        w, dw = twists[:, b, 3:].copy(), accels[:, b, 3:].copy()
+        v = twists[:, b, :3] + np.cross(w, place)
+        a = accels[:, b, :3] + np.cross(dw, place) + np.cross(w, np.cross(w, place))
+        twists[:, b] = np.concatenate([v @ rotation, w @ rotation], axis=1)
+        accels[:, b] = np.concatenate([a @ rotation, dw @ rotation], axis=1)
+    return twists, accels
+
+
+_DRAWN: dict[tuple[int, Motion, int], tuple[SelfModel, tuple[np.ndarray, ...], np.random.Generator]]
+_DRAWN = {}
+
+
+def _drawn(
+    model: SelfModel, motion: Motion, seed: int
+) -> tuple[tuple[np.ndarray, ...], np.random.Generator]:
+    """The motion of a seed, and its generator as that left it; the latest few are kept."""
+    key = id(model), motion, seed
+    if key not in _DRAWN:
+        while len(_DRAWN) >= DRAWN_KEPT:
+            del _DRAWN[next(iter(_DRAWN))]
+        rng = np.random.default_rng([seed, 17])
+        _DRAWN[key] = model, _moved(model, motion, rng), rng
+    _, moved, rng = _DRAWN[key]
+    return moved, copy.deepcopy(rng)
+
+
 def record(
     model: SelfModel,
     motion: Motion,
@@ -141,6 +209,7 @@ def record(
     noise: float = 1.0,
     base: bool | None = None,
     parts: str = "ta",
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = (),
 ) -> Case:
     """A shuffled recording.
 
@@ -148,9 +217,11 @@ def record(
         noise: times that of real parts.
         base: whether the base's motion is in it; where None, if it floats.
         parts: "t" with twists, "a" with accelerations.
+        mounts: (rotation, place) of the sensor of each body, the base first, in its joint frame.
     """
-    rng = np.random.default_rng([seed, 17])
-    q, dq, _, tau, twists, accels = _moved(model, motion, rng)
+    moved, rng = _drawn(model, motion, seed)
+    q, dq, _, tau, twists, accels = moved
+    twists, accels = _seen(twists, accels, mounts)
     root = np.sqrt(motion.rate_hz / 2)
     q = np.round(q / ENCODER_STEP) * ENCODER_STEP
     dq = dq + noise * DQ_NOISE * rng.normal(size=q.shape)
@@ -182,4 +253,5 @@ def record(
         twists[:, links] if "t" in parts else None,
         accels[:, links] if "a" in parts else None,
     )
-    return Case(log, edges, link_name.get(0, "base"), model)
+    body = {name: b for b, name in link_name.items()}
+    return Case(log, edges, link_name.get(0, "base"), model, body, mounts)

@@ -32,6 +32,12 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--cutoff", type=float, default=CUTOFF_HZ, metavar="HZ", help="of the filter, default 20"
     )
+    parser.add_argument(
+        "--base",
+        metavar="LINK",
+        help="the link that carries all others; needed for a floating base whose links' frames "
+        "do not turn about their z",
+    )
     parser.add_argument("--model", type=Path, metavar="FILE", help="write the self model (.json)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     parser.set_defaults(run=run)
@@ -41,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     log = read_log(args.log)
     warn(log.warnings)
-    found = discover(log, args.cutoff)
-    warn(list(found.recorded.notes))
+    found = discover(log, args.cutoff, args.base)
+    warn(list(found.notes))
     _print_tree(found)
     for sentence in found.undecided:
         console.print(f"[yellow]undecided:[/] {sentence}", soft_wrap=True)
@@ -56,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         figures["lambda"] = _lambda_figures(learned)
         _print_lambda(learned)
+        _print_mountings(found)
         if args.model is not None:
             figures.update(_write_model(args, found, learned))
     write_json(args.json, figures)
@@ -86,7 +93,8 @@ def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
         if edge.parent == parent:
             style = "green" if edge.confidence >= DECIDED else "yellow"
             by = edge.joint if edge.joint is not None else "(no joint)"
-            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(edge.confidence)}[/]"
+            way = "" if edge.directed else " [dim]or the other way round[/]"
+            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(edge.confidence)}[/]{way}"
             _hang(on.add(label), edge.link, edges)
 
 
@@ -104,6 +112,19 @@ def _print_lambda(learned: Learned) -> None:
         turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in _halves(schema.lam[j]))
         spread = " ".join(_worst(part) for part in _halves(_known(learned)[j]))
         table.add_row(name, turn, place, f"{schema.ranks[j]}/6", spread)
+    console.print(table)
+
+
+def _print_mountings(found: Discovery) -> None:
+    """Where sensors that do not turn about their z sit in their joints' frames."""
+    if not found.mountings:
+        return
+    table = Table(box=None, pad_edge=False)
+    for heading in ("sensor of", "axis in its frame", "x y z in the joint's frame, m"):
+        table.add_column(heading, no_wrap=True)
+    for name, mounting in found.mountings.items():
+        rows = (mounting.axis, mounting.as_dict()["position"])
+        table.add_row(name, *(" ".join(f"{x:6.3f}" for x in row) for row in rows))
     console.print(table)
 
 

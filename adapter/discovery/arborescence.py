@@ -8,6 +8,7 @@ forbidden, and the best bound is looked at first, so the first solution without 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import count
 
@@ -19,11 +20,12 @@ from adapter.discovery.hypotheses import FREE, LOST, Option
 from adapter.spatial import Array
 
 NEVER = -1e12  # score of what is not possible
-MOST_SPLITS = 3000  # of the search for the tree; more ambiguity than that is left undecided
+MOST_SPLITS = 2000  # of the search for the tree; more ambiguity than that is left undecided
 MOST_RIVAL_SPLITS = 30  # of the search for a rival, which else counts with its bound
 MOST_RIVALS = 30  # options of one link that are tried one by one
 
 Key = tuple[int, int, int]
+Ranked = list[tuple[Option, float]]
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,37 @@ class Search:
 
     def __init__(self, options: tuple[tuple[Option, ...], ...], joints: int) -> None:
         self._options, self._joints = options, joints
-        self._columns = joints + len(options)  # a column of its own for each link without joint
+        # a column of its own for each link without joint; each cell's options, best first
+        self._scores: Array = np.full((len(options), joints + len(options)), NEVER)
+        self._cells: dict[tuple[int, int], list[Option]] = {}
+        for own in options:
+            for option in sorted(own, key=lambda o: -o.score):
+                cell = self._cells.setdefault(self._cell(option), [])
+                cell.append(option)
+                self._scores[self._cell(option)] = cell[0].score
 
-    def best(self) -> Structure | None:
-        """The best structure; None where the search was given up."""
+    def _cell(self, option: Option) -> tuple[int, int]:
+        column = self._joints + option.link if option.joint == NO_JOINT else option.joint
+        return option.link, column
+
+    def best(self) -> Structure:
+        """The best structure; where the search was given up one of many that are about as good.
+
+        The latter shows in the posterior, as other options count with bounds on their score.
+        """
         structure, _ = self._search(None, MOST_SPLITS)
-        return structure
+        return structure or self._greedy()
+
+    def rooted_at(self, link: int) -> Structure | None:
+        """The best structure in which nothing carries a link."""
+        return self._search(self._free(link), MOST_RIVAL_SPLITS)[0]
+
+    def score_of_root(self, link: int) -> float:
+        """The score of that structure, or a bound on it."""
+        return self._search(self._free(link), MOST_RIVAL_SPLITS)[1]
+
+    def _free(self, link: int) -> Option:
+        return next(o for o in self._options[link] if o.parent == FREE)
 
     def _search(self, given: Option | None, splits: int) -> tuple[Structure | None, float]:
         """The best structure with one option given, and its score; or None and a bound on it."""
@@ -85,40 +112,64 @@ class Search:
         return None, -heap[0][0] if heap else NEVER
 
     def _assign(self, forbidden: frozenset[Key], given: Option | None) -> Structure | None:
-        scores: Array = np.full((len(self._options), self._columns), NEVER)
-        best: dict[tuple[int, int], Option] = {}
-        for link, options in enumerate(self._options):
-            allowed = (given,) if given is not None and given.link == link else options
-            for option in allowed:
-                if key_of(option) in forbidden:
-                    continue
-                column = self._joints + link if option.joint == NO_JOINT else option.joint
-                if option.score > scores[link, column]:
-                    scores[link, column] = option.score
-                    best[link, column] = option
+        scores = self._scores.copy()
+        changed: dict[tuple[int, int], Option] = {}
+        for link, joint, _ in forbidden:
+            cell = link, self._joints + link if joint == NO_JOINT else joint
+            left = (o for o in self._cells[cell] if key_of(o) not in forbidden)
+            option = next(left, None)
+            scores[cell] = NEVER if option is None else option.score
+            if option is not None:
+                changed[cell] = option
+        if given is not None:
+            cell = self._cell(given)
+            scores[given.link] = NEVER
+            scores[cell], changed[cell] = given.score, given
         rows, columns = linear_sum_assignment(scores, maximize=True)
         total = float(scores[rows, columns].sum())
         if total <= NEVER / 2:
             return None
-        pairs = zip(rows.tolist(), columns.tolist(), strict=True)
-        return Structure(tuple(best[pair] for pair in pairs), total)
+        pairs = list(zip(rows.tolist(), columns.tolist(), strict=True))
+        return Structure(tuple(changed.get(at) or self._cells[at][0] for at in pairs), total)
 
-    def posterior(self, structure: Structure) -> list[list[tuple[Option, float]]]:
+    def _greedy(self) -> Structure:
+        """A tree from the best options on; what is left is free."""
+        chosen = [self._free(link) for link in range(len(self._options))]
+        taken: set[int] = set()
+        every = sorted((o for own in self._options for o in own), key=lambda o: -o.score)
+        for option in every:
+            if chosen[option.link].parent != FREE or option.parent == FREE:
+                continue
+            if option.joint in taken or option.score <= chosen[option.link].score:
+                continue
+            before = chosen[option.link]
+            chosen[option.link] = option
+            if cycle(tuple(chosen)):
+                chosen[option.link] = before
+            elif option.joint != NO_JOINT:
+                taken.add(option.joint)
+        return Structure(tuple(chosen), sum(option.score for option in chosen))
+
+    def posterior(self, structure: Structure, roots: Collection[int] = ()) -> list[Ranked]:
         """For every link its options and their probabilities, most likely first.
 
         The probability of an option is that of the best structure with it, over the sum of the
-        same of all options.
+        same of all options. `roots` are taken for certain.
         """
-        tops = np.array([options[0].score for options in self._options])
+        given = tuple(
+            (self._free(link),) if link in roots else own for link, own in enumerate(self._options)
+        )
+        search = Search(given, self._joints)
+        tops = np.array([options[0].score for options in given])
         out = []
-        for link, options in enumerate(self._options):
+        for link, options in enumerate(given):
             others = tops.sum() - tops[link]
             own = structure.chosen[link]
             scores = {own: structure.score}
             near = [o for o in options if others + o.score >= structure.score - LOST]
             for option in near[:MOST_RIVALS]:
                 if option != own:
-                    _, scores[option] = self._search(option, MOST_RIVAL_SPLITS)
+                    _, scores[option] = search._search(option, MOST_RIVAL_SPLITS)
             top = max(scores.values())
             weights = {o: float(np.exp(s - top)) for o, s in scores.items()}
             total = sum(weights.values())

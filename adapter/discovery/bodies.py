@@ -40,6 +40,7 @@ class Bodies:
         floor: for each channel (links,) variance that no misfit of a link looks below.
         at_rest: (links,) bool.
         resting: (joints,) bool, whether a joint's speed shows nothing but noise.
+        base: the link that carries all others, if that was said.
     """
 
     recorded: Recorded
@@ -49,6 +50,7 @@ class Bodies:
     floor: dict[str, Array]
     at_rest: np.ndarray
     resting: np.ndarray
+    base: int | None = None
 
     @property
     def count(self) -> int:
@@ -85,8 +87,8 @@ class Bodies:
         return np.asarray(out)
 
 
-def bodies_of(recorded: Recorded) -> Bodies:
-    """The bodies of a recording; see `Bodies`."""
+def bodies_of(recorded: Recorded, base: int | None = None) -> Bodies:
+    """The bodies of a recording; `base` is the link that is known to carry all others."""
     motion = {k: x.copy() for k, x in recorded.motion.items()}
     noise = {k: x.copy() for k, x in recorded.noise.items()}
     size = {k: np.mean(x**2, axis=(0, 2)) for k, x in motion.items()}
@@ -99,7 +101,7 @@ def bodies_of(recorded: Recorded) -> Bodies:
     for k, x in motion.items():
         x[:, at_rest] = x[:, at_rest].mean(axis=0) if k == "a" else 0.0
         noise[k][at_rest] = 0.0
-    if links <= len(recorded.joint_names) or not at_rest.any():
+    if base is None and (links <= len(recorded.joint_names) or not at_rest.any()):
         for k, x in motion.items():
             still = np.zeros((len(x), 1, 3))
             if k == "a":
@@ -108,7 +110,7 @@ def bodies_of(recorded: Recorded) -> Bodies:
             noise[k] = np.append(noise[k], 0.0)
     speed = np.mean(recorded.dq**2, axis=0)
     resting = speed < REST_RATIO * recorded.joint_noise["dq"] + ABSOLUTE_FLOOR["w"] ** 2
-    return Bodies(recorded, links, motion, noise, floor, at_rest, resting)
+    return Bodies(recorded, links, motion, noise, floor, at_rest, resting, base)
 
 
 def turned(q: Array, x: Array) -> Array:
@@ -135,9 +137,9 @@ def across(bodies: Bodies, channel: str, link: int, joints: np.ndarray) -> Array
     return turned(q, x)
 
 
-def lever(bodies: Bodies, channel: str, body: int) -> Array:
-    """(m, 3, 3): what p is multiplied with in z of v ([w ×]) and a ([dw ×] + [w ×][w ×])."""
-    turn = skew(bodies.motion["w"][:, body])
+def lever(motion: dict[str, Array], channel: str, body: int) -> Array:
+    """(m, 3, 3): what a place is multiplied with in v ([w ×]) and a ([dw ×] + [w ×][w ×])."""
+    turn = skew(motion["w"][:, body])
     if channel == "v":
         return turn
-    return np.asarray(skew(bodies.motion["dw"][:, body]) + turn @ turn)
+    return np.asarray(skew(motion["dw"][:, body]) + turn @ turn)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.discovery.arborescence import Structure
+from adapter.discovery.arborescence import Ranked, Structure
 from adapter.discovery.bodies import NO_JOINT, Bodies
 from adapter.discovery.hypotheses import FREE, Option
 
@@ -14,22 +15,33 @@ ALIKE = 0.9999  # correlation of two joints' speeds above which they count as mo
 TOLD = 0.05  # probability from which an alternative is told
 MOST_TOLD = 4  # alternatives in one sentence
 
-Ranked = list[tuple[Option, float]]
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What was made of the beliefs.
+
+    Attributes:
+        names: of bodies; confidence: by link, of what was chosen.
+        roots: where a root is any link that moves, by it: which others it may be, how probably.
+        decided: confidence from which something counts as decided.
+    """
+
+    names: Sequence[str]
+    confidence: Sequence[float]
+    roots: Mapping[int, Mapping[int, float]]
+    decided: float
 
 
 def doubts_of(
-    bodies: Bodies,
-    structure: Structure,
-    posterior: Sequence[Ranked],
-    names: Sequence[str],
-    decided: float,
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
 ) -> list[str]:
     """All that is undecided, one sentence each."""
     return [
         *_resting(bodies),
         *_idle(bodies, structure),
-        *_roots(bodies, structure, names),
-        *_undecided(bodies, structure, posterior, names, decided),
+        *_roots(bodies, structure, verdicts.names),
+        *_either_way(verdicts),
+        *_undecided(bodies, structure, posterior, verdicts),
     ]
 
 
@@ -62,7 +74,7 @@ def _roots(bodies: Bodies, structure: Structure, names: Sequence[str]) -> Iterat
         yield (
             f"no joint and no other link in the recording make {', '.join(free)} move as they do; "
             "a base may be one of them. The links that carry them are not in the recording, their "
-            "sensors are late or turned, or their z is not their joint's axis"
+            "sensors are late or loose"
         )
     for option in structure.chosen:
         if option.joint == NO_JOINT and option.parent != FREE:
@@ -72,16 +84,27 @@ def _roots(bodies: Bodies, structure: Structure, names: Sequence[str]) -> Iterat
             )
 
 
+def _either_way(verdicts: Verdicts) -> Iterator[str]:
+    names = verdicts.names
+    for root, shares in verdicts.roots.items():
+        if shares[root] >= verdicts.decided:
+            continue
+        likely = sorted(shares.items(), key=lambda item: (-item[1], item[0] != root))
+        told = " or ".join(f"{names[k]} ({p:.2f})" for k, p in likely[:MOST_TOLD] if p >= TOLD)
+        told = told or f"any of {len(shares)} links, each as well"
+        yield (
+            f"which link is the base: {told}; with sensors mounted anyhow a joint looks the same "
+            f"from either side, so only what it connects is told; {names[root]} is taken: name "
+            "the base (--base)"
+        )
+
+
 def _undecided(
-    bodies: Bodies,
-    structure: Structure,
-    posterior: Sequence[Ranked],
-    names: Sequence[str],
-    decided: float,
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
 ) -> Iterator[str]:
-    joints = bodies.recorded.joint_names
-    for own, ranked in zip(structure.chosen, posterior, strict=True):
-        if dict(ranked)[own] >= decided:
+    joints, names = bodies.recorded.joint_names, verdicts.names
+    for own, ranked, sure in zip(structure.chosen, posterior, verdicts.confidence, strict=True):
+        if sure >= verdicts.decided or own.link in verdicts.roots:
             continue
         told = [(o, p) for o, p in ranked if p >= TOLD or o == own][:MOST_TOLD]
         listed = " or ".join(f"{_said(o, joints, names)} ({p:.2f})" for o, p in told)

@@ -13,6 +13,7 @@ import numpy as np
 from adapter.discovery.bodies import NO_JOINT
 from adapter.discovery.hypotheses import Option
 from adapter.discovery.inertias import neutral_theta, theta_of
+from adapter.discovery.mounting import in_joint_frame
 from adapter.discovery.verdict import UNSEEN_BASE, Discovery
 from adapter.errors import ModelError
 from adapter.model import LAMBDA_MEASURED, SelfModel, gravity_down
@@ -62,14 +63,25 @@ def _with_std(schema: SchemaResult, gain: float) -> SchemaResult:
     return replace(schema, std=schema.std * gain)
 
 
+def _in_joint_frames(discovery: Discovery) -> dict[str, Array]:
+    """Motion by channel, links whose axis was found in frames with z on it."""
+    motion = {k: x.copy() for k, x in discovery.bodies.motion.items()}
+    for option in discovery.structure.chosen:
+        if option.mounting is not None:
+            own = in_joint_frame(discovery.bodies.motion, option.link, option.mounting)
+            for k, x in own.items():
+                motion[k][:, option.link] = x
+    return motion
+
+
 def tree_data(discovery: Discovery) -> TreeData:
-    """The recording's filtered samples, in the order of the discovered tree.
+    """The recording's filtered samples, in the order of the discovered tree and its joint frames.
 
     Raises:
         ModelError: the tree has more than one root, or joints that move no link of it.
     """
     order, root = _order(discovery)
-    recorded, motion = discovery.recorded, discovery.bodies.motion
+    recorded, motion = discovery.recorded, _in_joint_frames(discovery)
     number = {option.link: k for k, option in enumerate(order)}
     parent = tuple(number.get(option.parent, BASE) for option in order)
     links = [option.link for option in order]
@@ -160,6 +172,7 @@ def self_model(discovery: Discovery, learned: Learned, name: str) -> tuple[SelfM
             "discovered": {
                 "confidence": {e.link: e.confidence for e in discovery.edges},
                 "undecided": list(discovery.undecided),
+                "mounting": {k: m.as_dict() for k, m in discovery.mountings.items()},
                 "theta": "learned from joint torques" if left is not None else "not learned",
             }
         },

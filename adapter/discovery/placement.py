@@ -29,13 +29,11 @@ class Placement(NamedTuple):
     Attributes:
         rotation: (3, 3) R0, frame j in the parent's at q = 0; position: (3,) p, m.
         misfit: mean square of one component of y - R0ᵀ z, by channel.
-        information: (6, 6) of [turn; shift] in the parent's axes, noise weighted.
     """
 
     rotation: Array
     position: Array
     misfit: dict[str, float]
-    information: Array
 
 
 def best_rotation(c: Array) -> tuple[Array, Array]:
@@ -116,7 +114,7 @@ def place(
     y = {k: across(bodies, k, link, np.array([joint]))[:, 0] for k in bodies.channels}
     z = {k: bodies.motion[k][:, parent] for k in bodies.channels}
     arms: dict[str, Array] = {
-        k: lever(bodies, k, parent) for k in ("v", "a") if k in bodies.channels
+        k: lever(bodies.motion, k, parent) for k in ("v", "a") if k in bodies.channels
     }
     problem = _Problem(y, z, arms, {k: 1.0 / max(variance[k], 1e-30) for k in y})
     fits = [problem.descend(start) for start in _starts(problem)]
@@ -168,10 +166,7 @@ class _Problem:
             (x, p), (cost, gradient, curvature, misfit) = near, found
             if gained < SETTLED:
                 break
-        into_parent = np.zeros((6, 6))
-        into_parent[:3, :3], into_parent[3:, 3:] = -x, np.eye(3)
-        information = into_parent.T @ curvature @ into_parent
-        return Placement(x.T, p, misfit, information)
+        return Placement(x.T, p, misfit)
 
     def _best_position(self, x: Array) -> Array:
         h, g = self._prior[3:, 3:].copy(), np.zeros(3)

@@ -10,17 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapter.discovery.channels import CHANNELS, STILL, Channels, channels_of, check, listed
 from adapter.discovery.zero_phase import KEPT_PER_CUTOFF, ZeroPhase
 from adapter.errors import SettingsError
 from adapter.filters import noise_from_samples
 from adapter.spatial import Array
 from drivers.mcap_file import Log
 
-CHANNELS = ("w", "dw", "v", "a")  # of link motion; the angular ones first
 CUTOFF_HZ = 20.0  # motion of arms and legs lies below
 SHORTEST_S = 0.5  # less motion than this decides nothing
 GAP_S = 0.05  # a longer silence of a sensor is not bridged
-STILL = 1e-9  # a channel that never exceeds this was not measured but filled in
 RESTING = 0.02  # rad/s, a joint slower than this counts as resting
 ENCODER_STEP = 2.0 * np.pi / 2**14  # rad, coarser than any encoder at a joint of today
 
@@ -42,6 +41,7 @@ class Recorded:
         rate_hz: of the recording; `samples` used of it; `duration_s` its length.
         cutoff_hz: corner of the filter.
         notes: what was done to the data, one sentence each.
+        adrift: (links,) bool, links whose w was added up from an unknown start.
     """
 
     joint_names: tuple[str, ...]
@@ -60,6 +60,7 @@ class Recorded:
     duration_s: float
     cutoff_hz: float
     notes: tuple[str, ...]
+    adrift: np.ndarray
 
     @property
     def motion_samples(self) -> float:
@@ -73,8 +74,12 @@ class Recorded:
 
 
 _ASSUMED_REST = (
-    "no angular velocity of links is recorded; it is added up from their angular acceleration, "
-    "all links taken to be at rest at the start"
+    "no angular velocity of links {names} is recorded; it is added up from their angular "
+    "acceleration, all links taken to be at rest at the start"
+)
+_FOUND_START = (
+    "no angular velocity of links {names} is recorded; it is added up from their angular "
+    "acceleration, and what it was at the start is found from the joints' speeds"
 )
 
 
@@ -89,14 +94,17 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> Recorded:
         SettingsError: no link motion, no angular motion, too short, too many gaps; the sentence
             says what the recording does have.
     """
-    _check(log, cutoff_hz)
+    if not 0.0 < cutoff_hz < np.inf:
+        raise SettingsError(f"the filter's corner must be above zero and finite, got {cutoff_hz}")
+    check(log, SHORTEST_S)
     t_s, first = _times(log)
-    measured, notes = _measured(log, first)
+    heard_of = channels_of(log, first)
+    measured = heard_of.values
     grid, rate_hz = _grid(t_s)
     heard = np.ones(len(grid), dtype=bool)
     joints: dict[str, Array] = {}
-    for name in ("q", "dq"):
-        joints[name] = _onto(grid, t_s, getattr(log, name)[first], heard)
+    for name, values in (("q", _unwrapped(log.q[first])), ("dq", log.dq[first])):
+        joints[name] = _onto(grid, t_s, values, heard)
     motion = {
         channel: np.stack(
             [_onto(grid, t_s, values[:, k], heard) for k in range(values.shape[1])], axis=1
@@ -108,29 +116,7 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> Recorded:
     tau = _onto(grid, t_s, torque, heard.copy()) if np.isfinite(torque).any(axis=0).all() else None
     through = ZeroPhase(rate_hz, cutoff_hz)
     levels = {k: _noise(x) * through.passes for k, x in measured.items()}
-    return _filtered(log, through, grid, heard, joints, tau, motion, levels, notes)
-
-
-def _check(log: Log, cutoff_hz: float) -> None:
-    if not 0.0 < cutoff_hz < np.inf:
-        raise SettingsError(f"the filter's corner must be above zero and finite, got {cutoff_hz}")
-    links = ", ".join(log.link_names) or "none"
-    if not log.link_names or (log.twists is None and log.accels is None):
-        raise SettingsError(
-            f"{log.path}: has no motion of links (topics /link_twists/<link> or "
-            f"/link_accels/<link>), of links: {links}; it needs that of every link, measured in "
-            "the link's own frame"
-        )
-    if len(log.link_names) < 2 and len(log.joint_names) > 1:
-        raise SettingsError(
-            f"{log.path}: has the motion of one link only ({links}) beside "
-            f"{len(log.joint_names)} joints; nothing can be compared"
-        )
-    span_s = 1e-9 * float(np.ptp(log.stamp_ns)) if len(log) else 0.0
-    if span_s < SHORTEST_S:
-        raise SettingsError(
-            f"{log.path}: lasts {span_s:.2f} s; discovery needs at least {SHORTEST_S} s of motion"
-        )
+    return _filtered(log, through, grid, heard, joints, tau, motion, levels, heard_of)
 
 
 def _times(log: Log) -> tuple[Array, np.ndarray]:
@@ -139,27 +125,13 @@ def _times(log: Log) -> tuple[Array, np.ndarray]:
     return 1e-9 * (stamps - stamps[0]).astype(np.float64), first
 
 
-def _measured(log: Log, rows: np.ndarray) -> tuple[dict[str, Array], list[str]]:
-    """The channels that hold anything, (k, links, 3) each."""
-    found: dict[str, Array] = {}
-    for table, names in ((log.twists, ("v", "w")), (log.accels, ("a", "dw"))):
-        if table is None:
-            continue
-        for k, name in enumerate(names):
-            part = table[rows][:, :, 3 * k : 3 * k + 3]
-            size = np.nanmax(np.abs(part), initial=0.0, where=np.isfinite(part), axis=(0, 2))
-            if (size > STILL).any() and np.isfinite(part).any(axis=(0, 2)).all():
-                found[name] = part
-    notes = []
-    missing = [name for name in CHANNELS if name not in found]
-    if "w" in missing and "dw" in missing:
-        raise SettingsError(
-            f"{log.path}: has neither angular velocity nor angular acceleration of every link; "
-            f"has: {', '.join(found) or 'nothing'} of {', '.join(log.link_names)}"
-        )
-    if "w" in missing:
-        notes.append(_ASSUMED_REST)
-    return found, notes
+def _unwrapped(q: Array) -> Array:
+    """q (k, n) without the jumps of whole turns, which no filter would survive."""
+    out = q.copy()
+    for column in out.T:
+        heard = np.isfinite(column)
+        column[heard] = np.unwrap(column[heard])
+    return out
 
 
 def _grid(t_s: Array) -> tuple[Array, float]:
@@ -208,7 +180,7 @@ def _filtered(
     tau: Array | None,
     motion: dict[str, Array],
     noise: dict[str, Array],
-    notes: list[str],
+    channels: Channels,
 ) -> Recorded:
     joint_noise = {k: noise_from_samples(x) ** 2 * through.passes for k, x in joints.items()}
     joint_noise["ddq"] = joint_noise["dq"] / through.passes * through.rate_passes
@@ -216,13 +188,10 @@ def _filtered(
     smooth = {k: through(x) for k, x in motion.items()}
     q, dq = through(joints["q"]), through(joints["dq"])
     ddq = through.rate_of(dq)
-    if "dw" not in smooth:
-        smooth["dw"] = through.rate_of(smooth["w"])
-        noise["dw"] = noise["w"] / through.passes * through.rate_passes
-    if "w" not in smooth:
-        _check_start(log, dq[: 2 * through.edge])
-        smooth["w"] = np.cumsum(smooth["dw"], axis=0) / through.rate_hz
-        noise["w"] = noise["dw"] / through.passes * len(grid) / through.rate_hz**2
+    turning = _Turning(through, len(grid), channels)
+    turning.complete(smooth, noise)
+    moving = float(np.abs(dq[: 2 * through.edge]).max()) > RESTING
+    adrift = turning.lacking["w"] & moving
     keep = np.zeros(len(grid), dtype=bool)
     keep[through.edge : len(grid) - through.edge : through.step] = True
     keep &= heard
@@ -242,7 +211,7 @@ def _filtered(
         ddq=ddq[keep],
         tau=None if tau is None else through(tau)[keep],
         motion={k: smooth[k][keep] for k in CHANNELS if k in smooth},
-        measured=tuple(k for k in CHANNELS if k in motion),
+        measured=channels.measured,
         noise=noise,
         joint_noise=joint_noise,
         motion_hz=float(np.clip(change / max(2 * np.pi * speed, STILL), 0.05, through.cutoff_hz)),
@@ -250,19 +219,45 @@ def _filtered(
         samples=int(keep.sum()),
         duration_s=float(keep.sum() * through.step / through.rate_hz),
         cutoff_hz=through.cutoff_hz,
-        notes=tuple(notes),
+        notes=(*channels.notes, *turning.notes(log.link_names, moving)),
+        adrift=adrift,
     )
 
 
-def _check_start(log: Log, dq: Array) -> None:
-    fastest = float(np.abs(dq).max())
-    if fastest > RESTING:
-        name = log.joint_names[int(np.abs(dq).max(axis=0).argmax())]
-        raise SettingsError(
-            f"{log.path}: has no angular velocity of links (/link_twists), and it can be added up "
-            f"from angular acceleration only from rest; joint {name} starts at "
-            f"{fastest:.2g} rad/s (at most {RESTING})"
+class _Turning:
+    """Fills in w by dw and dw by w, link by link."""
+
+    def __init__(self, through: ZeroPhase, samples: int, channels: Channels) -> None:
+        self._through, self._samples = through, samples
+        links = next(iter(channels.values.values())).shape[1]
+        every = np.ones(links, dtype=bool)
+        self.lacking = {k: channels.lacking.get(k, every) for k in ("w", "dw")}
+
+    def complete(self, smooth: dict[str, Array], noise: dict[str, Array]) -> None:
+        """Both channels of every link, filtered, and the variances of their noise."""
+        through, lacking = self._through, self.lacking
+        known = smooth["w"] if "w" in smooth else smooth["dw"]
+        for k in ("w", "dw"):
+            smooth.setdefault(k, np.zeros_like(known))
+            noise.setdefault(k, np.zeros(known.shape[1]))
+        drift = self._samples / through.rate_hz**2
+        rate = through.rate_of(smooth["w"][:, lacking["dw"]])
+        smooth["w"][:, lacking["w"]] = (
+            np.cumsum(smooth["dw"][:, lacking["w"]], axis=0) / through.rate_hz
         )
+        smooth["dw"][:, lacking["dw"]] = rate
+        noise["w"][lacking["w"]] = noise["dw"][lacking["w"]] / through.passes * drift
+        noise["dw"][lacking["dw"]] = (
+            noise["w"][lacking["dw"]] / through.passes * through.rate_passes
+        )
+
+    def notes(self, names: tuple[str, ...], moving: bool) -> list[str]:
+        """How w was found where it was not measured."""
+        without = self.lacking["w"]
+        if not without.any():
+            return []
+        sentence = _FOUND_START if moving else _ASSUMED_REST
+        return [sentence.format(names=listed(names, without))]
 
 
 def _noise(x: Array) -> Array:

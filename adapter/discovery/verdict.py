@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from adapter.discovery.arborescence import Search, Structure
 from adapter.discovery.bodies import NO_JOINT, Bodies, bodies_of
-from adapter.discovery.doubts import doubts_of
-from adapter.discovery.hypotheses import FREE, Hypotheses, Option, hypotheses_of
+from adapter.discovery.channels import listed
+from adapter.discovery.doubts import Verdicts, doubts_of
+from adapter.discovery.hypotheses import (
+    FREE,
+    FREE_RATIO,
+    Hypotheses,
+    Option,
+    convention_misfit,
+    hypotheses_of,
+    keeps_convention,
+)
+from adapter.discovery.mounted import mounted_hypotheses
+from adapter.discovery.mounting import Mounting
 from adapter.discovery.recorded import CUTOFF_HZ, Recorded, prepare
+from adapter.discovery.roots import central, component, floating_roots, rootings
+from adapter.discovery.start import with_start
 from adapter.errors import ModelError
 from drivers.mcap_file import Log
 
@@ -26,7 +41,8 @@ class Edge:
         joint: name; None for a link that rides on its parent without a joint.
         link, parent: names; parent None for a link that nothing carries.
         confidence: probability of the three together, given that the truth is among the
-            hypotheses.
+            hypotheses; where it is not directed, of the joint between these two links.
+        directed: whether the data tell which of the two carries the other.
         rival: the next best (joint, parent) of the same link; None where nothing comes close.
     """
 
@@ -35,10 +51,12 @@ class Edge:
     parent: str | None
     confidence: float
     rival: Edge | None = None
+    directed: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        out = {key: getattr(self, key) for key in ("joint", "link", "parent", "confidence")}
+        keys = ("joint", "link", "parent", "confidence", "directed")
+        out = {key: getattr(self, key) for key in keys}
         return {**out, "rival": None if self.rival is None else self.rival.as_dict()}
 
 
@@ -67,6 +85,26 @@ class Discovery:
         """The signals."""
         return self.bodies.recorded
 
+    @property
+    def mountings(self) -> dict[str, Mounting]:
+        """Where the axis was found in the frames of links, by their names."""
+        chosen = [option for option in self.structure.chosen if option.mounting is not None]
+        names = self.recorded.link_names
+        return {names[o.link]: o.mounting for o in chosen if o.mounting is not None}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was done to the data and what they were taken for, one sentence each."""
+        if not self.mountings:
+            return self.recorded.notes
+        names = self.recorded.link_names
+        found = listed(names, np.array([name in self.mountings for name in names]))
+        note = (
+            f"frames of links {found} do not turn about their z with the "
+            "origin on the axis: the axes were found, and λ is that of frames on them"
+        )
+        return (*self.recorded.notes, note)
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
         recorded = self.recorded
@@ -84,37 +122,56 @@ class Discovery:
             "rate_hz": recorded.rate_hz,
             "measured": list(recorded.measured),
             "misfit_over_noise": dict(self.hypotheses.excess),
-            "notes": list(recorded.notes),
+            "notes": list(self.notes),
+            "mounting": {name: m.as_dict() for name, m in self.mountings.items()},
         }
 
 
-def discover(log: Log, cutoff_hz: float = CUTOFF_HZ) -> Discovery:
+def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) -> Discovery:
     """Find the tree of a recording with link motion; order and names decide nothing.
 
+    Link frames are first taken to turn about their z, with their origin on their joint's axis
+    (eq. 9), which tells parent from child too. Where that leaves links unexplained, the axis may
+    lie anyhow in each link's frame and is found. A floating base is then any link, unless it is
+    said or frames of some links keep the convention; without either the most central one is taken.
+
     Args:
-        log: joint signals, and the motion of links in their own frames, whose z is their joint's
-            axis (eq. 9).
+        log: joint signals, and the motion of links, each in a frame fixed to it.
         cutoff_hz: of the filter that everything goes through.
+        base: name of the link that carries all others, if that is known.
 
     Raises:
         SettingsError: the recording cannot serve; one sentence says why.
-        ModelError: the joints don't move at all.
+        ModelError: the joints don't move at all, or no link has the base's name.
     """
-    bodies = bodies_of(prepare(log, cutoff_hz))
+    if base is not None and base not in log.link_names:
+        raise ModelError(
+            f"{log.path}: no link {base} in the recording to be the base; "
+            f"choose from {', '.join(log.link_names)}"
+        )
+    number = None if base is None else log.link_names.index(base)
+    bodies = bodies_of(with_start(prepare(log, cutoff_hz), number), number)
     if bodies.resting.all():
         raise ModelError(
             f"{log.path}: no joint moves ({', '.join(log.joint_names)}); nothing can be told"
         )
-    hypotheses = hypotheses_of(bodies)
-    search = Search(hypotheses.options, len(log.joint_names))
-    structure = search.best()
-    if structure is None:
-        raise ModelError(
-            f"{log.path}: so much is undecided that no tree stands out; record more motion, of "
-            "every joint and not all alike"
-        )
-    posterior = search.posterior(structure)
-    return _discovery(bodies, hypotheses, structure, posterior)
+    misfit = convention_misfit(bodies)
+    structure: Structure | None = None
+    if keeps_convention(bodies, misfit):
+        hypotheses = hypotheses_of(bodies, misfit)
+        structure = Search(hypotheses.options, len(log.joint_names)).best()
+    if structure is None or _unexplained(hypotheses, structure):
+        hypotheses = mounted_hypotheses(bodies, misfit)
+        structure = Search(hypotheses.options, len(log.joint_names)).best()
+    return _discovery(hypotheses, structure)
+
+
+def _unexplained(hypotheses: Hypotheses, structure: Structure) -> bool:
+    """Whether the convention leaves links that nothing carries, or more misfit than noise does."""
+    bodies = hypotheses.bodies
+    free = sum(option.parent == FREE for option in structure.chosen)
+    carried = any(option.parent == bodies.unseen_base for option in structure.chosen)
+    return free + carried > 1 or max(hypotheses.excess.values()) > FREE_RATIO
 
 
 def body_names(bodies: Bodies) -> tuple[str, ...]:
@@ -123,24 +180,31 @@ def body_names(bodies: Bodies) -> tuple[str, ...]:
     return names if bodies.unseen_base is None else (*names, UNSEEN_BASE)
 
 
-def _discovery(
-    bodies: Bodies,
-    hypotheses: Hypotheses,
-    structure: Structure,
-    posterior: list[list[tuple[Option, float]]],
-) -> Discovery:
+def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
+    bodies = hypotheses.bodies
+    search = Search(hypotheses.options, len(bodies.resting))
+    shares: dict[int, dict[int, float]] = {}
+    if hypotheses.mounted:
+        structure = central(search, bodies, structure)
+        for root in floating_roots(bodies, structure):
+            shares[root] = rootings(search, structure, root)
+    posterior = search.posterior(structure, shares)
     names = body_names(bodies)
-    edges = []
+    edges, confidence = [], []
     roots: dict[str, float] = {}
     for option, ranked in zip(structure.chosen, posterior, strict=True):
-        share = dict(ranked)[option]
-        if option.parent == FREE:
+        way = _direction(structure, shares, option.link)
+        share = dict(ranked)[option] * (way if way >= DECIDED else 1.0)
+        if option.link in shares:
+            share = roots[names[option.link]] = shares[option.link][option.link]
+        elif option.parent == FREE:
             roots[names[option.link]] = share
         elif option.parent == bodies.unseen_base:
             roots[names[option.parent]] = max(share, roots.get(names[option.parent], 0.0))
+        confidence.append(share)
         others = [(o, p) for o, p in ranked if o != option and p >= WORTH_TELLING]
         rival = _edge(bodies, *others[0]) if others else None
-        edges.append(_edge(bodies, option, share, rival))
+        edges.append(replace(_edge(bodies, option, share, rival), directed=way >= DECIDED))
     order = {name: k for k, name in enumerate(bodies.recorded.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
@@ -149,11 +213,28 @@ def _discovery(
         root=next(iter(roots)) if single else None,
         root_confidence=next(iter(roots.values())) if single else 0.0,
         edges=kept,
-        undecided=tuple(doubts_of(bodies, structure, posterior, names, DECIDED)),
+        undecided=tuple(
+            doubts_of(bodies, structure, posterior, Verdicts(names, confidence, shares, DECIDED))
+        ),
         bodies=bodies,
         structure=structure,
         hypotheses=hypotheses,
     )
+
+
+def _direction(structure: Structure, shares: dict[int, dict[int, float]], link: int) -> float:
+    """Probability that a link is carried by its parent, not the other way round.
+
+    The likeliest root that does not hang on the link is held against the likeliest that does: the
+    number of links on either side of a joint says nothing.
+    """
+    below = set(component(structure, link))
+    for root, share in shares.items():
+        if link != root and link in share:
+            inside = max(share[k] for k in below)
+            outside = max(p for k, p in share.items() if k not in below)
+            return outside / (inside + outside)
+    return 1.0
 
 
 def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = None) -> Edge:
