@@ -9,10 +9,12 @@ import copy
 import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+import pytest
 
 from adapter.errors import ModelWarning
 from adapter.model import SelfModel
@@ -78,6 +80,16 @@ def atlas() -> SelfModel:
         return read_urdf(ATLAS, floating=True)
 
 
+@cache
+def robot(name: str) -> SelfModel:
+    """The Panda or ATLAS by name; a test that wants ATLAS skips where it is not at hand."""
+    if name == "panda":
+        return panda()
+    if not ATLAS.exists():
+        pytest.skip(f"{ATLAS} is not here: the shared folder stays with the project's makers")
+    return atlas()
+
+
 def _sines(rng: np.random.Generator, t: np.ndarray, n: int, speed: float) -> tuple[np.ndarray, ...]:
     """Value, rate and second rate (m, n) of sums of sines that start at rest."""
     value, rate, second = (np.zeros((len(t), n)) for _ in range(3))
@@ -120,17 +132,17 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
     for j in motion.still:
         q[:, j], dq[:, j], ddq[:, j] = q[0, j], 0.0, 0.0
     _, speed, change = _sines(rng, t, 6, 0.6 if model.tree.floating else 0.0)
-    robot = _pin_model(model)
-    data = robot.createData()
-    pose = pin.neutral(robot)
+    arm = _pin_model(model)
+    data = arm.createData()
+    pose = pin.neutral(arm)
     twists, accels = (np.zeros((len(t), 1 + n, 6)) for _ in range(2))
     tau = np.zeros((len(t), n))
-    v = np.zeros(robot.nv)
+    v = np.zeros(arm.nv)
     for k in range(len(t)):
         pose[7:] = q[k]
         rates, seconds = np.concatenate([speed[k], dq[k]]), np.concatenate([change[k], ddq[k]])
-        tau[k] = pin.rnea(robot, data, pose, rates, seconds)[6:]
-        pin.forwardKinematics(robot, data, pose, rates, seconds)
+        tau[k] = pin.rnea(arm, data, pose, rates, seconds)[6:]
+        pin.forwardKinematics(arm, data, pose, rates, seconds)
         for b in range(1 + n):
             twists[k, b] = data.v[b + 1].vector
             a = data.a[b + 1]
@@ -139,7 +151,7 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
             accels[k, b, :3] = a.linear + np.cross(w, data.v[b + 1].linear) - down
             accels[k, b, 3:] = a.angular
         v[:6] = speed[k]
-        pose = pin.integrate(robot, pose, v / motion.rate_hz)
+        pose = pin.integrate(arm, pose, v / motion.rate_hz)
     return q, dq, ddq, tau, twists, accels
 
 

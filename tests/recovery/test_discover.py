@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from discovery_data import ATLAS, Case, Motion, atlas, panda, record
+from discovery_data import Case, Motion, record, robot
 
 from adapter.cli import discover as command
 from adapter.discovery import Discovery, discover
@@ -29,17 +29,8 @@ SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
 
 
 @cache
-def _robot(name: str) -> SelfModel:
-    if name == "panda":
-        return panda()
-    if not ATLAS.exists():
-        pytest.skip(f"{ATLAS} is not here: the shared folder stays with the project's makers")
-    return atlas()
-
-
-@cache
 def _case(name: str, motion: Motion, seed: int, noise: float = 1.0, parts: str = "ta") -> Case:
-    return record(_robot(name), motion, seed, noise=noise, parts=parts)
+    return record(robot(name), motion, seed, noise=noise, parts=parts)
 
 
 def _named(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
@@ -130,7 +121,7 @@ def test_a_missing_link_leaves_its_child_open() -> None:
 
 
 def test_base_at_rest_in_the_recording_is_the_root() -> None:
-    case = record(_robot("panda"), SHORT, 7, base=True)
+    case = record(robot("panda"), SHORT, 7, base=True)
     found = discover(case.log)
     assert found.root == case.root != "base"
     assert set(_named(found)) == case.edges and found.root_confidence > 0.99

@@ -7,28 +7,18 @@ from functools import cache
 
 import numpy as np
 import pytest
-from discovery_data import ATLAS, Case, Motion, anyhow, atlas, panda, record
+from discovery_data import Case, Motion, anyhow, record, robot
 
 from adapter.discovery import Discovery, discover
 from adapter.discovery.hypotheses import FREE
 from adapter.discovery.learned import learn, self_model
 from adapter.errors import ModelError, SettingsError
-from adapter.model import SelfModel
 from adapter.spatial import matrix_from_zxz
 from drivers.mcap_file import Log
 
 TRUSTED = 0.9
 RATE_HZ = 250.0
 SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
-
-
-@cache
-def _robot(name: str) -> SelfModel:
-    if name == "panda":
-        return panda()
-    if not ATLAS.exists():
-        pytest.skip(f"{ATLAS} is not here: the shared folder stays with the project's makers")
-    return atlas()
 
 
 @cache
@@ -42,11 +32,11 @@ def _case(
     noise: float = 1.0,
     base: bool | None = None,
 ) -> Case:
-    robot = _robot(name)
-    bodies = 1 + robot.tree.n
+    model = robot(name)
+    bodies = 1 + model.tree.n
     which = np.random.default_rng([seed, 31]).permutation(bodies)[: round(share * bodies)]
     mounts = anyhow(seed, which.tolist(), bodies, turned=turned, shifted=shifted)
-    return record(robot, motion, seed, noise=noise, base=base, mounts=mounts)
+    return record(model, motion, seed, noise=noise, base=base, mounts=mounts)
 
 
 def _named(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
