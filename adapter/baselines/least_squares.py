@@ -16,14 +16,13 @@ from adapter.baselines.features import Columns
 from adapter.baselines.learner import Facts, Progress, checked, unfitted
 from adapter.dynamics import regressor
 from adapter.errors import ModelError
+from adapter.identifiability import RANK_TOLERANCE
 from adapter.kinematics import DTYPE
+from adapter.offline.theta_factors import PER_BODY
 from adapter.spatial import Array
 from adapter.tree import Tree
 
-PARAMETERS = 10  # of a body
 AT_ONCE = 5_000  # samples, so that their regressor stays below 30 MB
-# Singular values below this share of the largest count as zero (`identifiability`).
-RANK_TOLERANCE = 1e-10
 # No joint's torque is taken for better than this share of its size.
 LEAST_SHARE = 1e-12
 
@@ -61,7 +60,7 @@ class RegressorLeastSquares:
         X = checked(X, Y, self.columns.width)
         if Y.shape[1] != self.tree.n:
             raise ModelError(f"Y must have {self.tree.n} columns, got {Y.shape[1]}")
-        width = PARAMETERS * self.tree.n + 1
+        width = PER_BODY * self.tree.n + 1
         triangles: list[Array] = [np.zeros((0, width)) for _ in range(self.tree.n)]
         for k in range(0, len(X), AT_ONCE):
             rows = self._rows(X[k : k + AT_ONCE])
@@ -81,7 +80,7 @@ class RegressorLeastSquares:
         """Regressor of the joint torques, (m, n, 10 n); the carrier's own inertia is in none."""
         q, dq, ddq = (torch.from_numpy(np.ascontiguousarray(s)) for s in self.columns.joints(x))
         full = regressor(self.tree, self.lam, q, dq, ddq, self.columns.carrier(x).torch())
-        return full[:, 6:, PARAMETERS:].numpy()
+        return full[:, 6:, PER_BODY:].numpy()
 
     def predict(self, X: Array) -> Array:
         """Torques (m, n), N m."""
@@ -102,7 +101,7 @@ class RegressorLeastSquares:
             "λ is known; θ by weighted least squares (QR), the weights from each joint's rest, "
             "the solution of smallest norm.",
         )
-        sizes = {"samples": samples, "parameters": PARAMETERS * self.tree.n, "rank": rank}
+        sizes = {"samples": samples, "parameters": PER_BODY * self.tree.n, "rank": rank}
         return Facts({k: float(v) for k, v in sizes.items()}, tuning, train_s)
 
 

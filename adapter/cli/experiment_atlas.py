@@ -19,13 +19,11 @@ from adapter.experiment.results import AtlasResults
 from adapter.experiment.topology import topology_trials
 from adapter.experiment.trajectories import gathered, split
 from adapter.offline.signals import Measured, smoothed_data
-from adapter.outcome import frame_errors
 from adapter.tree import Tree
 from adapter.tree_data import BodyMotion, TreeData
 from sim.free_fall_data import FallData, data_set
 from sim.tree_links import link_tables
 
-CONVERGED = 1e-3  # rad and m, of a joint's frame
 ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
 ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
 
@@ -115,7 +113,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         error_edges=np.log10(judged.training.edges),
         error_counts=judged.networks_training.histogram,
         moments_error_counts=judged.training.histogram,
-        not_converged=not_converged(body.networks.lam, truth.lam, tree),
+        not_converged=tuple(numbers["schema_networks_not_converged"]),
         full=args.full,
         learners=learners,
         stated=stated(numbers),
@@ -128,13 +126,6 @@ def online_numbers(source: Fall, control: Sequence[int]) -> dict[str, Any]:
     used = [k for k in range(len(source)) if k not in control][:ONLINE_FALLS]
     motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
     return online_trial(motions, source.exact(control[0]), source.truth.lam)[0]
-
-
-def not_converged(lam: np.ndarray, true_lam: np.ndarray, tree: Tree) -> tuple[str, ...]:
-    """Names of the joints whose frame the networks left farther off than `CONVERGED`."""
-    every = np.tile(np.eye(6), (tree.n, 1, 1))
-    off = np.maximum(*frame_errors(lam[None], true_lam, every))[0]
-    return tuple(name for name, x in zip(tree.joint_names, off, strict=True) if x > CONVERGED)
 
 
 def snapshots(kept: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:

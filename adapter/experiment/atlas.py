@@ -182,4 +182,5 @@ def noisy_trial(source: Trajectories, parts: Split, true_lam: Array, seed: int) 
         "ratio": float(np.sqrt(np.mean(np.square(ours / least)))),
         "ratio_of_total": float(np.sqrt(np.sum(ours**2) / np.sum(least**2))),
         "min_pseudo_inertia_eigenvalue": theta.min_eigenvalue,
+        "theta_converged": theta.converged,
     }

@@ -42,6 +42,12 @@ def numbers_of(
         "torque_rmse_nm": ours.rmse,
         "min_pseudo_inertia_eigenvalue": body.theta.min_eigenvalue,
         "base_parameters": body.theta.rank,
+        "theta_converged": body.theta.converged,
+        "schema_networks_not_converged": [
+            name
+            for name, done in zip(tree.joint_names, body.networks.converged, strict=True)
+            if not done
+        ],
         "sub_problems": [
             {"name": stage.name, "bodies": len(stage.bodies), "rank": stage.rank,
              "parameters": stage.parameters, "wall_s": stage.wall_s}
@@ -123,7 +129,8 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
         ),
         Stated("learned_samples", "samples for λ and θ", "1 % of training",
                numbers["learned_samples"]),
-        Stated("minibatch", "samples of a mini-batch; cycles", "10; 10", "10; 10"),
+        Stated("minibatch", "samples of a mini-batch; cycles", "10; 10", "10; 10", "",
+               "N problems (eq. 18) from random λ, each batch a step of recursive Gauss-Newton"),
         Stated("solver", "solver of θ", "interior point (fmincon)", "interior point (Clarabel)"),
         Stated(
             "kinematic_error_max", "largest |k - k_hat|, control set", "negligible", kinematics,
@@ -134,8 +141,8 @@ def stated(numbers: dict[str, Any]) -> list[Stated]:
             networks,
         ),
         Stated("sub_problems", "problems for θ", "3: legs, upper body", ", ".join(branches), "",
-               "found from A; then the base, then all bodies together twice, the second time "
-               "weighted by what the first left"),
+               "found from A; then all bodies together twice, the second time weighted by what "
+               "the first left"),
         *(
             Stated(f"torque_median_{name}", f"median error by eq. 20, {name} set", "minimal",
                    numbers["torque_relative_error_median"][name], "", "where |τ| > 0.1 N m")

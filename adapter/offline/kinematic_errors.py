@@ -9,6 +9,7 @@ import torch
 
 from adapter.errors import ModelError
 from adapter.kinematics import DTYPE, link_motion
+from adapter.offline.finite import check_finite, check_motion
 from adapter.offline.moments import CHANNELS
 from adapter.spatial import Array
 from adapter.tree_data import TreeData
@@ -40,12 +41,15 @@ def kinematic_errors(data: TreeData, lam: Array) -> KinematicErrors:
     """Errors of the motion of all links, carried from the base down the tree with λ (n, 6).
 
     Raises:
-        ModelError: no link motion to compare with, or a λ of another shape.
+        ModelError: no link motion to compare with, a λ of another shape, or numbers that are not
+            finite.
     """
     if data.links is None:
         raise ModelError("kinematic errors need the links' measured motion, and none is given")
     if lam.shape != (data.tree.n, 6):
         raise ModelError(f"λ must have shape ({data.tree.n}, 6), got {lam.shape}")
+    check_motion(data)
+    check_finite({"λ": lam})
     with_speed = data.links.v is not None and data.base.v is not None
     channels = [name for name in CHANNELS if name != "v" or with_speed]
     worst = {name: np.zeros(data.tree.n) for name in channels}

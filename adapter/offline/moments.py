@@ -13,6 +13,7 @@ import numpy as np
 
 from adapter.errors import ModelError
 from adapter.fast import jit
+from adapter.offline.finite import check_motion
 from adapter.schema_kernels import WIDTH, accumulate, signals
 from adapter.spatial import Array
 from adapter.tree import Tree
@@ -106,9 +107,8 @@ def schema_moments(data: TreeData) -> SchemaMoments:
     if len(data) == 0:
         raise ModelError("the body schema can't be learned from no samples")
     with_speed = data.links.v is not None and data.base.v is not None
+    check_motion(data)
     base, links = _table(data.base), _table(data.links)
-    if not all(np.isfinite(x).all() for x in (data.q, data.dq, data.ddq, base, links)):
-        raise ModelError("the samples hold numbers that are not finite; leave those samples out")
     sums = np.zeros((data.tree.n, len(CHANNELS), WIDTH, WIDTH))
     parent = np.array(data.tree.parent, dtype=np.int64)
     _accumulate(parent, data.q, data.dq, data.ddq, base, links, sums)

@@ -8,6 +8,8 @@ the explanations alone, as the one furthest from impossible, so that no digit is
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import clarabel
 import numpy as np
 from scipy import sparse
@@ -41,7 +43,22 @@ _TO_THETA = np.linalg.inv(_FROM_THETA)
 _ONE = _entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
 
 
-def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> tuple[Array, int]:
+@dataclass(frozen=True)
+class Possible:
+    """What was found.
+
+    Attributes:
+        theta: (bodies, 10), every body possible.
+        steps: of the solver.
+        solved: whether nothing better is possible; else it is the best found.
+    """
+
+    theta: Array
+    steps: int
+    solved: bool
+
+
+def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> Possible:
     """The possible bodies that leave least of R θ = b, and what does not show near a small body.
 
     Args:
@@ -49,28 +66,20 @@ def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> tuple[Arr
         shown: (10 bodies,) a least-squares solution.
         hidden: (10 bodies, h) directions of θ that R does not show.
 
-    Returns:
-        θ (bodies, 10) and the solver's steps.
-
     Raises:
-        ModelError: the solver gave up.
+        ModelError: the solver gave up without an answer.
     """
-    theta, steps = _roomiest(shown.reshape(-1, PER_BODY), hidden)
-    if theta is not None:
-        return theta, steps
-    theta, more = _closest(r, b)
-    if theta is None or not min_eigenvalue(theta).min() > 0.0:
-        raise ModelError(
-            "no possible bodies were found near what the data say: the conic solver gave up; "
-            "look for samples that are far off"
-        )
-    return theta, steps + more
+    exact = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    if exact.solved:
+        return exact
+    found = _closest(r, b)
+    return replace(found, steps=exact.steps + found.steps)
 
 
-def _roomiest(shown: Array, hidden: Array) -> tuple[Array | None, int]:
+def _roomiest(shown: Array, hidden: Array) -> Possible:
     """Among all least-squares solutions the one whose bodies are furthest from impossible.
 
-    Maximised is the least eigenvalue t of all bodies, up to `ROOM`; None if it is not above zero.
+    Maximised is the least eigenvalue t of all bodies, up to `ROOM`; solved if it is above zero.
     """
     bodies, count = len(shown), hidden.shape[1]
     fixed = (shown @ _FROM_THETA.T).ravel()
@@ -82,21 +91,20 @@ def _roomiest(shown: Array, hidden: Array) -> tuple[Array | None, int]:
     in_cone = np.column_stack([-free, one])
     in_room = np.append(np.zeros(count), 1.0)
     cones = [*_cones(bodies), clarabel.NonnegativeConeT(1)]
-    found, steps = _solve(
+    x, steps, _ = _solve(
         np.zeros((count + 1, count + 1)),
         goal,
         np.vstack([in_cone, in_room]),
         np.append(fixed, ROOM) / size,
         cones,
     )
-    if found is None:
-        return None, steps
-    entries = fixed + size * (free @ found[:count])
-    theta = entries.reshape(bodies, PER_BODY) @ _TO_THETA.T
-    return (theta if min_eigenvalue(theta).min() > 0.0 else None), steps
+    if not np.isfinite(x).all():
+        return Possible(shown, steps, False)
+    theta = (fixed + size * (free @ x[:count])).reshape(bodies, PER_BODY) @ _TO_THETA.T
+    return Possible(theta, steps, bool(min_eigenvalue(theta).min() > 0.0))
 
 
-def _closest(r: Array, b: Array) -> tuple[Array | None, int]:
+def _closest(r: Array, b: Array) -> Possible:
     """Least squares with every eigenvalue at least `EDGE`."""
     bodies = r.shape[1] // PER_BODY
     table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, PER_BODY), _TO_THETA)
@@ -105,14 +113,20 @@ def _closest(r: Array, b: Array) -> tuple[Array | None, int]:
     quadratic, goal = table.T @ table / power, -(table.T @ b) / power
     hold = HELD * float(np.trace(quadratic)) / len(quadratic)
     one = np.tile(_ONE, bodies)
-    found, steps = _solve(
+    x, steps, solved = _solve(
         quadratic + hold * np.eye(len(quadratic)),
         goal - hold * one,
         -np.eye(len(quadratic)),
         -EDGE * one,
         _cones(bodies),
     )
-    return None if found is None else found.reshape(bodies, PER_BODY) @ _TO_THETA.T, steps
+    if not np.isfinite(x).all():
+        raise ModelError("no possible bodies were found near what the data say; are they sound?")
+    theta = x.reshape(bodies, PER_BODY) @ _TO_THETA.T
+    least = np.linalg.eigvalsh(_UNITS @ pseudo_inertia(theta) @ _UNITS).min(axis=-1)
+    # where the solver stopped short of the edge's right side
+    lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
+    return Possible(theta + lifted, steps, solved)
 
 
 def _cones(bodies: int) -> list[clarabel.PSDTriangleConeT]:
@@ -121,8 +135,8 @@ def _cones(bodies: int) -> list[clarabel.PSDTriangleConeT]:
 
 def _solve(
     quadratic: Array, linear: Array, left: Array, right: Array, cones: list[object]
-) -> tuple[Array | None, int]:
-    """Minimise x·Q x / 2 + linear·x where right - left x lies in the cones."""
+) -> tuple[Array, int, bool]:
+    """Minimise x·Q x / 2 + linear·x where right - left x lies in the cones: x, steps, solved."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = PRECISION
@@ -131,6 +145,4 @@ def _solve(
     upper = sparse.triu(sparse.csc_matrix(quadratic), format="csc")
     solver = clarabel.DefaultSolver(upper, linear, sparse.csc_matrix(left), right, cones, settings)
     answer = solver.solve()
-    x = np.array(answer.x)
-    solved = str(answer.status) in SOLVED and np.isfinite(x).all()
-    return (x if solved else None), int(answer.iterations)
+    return np.array(answer.x), int(answer.iterations), str(answer.status) in SOLVED

@@ -1,27 +1,45 @@
-"""λ the paper's way (eq. 18): N independent networks, mini-batches, ADAM, from random starts.
+"""λ the paper's way (eq. 18): N independent networks, mini-batches, from random starts.
 
 Every joint's network takes its parent's measured motion, so all joints, and several starts of
-each, are one batch of tensors. Compared are the measured and the estimated twist turned by
-Rz(q_j), which changes no squared error and leaves R0 and p as all that varies.
+each, are one batch of tensors. A first-order descent crawls where a link's motion shows one
+direction of its frame far less than another, and ends wherever its rate has run out; with 6
+unknowns a joint, Gauss-Newton's curvature costs next to nothing, and its recursive form (the
+curvature a running mean over mini-batches, the step as much of Newton's as the newest batch is of
+the mean) goes down alike in all directions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from adapter.errors import ModelError
-from adapter.kinematics import joint_rotation, turn_z
+from adapter.offline.finite import check_motion
+from adapter.offline.frame_networks import (
+    Frames,
+    Signals,
+    costs,
+    network_signals,
+    newton_step,
+    slope_and_curvature,
+)
 from adapter.spatial import Array, matrix_from_zxz, zxz_from_matrix
-from adapter.tree import BASE
-from adapter.tree_data import BodyMotion, TreeData
+from adapter.tree_data import TreeData
 
 # Called after every iteration with its number and the mean cost of the batch.
 Callback = Callable[[int, float], None]
+
+# A cost below this share of the signal's is rounding: motion right to 1e-8 of its size.
+ROUNDING = 1e-16
+# A frame is at its minimum where Newton's step would take off less than this share of the cost;
+# the last digits of a descent by mini-batches take off 1e-3 or less.
+STATIONARY = 0.05
+# ... and the minimum is the frame's where it leaves less than this share of the signal: noise
+# leaves far less, a wrong frame (a saddle) the better part.
+UNEXPLAINED = 0.05
 
 
 @dataclass(frozen=True)
@@ -32,9 +50,10 @@ class NetworkSettings:
         minibatch: samples an iteration; cycles: passes over all samples (the paper: 10 and 10).
         starts: random starts of each joint, the best of which is kept: a rotation can start
             close to a saddle.
-        first_rate, last_rate: ADAM's rate at the start and at the end, rad and m; it falls
-            by a constant factor an iteration after `constant` of the iterations.
-        betas: ADAM's averaging constants; the second is short because gradients shrink by decades.
+        gain: weight of the newest batch in slope and curvature, above 0 and at most 1.
+        constant: share of the iterations (0 to 1) in which it stays; then it falls so that all
+            later batches count alike, which averages noise out.
+        longest_step: of an iteration, rad and m.
         position_span: starting positions are uniform within ± this, m; angles within ±π.
         accelerations: whether accelerations are compared beside the twist. None: only where
             twists can't show every frame (no measured v, or a base at rest).
@@ -44,10 +63,9 @@ class NetworkSettings:
     minibatch: int = 10
     cycles: int = 10
     starts: int = 6
-    first_rate: float = 0.03
-    constant: float = 0.15
-    last_rate: float = 1e-10
-    betas: tuple[float, float] = (0.9, 0.95)
+    gain: float = 0.3
+    constant: float = 0.5
+    longest_step: float = 0.05
     position_span: float = 0.5
     accelerations: bool | None = None
     snapshots: tuple[int, ...] = (0, 50, 100)
@@ -56,10 +74,15 @@ class NetworkSettings:
         for name in ("minibatch", "cycles", "starts"):
             if getattr(self, name) < 1:
                 raise ModelError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0.0 < self.last_rate <= self.first_rate:
-            raise ModelError(
-                f"rates must be above zero and fall, got {self.first_rate} to {self.last_rate}"
-            )
+        if not 0.0 < self.gain <= 1.0:
+            raise ModelError(f"gain must be above 0 and at most 1, got {self.gain}")
+        if not 0.0 <= self.constant <= 1.0:
+            raise ModelError(f"constant must be a share, 0 to 1, got {self.constant}")
+        for name in ("longest_step", "position_span"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ModelError(f"{name} must be above 0 and finite, got {getattr(self, name)}")
+        if any(epoch < 0 for epoch in self.snapshots):
+            raise ModelError(f"snapshots are iterations from 0 on, got {self.snapshots}")
 
 
 @dataclass
@@ -71,25 +94,15 @@ class NetworkResult:
         snapshots: λ (n, 6) of those starts by epoch, the last one included.
         loss: (epochs,) mean cost of the batch over joints, of those starts.
         final_loss: (n, starts) mean cost over all samples of every start at the end.
+        converged: (n,) bool, whether the joint's cost is rounding, or at a minimum that leaves
+            what noise may leave; λ of other joints is the best found and may be far off.
     """
 
     lam: Array
     snapshots: dict[int, Array]
     loss: Array
     final_loss: Array
-
-
-@dataclass
-class _Signals:
-    """What the networks compare, (m, n, 3) each: y of link j turned by Rz(q_j), x of its parent."""
-
-    y: dict[str, Tensor] = field(default_factory=dict)
-    x: dict[str, Tensor] = field(default_factory=dict)
-
-    def rows(self, rows: Tensor) -> _Signals:
-        return _Signals(
-            {k: t[rows] for k, t in self.y.items()}, {k: t[rows] for k, t in self.x.items()}
-        )
+    converged: np.ndarray
 
 
 def schema_by_networks(
@@ -107,7 +120,7 @@ def schema_by_networks(
         callback: told of every iteration.
 
     Raises:
-        ModelError: no link motion, fewer samples than a mini-batch.
+        ModelError: no link motion, fewer samples than a mini-batch, numbers that are not finite.
     """
     settings = settings or NetworkSettings()
     if data.links is None:
@@ -116,85 +129,47 @@ def schema_by_networks(
         raise ModelError(
             f"{len(data)} samples don't fill a mini-batch of {settings.minibatch}; give more"
         )
-    signals = _signals(data, settings)
+    check_motion(data)
+    signals = network_signals(data, _channels(data, settings))
     rng = np.random.default_rng(seed)
-    lam = torch.from_numpy(_random_starts(data.tree.n, settings, rng)).requires_grad_()
+    frames = _random_starts(data.tree.n, settings, rng)
     total = settings.cycles * (len(data) // settings.minibatch)
-    optimiser = torch.optim.Adam([lam], lr=settings.first_rate, betas=settings.betas, eps=1e-300)
-    kept, losses = {}, np.empty((total, *lam.shape[:2]))
+    kept, losses = {}, np.empty((total, data.tree.n, settings.starts))
+    curvature, gain = torch.zeros(()), 1.0
     for epoch, rows in enumerate(_batches(len(data), settings, rng)):
         if epoch in settings.snapshots:
-            kept[epoch] = lam.detach().numpy().copy()
-        optimiser.param_groups[0]["lr"] = _rate(settings, epoch / total)
-        optimiser.zero_grad()
-        cost = _costs(lam, signals.rows(torch.from_numpy(rows)))
-        cost.sum().backward()
-        optimiser.step()
-        losses[epoch] = cost.detach().numpy()
+            kept[epoch] = _lam(frames)
+        cost, slope, own = slope_and_curvature(frames, signals.take(rows))
+        gain = _gain(settings, gain, epoch / total)
+        curvature = (1.0 - gain) * curvature + gain * own
+        frames = frames.moved(_shortened(gain * newton_step(slope, curvature), settings))
+        losses[epoch] = cost.numpy()
         if callback is not None:
             callback(epoch, float(losses[epoch].min(axis=1).mean()))
-    kept[total] = lam.detach().numpy().copy()
-    with torch.no_grad():
-        final = _costs(lam, signals).numpy()
+    kept[total] = _lam(frames)
+    final = costs(frames, signals).numpy()
     joints, best = np.arange(data.tree.n), final.argmin(axis=1)
-    chosen = {epoch: _canonical(x[joints, best]) for epoch, x in kept.items()}
-    return NetworkResult(chosen[total], chosen, losses[:, joints, best].mean(axis=1), final)
+    chosen = {epoch: x[joints, best] for epoch, x in kept.items()}
+    found = Frames(frames.r0[joints, best][:, None], frames.p[joints, best][:, None])
+    loss = losses[:, joints, best].mean(axis=1)
+    return NetworkResult(chosen[total], chosen, loss, final, _converged(found, signals))
 
 
-def _signals(data: TreeData, settings: NetworkSettings) -> _Signals:
-    """The compared signals of all joints; joint axis and dq taken off as eq. 8b has them."""
+def _channels(data: TreeData, settings: NetworkSettings) -> list[str]:
+    """What is compared of w, v and a."""
     assert data.links is not None
     with_speed = data.links.v is not None and data.base.v is not None
     accelerations = settings.accelerations
     if accelerations is None:
         accelerations = not (with_speed and data.tree.floating)
-    q = torch.from_numpy(np.ascontiguousarray(data.q))
-    out = _Signals()
-    names = ["w", *(["v"] if with_speed else []), *(["a", "dw"] if accelerations else [])]
-    for name in names:
-        own = torch.from_numpy(np.array(getattr(data.links, name)))
-        if name == "w":
-            own[:, :, 2] -= torch.from_numpy(data.dq)
-        out.x[name] = _of_parents(data.tree.parent, data.base, data.links, name)
-        if name != "dw":  # of 8d only the parent's part is used: it carries p in 8c
-            out.y[name] = turn_z(q, own)
-    return out
+    return ["w", *(["v"] if with_speed else []), *(["a"] if accelerations else [])]
 
 
-def _of_parents(parent: tuple[int, ...], base: BodyMotion, links: BodyMotion, name: str) -> Tensor:
-    """A signal (m, n, 3) of the parent of every joint."""
-    every = np.concatenate([getattr(base, name)[:, None], getattr(links, name)], axis=1)
-    return torch.from_numpy(np.ascontiguousarray(every[:, [i - BASE for i in parent]]))
-
-
-def _costs(lam: Tensor, s: _Signals) -> Tensor:
-    """Half the mean squared error (n, starts) of λ (n, starts, 6) over samples (eq. 18)."""
-    r0, p = joint_rotation(lam), lam[..., 3:]
-
-    def gap(name: str, z: Tensor) -> Tensor:
-        """|y - R0^T z|² for z (m, n, starts, 3)."""
-        turned = torch.einsum("mnsa,nsab->mnsb", z, r0)
-        return ((s.y[name][:, :, None] - turned) ** 2).sum(dim=-1)
-
-    x = {name: t[:, :, None] for name, t in s.x.items()}
-    w = x["w"].expand(*x["w"].shape[:2], lam.shape[1], 3)
-    total = gap("w", w)
-    lever = torch.linalg.cross(w, p.expand_as(w))
-    if "v" in s.y:
-        total = total + gap("v", x["v"] + lever)  # 8a
-    if "a" in s.y:
-        swing = torch.linalg.cross(x["dw"].expand_as(w), p.expand_as(w))
-        total = total + gap("a", x["a"] + swing + torch.linalg.cross(w, lever))  # 8c
-    return 0.5 * total.mean(dim=0)
-
-
-def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> Array:
-    """λ (n, starts, 6): uniform angles, positions within ± the span."""
-    shape = (n, settings.starts, 3)
-    angles = rng.uniform(-np.pi, np.pi, shape)
-    return np.concatenate(
-        [angles, rng.uniform(-settings.position_span, settings.position_span, shape)], axis=-1
-    )
+def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> Frames:
+    """Uniform angles, positions within ± the span."""
+    angles = rng.uniform(-np.pi, np.pi, (n, settings.starts, 3))
+    p = rng.uniform(-settings.position_span, settings.position_span, angles.shape)
+    return Frames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
 
 
 def _batches(
@@ -207,13 +182,29 @@ def _batches(
         yield from order.reshape(whole, settings.minibatch)
 
 
-def _rate(settings: NetworkSettings, done: float) -> float:
-    """ADAM's rate after a share of the iterations."""
-    left = max(0.0, done - settings.constant) / (1.0 - settings.constant)
-    return settings.first_rate * float((settings.last_rate / settings.first_rate) ** left)
+def _gain(settings: NetworkSettings, last: float, done: float) -> float:
+    """Weight of the newest batch: 1, 1/2, 1/3, ... to `gain`, and on so where it is to fall."""
+    least = settings.gain if done < settings.constant else 0.0
+    return max(least, last / (1.0 + last)) if done > 0.0 else 1.0
 
 
-def _canonical(lam: Array) -> Array:
-    """The same frames with canonical angles."""
-    angles = zxz_from_matrix(matrix_from_zxz(lam[..., :3]))
-    return np.concatenate([angles, lam[..., 3:]], axis=-1)
+def _shortened(step: torch.Tensor, settings: NetworkSettings) -> torch.Tensor:
+    """Turn and shift (..., 6) no longer than the longest step each."""
+    both = step.unflatten(-1, (2, 3))
+    length = both.norm(dim=-1, keepdim=True)
+    share = (settings.longest_step / length.clamp_min(1e-300)).clamp_max(1.0)
+    return (both * share).flatten(-2)
+
+
+def _converged(frames: Frames, signals: Signals) -> np.ndarray:
+    """By joint (n,) of frames with one start each; see `NetworkResult`."""
+    cost, slope, curvature = slope_and_curvature(frames, signals)
+    gain = -0.5 * (slope * newton_step(slope, curvature)).sum(dim=-1)
+    power = signals.power()[:, None]
+    at_minimum = (gain <= STATIONARY * cost) & (cost <= UNEXPLAINED * power)
+    return ((cost <= ROUNDING * power) | at_minimum)[:, 0].numpy()
+
+
+def _lam(frames: Frames) -> Array:
+    """λ (n, starts, 6) with canonical angles."""
+    return np.concatenate([zxz_from_matrix(frames.r0.numpy()), frames.p.numpy()], axis=-1)

@@ -1,15 +1,15 @@
-"""θ of a whole tree: the branches that the topology dictates, the base, then all together.
+"""θ of a whole tree: the branches that the topology dictates, then all together with the base.
 
 With λ known and the base's motion measured, the joint torques of a branch depend on its own
 bodies alone (paper, section III-B). They leave three combinations of each link open, which act
-on the link below and in the end on the base, so the base is solved with the branches known, and
-a last solve over all bodies makes what the branches left open fit one possible robot.
+on the link below and in the end on the base; a last solve over all bodies, the base for the
+first time among them, makes what the branches left open fit one possible robot. (A base solved
+alone would have to make up for what the branches left open, which no possible body can.)
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +25,6 @@ from adapter.offline.branches import branches
 from adapter.offline.theta_factors import (
     PER_BODY,
     RowFactor,
-    qr_factor,
     row_factors,
     scales,
     system,
@@ -56,7 +55,8 @@ class ThetaSettings:
         std: standard deviation of every row of `row_factors`, N or N m. None: the size of its
             signal first, then what the first solve leaves of it.
         rounds: of weighting by what is left, where `std` is None.
-        whole: whether all bodies are solved together in the end.
+        whole: whether all bodies are solved together in the end; without it a floating base
+            keeps its start.
         prior: (bodies, 10), for "least squares"; zeros where None.
         adam_steps: for "adam".
     """
@@ -81,11 +81,12 @@ class Stage:
     """One solved sub-problem.
 
     Attributes:
-        name: of the branch, "base" or "whole tree".
+        name: of the branch, or "whole tree".
         bodies: rows of θ that it solved.
         rank: base parameters that its rows show; parameters: 10 per body.
         cost: half the weighted sum of squares left; steps: of the solver.
         wall_s: time it took.
+        converged: whether the cost is known to be the least there is (`Solution`).
     """
 
     name: str
@@ -95,6 +96,7 @@ class Stage:
     cost: float
     steps: int
     wall_s: float
+    converged: bool
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,8 @@ class ThetaResult:
         std: the weights' standard deviations by row.
         min_eigenvalue: smallest of all pseudo-inertias; above zero: every body is possible.
         factors_s: time that building the factors took.
+        converged: whether the last solve of every body did; if not, θ is the best found and may
+            be far from what the data say.
     """
 
     theta: Array
@@ -118,6 +122,7 @@ class ThetaResult:
     std: dict[str, float]
     min_eigenvalue: float
     factors_s: float
+    converged: bool
 
 
 def learn_theta(
@@ -149,6 +154,8 @@ def learn_theta(
         solve.reweigh()
         solve.again()
     names = [row.name for row in rows]
+    least = float(min_eigenvalue(solve.theta).min())
+    possible = least > 0.0 or settings.solver == "least squares"
     left = [row.residual(solve.theta) for row in rows]
     return ThetaResult(
         theta=solve.theta,
@@ -156,8 +163,9 @@ def learn_theta(
         stages=tuple(solve.stages),
         residual=dict(zip(names, left, strict=True)),
         std=dict(zip(names, solve.std.tolist(), strict=True)),
-        min_eigenvalue=float(min_eigenvalue(solve.theta).min()),
+        min_eigenvalue=least,
         factors_s=factors_s,
+        converged=possible and all(solve.converged.values()),
     )
 
 
@@ -183,14 +191,13 @@ class _Solve:
                 raise ModelError(f"the prior of θ must have shape {self.theta.shape}")
             self.theta = np.array(prior, dtype=float)
         self.stages: list[Stage] = []
+        self.converged: dict[int, bool] = {}  # by body, of its last solve
 
     def run(self) -> None:
-        """Branches, base, whole."""
+        """Branches, then the whole."""
         first = int(self.tree.floating)
         for branch in branches(self.tree):
             self._stage(branch.name, tuple(j + first for j in branch.joints))
-        if self.tree.floating:
-            self._stage(self.tree.base_name, (0,))
         self.again()
 
     def again(self) -> None:
@@ -209,16 +216,10 @@ class _Solve:
         return least_squares_theta(r, b, self.theta[list(bodies)]).rank or 0
 
     def _system(self, bodies: tuple[int, ...]) -> tuple[Array, Array]:
-        """R θ = b of some bodies, all others being as they are now.
-
-        A row counts where it sees one of the bodies and was not solved with another branch.
-        """
-        chosen, own = set(bodies), []
-        for row, sigma in zip(self.rows, self.std, strict=True):
-            if set(row.bodies) <= chosen:
-                own.append((row, sigma))
-            elif chosen == {0} and 0 in row.bodies:
-                own.append((_known(row, bodies, self.theta), sigma))
+        """R θ = b of some bodies, from the rows that see no others."""
+        chosen = set(bodies)
+        pairs = zip(self.rows, self.std, strict=True)
+        own = [(row, sigma) for row, sigma in pairs if set(row.bodies) <= chosen]
         if not own:
             raise ModelError("no row shows these bodies")
         return system([row for row, _ in own], np.array([s for _, s in own]), bodies)
@@ -231,9 +232,11 @@ class _Solve:
         self.theta[at] = found.theta
         rank = found.rank if found.rank is not None else self.rank(bodies)
         wall = time.perf_counter() - began
+        size = PER_BODY * len(bodies)
         self.stages.append(
-            Stage(name, bodies, rank, PER_BODY * len(bodies), found.cost, found.steps, wall)
+            Stage(name, bodies, rank, size, found.cost, found.steps, wall, found.converged)
         )
+        self.converged |= dict.fromkeys(bodies, found.converged)
 
     def _solve(self, r: Array, b: Array, now: Array, start: Array) -> Solution:
         if self.settings.solver == "least squares":
@@ -242,14 +245,3 @@ class _Solve:
             return consistent_theta(r, b)
         vectors = log_cholesky_from_theta(now) if is_consistent(now) else start
         return adam_theta(r, b, vectors, self.settings.adam_steps)
-
-
-def _known(row: RowFactor, bodies: Sequence[int], theta: Array) -> RowFactor:
-    """The same row with all bodies but these known: their part moves to the measured side."""
-    columns = np.arange(row.r.shape[1] - 1).reshape(-1, PER_BODY)
-    free = np.array([body in bodies for body in row.bodies])
-    others = [body for body in row.bodies if body not in bodies]
-    known = row.r[:, columns[~free].ravel()] @ theta[others].ravel()
-    kept = np.column_stack([row.r[:, columns[free].ravel()], row.r[:, -1] - known])
-    seen = tuple(body for body in row.bodies if body in bodies)
-    return RowFactor(row.name, row.kind, seen, qr_factor(kept), row.count)

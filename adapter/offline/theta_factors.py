@@ -17,14 +17,16 @@ from torch import Tensor
 
 from adapter.dynamics import MOMENT_Z, body_regressor, to_parent
 from adapter.errors import ModelError
+from adapter.inertia import PARAMETERS
 from adapter.kinematics import DTYPE, link_motion
+from adapter.offline.finite import check_dynamics, check_finite
 from adapter.spatial import Array
 from adapter.tree import BASE, Tree
 from adapter.tree_data import TreeData
 
 SUPERVISIONS = ("torques", "wrenches", "both")
 CHUNK = 1024  # samples a QR update takes in
-PER_BODY = 10
+PER_BODY = len(PARAMETERS)
 SMALLEST_SCALE = 1e-6  # of the median row: a row that is zero throughout gets the median's scale
 
 
@@ -210,8 +212,7 @@ def _check(data: TreeData, lam: Array, supervision: str, wrenches: Array | None)
     if supervision != "torques" and (wrenches is None or wrenches.shape != wanted):
         got = "none" if wrenches is None else f"shape {wrenches.shape}"
         raise ModelError(f"supervision '{supervision}' needs wrenches {wanted}, got {got}")
-    tables = [data.q, data.dq, data.ddq, data.tau, data.base.w, data.base.a, data.base.dw, lam]
-    if supervision != "torques" and wrenches is not None:
-        tables.append(wrenches)
-    if not all(np.isfinite(x).all() for x in tables):
-        raise ModelError("the samples hold numbers that are not finite; leave those samples out")
+    check_dynamics(data)
+    check_finite({"tau": data.tau, "λ": lam})
+    if supervision != "torques":
+        check_finite({"wrenches": wrenches})

@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 import torch
 
 from adapter.dynamics import theta_from_log_cholesky_torch
+from adapter.identifiability import RANK_TOLERANCE
 from adapter.inertia import theta_from_log_cholesky
 from adapter.offline.possible_bodies import possible_theta
 from adapter.spatial import Array
 
-# Singular values below this, relative to the largest, with columns of equal length: combinations
-# that no row shows (as in `identifiability`).
-RANK_TOLERANCE = 1e-10
 # Random bodies to start from: masses (kg), distance of the centre and radii of gyration (m).
 START_MASS, START_REACH, START_RADIUS, START_SPREAD = (0.5, 10.0), 0.1, 0.1, 0.3
+GAP, NEGLIGIBLE = 1e-7, 1e-14
 
 
 @dataclass(frozen=True)
@@ -28,12 +28,15 @@ class Solution:
         cost: half the weighted sum of squares that is left.
         steps: taken.
         rank: directions of θ that the rows show; None where the solver does not ask.
+        converged: whether the cost is the least that such bodies allow, but for `GAP` of it or
+            `NEGLIGIBLE` of the signal.
     """
 
     theta: Array
     cost: float
     steps: int
     rank: int | None = None
+    converged: bool = True
 
 
 def least_squares_theta(r: Array, b: Array, prior: Array) -> Solution:
@@ -54,13 +57,14 @@ def consistent_theta(r: Array, b: Array) -> Solution:
     """Least squares over possible bodies, see `possible_bodies`.
 
     Raises:
-        ModelError: the solver gave up.
+        ModelError: the solver gave up without an answer.
     """
     scale, u, values, vt = _decomposed(r)
     shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
     hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
-    theta, steps = possible_theta(r, b, shown, hidden)
-    return Solution(theta, _cost(r, b, theta), steps, len(values))
+    found = possible_theta(r, b, shown, hidden)
+    cost = _cost(r, b, found.theta)
+    return Solution(found.theta, cost, found.steps, len(values), found.solved)
 
 
 def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
@@ -72,9 +76,18 @@ def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
     """
     scale = np.linalg.norm(r, axis=0)
     scale = np.where(scale > RANK_TOLERANCE * scale.max(initial=1e-300), scale, np.inf)
-    u, values, vt = np.linalg.svd(r / scale, full_matrices=True)
+    u, values, vt = _svd(r / scale)
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
     return scale, u[:, :rank], values[:rank], vt
+
+
+def _svd(matrix: Array) -> tuple[Array, Array, Array]:
+    """Full SVD; by the slower algorithm where the fast one does not converge."""
+    try:
+        u, values, vt = np.linalg.svd(matrix, full_matrices=True)
+    except np.linalg.LinAlgError:
+        u, values, vt = scipy.linalg.svd(matrix, full_matrices=True, lapack_driver="gesvd")
+    return u, values, vt
 
 
 def adam_theta(
@@ -105,7 +118,9 @@ def adam_theta(
         (0.5 * theta @ (moments @ theta) - cross @ theta).backward()
         optimiser.step()
     found = theta_from_log_cholesky(x.detach().numpy())
-    return Solution(found, _cost(r, b, found), steps)
+    cost, least = _cost(r, b, found), consistent_theta(r, b).cost
+    close = cost - least <= max(GAP * least, NEGLIGIBLE * 0.5 * power)
+    return Solution(found, cost, steps, converged=close)
 
 
 def random_bodies(count: int, rng: np.random.Generator) -> Array:

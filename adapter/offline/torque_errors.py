@@ -10,6 +10,8 @@ import torch
 from adapter.dynamics import inverse_dynamics
 from adapter.errors import ModelError
 from adapter.kinematics import DTYPE
+from adapter.offline.finite import check_dynamics, check_finite
+from adapter.offline.theta_factors import PER_BODY
 from adapter.spatial import Array
 from adapter.tree_data import TreeData
 
@@ -34,7 +36,16 @@ class TorqueErrors:
 
 
 def predicted_torques(data: TreeData, lam: Array, theta: Array) -> Array:
-    """τ (m, rows) of λ (n, 6) and θ (bodies, 10) for the samples' motion, N m."""
+    """τ (m, rows) of λ (n, 6) and θ (bodies, 10) for the samples' motion, N m.
+
+    Raises:
+        ModelError: λ or θ of another shape, or numbers that are not finite.
+    """
+    wanted = (data.tree.n, 6), (data.tree.bodies, PER_BODY)
+    if (lam.shape, theta.shape) != wanted:
+        raise ModelError(f"λ and θ must have shapes {wanted}, got {lam.shape} and {theta.shape}")
+    check_dynamics(data)
+    check_finite({"λ": lam, "θ": theta})
     lam_t, theta_t = (torch.as_tensor(x, dtype=DTYPE) for x in (lam, theta))
     out = np.empty_like(data.tau)
     with torch.no_grad():
@@ -50,12 +61,11 @@ def relative_errors(tau: Array, estimate: Array) -> Array:
     """Eq. 20 by sample and joint, (m, n), in 0 to 2; NaN where |tau| is at most `LEAST_TORQUE`.
 
     Raises:
-        ModelError: tables of different shapes, or an estimate that is not finite.
+        ModelError: tables of different shapes, or numbers that are not finite.
     """
     if tau.shape != estimate.shape or tau.ndim != 2:
         raise ModelError(f"torques {tau.shape} and estimates {estimate.shape} must be like tables")
-    if not np.isfinite(estimate).all():
-        raise ModelError("the estimated torques are not all finite")
+    check_finite({"measured torque": tau, "estimated torque": estimate})
     judged = np.abs(tau) > LEAST_TORQUE
     larger = np.maximum(np.abs(tau), np.abs(estimate))
     error = np.abs(tau - estimate) / np.where(judged, larger, 1.0)

@@ -175,10 +175,14 @@ def test_impossible_least_squares_are_kept_out() -> None:
     assert truth[0] < truth[1]  # what is known to be possible keeps noise out
 
 
-def test_a_solver_that_gives_up_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_solver_that_stops_early_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bodies are possible all the same."""
+    rng = np.random.default_rng(6)
+    r, b = rng.normal(size=(30, 10)), rng.normal(size=30)
+    assert consistent_theta(r, b).converged
     monkeypatch.setattr("adapter.offline.possible_bodies.SOLVED", ())
-    with pytest.raises(ModelError, match="conic solver gave up"):
-        consistent_theta(np.eye(10), np.ones(10))
+    found = consistent_theta(r, b)
+    assert not found.converged and is_consistent(found.theta)
 
 
 def test_atlas_from_one_percent_of_samples() -> None:
@@ -191,10 +195,10 @@ def test_atlas_from_one_percent_of_samples() -> None:
     found = learn_theta(data, lam, 5)
     error = torque_errors(control, lam, found.theta)
     assert error.median < 1e-6 and error.p99 < 1e-3
-    assert found.rank == 220 and found.min_eigenvalue > 0.0
+    assert found.rank == 220 and found.min_eigenvalue > 0.0 and found.converged
     ranks = {s.name: (s.rank, s.parameters) for s in found.stages}
     assert ranks["right leg"] == ranks["left leg"] == (42, 60)
-    assert ranks["upper body"] == (126, 180) and ranks["pelvis"] == (10, 10)
+    assert ranks["upper body"] == (126, 180)
     assert ranks["whole tree"] == (220, 310)
 
 
@@ -202,7 +206,7 @@ def test_relative_error_is_that_of_the_paper() -> None:
     measured = np.array([[2.0, -1.0, 0.05, 1.0]])
     predicted = np.array([[1.0, -2.0, 0.0, -1.0]])
     np.testing.assert_allclose(relative_errors(measured, predicted), [[0.5, 0.5, np.nan, 2.0]])
-    with pytest.raises(ModelError, match="not all finite"):
+    with pytest.raises(ModelError, match="not finite"):
         relative_errors(measured, predicted * np.nan)
     with pytest.raises(ModelError, match="like tables"):
         relative_errors(measured, predicted[:, :2])
