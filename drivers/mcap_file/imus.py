@@ -149,6 +149,7 @@ def _same(one: Imu, other: Imu) -> bool:
     return (
         np.array_equal(one.stamp_ns, other.stamp_ns)
         and np.array_equal(one.w, other.w, equal_nan=True)
+        and np.array_equal(one.a, other.a, equal_nan=True)
         and bool(np.any(one.w))
     )
 

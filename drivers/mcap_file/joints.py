@@ -51,7 +51,7 @@ def assemble_joints(
         series, path: the topic, its file.
         want: names of joints that must be there.
         effort: whether messages without efforts are of no use. If not, torques are not a number
-            where there are none, and velocities that are 0 throughout are taken for absent.
+            where there are none, velocities where no message has any; 0 throughout is none.
 
     Raises:
         DriverError: no message has the joints asked for, or none has positions (and efforts).
@@ -69,9 +69,10 @@ def assemble_joints(
             raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
         warnings.append(f"{where} has no efforts: nothing is learned from torques")
     absent: NDArray[np.bool_] = np.all(np.isnan(dq), axis=1)
-    if not effort and not np.any(dq) and len(q) and np.any(q != q[0]):
-        absent[:] = True
-    if absent.any():
+    if not effort and (absent.all() or not np.any(dq)) and np.any(q != q[:1]):
+        dq = np.full_like(q, np.nan)
+        warnings.append(f"{where} has no velocities: they are those of the filtered positions")
+    elif absent.any():
         dq = np.where(absent[:, None], derive_velocity(stamp_ns, q), dq)
         warnings.append(
             f"{where}: {int(absent.sum())} of {len(q)} messages have no velocity; "

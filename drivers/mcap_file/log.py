@@ -46,7 +46,7 @@ class Log:
         path: where it came from.
         joint_names: order of the columns.
         stamp_ns: (m,) header stamps as recorded, not sorted.
-        q, dq, tau: (m, n) rad, rad/s, N m; of sensors on links, tau may be not a number.
+        q, dq, tau: (m, n) rad, rad/s, N m; read for discovery, dq and tau may be all not a number.
         link_names: order of the links; of our own recordings link i is moved by joint i.
         twists, accels: (m, links, 6) measured link motion, not a number where a stamp has none;
             None where the file has none at all.
@@ -153,7 +153,7 @@ def read_log(
         topic: of the joint states.
         sensors: read what sensors on links recorded beside the joints, for discovery: also
             Imu topics and link motion with stamps of its own, carried to the joint samples'
-            stamps; efforts may be absent.
+            stamps; efforts and velocities may be absent.
 
     Raises:
         DriverError: the file is unreadable or empty, or has no joint states with positions and
