@@ -1,9 +1,9 @@
-"""Bytes of the three ROS 2 messages in a recording, both ways, one at a time or many at once.
+"""Bytes of the ROS 2 messages in a recording, both ways, one at a time or many at once.
 
 Written: CDR (XCDR1) little endian, encapsulation header 00 01 00 00. Read: plain CDR of either
 byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes). Alignment counts from
 the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4 (encapsulation, plain
-CDR); message fields: see `ros_schemas`.
+CDR); message fields: see `ros_schemas`. Imu is only read.
 
 Decoding is split in two: a parser finds *where* the numbers of a message lie (`Layout`), then
 numpy reads them, from one message or from all messages whose other bytes are the same. Encoders
@@ -33,6 +33,7 @@ __all__ = [
     "decode_joint_state",
     "decode_many",
     "decode_motion",
+    "parse_imu",
     "parse_joint_state",
     "parse_motion",
 ]
@@ -42,6 +43,7 @@ Rows = NDArray[np.uint8]
 
 _STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulation header
 _MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
+IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
 _LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
@@ -150,6 +152,12 @@ def parse_motion(data: Bytes) -> Layout:
     return Layout(cursor.little, cursor.text(), (), (cursor.doubles(6),))
 
 
+def parse_imu(data: Bytes) -> Layout:
+    """Layout of a sensor_msgs/Imu: one run of `IMU_DOUBLES`. Raises CdrError."""
+    cursor = _Cursor(data)
+    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(IMU_DOUBLES),))
+
+
 def decode_joint_state(data: Bytes) -> JointState:
     """One JointState. Raises CdrError."""
     block = _read(np.frombuffer(data, np.uint8)[None], np.zeros(1, int), parse_joint_state(data))
@@ -173,7 +181,7 @@ def decode_many(
 
     Args:
         rows: (m, size) bytes, one message a row.
-        parse: `parse_joint_state` or `parse_motion`.
+        parse: `parse_joint_state`, `parse_motion` or `parse_imu`.
 
     Returns:
         The blocks, and (place, reason) of messages that cannot be read.

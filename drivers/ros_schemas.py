@@ -16,6 +16,7 @@ _FIELDS = {
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
     "geometry_msgs/Accel": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
 }
 
 
@@ -29,6 +30,7 @@ _HEADER = ("std_msgs/Header", "builtin_interfaces/Time")
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
+IMU = "sensor_msgs/msg/Imu"
 
 SCHEMAS = {
     JOINT_STATE: _schema(
@@ -43,5 +45,12 @@ SCHEMAS = {
     ACCEL_STAMPED: _schema(
         "std_msgs/Header header\ngeometry_msgs/Accel accel\n",
         (*_HEADER, "geometry_msgs/Accel", "geometry_msgs/Vector3"),
+    ),
+    IMU: _schema(
+        "std_msgs/Header header\n"
+        "geometry_msgs/Quaternion orientation\nfloat64[9] orientation_covariance\n"
+        "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
+        "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n",
+        (*_HEADER, "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
     ),
 }

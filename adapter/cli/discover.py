@@ -28,7 +28,13 @@ def add_parser(commands: Any) -> None:
         "which link and who is whose parent, each with a confidence; say what the data leave "
         "open; then learn λ, and θ where torques were recorded.",
     )
-    parser.add_argument("log", type=Path, metavar="LOG", help="MCAP recording with link motion")
+    parser.add_argument(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="MCAP recording with link motion: Imu topics, "
+        "or /link_twists/<link> and /link_accels/<link>",
+    )
     parser.add_argument(
         "--cutoff", type=float, default=CUTOFF_HZ, metavar="HZ", help="of the filter, default 20"
     )
@@ -45,7 +51,7 @@ def add_parser(commands: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    log = read_log(args.log)
+    log = read_log(args.log, sensors=True)
     warn(log.warnings)
     found = discover(log, args.cutoff, args.base)
     warn(list(found.notes))
@@ -155,7 +161,8 @@ def _lambda_figures(learned: Learned) -> dict[str, Any]:
 def _write_model(args: argparse.Namespace, found: Discovery, learned: Learned) -> dict[str, Any]:
     model, left = self_model(found, learned, args.log.stem)
     model.save(args.model)
-    what = "λ alone (no torques, or no accelerations with gravity)"
+    lacking = "no torques" if found.recorded.tau is None else "no torques above 0"
+    what = f"λ alone ({lacking if 'a' in found.bodies.motion else 'no accelerations'})"
     if left is not None:
         what = f"λ and θ; torque left unexplained {left.max():.2g} N m rms at the worst joint"
     console.print(f"{args.model}: {what}")

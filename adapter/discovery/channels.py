@@ -40,9 +40,9 @@ def check(log: Log, shortest_s: float) -> None:
     links = ", ".join(log.link_names) or "none"
     if not log.link_names or (log.twists is None and log.accels is None):
         raise SettingsError(
-            f"{log.path}: has no motion of links (topics /link_twists/<link> or "
-            f"/link_accels/<link>), of links: {links}; it needs that of every link, measured in "
-            "the link's own frame"
+            f"{log.path}: has no motion of links (sensor_msgs/msg/Imu on any topic, or "
+            f"/link_twists/<link> or /link_accels/<link>), of links: {links}; it needs that of "
+            f"every link, measured in the link's own frame; has: {_topics(log)}"
         )
     if len(log.link_names) < 2 and len(log.joint_names) > 1:
         raise SettingsError(
@@ -54,6 +54,11 @@ def check(log: Log, shortest_s: float) -> None:
         raise SettingsError(
             f"{log.path}: lasts {span_s:.2f} s; discovery needs at least {shortest_s} s of motion"
         )
+
+
+def _topics(log: Log) -> str:
+    told = [f"{name} ({t.messages} {t.schema or t.encoding})" for name, t in log.topics.items()]
+    return ", ".join(told) or "no topic"
 
 
 def channels_of(log: Log, rows: np.ndarray) -> Channels:

@@ -104,7 +104,8 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> Recorded:
     heard = np.ones(len(grid), dtype=bool)
     joints: dict[str, Array] = {}
     for name, values in (("q", _unwrapped(log.q[first])), ("dq", log.dq[first])):
-        joints[name] = _onto(grid, t_s, values, heard)
+        if name == "q" or np.isfinite(values).any(axis=0).all():
+            joints[name] = _onto(grid, t_s, values, heard)
     motion = {
         channel: np.stack(
             [_onto(grid, t_s, values[:, k], heard) for k in range(values.shape[1])], axis=1
@@ -183,10 +184,12 @@ def _filtered(
     channels: Channels,
 ) -> Recorded:
     joint_noise = {k: noise_from_samples(x) ** 2 * through.passes for k, x in joints.items()}
-    joint_noise["ddq"] = joint_noise["dq"] / through.passes * through.rate_passes
+    joint_noise.setdefault("dq", joint_noise["q"] / through.passes * through.rate_passes)
+    joint_noise["ddq"] = _rate_noise(joint_noise["dq"], through, "dq" in joints)
     joint_noise["q"] = np.minimum(joint_noise["q"], ENCODER_STEP**2)
     smooth = {k: through(x) for k, x in motion.items()}
-    q, dq = through(joints["q"]), through(joints["dq"])
+    q = through(joints["q"])
+    dq = through(joints["dq"]) if "dq" in joints else through.rate_of(q)
     ddq = through.rate_of(dq)
     turning = _Turning(through, len(grid), channels)
     turning.complete(smooth, noise)
@@ -222,6 +225,13 @@ def _filtered(
         notes=(*channels.notes, *turning.notes(log.link_names, moving)),
         adrift=adrift,
     )
+
+
+def _rate_noise(noise: Array, through: ZeroPhase, white: bool) -> Array:
+    """Variance of the rate of filtered noise; at most that of the corner where it isn't white."""
+    if white:
+        return noise / through.passes * through.rate_passes
+    return noise * (2 * np.pi * through.cutoff_hz) ** 2
 
 
 class _Turning:

@@ -2,7 +2,8 @@
 
 `/joint_states` (sensor_msgs/msg/JointState), `/link_twists/<link>` and `/link_accels/<link>`
 (geometry_msgs/msg/TwistStamped and AccelStamped, frame_id the link), `/joint_commands` (JointState
-with effort only), `/estimates` (JSON), a metadata record with configuration and version.
+with effort only), `/estimates` (JSON), a metadata record with configuration and version. Read only,
+and only for discovery: sensor_msgs/msg/Imu on any topic.
 """
 
 from drivers.mcap_file.joints import Commands, derive_velocity, looks_like_degrees

@@ -39,27 +39,40 @@ class Commands:
     tau: Array
 
 
-def assemble_joints(series: Series, path: Path, want: Sequence[str] | None) -> Joints:
+def assemble_joints(
+    series: Series, path: Path, want: Sequence[str] | None, *, effort: bool = True
+) -> Joints:
     """The joint states of a topic, in the order of the file.
 
     Messages of other joints than the chosen ones (those of `want`, else the most frequent set)
     are left out with a warning; a permuted order of joints is put straight.
 
+    Args:
+        series, path: the topic, its file.
+        want: names of joints that must be there.
+        effort: whether messages without efforts are of no use. If not, torques are not a number
+            where there are none, velocities where no message has any; 0 throughout is none.
+
     Raises:
-        DriverError: no message has the joints asked for, or none has positions and efforts.
+        DriverError: no message has the joints asked for, or none has positions (and efforts).
     """
     where = f"{path}: {series.topic}"
     check_type(series, path)
     warnings = _unreadable(series, where)
     series = _one_set_of_joints(series, where, want, warnings)
     names = series.blocks[0].layout.names
-    series = _complete(series, where, warnings)
+    series = _complete(series, where, warnings, effort)
     stamp_ns = stamps(series, where, warnings)
     q, dq, tau = (_column(series, run, names) for run in range(3))
     if np.isnan(tau).all():
-        raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
+        if effort:
+            raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
+        warnings.append(f"{where} has no efforts: nothing is learned from torques")
     absent: NDArray[np.bool_] = np.all(np.isnan(dq), axis=1)
-    if absent.any():
+    if not effort and (absent.all() or not np.any(dq)) and np.any(q != q[:1]):
+        dq = np.full_like(q, np.nan)
+        warnings.append(f"{where} has no velocities: they are those of the filtered positions")
+    elif absent.any():
         dq = np.where(absent[:, None], derive_velocity(stamp_ns, q), dq)
         warnings.append(
             f"{where}: {int(absent.sum())} of {len(q)} messages have no velocity; "
@@ -76,6 +89,7 @@ def assemble_joints(series: Series, path: Path, want: Sequence[str] | None) -> J
 
 
 _NEED = "learning needs positions and measured joint torques (effort)"
+_NEED_POSITION = "discovery needs the positions of the joints"
 
 
 def check_type(series: Series, path: Path) -> None:
@@ -134,22 +148,25 @@ def _run(block: Block, run: int) -> Array | None:
     return values if values.shape[1] == len(block.layout.names) else None
 
 
-def _complete(series: Series, where: str, warnings: list[str]) -> Series:
-    """Messages with positions and efforts; velocities may be absent, but not of another length."""
-    for run, what in ((0, "position"), (2, "effort")):
+def _complete(series: Series, where: str, warnings: list[str], effort: bool) -> Series:
+    """Messages with positions (and efforts); what else has another length counts as absent."""
+    needed, need = ((0, 2), _NEED) if effort else ((0,), _NEED_POSITION)
+    what_of = {0: "position", 2: "effort"}
+    for run in needed:
         if all(_run(block, run) is None for block in series.blocks):
             lengths = sorted({block.values[run].shape[1] for block in series.blocks})
             count = len(series.blocks[0].layout.names)
             raise DriverError(
-                f"{where} has no {what} ({', '.join(map(str, lengths))} values for {count} "
-                f"joints); {_NEED}"
+                f"{where} has no {what_of[run]} ({', '.join(map(str, lengths))} values for "
+                f"{count} joints); {need}"
             )
-    part = series.only(lambda b: _run(b, 0) is not None and _run(b, 2) is not None)
+    part = series.only(lambda b: all(_run(b, run) is not None for run in needed))
     if not part.blocks:
         raise DriverError(f"{where} has no message with both position and effort; {_NEED}")
     if part.count < series.count:
         warnings.append(
-            f"{where}: {series.count - part.count} messages lack position or effort; left out"
+            f"{where}: {series.count - part.count} messages lack "
+            f"{' or '.join(what_of[run] for run in needed)}; left out"
         )
     return part
 

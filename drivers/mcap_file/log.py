@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interface import Array, DriverError
-from drivers.mcap_file.joints import Commands, assemble_joints, read_commands
-from drivers.mcap_file.links import assemble_links
+from drivers.mcap_file.carried import Carrier
+from drivers.mcap_file.imus import with_imus
+from drivers.mcap_file.joints import Commands, Joints, assemble_joints, read_commands
+from drivers.mcap_file.links import Links, assemble_links
 from drivers.mcap_file.records import McapScan
 from drivers.mcap_file.series import Series, collect
 from drivers.mcap_file.writer import (
@@ -24,7 +26,7 @@ from drivers.mcap_file.writer import (
     LINK_TWISTS,
     METADATA,
 )
-from drivers.ros_schemas import JOINT_STATE
+from drivers.ros_schemas import IMU, JOINT_STATE
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +46,7 @@ class Log:
         path: where it came from.
         joint_names: order of the columns.
         stamp_ns: (m,) header stamps as recorded, not sorted.
-        q, dq, tau: (m, n) rad, rad/s, N m.
+        q, dq, tau: (m, n) rad, rad/s, N m; read for discovery, dq and tau may be all not a number.
         link_names: order of the links; of our own recordings link i is moved by joint i.
         twists, accels: (m, links, 6) measured link motion, not a number where a stamp has none;
             None where the file has none at all.
@@ -137,7 +139,11 @@ def _places(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[in
 
 
 def read_log(
-    path: str | Path, joint_names: Sequence[str] | None = None, topic: str = JOINT_STATES
+    path: str | Path,
+    joint_names: Sequence[str] | None = None,
+    topic: str = JOINT_STATES,
+    *,
+    sensors: bool = False,
 ) -> Log:
     """Read a recording, cut or whole, by whatever recorder.
 
@@ -145,24 +151,24 @@ def read_log(
         path: an MCAP file; chunked or not; uncompressed, zstd or lz4.
         joint_names: joints that must be there, in the order wanted; all joints where None.
         topic: of the joint states.
+        sensors: read what sensors on links recorded beside the joints, for discovery: also
+            Imu topics and link motion with stamps of its own, carried to the joint samples'
+            stamps; efforts and velocities may be absent.
 
     Raises:
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
     scan = McapScan(Path(path))
-    topics = collect(scan, lambda name: name in (topic, JOINT_COMMANDS) or _of_links(name))
+    topics = collect(scan, lambda series: _wanted(series, topic, sensors))
     series = topics.get(topic)
     if series is None or not series.count:
         raise DriverError(_nothing_found(scan, topics, topic))
     with np.errstate(invalid="ignore"):  # not-a-number is counted, not computed with
-        joints = assemble_joints(series, scan.path, joint_names)
+        joints = assemble_joints(series, scan.path, joint_names, effort=not sensors)
     warnings = scan.warnings + joints.warnings
     metadata = _metadata(scan)
-    order = metadata.get("link_names")
-    links = assemble_links(
-        topics, joints.stamp_ns, order if isinstance(order, list) else [], scan.path, warnings
-    )
+    links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
     commands = None
     if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
         commands = read_commands(topics[JOINT_COMMANDS], scan.path, joints.names, warnings)
@@ -189,7 +195,7 @@ def read_log(
 def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
     """Topics, warnings and whether the file is cut, of any MCAP file. Raises DriverError."""
     scan = McapScan(Path(path))
-    return _summary(collect(scan, lambda name: False)), scan.warnings, scan.truncated
+    return _summary(collect(scan, lambda series: False)), scan.warnings, scan.truncated
 
 
 def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[str, Any]]:
@@ -202,8 +208,33 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
             yield json.loads(region.data[region.start[i] : region.stop[i]].tobytes())
 
 
-def _of_links(topic: str) -> bool:
-    return topic.startswith((LINK_TWISTS, LINK_ACCELS))
+def _wanted(series: Series, topic: str, sensors: bool) -> bool:
+    """Whether the messages of a topic are decoded."""
+    if series.topic in (topic, JOINT_COMMANDS):
+        return True
+    if series.schema == IMU:
+        return sensors
+    return series.topic.startswith((LINK_TWISTS, LINK_ACCELS))
+
+
+def _links(
+    topics: Mapping[str, Series],
+    joints: Joints,
+    order: Any,
+    path: Path,
+    warnings: list[str],
+    sensors: bool,
+) -> Links:
+    names = order if isinstance(order, list) else []
+    if not sensors:
+        return assemble_links(topics, joints.stamp_ns, names, path, warnings)
+    carrier = Carrier(joints.stamp_ns, path, warnings)
+    others = {name: series for name, series in topics.items() if series.schema != IMU}
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are found by their size
+        links = assemble_links(others, joints.stamp_ns, names, path, warnings, carrier)
+        links = with_imus(links, topics, carrier, path, warnings)
+    carrier.tell()
+    return links
 
 
 def _summary(topics: Mapping[str, Series]) -> dict[str, Topic]:

@@ -9,15 +9,24 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from drivers.cdr import Block, Bytes, Layout, decode_many, parse_joint_state, parse_motion
+from drivers.cdr import (
+    Block,
+    Bytes,
+    Layout,
+    decode_many,
+    parse_imu,
+    parse_joint_state,
+    parse_motion,
+)
 from drivers.mcap_file.records import McapScan
 from drivers.mcap_file.walk import Region
-from drivers.ros_schemas import ACCEL_STAMPED, JOINT_STATE, TWIST_STAMPED
+from drivers.ros_schemas import ACCEL_STAMPED, IMU, JOINT_STATE, TWIST_STAMPED
 
 _PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     JOINT_STATE: parse_joint_state,
     TWIST_STAMPED: parse_motion,
     ACCEL_STAMPED: parse_motion,
+    IMU: parse_imu,
 }
 
 
@@ -88,7 +97,7 @@ def schema_name(scan: McapScan, channel: Channel) -> str:
     return "/".join((parts[0], "msg", parts[1])) if len(parts) == 2 else schema.name
 
 
-def collect(scan: McapScan, wanted: Callable[[str], bool]) -> dict[str, Series]:
+def collect(scan: McapScan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
     """Every topic of the file by name; those `wanted` are decoded, the others counted."""
     topics: dict[str, Series] = {}
     unknown = 0
@@ -101,7 +110,7 @@ def collect(scan: McapScan, wanted: Callable[[str], bool]) -> dict[str, Series]:
                 unknown += len(which)
                 continue
             series = _series(topics, scan, scan.channels[numbers[0]])
-            if wanted(topic) and series.encoding == "cdr" and series.schema in _PARSERS:
+            if wanted(series) and series.encoding == "cdr" and series.schema in _PARSERS:
                 series.add(region, which, times)
             else:
                 series.count += len(which)
