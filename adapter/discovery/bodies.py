@@ -21,6 +21,8 @@ from adapter.spatial import Array, skew
 
 NO_JOINT = -1  # the link rides rigidly on its parent
 REST_RATIO = 3.0  # a link at rest moves less than so many times its noise's variance
+# A mean below this does not speak against rest: gravity, and the bias of a gyroscope.
+MOST_BIAS = {"a": np.inf, "w": np.radians(3.0)}  # m/s², rad/s
 LEVER_M = 0.4  # m, distance of two neighbouring frames for which noise of the turning counts
 # Filtering and sampling are not quite the same for all signals: share of a signal that may be
 # left over without meaning anything.
@@ -96,7 +98,9 @@ def bodies_of(recorded: Recorded, base: int | None = None) -> Bodies:
     links = len(recorded.link_names)
     at_rest = np.ones(links, dtype=bool)
     for k in motion:
-        x = motion[k] - (motion[k].mean(axis=0) if k == "a" else 0.0)
+        mean = motion[k].mean(axis=0)
+        small = np.linalg.norm(mean, axis=1, keepdims=True) < MOST_BIAS.get(k, 0.0)
+        x = motion[k] - np.where(small, mean, 0.0)
         at_rest &= np.mean(x**2, axis=(0, 2)) < REST_RATIO * noise[k] + ABSOLUTE_FLOOR[k] ** 2
     for k, x in motion.items():
         x[:, at_rest] = x[:, at_rest].mean(axis=0) if k == "a" else 0.0

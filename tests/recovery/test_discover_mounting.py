@@ -164,6 +164,19 @@ def test_no_wrong_edge_is_trusted(
         assert doubtful
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_base_at_rest_whose_gyroscope_is_biased_is_the_root(seed: int) -> None:
+    """As all the other gyroscopes are, by 0.3 °/s."""
+    case = _case("panda", seed, Motion(seconds=8.0, rate_hz=RATE_HZ), base=True)
+    twists = case.log.twists
+    assert twists is not None
+    drawn = np.random.default_rng(seed).normal(size=twists.shape[1:])[:, 3:]
+    bias = np.radians(0.3) * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    found = discover(replace(case.log, twists=twists + np.pad(bias, ((0, 0), (3, 0)))))
+    assert found.root == case.root
+    assert {(e.joint, e.link, e.parent) for e in found.edges} == case.edges
+
+
 def test_base_at_rest_is_the_root_also_where_frames_are_any() -> None:
     case = _case("panda", 13, base=True)
     found = discover(case.log)
