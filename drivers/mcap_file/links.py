@@ -104,7 +104,7 @@ def _frames_of_their_own(
     """Frames that can only be the links' own, though they have other names.
 
     Motion told in a frame of the world, of the base or of another link shares that frame with
-    others, or with their names. So all links must have a frame each that no other has.
+    others, or with their names. So all links must have a frame each that no other has, or none.
     """
     frames = {}
     for name in names:
@@ -115,6 +115,9 @@ def _frames_of_their_own(
                 counts[block.layout.frame_id] += len(block.index)
         frames[name] = max(counts, key=lambda frame: counts[frame], default="")
     told = set(frames.values())
+    if told == {""}:
+        warnings.append(f"{path}: no frame of link motion is named; taken to be the links' own")
+        return frames
     if len(names) < 2 or len(told) < len(names) or "" in told or told & set(names):
         return {}
     pairs = ", ".join(f"{frame!r} of {name!r}" for name, frame in frames.items())

@@ -153,6 +153,7 @@ def test_two_sensors_on_a_topic_and_a_clock_of_its_own(tmp_path) -> None:
         ((LINKS[0], LINKS[1], "world"), LINKS[:2]),
         (("world", LINKS[0], LINKS[1]), ()),  # that of the link before
         (("imu_1", "imu_2", ""), ()),
+        (("", "", ""), LINKS),  # not told; topics tell the links
     ],
 )
 def test_frames_that_may_be_of_another_body_are_left_out(tmp_path, frames, kept) -> None:
