@@ -97,10 +97,11 @@ def _print_tree(found: Discovery) -> None:
 def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
     for edge in edges:
         if edge.parent == parent:
-            style = "green" if edge.confidence >= DECIDED else "yellow"
+            sure = edge.confidence if edge.directed else edge.connected
+            style = "green" if sure >= DECIDED else "yellow"
             by = edge.joint if edge.joint is not None else "(no joint)"
-            way = "" if edge.directed else " [dim]or the other way round[/]"
-            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(edge.confidence)}[/]{way}"
+            way = "" if edge.directed else " [dim]this way or the other[/]"
+            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(sure)}[/]{way}"
             _hang(on.add(label), edge.link, edges)
 
 

@@ -41,8 +41,9 @@ class Edge:
         joint: name; None for a link that rides on its parent without a joint.
         link, parent: names; parent None for a link that nothing carries.
         confidence: probability of the three together, given that the truth is among the
-            hypotheses; where it is not directed, of the joint between these two links.
-        directed: whether the data tell which of the two carries the other.
+            hypotheses.
+        connected: that of the joint between these two links, whichever carries the other.
+        directed: whether the data tell which of the two does.
         rival: the next best (joint, parent) of the same link; None where nothing comes close.
     """
 
@@ -50,12 +51,13 @@ class Edge:
     link: str
     parent: str | None
     confidence: float
+    connected: float
     rival: Edge | None = None
     directed: bool = True
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        keys = ("joint", "link", "parent", "confidence", "directed")
+        keys = ("joint", "link", "parent", "confidence", "connected", "directed")
         out = {key: getattr(self, key) for key in keys}
         return {**out, "rival": None if self.rival is None else self.rival.as_dict()}
 
@@ -194,17 +196,18 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
     roots: dict[str, float] = {}
     for option, ranked in zip(structure.chosen, posterior, strict=True):
         way = _direction(structure, shares, option.link)
-        share = dict(ranked)[option] * (way if way >= DECIDED else 1.0)
+        share = dict(ranked)[option]
         if option.link in shares:
             share = roots[names[option.link]] = shares[option.link][option.link]
         elif option.parent == FREE:
             roots[names[option.link]] = share
         elif option.parent == bodies.unseen_base:
             roots[names[option.parent]] = max(share, roots.get(names[option.parent], 0.0))
-        confidence.append(share)
+        confidence.append(share * (way if way >= DECIDED else 1.0))
         others = [(o, p) for o, p in ranked if o != option and p >= WORTH_TELLING]
         rival = _edge(bodies, *others[0]) if others else None
-        edges.append(replace(_edge(bodies, option, share, rival), directed=way >= DECIDED))
+        edge = _edge(bodies, option, share, rival)
+        edges.append(replace(edge, confidence=way * share, directed=way >= DECIDED))
     order = {name: k for k, name in enumerate(bodies.recorded.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
@@ -241,4 +244,4 @@ def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = Non
     names = body_names(bodies)
     joint = None if option.joint == NO_JOINT else bodies.recorded.joint_names[option.joint]
     parent = None if option.parent == FREE else names[option.parent]
-    return Edge(joint, names[option.link], parent, share, rival)
+    return Edge(joint, names[option.link], parent, share, share, rival)

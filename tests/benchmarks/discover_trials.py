@@ -99,15 +99,17 @@ HARD = (
 def judge(case: Case, found: Discovery) -> dict[str, Any]:
     """Right, wrong, and the confidences that matter.
 
-    An edge whose direction is said to be open is right if it connects the right links.
+    An edge whose direction is said to be open is right if it connects the right links. What
+    counts against an edge is its confidence as it stands, or that of a connection that is not.
     """
     named = {
         (e.joint, e.link, e.parent): e for e in found.edges if e.joint and e.parent is not None
     }
     either_way = case.edges | {(joint, parent, link) for joint, link, parent in case.edges}
     truth = {key: either_way if not e.directed else case.edges for key, e in named.items()}
-    right = [e.confidence for key, e in named.items() if key in truth[key]]
-    wrong = [e.confidence for key, e in named.items() if key not in truth[key]]
+    right = [e.connected for key, e in named.items() if key in truth[key]]
+    wrong = [e.connected for key, e in named.items() if key not in truth[key]]
+    told = [e.confidence for key, e in named.items() if key not in case.edges]
     root = found.root == case.root or found.root_confidence <= TRUSTED
     return {
         "edges": len(case.edges),
@@ -117,7 +119,7 @@ def judge(case: Case, found: Discovery) -> dict[str, Any]:
         "least_right": min(right, default=None),
         "trusted_right": sum(c > TRUSTED for c in right),
         "wrong": len(wrong),
-        "worst_wrong": max(wrong, default=0.0),
+        "worst_wrong": max(wrong + told, default=0.0),
         "root_right": found.root == case.root,
         "worst_root": found.root_confidence if found.root not in (case.root, None) else 0.0,
         "undecided": len(found.undecided),

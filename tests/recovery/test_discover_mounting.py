@@ -52,18 +52,14 @@ def _connected(found: Discovery) -> set[tuple[str | None, frozenset[str | None]]
 
 
 def _worst_wrong(case: Case, found: Discovery) -> float:
-    """Confidence of an edge that is not there, or not so where its direction is told."""
-    pairs = _pairs(case)
-    wrong = [
-        e.confidence
-        for e in found.edges
-        if e.joint is not None
-        and (
-            (e.joint, frozenset((e.link, e.parent))) not in pairs
-            or (e.directed and (e.joint, e.link, e.parent) not in case.edges)
-        )
-    ]
-    return max(wrong, default=0.0)
+    """Most confidence in a connection that is not there, or in an edge as it is not."""
+    pairs, worst = _pairs(case), 0.0
+    for e in (e for e in found.edges if e.joint is not None):
+        if (e.joint, frozenset((e.link, e.parent))) not in pairs:
+            worst = max(worst, e.connected)
+        elif (e.joint, e.link, e.parent) not in case.edges:
+            worst = max(worst, e.confidence)
+    return worst
 
 
 def _heard(log: Log, parts: str) -> Log:
@@ -97,7 +93,8 @@ def test_floating_base_decides_what_is_connected_and_a_word_the_rest(seed: int, 
     log = _heard(case.log, parts)
     found = discover(log)
     assert _connected(found) == _pairs(case) and not any(e.directed for e in found.edges)
-    assert min(_named(found).values()) > 0.99
+    assert min(e.connected for e in found.edges) > 0.99
+    assert list(_named(found).values()) == pytest.approx([0.5] * 30, abs=0.01)  # either way
     assert found.root_confidence == pytest.approx(1 / 31, rel=0.05)
     assert len(found.undecided) == 1 and "--base" in found.undecided[0]
     named = discover(log, base=case.root)
@@ -109,7 +106,7 @@ def test_floating_base_decides_what_is_connected_and_a_word_the_rest(seed: int, 
 def test_links_that_keep_the_convention_tell_the_direction() -> None:
     case = _case("atlas", 0, share=0.2)
     found = discover(case.log)
-    assert _connected(found) == _pairs(case) and _worst_wrong(case, found) == 0.0
+    assert _connected(found) == _pairs(case) and _worst_wrong(case, found) < 0.51
     assert sum(e.directed for e in found.edges) >= 20
     turned = {name for name, b in case.body.items() if case.mounts[b][0][2, 2] < 1.0}
     named = discover(case.log, base=case.root)

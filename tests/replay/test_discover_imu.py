@@ -116,7 +116,7 @@ def test_floating_base_needs_a_word(tmp_path, capsys) -> None:
     case = _case(2, True, True)
     path = _write(tmp_path / "a.mcap", case, str, dq=True)
     assert any("--base" in line for line in _discovered(path)["undecided"])
-    assert "or the other way round" in capsys.readouterr().err
+    assert "this way or the other" in capsys.readouterr().err
     figures = _discovered(path, "--base", case.root)
     assert _edges(figures) == case.edges and figures["undecided"] == []
     assert main(["discover", str(path), "--base", "nobody"]) != 0
