@@ -101,11 +101,23 @@ def _fitted(ruler: Ruler, pairs: _Pairs) -> dict[Pair, Mounted]:
         for s, i in promising(bound[:, j], ruler.free_score() - LOST, MOST_MOUNTED):
             swap = i < j and not bodies.at_rest[i]
             wanted.add((s, i, j) if swap else (s, j, i))
-    out = {}
-    for s, j, i in sorted(wanted):
-        of = {k: float(x[s, j, i]) for k, x in pairs.variance.items()}
-        out[s, j, i] = mount(bodies, (j, i), s, pairs.axes.axis[s, j, i], of)
-    return out
+    return {at: _fit(ruler, pairs, at) for at in sorted(wanted)}
+
+
+def _fit(ruler: Ruler, pairs: _Pairs, at: Pair) -> Mounted:
+    """A pair's fit; begun at its other link too where the first leaves more than noise.
+
+    Both sides have the same minimum, but not the same ways into others.
+    """
+    s, j, i = at
+    of = {k: float(x[at]) for k, x in pairs.variance.items()}
+    fit = mount(ruler.bodies, (j, i), s, pairs.axes.axis[at], of)
+    if i >= ruler.bodies.links or ruler.total(_ratios(pairs, at, fit)) >= 0.0:
+        return fit
+    other = mount(ruler.bodies, (i, j), s, pairs.axes.axis[s, i, j], of)
+    if sum(other.misfit[k] / of[k] for k in of) >= sum(fit.misfit[k] / of[k] for k in of):
+        return fit
+    return Mounted(other.parent, other.child, other.misfit)
 
 
 def _ratios(pairs: _Pairs, at: Pair, fit: Mounted) -> dict[str, float]:

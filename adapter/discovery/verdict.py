@@ -169,11 +169,14 @@ def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) ->
 
 
 def _unexplained(hypotheses: Hypotheses, structure: Structure) -> bool:
-    """Whether the convention leaves links that nothing carries, or more misfit than noise does."""
+    """Whether the convention leaves links that nothing carries, joints that move none, or more
+    misfit than noise does."""
     bodies = hypotheses.bodies
+    used = {option.joint for option in structure.chosen}
+    idle = any(s not in used for s in np.flatnonzero(~bodies.resting).tolist())
     free = sum(option.parent == FREE for option in structure.chosen)
     carried = any(option.parent == bodies.unseen_base for option in structure.chosen)
-    return free + carried > 1 or max(hypotheses.excess.values()) > FREE_RATIO
+    return idle or free + carried > 1 or max(hypotheses.excess.values()) > FREE_RATIO
 
 
 def body_names(bodies: Bodies) -> tuple[str, ...]:
