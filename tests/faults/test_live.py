@@ -241,7 +241,7 @@ def test_after_kill_9_the_workers_close_the_recording_and_go(running):
     process.kill()
     process.wait()
     assert tools.wait_for(lambda: not _truncated(path))
-    assert len(read_log(path)) > 300
+    assert len(read_log(path)) > 100  # what 60 kB held at the least
 
 
 def _truncated(path: Path) -> bool:
