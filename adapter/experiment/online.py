@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.identifiability import frame_observability
+from adapter.model import gravity_down
 from adapter.outcome import frame_errors
 from adapter.spatial import Array
 from adapter.tree_data import BodyMotion, TreeData
@@ -17,7 +18,6 @@ from adapter.tree_learner import TreeLearner, samples_of
 HELD_OUT_EVERY = 10  # samples
 LOOK_EVERY = 5000  # samples between two looks at the errors
 PAUSE_NS = 1_000_000_000  # between two motions
-DOWN: Array = np.array([0.0, 0.0, -9.81])  # m/s²
 # Noise of signals behind a filter, standard deviations: rad, rad/s, rad/s² of joints; rad/s,
 # m/s², rad/s² of bodies; share of the torque's own spread.
 NOISE_Q, NOISE_DQ, NOISE_DDQ = 2e-5, 1e-3, 2e-2
@@ -94,7 +94,7 @@ def online_trial(
     """
     test = test.take(slice(None, None, HELD_OUT_EVERY))
     learner = TreeLearner(test.tree)
-    seen = frame_observability(learner.tree, true_lam, DOWN)
+    seen = frame_observability(learner.tree, true_lam, gravity_down())
     times_ns: list[int] = []
     history: list[dict[str, float]] = []
     clock_ns = 0

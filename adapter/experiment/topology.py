@@ -16,8 +16,6 @@ from adapter.discovery.verdict import UNSEEN_BASE
 from adapter.tree import BASE, Tree
 from drivers.mcap_file import Log
 
-DECIDING = 0.9  # confidence above which nothing wrong may be reported (the project's goal)
-
 Edges = frozenset[tuple[str, str, str]]  # (joint, the link it moves, its parent)
 
 
@@ -66,7 +64,6 @@ def judged(puzzle: Puzzle, found: Discovery) -> dict[str, Any]:
         "right": len(right) == len(puzzle.edges) and not wrong and found.root == puzzle.root,
         "least_confidence_right": min(right, default=0.0),
         "most_confidence_wrong": max(wrong, default=0.0),
-        "misfit_over_noise": dict(found.hypotheses.excess),
         "motion_s": found.recorded.duration_s,
     }
 
