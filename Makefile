@@ -3,10 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
-# Tests without a real-time loop, which may share the machine with each other.
-TIMELESS := tests/oracles tests/properties tests/recovery
+# Folders whose tests answer in seconds: what a change breaks at once
+QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/report
 
-.PHONY: run test experiment setup lint trials soak bench clean
+.PHONY: run test quick experiment setup lint trials soak bench clean
 
 run: $(STAMP)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
@@ -15,8 +15,11 @@ experiment: $(STAMP)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
 test: $(STAMP) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 $(TIMELESS)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(addprefix --ignore ,$(TIMELESS))
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m "not alone and not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "alone and not slow"
+
+quick: $(STAMP) lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m "not alone and not slow" $(QUICK)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -35,9 +38,11 @@ $(STAMP): pyproject.toml constraints.txt
 
 trials: $(STAMP)
 	mkdir -p runs
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m slow
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/discover_trials.py --hard --json runs/discover_trials.json
+	PYTHONPATH=. $(BIN)/python tests/benchmarks/mutations.py --json runs/mutations.json
 
 soak: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10

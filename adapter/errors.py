@@ -15,5 +15,13 @@ class ControlError(RuntimeError):
     """The controller cannot keep the arm; it has to be stopped by its driver."""
 
 
+class UsageError(ValueError):
+    """The command line asks for something that does not exist; the message names the choices."""
+
+
+class MeansError(RuntimeError):
+    """The machine lacks what is needed: memory that processes share, a process, an estimate."""
+
+
 class SettingsError(ValueError):
     """A setting has a value or a name that does not fit; the message says what does."""

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 
+from drivers.files.log import LogArm
 from drivers.interface import Driver, DriverError
-from drivers.log import LogArm
 
 Builder = Callable[[str], Driver]
-HARDWARE = ("fci", "can")  # behind these an arm may be real
+# Behind these an arm may be real. Loaded by name when one is opened: no arm needs the libraries
+# of another. The class takes (address, joint names, whether the arm may be moved).
+HARDWARE = {"fci": "drivers.fci.arm:FciArm", "can": "drivers.damiao.arm:DamiaoArm"}
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
 
@@ -46,12 +49,8 @@ def open_driver(
         return builders[scheme](rest)
     if scheme == "log":
         return LogArm(rest, joint_names)
-    if scheme == "fci":
-        from drivers.fci.arm import FciArm
-
-        return FciArm(address, joint_names, allow_motion)
-    if scheme == "can":
-        from drivers.damiao.arm import DamiaoArm  # brings python-can
-
-        return DamiaoArm(address, joint_names, allow_motion)
-    raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+    if scheme not in HARDWARE:
+        raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+    module, _, name = HARDWARE[scheme].partition(":")
+    driver: Driver = getattr(import_module(module), name)(address, joint_names, allow_motion)
+    return driver

@@ -21,7 +21,7 @@ catalogue: what is to be said of them is that something is unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,10 +30,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Number = float | list[float]
+JointLaw = Callable[[float, float, float, float], float]
 
 # Where an effect acts: on the motion of a joint, on the rigid bodies, at the flange, on what an
 # encoder or a torque sensor says. Name -> (place, needed keys, keys with a default).
 MOTION, BODY, WRENCH, ENCODER, TORQUE = "motion", "body", "wrench", "encoder", "torque"
+LAW = "law"  # in the motion of a joint too, but by a law that came with the entry
 SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "viscous_friction": (MOTION, ("Fv",), ()),
     "coulomb_friction": (MOTION, ("Fc",), ()),
@@ -84,31 +86,35 @@ class Effect:
     """One effect of a simulated arm.
 
     Attributes:
-        name: one of `SPECS`.
+        name: one of `SPECS`, or any other where a law comes with it.
         joints: counted from 1; what acts on the whole arm needs none, `signal_delay` without
             joints acts on all.
         parameters: by key; SI.
         interval_s: [from, to) in seconds of plant time, `to` None to the end; None for always.
+        law: of an effect that has no place in `SPECS`: q, dq, ddq and rigid torque of a joint
+            (rad, rad/s, rad/s², N m) to the torque that the effect takes there, N m.
     """
 
     name: str
     joints: tuple[int, ...]
     parameters: Mapping[str, Number] = field(hash=False)
     interval_s: tuple[float, float | None] | None = None
+    law: JointLaw | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        if self.name not in SPECS:
+        if self.name not in SPECS and self.law is None:
             raise ValueError(f"no effect {self.name!r}; have: {', '.join(SPECS)}")
         object.__setattr__(self, "joints", tuple(int(j) for j in self.joints))
-        _check_keys(self)
+        if self.name in SPECS:
+            _check_keys(self)
         _check_joints(self)
         if self.interval_s is not None and not self.start_s < self.end_s:
             raise ValueError(f"{self.name}: interval {self.interval_s} ends before it starts")
 
     @property
     def place(self) -> str:
-        """Where it acts: motion, body, wrench, encoder or torque."""
-        return SPECS[self.name][0]
+        """Where it acts: motion, body, wrench, encoder, torque, or by its own law."""
+        return SPECS[self.name][0] if self.name in SPECS else LAW
 
     @property
     def start_s(self) -> float:
@@ -149,8 +155,37 @@ class Effect:
         }
 
 
+def per_joint(name: str, key: str, values: Sequence[float] | Array) -> tuple[Effect, ...]:
+    """An effect of one parameter on every joint whose value (n,) is not zero."""
+    numbers = [float(value) for value in values]
+    return tuple(Effect(name, (j,), {key: x}) for j, x in enumerate(numbers, 1) if x)
+
+
+def payload(
+    m: float, com: Sequence[float] | Array, inertia: Array | None = None, t_s: float | None = None
+) -> Effect:
+    """A rigid body that the last link carries from `t_s` on.
+
+    It is taken over in motion: the joint velocities do not jump and the body arrives with the
+    velocity of the link, so that from then on only more force is needed to move it.
+
+    Args:
+        m: mass, kg.
+        com: (3,) centre of mass in the frame of the last link, m.
+        inertia: (3, 3) about it, axes of the last link, kg m²; a point's where None.
+        t_s: when, s of plant time; always where None.
+    """
+    cx, cy, cz = (float(x) for x in com)
+    numbers: dict[str, Number] = {"m": float(m), "cx": cx, "cy": cy, "cz": cz}
+    if inertia is not None:
+        numbers["inertia"] = np.asarray(inertia, float)[np.triu_indices(3)].tolist()
+    return Effect("payload", (), numbers, None if t_s is None else (t_s, None))
+
+
 def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
-    """The effect of a canonical entry: effect, joints, interval_s, parameters; no other key counts.
+    """The effect of a canonical entry: effect, joints, interval_s, parameters.
+
+    A `law` counts where the name is in no catalogue, and no other key does.
 
     Raises:
         ValueError: unknown name, a key that is missing, unknown or not a number.
@@ -161,7 +196,9 @@ def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
         raise ValueError(f"an effect entry has {sorted(entry)}; needs: effect, parameters")
     span = entry.get("interval_s")
     interval = None if span is None else (float(span[0] or 0.0), span[1])
-    return Effect(entry["effect"], tuple(entry.get("joints") or ()), entry["parameters"], interval)
+    law = None if entry["effect"] in SPECS else entry.get("law")
+    joints = tuple(entry.get("joints") or ())
+    return Effect(entry["effect"], joints, entry["parameters"], interval, law)
 
 
 def _check_keys(effect: Effect) -> None:

@@ -7,190 +7,266 @@ The torque that belongs to such a step is that of its middle, and the position a
 the stored one minus h/2 times the velocity. What is left is that PyBullet takes velocity-dependent
 forces at the step's start; the change of the Coriolis torque over half a sub-step is added (left
 out, it reads as a lag of 30 µs between torque and acceleration).
+
+Friction and what else acts on a joint enter the sub-step at its middle, stiff parts implicitly
+(`sim.joint_effects.step`). Where masses or gravity change, the arm moves on as another rigid arm.
 """
 
 from __future__ import annotations
 
-import tempfile
 import weakref
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pybullet as bullet
 
-from sim.bare import make_bare
+from sim.dynamics import end_effector
+from sim.effects import LAW, WRENCH
+from sim.joint_effects import Losses, add_up, bend, losses_at, rows_of, step
+from sim.rigid_bodies import Stage, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
-from sim.urdf_writer import payload_moments, urdf
 
 PERIOD_S = 1e-3
-SUBSTEPS = 4
-H_S = PERIOD_S / SUBSTEPS  # 0.25 ms
-MIDDLES = ((np.arange(SUBSTEPS) + 0.5) / SUBSTEPS)[:, None]  # of the sub-steps, in parts of a tick
-COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
+SUBSTEPS = 4  # of 0.25 ms
+FORCES = ("fx", "fy", "fz", "mx", "my", "mz")
+# End stops, our choice: a falling arm (50 J) gives them 0.14 rad and comes to rest there.
+STOP_STIFFNESS = 5000.0  # N m/rad
+SLOPE_RAD_S = 1e-3  # over which the slope of a law is taken
+STOP_DAMPING = 50.0  # N m s/rad
+
+
+class Law(NamedTuple):
+    """What the drives do during a tick, (n,) each: kp (q_des - q) + kd (dq_des - dq) + ff, cut.
+
+    A drive evaluates its law far more often than a millisecond, so that the law is part of every
+    sub-step, with its damping at the middle: kd = 5 N m s/rad on a wrist joint of 0.005 kg m²
+    would be unstable if it lagged by a tick.
+
+    Attributes:
+        q_des, dq_des, kp, kd: rad, rad/s, N m/rad, N m s/rad.
+        ff0: feed-forward torque at the start of the tick, N m.
+        ff1: at its end; linear in between.
+        most: limit of a drive's torque, N m; 0 for one that does not drive.
+    """
+
+    q_des: Array
+    dq_des: Array
+    kp: Array
+    kd: Array
+    ff0: Array
+    ff1: Array
+    most: Array
 
 
 class Engine:
-    """The rigid body, its losses and its payloads; knows nothing of time or commands.
+    """The rigid arm in its stages and all that acts on its joints; knows nothing of commands.
 
-    Two PyBullet clients: one holds the arm that moves; the other one never steps and holds the
-    arm once per payload stage, for mass matrix and inverse dynamics, which PyBullet caches per
-    body and does not renew when a mass changes.
+    Attributes:
+        stopped: a joint touched an end stop during the last tick.
     """
 
-    def __init__(self, truth: Truth) -> None:
-        self._n = truth.n
-        self._joints = list(range(truth.n))
-        self._truth = truth
-        self._lossy = bool(np.any([truth.Fv, truth.Fc, truth.motor_inertia]))
-        self._world = bullet.connect(bullet.DIRECT)
-        self._queries = bullet.connect(bullet.DIRECT)
-        self._close = weakref.finalize(self, _disconnect, self._world, self._queries)
-        self._arm = _load(truth, 0, self._world)
-        self._stages = [_load(truth, k, self._queries) for k in range(1 + len(truth.events))]
-        self._carried = 0
-        self._q = self._dq = self._ddq = np.zeros(truth.n)
-        self._prepare()
+    def __init__(
+        self,
+        truth: Truth,
+        period_s: float = PERIOD_S,
+        substeps: int = SUBSTEPS,
+        end_stops: bool = False,
+    ) -> None:
+        """Load the arm.
 
-    def _prepare(self) -> None:
-        """Switch off whatever PyBullet adds on its own account."""
-        arm, world = self._arm, self._world
-        make_bare(arm, world)
-        bullet.setJointMotorControlArray(
-            arm,
-            self._joints,
-            bullet.VELOCITY_CONTROL,
-            forces=[0.0] * self._n,
-            physicsClientId=world,
-        )
-        bullet.setTimeStep(H_S, physicsClientId=world)
-        for client in (world, self._queries):
-            bullet.setGravity(*self._truth.gravity.tolist(), physicsClientId=client)
+        Args:
+            truth: arm and effects; those of the sensors are not this class's business.
+            period_s: of a tick.
+            substeps: of a tick.
+            end_stops: whether joints have springs at the ends of their ranges.
+
+        Raises:
+            ValueError: a body that cannot be simulated.
+        """
+        self._n, self._period_s, self._substeps = truth.n, period_s, substeps
+        self._h = period_s / substeps
+        self._joints, self._rest = list(range(truth.n)), np.zeros(truth.n)
+        self._lower = truth.limits.lower if end_stops else np.full(truth.n, -np.inf)
+        self._upper = truth.limits.upper if end_stops else np.full(truth.n, np.inf)
+        self.stopped, self._end_stops = False, end_stops
+        self._mass: Array | None = None
+        self._rows = rows_of(truth)
+        self._bent = np.zeros(len(self._rows))
+        self._wrenches = [
+            (effect.start_s, effect.end_s, np.array([effect.number(key) for key in FORCES]))
+            for effect in truth.effects
+            if effect.place == WRENCH
+        ]
+        self._laws = [
+            (effect, j)
+            for effect in truth.effects
+            if effect.place == LAW
+            for j in effect.columns(truth.n)
+        ]
+        self._stages: list[Stage] = []
+        clients: list[int] = []
+        self._close = weakref.finalize(self, disconnect, clients)
+        for start_s, rigid in rigid_truths(truth, period_s):
+            self._stages.append(load(start_s, rigid, self._h))
+            clients.append(self._stages[-1].client)
+        self._ticks, self._start_s = 0, 0.0
+        self._stage = self._stages[0]
+        self.place(self._rest, self._rest)
 
     @property
     def truth(self) -> Truth:
-        """The arm, payloads aside."""
-        return self._truth
+        """The rigid arm as it is at present."""
+        return self._stage.truth
 
-    def place(self, q: Array, dq: Array) -> None:
-        """Put the arm at positions q (n,) rad with velocities dq (n,) rad/s."""
-        for j, at, speed in zip(
-            self._joints, (q + H_S / 2 * dq).tolist(), dq.tolist(), strict=True
-        ):
-            bullet.resetJointState(self._arm, j, at, speed, physicsClientId=self._world)
-        self._q, self._dq, self._ddq = q, dq, np.zeros(self._n)
+    def place(self, q: Array, dq: Array, t_s: float = 0.0) -> None:
+        """Put the arm at q (n,) rad with dq (n,) rad/s at the time t_s."""
+        self.set_time(t_s)
+        self._stage = self._due()
+        self._set(q + self._h / 2 * dq, dq)
+        self._q, self._dq = q, dq
+        self._ddq: Array | None = None  # unknown before the first tick
+
+    def set_time(self, t_s: float) -> None:
+        """What the effects' clock shows from now on."""
+        self._ticks, self._start_s = 0, t_s
 
     def state(self) -> tuple[Array, Array]:
-        """q (n,) rad and dq (n,) rad/s at the stamp."""
+        """q (n,) rad and dq (n,) rad/s of the links at the stamp."""
         return self._q, self._dq
 
     def tick(self, start: Array, end: Array) -> None:
         """Move on by one period, driving torque (n,) N m linear from `start` to `end`."""
-        ahead = self._coriolis_ahead()
-        for tau in start + MIDDLES * (end - start):
-            rigid = self._through_the_drive(tau) if self._lossy else tau
+        nothing = self._rest
+        self.drive(Law(nothing, nothing, nothing, nothing, start, end, np.full(self._n, np.inf)))
+
+    def drive(self, law: Law) -> None:
+        """Move on by one period under a law of the drives."""
+        t, h, stored, dq = self._now(), self._h, self._q + self._h / 2 * self._dq, self._dq
+        due = self._due()
+        if due is not self._stage:
+            self._stage = due
+            self._set(stored, dq)
+        if self._ddq is None:
+            self._ddq = self.acceleration(self._q, dq, law.ff0)
+        stage, ahead = self._stage, self._coriolis_ahead(self._ddq)
+        self.stopped, self._mass = False, None
+        # Where nothing depends on the motion the state is only asked for at the tick's end.
+        acting = len(self._rows) or self._laws or self._wrenches or self._end_stops
+        free = not acting and not law.kp.any() and not law.kd.any()
+        for i in range(self._substeps):
+            part = (i + 0.5) / self._substeps
+            ff = law.ff0 + part * (law.ff1 - law.ff0)
+            rigid = self._reaching(t + part * self._period_s, stored, dq, law, ff, ahead)
             bullet.setJointMotorControlArray(
-                self._arm,
+                stage.arm,
                 self._joints,
                 bullet.TORQUE_CONTROL,
                 forces=(rigid - ahead).tolist(),
-                physicsClientId=self._world,
+                physicsClientId=stage.client,
             )
-            bullet.stepSimulation(physicsClientId=self._world)
-        stored, dq = self._stored()
-        self._ddq = (dq - self._dq) / PERIOD_S
-        self._q, self._dq = stored - H_S / 2 * dq, dq
-
-    def carry(self, count: int) -> None:
-        """Let the last link carry the first `count` payload events from now on."""
-        for k in range(self._carried, count):
-            event = self._truth.events[k]
-            bullet.changeDynamics(
-                self._arm,
-                self._n + k,
-                mass=event.m,
-                localInertiaDiagonal=payload_moments(event),
-                physicsClientId=self._world,
-            )
-        self._carried = count
+            bullet.stepSimulation(physicsClientId=stage.client)
+            if free and i < self._substeps - 1:
+                continue
+            states = bullet.getJointStates(stage.arm, self._joints, physicsClientId=stage.client)
+            both = np.array([state[:2] for state in states])
+            stored, speed = both[:, 0].copy(), both[:, 1].copy()
+            if len(self._bent):
+                bend(self._rows, (dq + speed) / 2, h, self._bent)
+            self._ddq, dq = (speed - dq) / (self._period_s if free else h), speed
+        self._q, self._dq = stored - h / 2 * dq, dq
+        self._ticks += 1
 
     def acceleration(self, q: Array, dq: Array, drive: Array) -> Array:
         """Joint acceleration (n,) rad/s² under driving torques `drive` (n,) N m."""
-        M, bias = self._mass_matrix(q), self._rigid(q, dq, np.zeros(self._n))
-        left = drive - self._friction(dq) - bias
-        M.flat[:: self._n + 1] += self._truth.motor_inertia
+        losses = self._losses(self._now(), q, dq, drive)
+        M, bias = self._stage.mass_matrix(q), self._stage.torques(q, dq, self._rest)
+        left = drive - losses.explicit - losses.friction(dq) - bias
+        M.flat[:: self._n + 1] += losses.armature
         return np.asarray(np.linalg.solve(M, left), float)
 
     def drive_for(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Driving torques (n,) N m that give the joint acceleration `ddq` (n,) rad/s²."""
-        return self._rigid(q, dq, ddq) + self._truth.motor_inertia * ddq + self._friction(dq)
+        rigid = self._stage.torques(q, dq, ddq)
+        losses = self._losses(self._now(), q, dq, rigid)
+        return rigid + losses.armature * ddq + losses.explicit + losses.friction(dq)
 
     def close(self) -> None:
-        """Free both PyBullet clients; may be called more than once."""
+        """Free PyBullet's clients; may be called more than once."""
         self._close()
 
-    def _stored(self) -> tuple[Array, Array]:
-        states = bullet.getJointStates(self._arm, self._joints, physicsClientId=self._world)
-        both = np.array([state[:2] for state in states])
-        return both[:, 0], both[:, 1]
+    def _now(self) -> float:
+        return self._start_s + self._ticks * self._period_s
 
-    def _friction(self, dq: Array) -> Array:
-        return self._truth.Fv * dq + self._truth.Fc * np.tanh(dq / COULOMB_WIDTH)
+    def _due(self) -> Stage:
+        """The stage of the tick that starts now."""
+        now = self._now()
+        return next(stage for stage in reversed(self._stages) if stage.start_s <= now)
 
-    def _mass_matrix(self, q: Array) -> Array:
-        """(n, n) of the rigid arm with its payload, kg m²."""
-        stage = self._stages[self._carried]
-        return np.array(
-            bullet.calculateMassMatrix(stage, q.tolist(), physicsClientId=self._queries)
-        )
+    def _set(self, stored: Array, dq: Array) -> None:
+        stage = self._stage
+        for j, at, speed in zip(self._joints, stored.tolist(), dq.tolist(), strict=True):
+            bullet.resetJointState(stage.arm, j, at, speed, physicsClientId=stage.client)
 
-    def _rigid(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Inverse dynamics (n,) N m of the rigid arm with its payload."""
-        motion = q.tolist(), dq.tolist(), ddq.tolist()
-        stage = self._stages[self._carried]
-        return np.array(
-            bullet.calculateInverseDynamics(stage, *motion, physicsClientId=self._queries)
-        )
+    def _losses(self, t: float, q: Array, dq: Array, rigid: Array) -> Losses:
+        losses = losses_at(self._rows, t, q, dq, rigid, self._bent)
+        losses.explicit[:] -= self._contact(t, q)
+        for effect, j in self._laws:
+            if effect.law is not None and effect.acts(t):
+                losses.explicit[j] += effect.law(q[j], dq[j], 0.0, rigid[j])
+        return losses
 
-    def _coriolis_ahead(self) -> Array:
+    def _add_laws(self, t: float, q: Array, v: Array, ddq: Array, rigid: Array, out: Array) -> None:
+        """Torques of laws about the velocity v (n,), added to the parts (5, n) of a step."""
+        for effect, j in self._laws:
+            if effect.law is not None and effect.acts(t):
+                here, there = (
+                    effect.law(q[j], x, ddq[j], rigid[j]) for x in (v[j], v[j] + SLOPE_RAD_S)
+                )
+                slope = max((there - here) / SLOPE_RAD_S, 0.0)  # what opposes motion is implicit
+                out[0, j] += here - slope * v[j]
+                out[1, j] += slope
+
+    def _contact(self, t: float, q: Array) -> Array:
+        """J^T wrench (n,) N m of what touches the last link at its origin."""
+        torque = np.zeros(self._n)
+        for start, end, wrench in self._wrenches:
+            if start <= t < end:
+                _, J = end_effector(self._stage.truth.frames, q, np.eye(4))
+                torque += J.T @ wrench
+        return torque
+
+    def _coriolis_ahead(self, ddq: Array) -> Array:
         """By how much the Coriolis torque (n,) N m grows in half a sub-step."""
-        rest = np.zeros(self._n)
-        middle = self._dq + H_S / 2 * self._ddq
-        return self._rigid(self._q, middle, rest) - self._rigid(self._q, self._dq, rest)
+        stage, middle = self._stage, self._dq + self._h / 2 * ddq
+        now = stage.torques(self._q, self._dq, self._rest)
+        return stage.torques(self._q, middle, self._rest) - now
 
-    def _through_the_drive(self, tau: Array) -> Array:
-        """What of a driving torque reaches the rigid arm in the next sub-step, (n,) N m.
+    def _reaching(self, t: float, q: Array, dq: Array, law: Law, ff: Array, ahead: Array) -> Array:
+        """What of the drives' torques reaches the rigid arm in the next sub-step, (n,) N m.
 
-        Friction at the middle of the step is f(v) + f'(v) dv / 2 with the dv that it itself
-        allows: Coulomb friction smoothed over 0.01 rad/s is too stiff for an explicit step on
-        joint 7 (f' h / M = 2). The motor's inertia takes its share of dv in the same equation.
+        Args:
+            t: the sub-step's middle, s; q: (n,) rad, the position there.
+            dq: (n,) rad/s at its start.
+            law: of the drives; ff: (n,) its feed-forward torque at the middle, N m.
+            ahead: (n,) N m, growth of the Coriolis torque up to the middle.
         """
-        truth = self._truth
-        q, dq = self._stored()
-        A, bias = self._mass_matrix(q), self._rigid(q, dq, np.zeros(self._n))
-        sign = np.tanh(dq / COULOMB_WIDTH)
-        friction = truth.Fv * dq + truth.Fc * sign
-        slope = truth.Fv + truth.Fc / COULOMB_WIDTH * (1 - sign * sign)
-        per_dv = truth.motor_inertia / H_S + slope / 2
-        A /= H_S
-        A.flat[:: self._n + 1] += per_dv
-        dv = np.linalg.solve(A, tau - friction - bias)
-        return tau - friction - per_dv * dv
-
-
-def _load(truth: Truth, carried: int, client: int) -> int:
-    """The arm as a PyBullet body with `carried` of its payloads; its number in the client."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "arm.urdf"
-        path.write_text(urdf(truth, carried), "utf-8")
-        return bullet.loadURDF(
-            str(path),
-            useFixedBase=True,
-            flags=bullet.URDF_USE_INERTIA_FROM_FILE,
-            physicsClientId=client,
-        )
-
-
-def _disconnect(*clients: int) -> None:
-    for client in clients:
-        if bullet.isConnected(physicsClientId=client):
-            bullet.disconnect(physicsClientId=client)
+        beyond = q - np.minimum(np.maximum(q, self._lower), self._upper)
+        touching = beyond != 0.0
+        self.stopped |= bool(touching.any())
+        push = law.kp * (law.q_des - q) + law.kd * law.dq_des + ff
+        if not len(self._rows) and not self._laws and not law.kd.any() and not touching.any():
+            got = np.minimum(np.maximum(push, -law.most), law.most)
+            return np.asarray(got + self._contact(t, q))
+        stage = self._stage
+        if self._mass is None:  # one for a whole tick: it changes little, and only dv hangs on it
+            self._mass = stage.mass_matrix(q)
+        M, bias = self._mass.copy(), stage.torques(q, dq, self._rest) + ahead
+        ddq = self._rest if self._ddq is None else self._ddq
+        middle = dq + self._h / 2 * ddq
+        rigid = bias + M @ ddq
+        parts = add_up(self._rows, t, q, middle, rigid, self._bent)
+        self._add_laws(t, q, middle, ddq, rigid, parts)
+        parts[0] += STOP_STIFFNESS * beyond - self._contact(t, q)
+        parts[1] += STOP_DAMPING * touching
+        drive = np.array([push, law.kd, law.most])
+        return np.asarray(step(M, bias, dq, self._h, parts, drive))

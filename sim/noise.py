@@ -14,6 +14,7 @@ import numpy as np
 from scipy.signal import butter, sosfilt, sosfreqz
 
 from drivers.interface import JointSample, LinkMotion
+from sim.options import NOISES
 from sim.truth import Array, facts_of
 
 RATE_HZ = 1000.0
@@ -77,8 +78,8 @@ def levels_of(name: str, **changes: float) -> NoiseLevels:
     Raises:
         ValueError: unknown name or unknown level; the message has the choices.
     """
-    if name not in ("real", "none"):
-        raise ValueError(f"no noise {name!r}; have: real, none")
+    if name not in NOISES:
+        raise ValueError(f"no noise {name!r}; have: {', '.join(NOISES)}")
     known = {item.name for item in fields(NoiseLevels)}
     for key in changes.keys() - known:
         raise ValueError(f"no noise level {key!r}; have: {', '.join(sorted(known))}")

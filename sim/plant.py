@@ -6,11 +6,10 @@ import time
 
 import numpy as np
 
-from drivers.interface import DriverError, JointSample
-from sim.effect_engine import EffectEngine, acts_on_motion
+from drivers.interface import DriverError, JointSample, LinkMotion
+from sim.dynamics import link_motion
 from sim.effects import ENCODER, TORQUE
 from sim.engine import PERIOD_S, Engine
-from sim.links import link_motion
 from sim.noise import NoiseLevels, SensorNoise, levels_of
 from sim.sensors import Sensors
 from sim.truth import Array, Truth
@@ -27,7 +26,7 @@ class Plant:
 
     The driving torque goes linearly from one command to the next over a tick, so that it is
     continuous and equals the command at the end of the tick. A sample holds q, dq, the driving
-    torque plus sensor offset, and link motion of one and the same instant. Where the truth has
+    torque and link motion of one and the same instant. Where the truth has
     effects in its sensors, q, dq and torque are what these make of it; brakes, limits and link
     motion go by the links themselves.
 
@@ -60,17 +59,15 @@ class Plant:
             links: whether the links' motion is measured.
             q0: (n,) posture at the start, rad; the truth's by default.
         """
-        order = sorted(truth.events, key=lambda event: event.t_s)
-        self.truth = truth = truth.with_changes(events=tuple(order))
+        self.truth = truth
         self.saturated, self.braked = False, True
         self.fault: str | None = None
         self.compute_ns = 0
         self._links = links
-        self._engine = EffectEngine(truth) if acts_on_motion(truth) else Engine(truth)
+        self._engine = Engine(truth)
         sensing = any(effect.place in (ENCODER, TORQUE) for effect in truth.effects)
         self._sensors = Sensors(truth, PERIOD_S) if sensing else None
         self._noise = SensorNoise(noise or levels_of("real"), truth.n, seed)
-        self._carried = 0
         self._q = np.array(truth.ready if q0 is None else q0, dtype=float)
         self._dq = np.zeros(truth.n)
         self._engine.place(self._q, self._dq)
@@ -80,7 +77,7 @@ class Plant:
         self._lock, self._moving = self._q.copy(), np.zeros(truth.n, dtype=bool)
         self._k = -1
         self._clean: JointSample | None = None
-        self._seen = self._q, self._dq, self._drive + truth.torque_offset
+        self._seen = self._q, self._dq, self._drive
         self._observe()  # what is compiled on first use is compiled before the clock runs
 
     @property
@@ -160,7 +157,6 @@ class Plant:
 
     def _move_on(self) -> None:
         """One tick of the arm itself."""
-        self._handle_events()
         self._age += 1
         if self._age > REFRESH_TICKS:
             self.stop()
@@ -169,16 +165,6 @@ class Plant:
         self._drive = end
         self._q, self._dq = self._engine.state()
         self._watch()
-
-    def _handle_events(self) -> None:
-        """Payloads whose time the last sample has reached act from here on."""
-        if self._carried == len(self.truth.events):
-            return
-        now_s = (self._k - 1) * PERIOD_S
-        due = sum(event.t_s <= now_s + PERIOD_S / 2 for event in self.truth.events)
-        if due > self._carried:
-            self._engine.carry(due)
-            self._carried = due
 
     def _brake(self) -> Array:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""
@@ -205,9 +191,12 @@ class Plant:
     def _observe(self) -> JointSample:
         """The present instant, without noise."""
         if self._sensors is None:
-            self._seen = self._q, self._dq, self._drive + self.truth.torque_offset
+            self._seen = self._q, self._dq, self._drive
         q, dq, tau = self._seen
         links = None
         if self._links:
-            links = link_motion(self._engine.truth, self._q, self._dq, self.ddq())
+            arm = self._engine.truth
+            motion = link_motion(arm.frames, arm.base, self._q, self._dq, self.ddq())
+            both = motion.reshape(arm.n, 2, 6)  # [v; w] and [a; dw]
+            links = LinkMotion(both[:, 0].copy(), both[:, 1].copy())
         return JointSample(max(self._k, 0) * PERIOD_NS, q, dq, tau, links)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sim.effect_engine import EffectEngine
 from sim.effects import ENCODER, Effect, effect_from
+from sim.engine import Engine
 from sim.sensors import Play, decoded, encoded, freed
 from sim.truth import Array, Limits, Truth
 
@@ -55,12 +55,25 @@ def segments_of(t: Array, length_s: float = SEGMENT_S) -> list[tuple[int, int]]:
     return [(start, start + rows) for start in starts]
 
 
+class MotionTable(NamedTuple):
+    """A recording over time.
+
+    Attributes:
+        t: (m,) s, uniform; longer periods than 1 ms are ticked through.
+        q: (m, n) measured positions, smoothed, rad.
+        dq: (m, n) measured velocities, smoothed, rad/s.
+        u: (m, n) driving torque at the times t, linear between them, N m.
+    """
+
+    t: Array
+    q: Array
+    dq: Array
+    u: Array
+
+
 def rollout(
     truth: Truth,
-    t: Array,
-    q: Array,
-    dq: Array,
-    u: Array,
+    table: MotionTable,
     segments: Iterable[tuple[int, int]] | None = None,
     drive: str = "commands",
     substeps: int = SUBSTEPS,
@@ -68,11 +81,8 @@ def rollout(
     """Simulate an arm along a recording.
 
     Args:
-        truth: arm and effects; effects with intervals act by the times in `t`.
-        t: (m,) s, uniform; longer periods than 1 ms are ticked through.
-        q: (m, n) measured positions, smoothed, rad.
-        dq: (m, n) measured velocities, smoothed, rad/s.
-        u: (m, n) driving torque at the times t, linear between them, N m.
+        truth: arm and effects; effects with intervals act by the times of the table.
+        table: the recording.
         segments: (start, stop) rows, stop excluded; every 0.5 s by default.
         drive: `commands` (u is the true driving torque) or `measured` (u is what the torque
             sensors read: it is freed of the truth's gain, offset and delay).
@@ -85,14 +95,14 @@ def rollout(
         ValueError: shapes that do not fit, times that are not uniform, values that are not
             finite, an unknown drive, a segment outside the table, a body that cannot be simulated.
     """
-    t, q, dq, u = _checked(truth, t, q, dq, u)
+    t, q, dq, u = _checked(truth, table)
     if drive not in DRIVES:
         raise ValueError(f"no drive {drive!r}; have: {', '.join(DRIVES)}")
     chosen = segments_of(t) if segments is None else [(int(a), int(b)) for a, b in segments]
     for start, stop in chosen:
         if not 0 <= start < stop <= len(t):
             raise ValueError(f"segment ({start}, {stop}) is not inside a table of {len(t)} rows")
-    true_u = freed(truth.effects, t, u - truth.torque_offset) if drive == "measured" else u
+    true_u = freed(truth.effects, t, u) if drive == "measured" else u
     return _Runner(truth, t, true_u, substeps).run(q, dq, chosen)
 
 
@@ -104,7 +114,7 @@ class _Runner:
         self._period_s = float(t[-1] - t[0]) / (len(t) - 1)
         self._ticks = max(int(np.ceil(self._period_s / STEP_S - UNEVEN)), 1)
         self._effects = [effect for effect in truth.effects if effect.place == ENCODER]
-        self._engine = EffectEngine(truth, self._period_s / self._ticks, substeps)
+        self._engine = Engine(truth, self._period_s / self._ticks, substeps)
         self._twisting = _smooth(u, self._period_s)
 
     def run(self, q: Array, dq: Array, segments: Sequence[tuple[int, int]]) -> Rollout:
@@ -145,70 +155,46 @@ class _Runner:
 
 
 def truth_from(
-    joint_names: Sequence[str],
-    link_names: Sequence[str],
-    R: Array,
-    p: Array,
+    names: tuple[Sequence[str], Sequence[str]],
+    frames: tuple[Array, Array],
     theta: Array,
     gravity: Array,
-    limits: Mapping[str, Sequence[float]] | None = None,
     effects: Sequence[Effect | Mapping[str, Any]] = (),
-    ready: Sequence[float] | None = None,
 ) -> Truth:
-    """A truth from plain numbers: a serial arm, joint j turns link j about its z axis.
+    """A truth from plain numbers: a serial arm without limits, joint j turns link j about its z.
 
     Args:
-        joint_names: n names.
-        link_names: n names.
-        R: (n, 3, 3) orientation of joint frame j in frame j - 1 (the base for j = 0) at q_j = 0.
-        p: (n, 3) its position there, m.
+        names: of the n joints and of the n links.
+        frames: R (n, 3, 3) and p (n, 3) m of joint frame j in frame j - 1 (the base for j = 0) at
+            q_j = 0.
         theta: (n, 10) about the link-frame origin, SI.
         gravity: (3,) in the base frame, m/s².
-        limits: (n,) each by name (lower, upper, velocity, effort, acceleration); none by default.
         effects: canonical entries or `Effect`s.
-        ready: (n,) rad, zero by default.
-
-    Returns:
-        The truth; without losses but those in `effects`.
 
     Raises:
         ValueError: shapes that do not fit, matrices that are no rotations, values that are not
             finite, effects that are unknown or on joints that are not there.
     """
-    n = len(joint_names)
-    if len(link_names) != n or n == 0:
-        raise ValueError(f"{n} joints and {len(link_names)} links; need as many of both, above 0")
-    shapes = {"R": (n, 3, 3), "p": (n, 3), "theta": (n, 10), "gravity": (3,)}
-    given = {"R": R, "p": p, "theta": theta, "gravity": gravity}
-    numbers = {key: _array(key, given[key], shape) for key, shape in shapes.items()}
-    turns = numbers["R"]
-    off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
-    if off > 1e-6 or np.linalg.det(turns).min() < 0:
+    joints, links = names
+    n = len(joints)
+    if len(links) != n or n == 0:
+        raise ValueError(f"{n} joints and {len(links)} links; need as many of both, above 0")
+    R = _array("R", frames[0], (n, 3, 3))
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max()
+    if off > 1e-6 or np.linalg.det(R).min() < 0:
         raise ValueError(f"R holds what is no rotation (R R^T is off by {off:.2g})")
-    zero = np.zeros(n)
+    most = np.full(n, np.inf)
     return Truth(
-        joint_names=tuple(joint_names),
-        link_names=tuple(link_names),
-        R=turns,
-        p=numbers["p"],
-        theta=numbers["theta"],
-        gravity=numbers["gravity"],
-        limits=_limits(limits or {}, n),
-        ready=zero if ready is None else _array("ready", ready, (n,)),
-        Fv=zero,
-        Fc=zero,
-        torque_offset=zero,
-        motor_inertia=zero,
+        joint_names=tuple(joints),
+        link_names=tuple(links),
+        R=R,
+        p=_array("p", frames[1], (n, 3)),
+        theta=_array("theta", theta, (n, 10)),
+        gravity=_array("gravity", gravity, (3,)),
+        limits=Limits(-most, most, most, most, most),
+        ready=np.zeros(n),
         effects=tuple(effect_from(entry) for entry in effects),
     )
-
-
-def _limits(given: Mapping[str, Sequence[float]], n: int) -> Limits:
-    """Limits by name, no limit where none is given."""
-    for key in given.keys() - set(Limits.__slots__):
-        raise ValueError(f"no limit {key!r}; have: {', '.join(Limits.__slots__)}")
-    free = {key: np.full(n, -np.inf if key == "lower" else np.inf) for key in Limits.__slots__}
-    return Limits(**{**free, **{key: np.array(values, float) for key, values in given.items()}})
 
 
 def _array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
@@ -221,12 +207,11 @@ def _array(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _checked(
-    truth: Truth, t: Array, q: Array, dq: Array, u: Array
-) -> tuple[Array, Array, Array, Array]:
-    t = _table_times(t)
+def _checked(truth: Truth, table: MotionTable) -> MotionTable:
+    """The table as arrays. Raises ValueError."""
+    t = _table_times(table.t)
     shape = (len(t), truth.n)
-    return t, _array("q", q, shape), _array("dq", dq, shape), _array("u", u, shape)
+    return MotionTable(t, *(_array(key, getattr(table, key), shape) for key in ("q", "dq", "u")))
 
 
 def _table_times(t: Array) -> Array:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sim.effects import payload, per_joint
 from sim.noise import NoiseLevels, levels_of
+from sim.options import SCENARIOS, check
 from sim.plant import Plant
-from sim.truth import Array, Payload, Truth, facts_of, panda, turn
+from sim.truth import Array, Truth, facts_of, panda, turn
 
-FORMAT, VERSION = "panda-adapter/truth", 1
+FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
 FLANGE_M = 0.107  # m, from the frame of link 7 to the flange along z (franka_ros)
 BALL_RADIUS_M = 0.04  # m, the payload is a solid ball
@@ -79,14 +81,15 @@ def bent_link(rng: np.random.Generator, angle_deg: float = 5.0, offset_m: float 
 def payload_at_20s(rng: np.random.Generator, mass: float = 1.0, t_s: float = 20.0) -> Truth:
     """A ball of `mass` kg at the flange after `t_s`."""
     com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
-    ball = Payload(t_s, mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3))
-    return panda().with_changes(events=(ball,))
+    ball = payload(mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
+    return panda().with_changes(effects=(ball,))
 
 
 def friction(rng: np.random.Generator) -> Truth:
     """The documented arm with the friction published for it."""
     losses = facts_of("panda")["friction"]
-    return panda().with_changes(Fv=np.array(losses["Fv"]), Fc=np.array(losses["Fc"]))
+    viscous = per_joint("viscous_friction", "Fv", losses["Fv"])
+    return panda().with_changes(effects=viscous + per_joint("coulomb_friction", "Fc", losses["Fc"]))
 
 
 def wall_mounted(rng: np.random.Generator) -> Truth:
@@ -95,23 +98,20 @@ def wall_mounted(rng: np.random.Generator) -> Truth:
     return arm.with_changes(gravity=turn(1, np.pi / 2).T @ arm.gravity)
 
 
-# Name -> how its truth is drawn, whether link motion is measured.
-SCENARIOS: dict[str, tuple[Callable[..., Truth], bool]] = {
-    "nominal": (nominal, False),
-    "bent_link": (bent_link, True),
-    "payload_at_20s": (payload_at_20s, False),
-    "friction": (friction, False),
-    "wall_mounted": (wall_mounted, False),
+DRAWN_BY: dict[str, Callable[..., Truth]] = {
+    "nominal": nominal,
+    "bent_link": bent_link,
+    "payload_at_20s": payload_at_20s,
+    "friction": friction,
+    "wall_mounted": wall_mounted,
 }
-OPTIONS = {"bent_link": ("angle_deg", "offset_m"), "payload_at_20s": ("mass", "t_s")}
-COMMON_OPTIONS = ("noise", "links", "levels")
 
 
 def build(name: str, seed: int = 0, **options: Any) -> Scenario:
     """A scenario by name.
 
     Args:
-        name: one of `SCENARIOS`.
+        name: one of `options.SCENARIOS`.
         seed: decides truth and noise.
         options: `noise` ("real" or "none"), `links` (bool: measure link motion or not), `levels`
             (a mapping of single noise levels to change, see `NoiseLevels`), and those of the
@@ -120,51 +120,14 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
     Raises:
         ValueError: unknown name, option or level, or a value out of range; with the choices.
     """
-    if name not in SCENARIOS:
-        raise ValueError(f"no scenario {name!r}; have: {', '.join(SCENARIOS)}")
-    own = OPTIONS.get(name, ())
-    for key in options.keys() - {*own, *COMMON_OPTIONS}:
-        raise ValueError(f"{name} has no option {key!r}; have: {', '.join(own + COMMON_OPTIONS)}")
-    numbers = {key: _size(name, key, options[key]) for key in own if key in options}
-    draw, measured = SCENARIOS[name]
-    links = options.get("links", measured)
-    if not isinstance(links, bool):
-        raise ValueError(f"{name}: links is {links!r}; have: True, False")
+    numbers = check(name, options)
     return Scenario(
         name,
         seed,
-        draw(np.random.default_rng([seed, TRUTH_STREAM]), **numbers),
+        DRAWN_BY[name](np.random.default_rng([seed, TRUTH_STREAM]), **numbers),
         levels_of(options.get("noise", "real"), **options.get("levels", {})),
-        links,
+        options.get("links", SCENARIOS[name].links),
     )
-
-
-def options_of(texts: Sequence[str]) -> dict[str, Any]:
-    """Options of a scenario from KEY=VALUE texts; values are JSON, or text as it stands.
-
-    Raises ValueError for a text without a key.
-    """
-    found: dict[str, Any] = {}
-    for text in texts:
-        key, equals, value = text.partition("=")
-        if not equals:
-            raise ValueError(f"--set takes KEY=VALUE, got '{text}'")
-        try:
-            found[key] = json.loads(value)
-        except json.JSONDecodeError:
-            found[key] = value
-    return found
-
-
-def _size(name: str, key: str, value: Any) -> float:
-    """An option's value as a number from 0 up. Raises ValueError for anything else."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = -1.0
-    if not 0.0 <= number < np.inf:
-        raise ValueError(f"{name}: {key} is {value!r}; have: numbers from 0 up")
-    return number
 
 
 def _direction(rng: np.random.Generator) -> Array:

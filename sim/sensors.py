@@ -135,7 +135,7 @@ class Sensors:
 
     def __init__(self, truth: Truth, period_s: float) -> None:
         self._effects = [e for e in truth.effects if e.place in (ENCODER, TORQUE)]
-        self._offset, self._n, self._period_s = truth.torque_offset, truth.n, period_s
+        self._n, self._period_s = truth.n, period_s
         self._play = Play(self._effects, truth.n)
         self._tau: Array | None = None
         self._lagging: Array | None = None
@@ -152,7 +152,7 @@ class Sensors:
         self._play.move(t, dq, self._period_s)
         q, dq = q + self._play.gap, dq + self._play.rate
         told_q, told_dq = encoded(self._effects, t, q, dq, (tau, rate))
-        return told_q, told_dq, self._delayed(t, self._torque(t, tau) + self._offset)
+        return told_q, told_dq, self._delayed(t, self._torque(t, tau))
 
     def _torque(self, t: float, true: Array) -> Array:
         """What the torque sensors say of (n,), but for their delay."""

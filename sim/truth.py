@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import resources
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.dynamics import Frames, resting
 from sim.effects import Effect
 
 Array = NDArray[np.float64]
@@ -28,46 +30,12 @@ class Limits:
     acceleration: Array
 
 
-@dataclass(frozen=True, slots=True)
-class Payload:
-    """A rigid body that the last link carries in every instant after `t_s`.
-
-    It is taken over in motion: the joint velocities do not jump and the body arrives with the
-    velocity of the link, so that from then on only more force is needed to move it.
-
-    Attributes:
-        t_s: when, seconds of plant time.
-        m: mass, kg.
-        com: (3,) centre of mass in the frame of the last link, m.
-        inertia: (3, 3) about the centre of mass, axes of the last link, kg m².
-    """
-
-    t_s: float
-    m: float
-    com: Array
-    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
-
-    def as_dict(self) -> dict[str, Any]:
-        """The event as it stands in a truth file (keys: effect catalogue, `payload`)."""
-        (xx, xy, xz), (_, yy, yz), (_, _, zz) = self.inertia.tolist()
-        cx, cy, cz = self.com.tolist()
-        return {
-            "t_s": self.t_s,
-            "effect": "payload",
-            "m": self.m,
-            "cx": cx,
-            "cy": cy,
-            "cz": cz,
-            "inertia": [xx, xy, xz, yy, yz, zz],
-        }
-
-
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Everything that decides how a simulated serial arm moves.
 
-    The torque of a sample is that of the driving side, friction and offset included:
-    `tau = tau_rigid + motor_inertia ddq + Fv dq + Fc tanh(dq / 0.01 rad/s) + torque_offset`.
+    The torque of a sample is that of the driving side, everything that acts on it included:
+    `tau = tau_rigid(q, dq, ddq) + sum of effects`.
 
     Attributes:
         joint_names: n names.
@@ -78,12 +46,8 @@ class Truth:
         limits: of the joints.
         gravity: (3,) acceleration of gravity in the base frame, m/s².
         ready: (n,) posture at the start, rad.
-        Fv: (n,) viscous friction, N m s/rad.
-        Fc: (n,) Coulomb friction, N m.
-        torque_offset: (n,) what the torque sensor adds, N m.
-        motor_inertia: (n,) reflected inertia of the drive, kg m².
-        events: what changes while the arm runs.
-        effects: whatever else acts on the arm or its sensors; table in `sim.effects`.
+        effects: friction, loads, offsets and whatever else acts on the arm or its sensors; table
+            in `sim.effects`.
 
     Raises:
         ValueError: an effect on a joint that the arm does not have.
@@ -97,11 +61,6 @@ class Truth:
     limits: Limits
     gravity: Array
     ready: Array
-    Fv: Array
-    Fc: Array
-    torque_offset: Array
-    motor_inertia: Array
-    events: tuple[Payload, ...] = ()
     effects: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
@@ -113,10 +72,21 @@ class Truth:
         """Number of joints."""
         return len(self.joint_names)
 
+    @cached_property
+    def frames(self) -> Frames:
+        """The joint frames, as the dynamics take them."""
+        parent = np.arange(self.n) - 1
+        return Frames(parent, np.ascontiguousarray(self.R), np.ascontiguousarray(self.p))
+
+    @cached_property
+    def base(self) -> Array:
+        """(4, 3) motion of the base, at rest under gravity, as the dynamics take it."""
+        return resting(self.gravity)
+
     @property
     def lam(self) -> Array:
-        """λ (n, 6): [α β γ p], R = Rz(α) Rx(β) Rz(γ), rad and m."""
-        return np.array([[*zxz_angles(R), *p] for R, p in zip(self.R, self.p, strict=True)])
+        """λ (n, 6), see `lam_of`."""
+        return lam_of(self.R, self.p)
 
     def with_changes(self, **changes: Any) -> Truth:
         """A copy with some attributes replaced."""
@@ -130,10 +100,6 @@ class Truth:
             "lambda": self.lam.tolist(),
             "theta": self.theta.tolist(),
             "gravity": self.gravity.tolist(),
-            "friction": {"Fv": self.Fv.tolist(), "Fc": self.Fc.tolist()},
-            "torque_offset": self.torque_offset.tolist(),
-            "motor_inertia": self.motor_inertia.tolist(),
-            "events": [event.as_dict() for event in self.events],
             "effects": [effect.as_dict() for effect in self.effects],
         }
 
@@ -142,7 +108,6 @@ def panda() -> Truth:
     """The Panda as documented, with the inertias of Gaz et al. 2019 and without friction."""
     facts = facts_of("panda")
     joints = facts["joint"]
-    zero = np.zeros(len(joints))
     return Truth(
         joint_names=tuple(j["name"] for j in joints),
         link_names=tuple(j["link"] for j in joints),
@@ -152,11 +117,12 @@ def panda() -> Truth:
         limits=Limits(*(np.array([j[k] for j in joints]) for k in Limits.__slots__)),
         gravity=np.array(facts["robot"]["gravity"]),
         ready=np.array(facts["robot"]["ready"]),
-        Fv=zero,
-        Fc=zero,
-        torque_offset=zero,
-        motor_inertia=zero,
     )
+
+
+def lam_of(turns: Array, p: Array) -> Array:
+    """λ (n, 6): [α β γ p] of frames R (n, 3, 3), p (n, 3); R = Rz(α) Rx(β) Rz(γ), rad and m."""
+    return np.array([[*zxz_angles(R), *at] for R, at in zip(turns, p, strict=True)])
 
 
 def facts_of(robot: str) -> dict[str, Any]:

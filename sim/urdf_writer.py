@@ -9,39 +9,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.truth import Array, Payload, Truth, body_of, to_rpy
+from sim.truth import Array, Truth, body_of, to_rpy
 
 
-def urdf(truth: Truth, carried: int = 0) -> str:
-    """URDF of the arm with a fixed link for each payload.
-
-    Args:
-        truth: the arm.
-        carried: how many of its payload events are in force; the others' links weigh nothing.
-    """
+def urdf(truth: Truth) -> str:
+    """URDF of the rigid arm, without its effects."""
     parts = ['<robot name="arm">', link_text("base", 1.0, np.zeros(3), np.eye(3))]
     parent = "base"
     for j, name in enumerate(truth.link_names):
         parts.append(link_text(name, *body_of(truth.theta[j])))
         parts.append(joint_text(truth.joint_names[j], parent, name, truth.p[j], truth.R[j]))
         parent = name
-    for k, event in enumerate(truth.events):
-        moments, axes = principal(event.inertia)
-        weighs = float(k < carried)
-        body = weighs * event.m, np.zeros(3), weighs * np.diag(moments)
-        parts.append(link_text(payload_link(k), *body))
-        parts.append(joint_text(f"hold_{k}", parent, payload_link(k), event.com, axes, "fixed"))
     return "\n".join([*parts, "</robot>"])
-
-
-def payload_link(k: int) -> str:
-    """Name of the link that stands for payload event k."""
-    return f"payload_{k}"
-
-
-def payload_moments(event: Payload) -> list[float]:
-    """Principal moments of a payload in the axes that `urdf` gave its link, kg m²."""
-    return principal(event.inertia)[0].tolist()
 
 
 def principal(inertia: Array) -> tuple[Array, Array]:
@@ -70,11 +49,9 @@ def link_text(name: str, m: float, com: Array, inertia: Array) -> str:
     )
 
 
-def joint_text(
-    name: str, parent: str, child: str, p: Array, R: Array, kind: str = "continuous"
-) -> str:
+def joint_text(name: str, parent: str, child: str, p: Array, R: Array) -> str:
     """A joint at p (3,) m, turned by R (3, 3), about its own z."""
     return (
-        f'<joint name="{name}" type="{kind}">{_origin(p, R)}<parent link="{parent}"/>'
+        f'<joint name="{name}" type="continuous">{_origin(p, R)}<parent link="{parent}"/>'
         f'<child link="{child}"/><axis xyz="0 0 1"/></joint>'
     )

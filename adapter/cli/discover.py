@@ -3,57 +3,35 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 from rich.tree import Tree as Shown
 
-from adapter.cli.common import console, warn, write_json
-from adapter.discovery import Discovery, Edge, discover
-from adapter.discovery.learned import Learned, learn, self_model
-from adapter.discovery.recorded import CUTOFF_HZ
-from adapter.discovery.verdict import DECIDED
+from adapter.discovery import (
+    CUTOFF_HZ,
+    DECIDED,
+    Discovery,
+    Edge,
+    LearnedTree,
+    discover,
+    learn,
+    self_model,
+)
 from adapter.errors import ModelError
-from drivers.mcap_file import read_log
-
-
-def add_parser(commands: Any) -> None:
-    """Declare the subcommand."""
-    parser = commands.add_parser(
-        "discover",
-        help="find the tree of a robot from the motion of its links",
-        description="From joint signals and link motion in unknown order find which joint moves "
-        "which link and who is whose parent, each with a confidence; say what the data leave "
-        "open; then learn λ, and θ where torques were recorded.",
-    )
-    parser.add_argument(
-        "log",
-        type=Path,
-        metavar="LOG",
-        help="MCAP recording with link motion: Imu topics, "
-        "or /link_twists/<link> and /link_accels/<link>",
-    )
-    parser.add_argument(
-        "--cutoff", type=float, default=CUTOFF_HZ, metavar="HZ", help="of the filter, default 20"
-    )
-    parser.add_argument(
-        "--base",
-        metavar="LINK",
-        help="the link that carries all others; needed for a floating base whose links' frames "
-        "do not turn about their z",
-    )
-    parser.add_argument("--model", type=Path, metavar="FILE", help="write the self model (.json)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
-    parser.set_defaults(run=run)
+from adapter.model.model_file import save_model
+from adapter.runs.compiling import announce_compiling
+from adapter.runs.terminal import console, warn, write_json
+from drivers.files.mcap import read_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
+    announce_compiling(console.print)
     log = read_log(args.log, sensors=True)
     warn(log.warnings)
-    found = discover(log, args.cutoff, args.base)
+    found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))
     _print_tree(found)
     for sentence in found.undecided:
@@ -76,17 +54,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_tree(found: Discovery) -> None:
-    recorded = found.recorded
+    log = found.log
     console.print(
-        f"{len(recorded.joint_names)} joints, {len(recorded.link_names)} links; "
-        f"{recorded.duration_s:.1f} s of {', '.join(recorded.measured)} at "
-        f"{recorded.rate_hz:.0f} Hz"
+        f"{len(log.joint_names)} joints, {len(log.link_names)} links; "
+        f"{log.duration_s:.1f} s of {', '.join(log.measured)} at {log.rate_hz:.0f} Hz"
     )
     carried = {edge.link for edge in found.edges}
     parents = [edge.parent for edge in found.edges if edge.parent is not None]
     roots = dict.fromkeys(
-        [name for name in recorded.link_names if name not in carried]
-        + [name for name in parents if name not in recorded.link_names]
+        [name for name in log.link_names if name not in carried]
+        + [name for name in parents if name not in log.link_names]
     )
     for root in roots:
         top = Shown(f"[bold]{root}[/]")
@@ -110,7 +87,7 @@ def _shown(confidence: float) -> str:
     return f"{min(confidence, 0.9999):.4f}" if confidence >= DECIDED else f"{confidence:.2f}"
 
 
-def _print_lambda(learned: Learned) -> None:
+def _print_lambda(learned: LearnedTree) -> None:
     tree, schema = learned.data.tree, learned.schema
     table = Table(box=None, pad_edge=False)
     for heading in ("joint", "α β γ rad", "p m", "shown", "± rad, m"):
@@ -139,7 +116,7 @@ def _halves(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row[:3], row[3:]
 
 
-def _known(learned: Learned) -> np.ndarray:
+def _known(learned: LearnedTree) -> np.ndarray:
     """Standard deviations (n, 6), NaN where a single turn or shift is not shown."""
     return np.where(learned.schema.observable, learned.schema.std, np.nan)
 
@@ -148,7 +125,7 @@ def _worst(part: np.ndarray) -> str:
     return f"{np.nanmax(part):.1g}" if np.isfinite(part).any() else "-"
 
 
-def _lambda_figures(learned: Learned) -> dict[str, Any]:
+def _lambda_figures(learned: LearnedTree) -> dict[str, Any]:
     tree, schema = learned.data.tree, learned.schema
     return {
         "joint_names": list(tree.joint_names),
@@ -159,10 +136,12 @@ def _lambda_figures(learned: Learned) -> dict[str, Any]:
     }
 
 
-def _write_model(args: argparse.Namespace, found: Discovery, learned: Learned) -> dict[str, Any]:
+def _write_model(
+    args: argparse.Namespace, found: Discovery, learned: LearnedTree
+) -> dict[str, Any]:
     model, left = self_model(found, learned, args.log.stem)
-    model.save(args.model)
-    lacking = "no torques" if found.recorded.tau is None else "no torques above 0"
+    save_model(model, args.model)
+    lacking = "no torques" if found.log.tau is None else "no torques above 0"
     what = f"λ alone ({lacking if 'a' in found.bodies.motion else 'no accelerations'})"
     if left is not None:
         what = f"λ and θ; torque left unexplained {left.max():.2g} N m rms at the worst joint"

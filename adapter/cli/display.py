@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from adapter.cli.common import console
 from adapter.realtime.jobs import View
+from adapter.runs.terminal import console
 
 
 def make_display(duration_s: float) -> Callable[[View], None]:

@@ -12,71 +12,39 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
-from adapter.cli.common import UsageError, console, warn, write_json
-from adapter.cli.results import results_folder
 from adapter.cli.rollouts import Rollouts
-from adapter.errors import ModelError
-from adapter.export import to_urdf
-from adapter.export_effects import UrdfParts
-from adapter.gap.refusals import Refusal
+from adapter.effects.active import check_effects
+from adapter.effects.export import left_out_of_urdf, to_urdf
+from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
-from adapter.gap.summary import console_summary
-from adapter.gap.workflow import GapSettings, analyse
-from adapter.model import SelfModel
+from adapter.gap.screen import Refusal
+from adapter.gap.words import as_json, console_summary
+from adapter.gap.workflow import GapSettings, find_gap
+from adapter.model.model_file import load_model
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
-from adapter.robots import documented
+from adapter.runs.compiling import announce_compiling
+from adapter.runs.terminal import console, results_folder, warn, write_json
 
 EXIT_REFUSED = 2
 
 
-def add_parser(commands: Any) -> None:
-    """Declare the subcommand."""
-    parser = commands.add_parser(
-        "gap",
-        help="find what a model lacks",
-        description="Find where a model and recordings disagree, name the effects that the model "
-        "lacks, add them, and measure the gap again on data that the fit never saw. Of several "
-        "recordings the last one is held out; of one, blocks of it. Exit codes: 0 analysed, also "
-        "where too little moves to tell anything; 2 wrong use, or a recording that does not fit "
-        "the model (another robot, flipped signs, other units).",
-    )
-    parser.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="MCAP recording")
-    parser.add_argument(
-        "--model",
-        required=True,
-        metavar="MODEL",
-        help="self model (.json), .urdf, or a robot known by name: panda",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write findings and figures")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="where results go")
-    parser.add_argument(
-        "--inertia-prior",
-        type=float,
-        default=GapSettings.inertia_prior,
-        metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.02)",
-    )
-    parser.add_argument(
-        "--validate-from", type=float, metavar="S", help="fit before this second, score after it"
-    )
-    parser.add_argument("--no-report", action="store_true", help="do not write the HTML page")
-    parser.add_argument("--no-simulation", action="store_true", help="compare torques only")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    if args.validate_from is not None and len(args.logs) > 1:
-        raise UsageError("--validate-from splits one LOG; of several the last one is held out")
-    settings = GapSettings(args.inertia_prior, args.validate_from)
-    nominal = documented(args.model)
-    folder = results_folder(args, "gap")
+    settings = GapSettings(validate_from_s=args.validate_from)
+    if args.inertia_prior is not None:
+        settings = replace(settings, inertia_prior=args.inertia_prior)
+    if args.rounds is not None:
+        settings = replace(settings, rounds=args.rounds)
+    announce_compiling(console.print)
+    nominal = check_effects(documented(args.model), args.model)
+    folder = results_folder(args.out, "gap")
     model_out = _new_model(folder, args.model)
     rollouts = None if args.no_simulation else Rollouts()
     try:
         with _progress(args.quiet) as tell:
-            result = analyse(args.logs, nominal, settings, rollouts, model_out, tell)
+            result = find_gap(args.logs, nominal, settings, rollouts, model_out, tell)
     except Refusal as refusal:
         names, logs = nominal.tree.joint_names, [log.name for log in args.logs]
         nothing = GapResult.untold(names, nominal.name, logs, args.model, str(refusal))
@@ -127,7 +95,7 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
     """Write URDF, page and figures beside the model; print the summary."""
     more: dict[str, Any] = {}
     if result.model_out is not None:
-        more["urdf_out"] = _write_urdf(SelfModel.load(result.model_out), folder / "model.urdf")
+        more["urdf_out"] = _write_urdf(load_model(result.model_out), folder / "model.urdf")
     if not args.no_report:
         more["report"] = str(write_gap_page(result, folder / "report.html"))
     _write(args, folder, result, more)
@@ -144,13 +112,13 @@ def _write_urdf(model: SelfModel, path: Path) -> str | None:
     except ModelError as error:
         warn([f"no URDF: {error}"])
         return None
-    left_out = UrdfParts.of(model).names
+    left_out = left_out_of_urdf(model)
     if left_out:
         warn([f"{path}: a URDF has no full place for {', '.join(left_out)}; the model file has"])
     return str(path)
 
 
 def _write(args: argparse.Namespace, folder: Path, result: GapResult, more: dict[str, Any]) -> None:
-    figures = {**result.as_dict(), **more}
+    figures = {**as_json(result), **more}
     write_json(folder / "gap.json", figures)
     write_json(args.json, figures)

@@ -1,52 +1,49 @@
-"""What `run` and `replay` leave behind and print at the end."""
+"""What `run` and `replay` leave behind and print at the end; `export` and `report` from it."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
-from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from adapter.cli.common import console, plain, program_version, warn, write_json
+from adapter.effects.active import check_effects
+from adapter.effects.export import left_out_of_urdf, to_urdf
 from adapter.errors import ModelError
-from adapter.export import to_urdf
-from adapter.front_end import FrontEnd
-from adapter.gap.monitor_book import sentence
-from adapter.model import SelfModel
-from adapter.outcome import Outcome
+from adapter.gap.monitor_judge import sentence
+from adapter.model.model_file import load_model
+from adapter.model.self_model import SelfModel
 from adapter.report import write_report
-from adapter.run_folder import run_data, save_run
-from adapter.score import Reference
+from adapter.runs.outcome import Outcome
+from adapter.runs.run_folder import load_run, run_data, save_run
+from adapter.runs.score import Reference
+from adapter.runs.terminal import console, json_ready, program_version, warn, write_json
+from adapter.signals.front_end import FrontEnd
 
 
-def results_folder(args: argparse.Namespace, kind: str) -> Path:
-    """The folder results go to: the one asked for, or a new one in runs/."""
-    folder: Path = args.out or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}-{kind}"
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
+class Learned(NamedTuple):
+    """What a run or a replay ended with, and what it is judged against."""
+
+    outcome: Outcome
+    robot: SelfModel
+    reference: Reference
+    front_end: FrontEnd
 
 
 def conclude(
-    args: argparse.Namespace,
-    folder: Path,
-    outcome: Outcome,
-    robot: SelfModel,
-    reference: Reference,
-    figures: dict[str, Any],
-    front_end: FrontEnd,
-    source: str,
+    args: argparse.Namespace, folder: Path, learned: Learned, figures: dict[str, Any], source: str
 ) -> None:
     """Write model, figures and report; print the headline."""
+    outcome, robot, reference, front_end = learned
     warn(front_end.messages)
     figures["model"] = str(folder / "model.json")
     data = run_data(
         outcome,
         robot,
-        plain(figures),
+        json_ready(figures),
         reference,
         delay_s=front_end.delay_s,
         first_moving_ns=front_end.first_moving_ns,
@@ -113,3 +110,30 @@ def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
 
 def _seconds(value: float | None) -> str:
     return "not converged" if value is None else f"converged {value:.2f} s after the first motion"
+
+
+def run_export(args: argparse.Namespace) -> int:
+    """Carry `export` out."""
+    model = check_effects(load_model(args.model), args.model)
+    args.urdf.write_text(to_urdf(model))
+    left_out = left_out_of_urdf(model)
+    if left_out:
+        listed = ", ".join(left_out)
+        warn([f"a URDF has no full place for {listed}; a comment in it lists what is missing"])
+    facts = {
+        "model": str(args.model),
+        "urdf": str(args.urdf),
+        "lambda_source": model.lambda_source,
+        "left_out": left_out,
+    }
+    write_json(args.json, facts)
+    console.print(f"{args.urdf}: {model.name}, λ {model.lambda_source}")
+    return 0
+
+
+def run_report(args: argparse.Namespace) -> int:
+    """Carry `report` out."""
+    page = write_report(args.html or args.folder / "report.html", load_run(args.folder))
+    write_json(args.json, {"report": str(page)})
+    console.print(str(page))
+    return 0

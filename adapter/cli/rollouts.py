@@ -9,15 +9,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pybullet
 
 from adapter.effects.active import active_effects
-from adapter.model import SelfModel
-from adapter.records import Array
-from adapter.rigid_arm import RigidArm
+from adapter.gap.held_out import DrivenMotion
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from sim.rollout import MotionTable, rollout, truth_from
 
 
 class Rollouts:
-    """Simulates self models by PyBullet; an `adapter.gap.shrink.Simulate`.
+    """Simulates self models by PyBullet; an `adapter.gap.held_out.Simulate`.
 
     Attributes:
         troubles: why models could not be simulated, a sentence each.
@@ -29,25 +32,18 @@ class Rollouts:
     def __call__(
         self,
         model: SelfModel,
-        t: Array,
-        q: Array,
-        dq: Array,
-        u: Array,
+        motion: DrivenMotion,
         segments: Sequence[tuple[int, int]],
         drive: str,
     ) -> tuple[Array, Array]:
         """Simulated q, dq (m, n): NaN outside the segments, all NaN where it cannot be done."""
-        import pybullet  # few commands need it
-
-        from sim.rollout import rollout
-
         try:
-            found = rollout(_truth_of(model), t, q, dq, u, segments, drive)
+            found = rollout(_truth_of(model), MotionTable(*motion), segments, drive)
         except (ValueError, pybullet.error) as error:
             trouble = f"no forward simulation: {error}"
             if trouble not in self.troubles:
                 self.troubles.append(trouble)
-            return np.full_like(q, np.nan), np.full_like(q, np.nan)
+            return np.full_like(motion.q, np.nan), np.full_like(motion.q, np.nan)
         return found.q, found.dq
 
 
@@ -57,16 +53,12 @@ def _truth_of(model: SelfModel) -> Any:
     Raises:
         ValueError: it branches, or holds what cannot be simulated.
     """
-    from sim.rollout import truth_from
-
     tree, arm = model.tree, RigidArm.of(model)
-    if not np.array_equal(arm.parent, np.arange(tree.n) - 1):
+    if not np.array_equal(arm.frames.parent, np.arange(tree.n) - 1):
         raise ValueError(f"{model.name} branches; only serial arms are simulated")
     return truth_from(
-        tree.joint_names,
-        tree.link_names,
-        arm.R0,
-        arm.p,
+        (tree.joint_names, tree.link_names),
+        (arm.frames.R0, arm.frames.p),
         arm.theta,
         arm.gravity,
         effects=_entries(model),
@@ -81,6 +73,7 @@ def _entries(model: SelfModel) -> list[dict[str, Any]]:
             "joints": [] if active.joint < 0 else [active.joint + 1],
             "interval_s": [_bound(x) for x in active.interval_s],
             "parameters": dict(active.values),
+            **active.effect.simulated(active.values),
         }
         for active in active_effects(model.effects, model.tree.n)
     ]

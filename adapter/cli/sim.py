@@ -4,38 +4,43 @@ from __future__ import annotations
 
 import argparse
 from importlib import import_module
-from typing import Any
+from typing import NamedTuple
 
-ARMS = {  # what is served, and the module that does it; imported only when it is asked for
-    "fci": ("a Franka robot: FCI protocol 5 (Panda, FER) or 10 (FR3), on 127.0.0.1", "sim.fci"),
-    "can": ("an arm of Damiao motors in MIT mode, on a python-can bus", "sim.damiao"),
+
+class Served(NamedTuple):
+    """An arm that can be served: in words; modules with its options, and with what carries it out.
+
+    They are loaded by name when they are needed: the second one brings PyBullet.
+    """
+
+    words: str
+    options: str
+    command: str
+
+
+ARMS = {
+    "fci": Served(
+        "a Franka robot: FCI protocol 5 (Panda, FER) or 10 (FR3), on 127.0.0.1",
+        "sim.fci.options",
+        "sim.fci.command",
+    ),
+    "can": Served(
+        "an arm of Damiao motors in MIT mode, on a python-can bus",
+        "sim.damiao.options",
+        "sim.damiao.command",
+    ),
 }
-
-
-def add_parser(commands: Any) -> None:
-    """Declare the subcommand."""
-    parser = commands.add_parser(
-        "sim",
-        help="simulated hardware behind real wire protocols",
-        description="Serve a simulated arm to drivers and to other people's clients, on this "
-        "machine only, until SIGTERM or Ctrl-C. " + _choices(),
-        epilog="adapter sim ARM --help tells more",
-    )
-    parser.add_argument("arm", choices=tuple(ARMS), metavar="ARM", help=", ".join(ARMS))
-    parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="options of the arm")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve; returns the exit code."""
-    what, package = ARMS[args.arm]
-    command = import_module(f"{package}.command")
+    served = ARMS[args.arm]
+    options = import_module(served.options)
     parser = argparse.ArgumentParser(
-        prog=f"adapter sim {args.arm}", description=f"Serve {what}, until SIGTERM or Ctrl-C."
+        prog=f"adapter sim {args.arm}",
+        description=f"Serve {served.words}, until SIGTERM or Ctrl-C.",
     )
-    command.add_arguments(parser)
-    return int(command.run(parser.parse_args(args.rest)))
-
-
-def _choices() -> str:
-    return " ".join(f"{name}: {what}." for name, (what, _) in ARMS.items())
+    options.add_arguments(parser)
+    asked = parser.parse_args(args.rest)
+    options.check(asked)
+    return int(import_module(served.command).run(asked))

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.discovery.recorded import Recorded
-from adapter.model import STANDARD_GRAVITY
-from adapter.spatial import Array, skew
+from adapter.discovery.prepare import PreparedLog
+from adapter.model.self_model import STANDARD_GRAVITY
+from adapter.model.spatial import Array, skew
 
 NO_JOINT = -1  # the link rides rigidly on its parent
 REST_RATIO = 3.0  # a link at rest moves less than so many times its noise's variance
@@ -35,7 +35,7 @@ class Bodies:
     """Links, and after them a base at rest under gravity if nothing in the recording is it.
 
     Attributes:
-        recorded: the signals.
+        log: the signals.
         links: how many of the bodies are links.
         motion: for each channel (m, bodies, 3); links at rest are exactly at rest.
         noise: for each channel (bodies,) variances.
@@ -45,7 +45,7 @@ class Bodies:
         base: the link that carries all others, if that was said.
     """
 
-    recorded: Recorded
+    log: PreparedLog
     links: int
     motion: dict[str, Array]
     noise: dict[str, Array]
@@ -67,11 +67,11 @@ class Bodies:
     @property
     def channels(self) -> tuple[str, ...]:
         """What was measured, angular first; what merely follows is not held against anything."""
-        return self.recorded.measured
+        return self.log.measured
 
     def variance(self, channel: str, joints: np.ndarray) -> Array:
         """(links, joints, bodies) expected variance of one component of y - R0ᵀ z."""
-        r, own = self.recorded, self.noise[channel]
+        r, own = self.log, self.noise[channel]
         out = (
             own[: self.links, None, None] + own[None, None, :] + self.floor[channel][:, None, None]
         )
@@ -89,13 +89,13 @@ class Bodies:
         return np.asarray(out)
 
 
-def bodies_of(recorded: Recorded, base: int | None = None) -> Bodies:
+def bodies_of(log: PreparedLog, base: int | None = None) -> Bodies:
     """The bodies of a recording; `base` is the link that is known to carry all others."""
-    motion = {k: x.copy() for k, x in recorded.motion.items()}
-    noise = {k: x.copy() for k, x in recorded.noise.items()}
+    motion = {k: x.copy() for k, x in log.motion.items()}
+    noise = {k: x.copy() for k, x in log.noise.items()}
     size = {k: np.mean(x**2, axis=(0, 2)) for k, x in motion.items()}
     floor = {k: (RELATIVE_FLOOR**2) * size[k] + ABSOLUTE_FLOOR[k] ** 2 for k in motion}
-    links = len(recorded.link_names)
+    links = len(log.link_names)
     at_rest = np.ones(links, dtype=bool)
     for k in motion:
         mean = motion[k].mean(axis=0)
@@ -105,16 +105,16 @@ def bodies_of(recorded: Recorded, base: int | None = None) -> Bodies:
     for k, x in motion.items():
         x[:, at_rest] = x[:, at_rest].mean(axis=0) if k == "a" else 0.0
         noise[k][at_rest] = 0.0
-    if base is None and (links <= len(recorded.joint_names) or not at_rest.any()):
+    if base is None and (links <= len(log.joint_names) or not at_rest.any()):
         for k, x in motion.items():
             still = np.zeros((len(x), 1, 3))
             if k == "a":
                 still[..., 2] = STANDARD_GRAVITY
             motion[k] = np.concatenate([x, still], axis=1)
             noise[k] = np.append(noise[k], 0.0)
-    speed = np.mean(recorded.dq**2, axis=0)
-    resting = speed < REST_RATIO * recorded.joint_noise["dq"] + ABSOLUTE_FLOOR["w"] ** 2
-    return Bodies(recorded, links, motion, noise, floor, at_rest, resting, base)
+    speed = np.mean(log.dq**2, axis=0)
+    resting = speed < REST_RATIO * log.joint_noise["dq"] + ABSOLUTE_FLOOR["w"] ** 2
+    return Bodies(log, links, motion, noise, floor, at_rest, resting, base)
 
 
 def turned(q: Array, x: Array) -> Array:
@@ -126,7 +126,7 @@ def turned(q: Array, x: Array) -> Array:
 
 def across(bodies: Bodies, channel: str, link: int, joints: np.ndarray) -> Array:
     """y (m, joints, 3) of one link seen across each of the joints."""
-    r = bodies.recorded
+    r = bodies.log
     none = joints == NO_JOINT
     at = np.where(none, 0, joints)
     q, dq, ddq = (np.where(none, 0.0, x[:, at]) for x in (r.q, r.dq, r.ddq))

@@ -1,7 +1,7 @@
 """From a discovered tree to λ, and to θ where torques were recorded.
 
 Once N and A are known, body schema and dynamics are the paper's problems (eqs. 18, 19), solved by
-`adapter.offline` from the same filtered samples.
+`adapter.learning.batch` from the same filtered samples.
 """
 
 from __future__ import annotations
@@ -11,23 +11,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adapter.discovery.bodies import NO_JOINT
+from adapter.discovery.frames import in_joint_frame
 from adapter.discovery.hypotheses import Option
-from adapter.discovery.inertias import neutral_theta, theta_of
-from adapter.discovery.mounting import in_joint_frame
 from adapter.discovery.verdict import UNSEEN_BASE, Discovery
 from adapter.errors import ModelError
-from adapter.model import LAMBDA_MEASURED, SelfModel, gravity_down
-from adapter.offline.moments import LinkNoise
-from adapter.offline.schema import SchemaResult, SchemaSettings, schema_from_moments
-from adapter.spatial import Array
-from adapter.tree import BASE, Tree
-from adapter.tree_data import BodyMotion, TreeData
+from adapter.learning.batch.moments import LinkNoise
+from adapter.learning.batch.schema import BatchSchemaSettings, SchemaResult, schema_from_moments
+from adapter.learning.batch.theta_factors import row_factors, scales, system
+from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta
+from adapter.learning.theta import NEUTRAL_INERTIA, NEUTRAL_MASS, PRIOR_STD
+from adapter.learning.tree_data import BodyMotion, TreeData
+from adapter.model.inertia import theta_from_body
+from adapter.model.self_model import LAMBDA_MEASURED, SelfModel, gravity_down
+from adapter.model.spatial import Array
+from adapter.model.tree import BASE, Tree
 
 CHANNEL_NOISE_FLOOR = 1e-9  # rad/s, m/s, ...: keeps a link at rest from infinite weight
+ROUNDS = 3  # of weighting
+LEAST_TORQUE = 1e-4  # N m; no joint is trusted to be explained better
 
 
 @dataclass(frozen=True)
-class Learned:
+class LearnedTree:
     """λ of a discovered tree.
 
     Attributes:
@@ -39,24 +44,24 @@ class Learned:
     schema: SchemaResult
 
 
-def learn(discovery: Discovery) -> Learned:
+def learn(discovery: Discovery) -> LearnedTree:
     """λ of the most likely tree.
 
     Raises:
         ModelError: the tree has more than one root, or joints that move no link of it.
     """
     data = tree_data(discovery)
-    recorded = discovery.recorded
+    log = discovery.log
     excess = discovery.hypotheses.excess
     noise = dict.fromkeys(("w", "v", "a", "dw"), 0.0)
     for k, variance in discovery.bodies.noise.items():
         moving = variance[variance > 0.0]
         size = np.median(moving) if len(moving) else 0.0
         noise[k] = float(np.sqrt(size * excess.get(k, 1.0))) + CHANNEL_NOISE_FLOOR
-    schema = schema_from_moments(data, SchemaSettings(noise=LinkNoise(**noise)))
+    schema = schema_from_moments(data, BatchSchemaSettings(noise=LinkNoise(**noise)))
     # neighbouring samples share their noise: the filter leaves fewer independent ones
-    gain = np.sqrt(max(1.0, recorded.samples / recorded.noise_samples))
-    return Learned(data, _with_std(schema, gain))
+    gain = np.sqrt(max(1.0, log.samples / log.noise_samples))
+    return LearnedTree(data, _with_std(schema, gain))
 
 
 def _with_std(schema: SchemaResult, gain: float) -> SchemaResult:
@@ -81,25 +86,25 @@ def tree_data(discovery: Discovery) -> TreeData:
         ModelError: the tree has more than one root, or joints that move no link of it.
     """
     order, root = _order(discovery)
-    recorded, motion = discovery.recorded, _in_joint_frames(discovery)
+    log, motion = discovery.log, _in_joint_frames(discovery)
     number = {option.link: k for k, option in enumerate(order)}
     parent = tuple(number.get(option.parent, BASE) for option in order)
     links = [option.link for option in order]
     joints = [option.joint for option in order]
-    names = recorded.link_names
+    names = log.link_names
     unseen = root == discovery.bodies.unseen_base
     floating = not unseen and not bool(discovery.bodies.at_rest[root])
     tree = Tree(
         parent,
         floating,
-        tuple(recorded.joint_names[s] for s in joints),
+        tuple(log.joint_names[s] for s in joints),
         tuple(names[k] for k in links),
         UNSEEN_BASE if unseen else names[root],
     )
-    m = len(recorded.q)
+    m = len(log.q)
     tau: Array = np.zeros((m, tree.rows))
-    if recorded.tau is not None:
-        tau[:, tree.rows - tree.n :] = recorded.tau[:, joints]
+    if log.tau is not None:
+        tau[:, tree.rows - tree.n :] = log.tau[:, joints]
 
     def part(bodies: list[int] | int) -> BodyMotion:
         nothing = np.zeros_like(motion["w"][:, bodies])
@@ -110,7 +115,7 @@ def tree_data(discovery: Discovery) -> TreeData:
             motion["v"][:, bodies] if "v" in motion else None,
         )
 
-    signals = (recorded.q[:, joints], recorded.dq[:, joints], recorded.ddq[:, joints])
+    signals = (log.q[:, joints], log.dq[:, joints], log.ddq[:, joints])
     return TreeData(tree, *signals, tau, part(root), part(links))
 
 
@@ -119,16 +124,16 @@ def _order(discovery: Discovery) -> tuple[list[Option], int]:
     bodies, chosen = discovery.bodies, discovery.structure.chosen
     if discovery.root is None:
         raise ModelError("more than one link is carried by nothing: no tree to learn λ of")
-    rigid = [bodies.recorded.link_names[o.link] for o in chosen if o.joint == NO_JOINT]
+    rigid = [bodies.log.link_names[o.link] for o in chosen if o.joint == NO_JOINT]
     jointed = [o for o in chosen if o.joint != NO_JOINT]
-    names = bodies.recorded.link_names
+    names = bodies.log.link_names
     root = names.index(discovery.root) if discovery.root in names else bodies.unseen_base
     assert root is not None
-    if len(jointed) < len(bodies.recorded.joint_names) or len(chosen) - len(jointed) > (
+    if len(jointed) < len(bodies.log.joint_names) or len(chosen) - len(jointed) > (
         root != bodies.unseen_base
     ):
         raise ModelError(
-            f"{len(jointed)} of {len(bodies.recorded.joint_names)} joints move a link of the tree "
+            f"{len(jointed)} of {len(bodies.log.joint_names)} joints move a link of the tree "
             f"and links without a joint are {', '.join(rigid) or 'none'}: no tree to learn λ of"
         )
     placed = {root}
@@ -140,7 +145,9 @@ def _order(discovery: Discovery) -> tuple[list[Option], int]:
     return order, root
 
 
-def self_model(discovery: Discovery, learned: Learned, name: str) -> tuple[SelfModel, Array | None]:
+def self_model(
+    discovery: Discovery, learned: LearnedTree, name: str
+) -> tuple[SelfModel, Array | None]:
     """The self model of a discovered tree, and the torque (n,), N m rms, left unexplained.
 
     θ is learned where torques and accelerations with gravity were recorded; else it is that of
@@ -151,7 +158,7 @@ def self_model(discovery: Discovery, learned: Learned, name: str) -> tuple[SelfM
     """
     data, schema = learned.data, learned.schema
     tree = data.tree
-    with_torque = discovery.recorded.tau is not None and "a" in discovery.bodies.motion
+    with_torque = discovery.log.tau is not None and "a" in discovery.bodies.motion
     left = None
     theta = neutral_theta(tree.bodies)
     if with_torque and np.abs(data.tau).max() > 0.0:
@@ -177,3 +184,39 @@ def self_model(discovery: Discovery, learned: Learned, name: str) -> tuple[SelfM
             }
         },
     ), left
+
+
+def neutral_theta(bodies: int) -> Array:
+    """θ (bodies, 10) of what is believed of a link before any data."""
+    body = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+    return np.tile(body, (bodies, 1))
+
+
+def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
+    """θ (bodies, 10) and the torque (n,), N m rms, that it leaves unexplained.
+
+    The wrench on a floating base is not used: nothing in a recording measures it. What torques
+    don't show stays near a neutral body. Friction is not modelled.
+
+    Args:
+        data: samples with joint torques; the base's motion with gravity.
+        lam: (n, 6) λ.
+    """
+    rows = [row for row in row_factors(data, lam) if row.kind == "torque"]
+    first = data.tree.bodies - data.tree.n
+    bodies = tuple(range(first, data.tree.bodies))
+    theta = neutral_theta(data.tree.bodies)
+    std = scales(rows)
+    for _ in range(ROUNDS):  # weighted by what the round before left
+        r, b = system(rows, std, bodies)
+        theta[first:] = least_squares_theta(r, b, theta[first:]).theta
+        std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
+    r, b = _with_prior(*system(rows, std, bodies), neutral_theta(len(bodies)))
+    theta[first:] = consistent_theta(r, b).theta
+    return theta, np.array([row.residual(theta) for row in rows])
+
+
+def _with_prior(r: Array, b: Array, centre: Array) -> tuple[Array, Array]:
+    """Rows below that hold θ (bodies, 10) to a centre, by how far links differ from one another."""
+    weight = np.diag(np.tile(1.0 / PRIOR_STD, r.shape[1] // 10))
+    return np.vstack([r, weight]), np.r_[b, weight @ centre.ravel()]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from adapter.discovery.arborescence import Search, Structure
+from adapter.discovery.axes import with_start
 from adapter.discovery.bodies import NO_JOINT, Bodies, bodies_of
-from adapter.discovery.channels import listed
-from adapter.discovery.doubts import Verdicts, doubts_of
+from adapter.discovery.frames import Mounting
 from adapter.discovery.hypotheses import (
     FREE,
     FREE_RATIO,
@@ -19,18 +19,27 @@ from adapter.discovery.hypotheses import (
     convention_misfit,
     hypotheses_of,
     keeps_convention,
+    mounted_hypotheses,
 )
-from adapter.discovery.mounted import mounted_hypotheses
-from adapter.discovery.mounting import Mounting
-from adapter.discovery.recorded import CUTOFF_HZ, Recorded, prepare
-from adapter.discovery.roots import central, component, floating_roots, rootings
-from adapter.discovery.start import with_start
+from adapter.discovery.prepare import CUTOFF_HZ, PreparedLog, listed, prepare
+from adapter.discovery.tree_search import (
+    Ranked,
+    Structure,
+    TreeSearch,
+    central,
+    component,
+    floating_roots,
+    rootings,
+)
 from adapter.errors import ModelError
-from drivers.mcap_file import Log
+from drivers.files.mcap import Log
 
 UNSEEN_BASE = "base"  # name of a base at rest that is not in the recording
 DECIDED = 0.9  # confidence from which an edge counts as decided
 WORTH_TELLING = 0.001  # probability below which no rival is told
+ALIKE = 0.9999  # correlation of two joints' speeds above which they count as moving alike
+TOLD = 0.05  # probability from which an alternative is told
+MOST_TOLD = 4  # alternatives in one sentence
 
 
 @dataclass(frozen=True)
@@ -82,47 +91,51 @@ class Discovery:
     structure: Structure
     hypotheses: Hypotheses
 
+    def __repr__(self) -> str:
+        open_ = f"{len(self.undecided)} left open" if self.undecided else "all decided"
+        return f"Discovery({len(self.edges)} edges, root {self.root}, {open_})"
+
     @property
-    def recorded(self) -> Recorded:
-        """The signals."""
-        return self.bodies.recorded
+    def log(self) -> PreparedLog:
+        """The filtered signals."""
+        return self.bodies.log
 
     @property
     def mountings(self) -> dict[str, Mounting]:
         """Where the axis was found in the frames of links, by their names."""
         chosen = [option for option in self.structure.chosen if option.mounting is not None]
-        names = self.recorded.link_names
+        names = self.log.link_names
         return {names[o.link]: o.mounting for o in chosen if o.mounting is not None}
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What was done to the data and what they were taken for, one sentence each."""
         if not self.mountings:
-            return self.recorded.notes
-        names = self.recorded.link_names
+            return self.log.notes
+        names = self.log.link_names
         found = listed(names, np.array([name in self.mountings for name in names]))
         note = (
             f"frames of links {found} do not turn about their z with the "
             "origin on the axis: the axes were found, and λ is that of frames on them"
         )
-        return (*self.recorded.notes, note)
+        return (*self.log.notes, note)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        recorded = self.recorded
+        log = self.log
         jointed = [edge.as_dict() for edge in self.edges if edge.joint is not None]
         rigid = [edge.as_dict() for edge in self.edges if edge.joint is None and edge.parent]
         return {
             "root": self.root,
             "root_confidence": self.root_confidence,
-            "joints": len(recorded.joint_names),
+            "joints": len(log.joint_names),
             "edges": jointed,
             "rigid": rigid,
             "undecided": list(self.undecided),
-            "samples_used": recorded.samples,
-            "duration_s": recorded.duration_s,
-            "rate_hz": recorded.rate_hz,
-            "measured": list(recorded.measured),
+            "samples_used": log.samples,
+            "duration_s": log.duration_s,
+            "rate_hz": log.rate_hz,
+            "measured": list(log.measured),
             "misfit_over_noise": dict(self.hypotheses.excess),
             "notes": list(self.notes),
             "mounting": {name: m.as_dict() for name, m in self.mountings.items()},
@@ -161,10 +174,10 @@ def discover(log: Log, cutoff_hz: float = CUTOFF_HZ, base: str | None = None) ->
     structure: Structure | None = None
     if keeps_convention(bodies, misfit):
         hypotheses = hypotheses_of(bodies, misfit)
-        structure = Search(hypotheses.options, len(log.joint_names)).best()
+        structure = TreeSearch(hypotheses.options, len(log.joint_names)).best()
     if structure is None or _unexplained(hypotheses, structure):
         hypotheses = mounted_hypotheses(bodies, misfit)
-        structure = Search(hypotheses.options, len(log.joint_names)).best()
+        structure = TreeSearch(hypotheses.options, len(log.joint_names)).best()
     return _discovery(hypotheses, structure)
 
 
@@ -181,13 +194,13 @@ def _unexplained(hypotheses: Hypotheses, structure: Structure) -> bool:
 
 def body_names(bodies: Bodies) -> tuple[str, ...]:
     """Names of links, and of the base that is not in the recording."""
-    names = bodies.recorded.link_names
+    names = bodies.log.link_names
     return names if bodies.unseen_base is None else (*names, UNSEEN_BASE)
 
 
 def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
     bodies = hypotheses.bodies
-    search = Search(hypotheses.options, len(bodies.resting))
+    search = TreeSearch(hypotheses.options, len(bodies.resting))
     shares: dict[int, dict[int, float]] = {}
     if hypotheses.mounted:
         structure = central(search, bodies, structure)
@@ -211,7 +224,7 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         rival = _edge(bodies, *others[0]) if others else None
         edge = _edge(bodies, option, share, rival)
         edges.append(replace(edge, confidence=way * share, directed=way >= DECIDED))
-    order = {name: k for k, name in enumerate(bodies.recorded.joint_names)}
+    order = {name: k for k, name in enumerate(bodies.log.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
     single = len(roots) == 1
@@ -245,6 +258,144 @@ def _direction(structure: Structure, shares: dict[int, dict[int, float]], link: 
 
 def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = None) -> Edge:
     names = body_names(bodies)
-    joint = None if option.joint == NO_JOINT else bodies.recorded.joint_names[option.joint]
+    joint = None if option.joint == NO_JOINT else bodies.log.joint_names[option.joint]
     parent = None if option.parent == FREE else names[option.parent]
     return Edge(joint, names[option.link], parent, share, share, rival)
+
+
+# --- sentences on what is left open, why, and which motion would decide it ---------------------
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What was made of the beliefs.
+
+    Attributes:
+        names: of bodies; confidence: by link, of what was chosen.
+        roots: where a root is any link that moves, by it: which others it may be, how probably.
+        decided: confidence from which something counts as decided.
+    """
+
+    names: Sequence[str]
+    confidence: Sequence[float]
+    roots: Mapping[int, Mapping[int, float]]
+    decided: float
+
+
+def doubts_of(
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
+) -> list[str]:
+    """All that is undecided, one sentence each."""
+    return [
+        *_resting(bodies),
+        *_idle(bodies, structure),
+        *_roots(bodies, structure, verdicts.names),
+        *_either_way(verdicts),
+        *_undecided(bodies, structure, posterior, verdicts),
+    ]
+
+
+def _resting(bodies: Bodies) -> Iterator[str]:
+    log = bodies.log
+    for s in np.flatnonzero(bodies.resting):
+        speed = float(np.sqrt(np.mean(log.dq[:, s] ** 2)))
+        yield (
+            f"joint {log.joint_names[s]} does not move (rms {speed:.1g} rad/s, no more than "
+            "its noise): which link it moves follows only from what the other joints leave over; "
+            "move it"
+        )
+
+
+def _idle(bodies: Bodies, structure: Structure) -> Iterator[str]:
+    used = {option.joint for option in structure.chosen}
+    log = bodies.log
+    for s, name in enumerate(log.joint_names):
+        if s not in used:
+            yield (
+                f"joint {name} moves no link whose motion is in the recording; record the motion "
+                "of the link that it moves"
+            )
+
+
+def _roots(bodies: Bodies, structure: Structure, names: Sequence[str]) -> Iterator[str]:
+    free = [names[option.link] for option in structure.chosen if option.parent == FREE]
+    carried = [option for option in structure.chosen if option.parent == bodies.unseen_base]
+    if len(free) + bool(carried) > 1:
+        yield (
+            f"no joint and no other link in the recording make {', '.join(free)} move as they do; "
+            "a base may be one of them. The links that carry them are not in the recording, their "
+            "sensors are late or loose"
+        )
+    for option in structure.chosen:
+        if option.joint == NO_JOINT and option.parent != FREE:
+            yield (
+                f"links {names[option.link]} and {names[option.parent]} move as one body; a joint "
+                "between them, if there is one, did not move"
+            )
+
+
+def _either_way(verdicts: Verdicts) -> Iterator[str]:
+    names = verdicts.names
+    for root, shares in verdicts.roots.items():
+        if shares[root] >= verdicts.decided:
+            continue
+        likely = sorted(shares.items(), key=lambda item: (-item[1], item[0] != root))
+        told = " or ".join(f"{names[k]} ({p:.2f})" for k, p in likely[:MOST_TOLD] if p >= TOLD)
+        told = told or f"any of {len(shares)} links, each as well"
+        yield (
+            f"which link is the base: {told}; with sensors mounted anyhow a joint looks the same "
+            f"from either side, so only what it connects is told; {names[root]} is taken: name "
+            "the base (--base)"
+        )
+
+
+def _undecided(
+    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
+) -> Iterator[str]:
+    joints, names = bodies.log.joint_names, verdicts.names
+    for own, ranked, sure in zip(structure.chosen, posterior, verdicts.confidence, strict=True):
+        if sure >= verdicts.decided or own.link in verdicts.roots:
+            continue
+        told = [(o, p) for o, p in ranked if p >= TOLD or o == own][:MOST_TOLD]
+        listed = " or ".join(f"{_said(o, joints, names)} ({p:.2f})" for o, p in told)
+        more = sum(1 for _, p in ranked if p >= TOLD) - len(told)
+        listed += f" or {more} more" if more > 0 else ""
+        rival = next((o for o, _ in ranked if o != own), own)
+        yield f"link {names[own.link]}: {listed}; {_remedy(bodies, own, rival, names)}"
+
+
+def _said(option: Option, joints: Sequence[str], names: Sequence[str]) -> str:
+    if option.parent == FREE:
+        return "carried by nothing in the recording"
+    if option.joint == NO_JOINT:
+        return f"fixed to {names[option.parent]}"
+    return f"moved by joint {joints[option.joint]} on {names[option.parent]}"
+
+
+def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) -> str:
+    """Which motion would tell two options apart."""
+    joints = bodies.log.joint_names
+    pair = [o.joint for o in (own, rival) if o.joint != NO_JOINT]
+    resting = [joints[s] for s in pair if bodies.resting[s]]
+    if resting:
+        return f"joint {' and '.join(dict.fromkeys(resting))} did not move: move it, by itself"
+    if len(pair) == 2 and pair[0] != pair[1] and _alike(bodies, *pair):
+        return (
+            f"joints {joints[pair[0]]} and {joints[pair[1]]} moved alike: move one without the "
+            "other"
+        )
+    parents = [o.parent for o in (own, rival) if o.parent != FREE]
+    if len(parents) == 2 and parents[0] != parents[1]:
+        first, second = (names[i] for i in parents)
+        return (
+            f"{first} and {second} moved too much alike: move the joints between them while joint "
+            f"{joints[own.joint] if own.joint != NO_JOINT else 'of the link'} moves too"
+        )
+    return (
+        "what is left unexplained is no smaller than the difference: record longer or faster motion"
+    )
+
+
+def _alike(bodies: Bodies, first: int, second: int) -> bool:
+    dq = bodies.log.dq
+    return abs(float(np.corrcoef(dq[:, first], dq[:, second])[0, 1])) > ALIKE

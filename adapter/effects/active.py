@@ -4,13 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import ALL, JOINT, LINK, Array, Effect, Flags, Parameter, Values
+from adapter.effects.base import (
+    ALL,
+    JOINT,
+    LINK,
+    Array,
+    BodyEffect,
+    Effect,
+    Flags,
+    Parameter,
+    Values,
+)
+from adapter.effects.by_joint import ByJoint, Tables
 from adapter.effects.catalogue import CATALOGUE
 from adapter.errors import ModelError
+from adapter.model.self_model import SelfModel
 
 WHOLE = (-np.inf, np.inf)
 NEEDED = ("effect", "parameters")
@@ -61,6 +74,48 @@ def active_effects(entries: Iterable[Mapping[str, Any]], n: int) -> tuple[Active
 def lasting_effects(entries: Iterable[Mapping[str, Any]], n: int) -> tuple[Active, ...]:
     """Those without an end, taken as acting always: what holds beyond the recording."""
     return tuple(replace(a, interval_s=WHOLE) for a in active_effects(entries, n) if a.lasting)
+
+
+def check_effects(model: SelfModel, where: str | Path) -> SelfModel:
+    """The model itself, its effects being what the catalogue has.
+
+    Raises:
+        ModelError: as `active_effects`, naming `where` the model came from.
+    """
+    try:
+        active_effects(model.effects, model.tree.n)
+    except ModelError as error:
+        raise ModelError(f"{where}: {error}") from None
+    return model
+
+
+def with_bodies(model: SelfModel) -> SelfModel:
+    """The model with its lasting `BodyEffect`s in θ and gravity, and without their entries.
+
+    An effect that ends with its recording is over and left as it is. A model without any is
+    returned itself.
+    """
+    n, theta, gravity, kept = model.tree.n, model.theta.copy(), model.gravity, []
+    for entry in model.effects:
+        for active in active_effects([entry], n):
+            if not (isinstance(active.effect, BodyEffect) and active.lasting):
+                kept.append(entry)
+                break
+            links, gravity = active.effect.body(theta[-n:], gravity, active.joint, active.values)
+            theta[-n:] = links
+    if len(kept) == len(model.effects):
+        return model
+    return replace(model, theta=theta, gravity=np.array(gravity), effects=tuple(kept))
+
+
+def by_joint(effects: Iterable[Active], n: int) -> ByJoint:
+    """Tables over n joints of effects, whatever their intervals; those of bodies stay out."""
+    tables, left_out = Tables.zero(n), set()
+    for active in effects:
+        joint = slice(None) if active.joint < 0 else active.joint
+        if not active.effect.at_instant(tables, joint, active.values):
+            left_out.add(active.effect.name)
+    return tables.by_joint(left_out)
 
 
 def _of_entry(entry: Any, n: int) -> list[Active]:

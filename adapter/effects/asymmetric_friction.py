@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar
-
 import numpy as np
 
 from adapter.effects.base import (
+    LEVEL,
+    LEVEL_BY_LOAD,
+    TWO_LEVELS,
     Array,
     JointTorque,
     Parameter,
@@ -15,6 +15,9 @@ from adapter.effects.base import (
     Values,
     smooth_sign,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import BOTH_WAYS, STILL
+from adapter.model.urdf_text import FRICTION, Additions
 
 
 class AsymmetricFriction(JointTorque):
@@ -26,13 +29,10 @@ class AsymmetricFriction(JointTorque):
     positive = ("Fc_pos", "Fc_neg")
     log_odds = -3.0  # Coulomb friction and an offset say the same in simpler words
     inexact = 0.02
-    simpler: ClassVar[Mapping[str, float]] = {
-        "coulomb_friction": 10.0,
-        "load_dependent_friction": 10.0,
-    }
-    split_by = (
-        "hold the joint still after moving in either direction: an offset stays, friction fades"
-    )
+    simpler = ((LEVEL, 10.0), (LEVEL_BY_LOAD, 10.0))
+    phrase = Phrase("{who} {lacks} Coulomb friction of {Fc_pos} forwards and {Fc_neg} backwards")
+    form = TWO_LEVELS
+    shows = ((STILL, "fades or changes sign"), (BOTH_WAYS, "is larger one way than the other"))
 
     def templates(self) -> tuple[Template, ...]:
         """Both sizes."""
@@ -50,3 +50,8 @@ class AsymmetricFriction(JointTorque):
         """Fc_pos where dq > 0, -Fc_neg where dq < 0, smoothed around rest."""
         sign = smooth_sign(dq, ddq, smoothing_s)
         return np.asarray(np.where(sign > 0.0, values["Fc_pos"], values["Fc_neg"]) * sign)
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """The mean, as dry friction."""
+        mean = 0.5 * (values["Fc_pos"] + values["Fc_neg"])
+        return more.at_joint(FRICTION, joint, mean, "the mean of both is there as friction")

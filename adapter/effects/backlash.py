@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values, smooth_sign
-from adapter.fast import jit
+from adapter.effects.base import (
+    Array,
+    Motion,
+    MotionEffect,
+    Parameter,
+    Values,
+    late_jit,
+    smooth_sign,
+)
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import FLANK
 
 
-@jit
+@late_jit
 def play(q, half, start, link):
     """Fill link (m,), the angle behind a motor angle q (m,) with a play of ± half, rad.
 
@@ -28,11 +38,12 @@ class Backlash(MotionEffect):
     name = "backlash"
     title = "backlash"
     parameters = (Parameter("b", "rad", lower=0.0),)
-    typical = 5e-3
+    prior_std = 5e-3
     positive = ("b",)
     log_odds = -1.0
     inexact = 0.1
-    split_by = "reverse the joint slowly with and without a load that keeps the gear on one flank"
+    phrase = Phrase("{who} {has} {b} of backlash")
+    shows = ((FLANK, "is gone under that load"),)
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """The play operator driven by q: the link is pushed by one flank, then by the other.
@@ -46,3 +57,8 @@ class Backlash(MotionEffect):
             play(q, half, q[0] - half * smooth_sign(motion.dq[:1, joint])[0], link)
         still = np.zeros_like(q)
         return motion.moved(joint, link - q, still, still)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """Half the play."""
+        tables.half_play[joint] += 0.5 * float(values["b"])
+        return True

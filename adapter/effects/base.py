@@ -14,26 +14,39 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from functools import cache, wraps
+from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import Split
 from adapter.errors import ModelError
-from adapter.rigid_arm import RigidArm
+from adapter.model.spatial import Array
+from adapter.model.urdf_text import NO_PLACE, Additions
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 FEWEST_TO_FILTER = 100  # instants
+
+START_ODDS, RARE_START_ODDS = -2.0, -10.0
+
+# Forms of friction that turns with the direction of motion; finer ones say which they refine.
+LEVEL, LEVEL_BY_LOAD, TWO_LEVELS = "one level", "one level by load", "two levels"
 
 JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that an effect needs: key and unit as in files, and what it may be."""
+    """A number that an effect needs: key and unit as in files, and what it may be.
+
+    `grid_share`: of its size, the standard deviation of one that is searched for on a grid.
+    """
 
     key: str
     unit: str
@@ -41,6 +54,28 @@ class Parameter:
     upper: float = math.inf
     count: int = 1
     optional: bool = False
+    grid_share: float = 0.0
+
+
+class ArmDynamics(Protocol):
+    """The rigid body that an effect acts on; see `physics.rigid_arm.RigidArm`."""
+
+    @property
+    def n(self) -> int: ...
+
+    @property
+    def theta(self) -> Array: ...
+
+    @property
+    def gravity(self) -> Array: ...
+
+    def changed(self, theta: Array | None = None, gravity: Array | None = None) -> ArmDynamics: ...
+
+    def torque(self, q: Array, dq: Array, ddq: Array) -> Array: ...
+
+    def regressor(self, q: Array, dq: Array, ddq: Array) -> Array: ...
+
+    def wrench_torque(self, q: Array, wrench: Array) -> Array: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +93,7 @@ class Motion:
     q: Array
     dq: Array
     ddq: Array
-    arm: RigidArm
+    arm: ArmDynamics
     band_hz: float = math.inf
 
     def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
@@ -114,30 +149,63 @@ class Effect:
         scope: what `joints` counts: `JOINT` one joint each, `LINK` the link of that number,
             `FLANGE` and `BASE` none, `ALL` all joints or one.
         parameters: in the order of the catalogue.
-        typical: size of its one parameter, where it has but one and is linear in it.
-        split_by: the experiment that tells it from what looks alike.
+        prior_std: how large its parameter may well be, in its unit, where it has but one; the
+            prior's mean is zero. One prior for the search, the learner and the monitor.
+        phrase: how to say that it is there.
+        shows: what it shows in the experiments of `splits` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
-        simpler: effects of which it is a finer form, each with the share of the evidence that
-            the finer form must add: no gear is exactly as an equation says.
+        form: of friction with the direction of motion, see `LEVEL`; empty for all else.
+        simpler: forms of which it is a finer one, each with the share of the evidence that the
+            finer form must add: no gear is exactly as an equation says.
         log_odds: ln of how much more often than the common ones it is met, before any data.
+        sudden: whether it does come in mid-recording; a base that tilts or an encoder that
+            slips is rarer.
+        passing: whether it comes and goes by itself.
+        watched: whether the monitor looks for it while an arm is learned: an effect of a joint
+            with `columns`, a body or a wrench at the flange.
+        bundled: whether friction and offsets of the same joint can hide it and be hidden by it.
+        over_angle: whether it is a curve over the joint's angle.
+        is_theta: whether its coefficients are the ten inertial parameters of a link.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     scope: ClassVar[str] = JOINT
     parameters: ClassVar[tuple[Parameter, ...]]
-    typical: ClassVar[float] = 1.0
+    prior_std: ClassVar[float]
+    phrase: ClassVar[Phrase] = Phrase()
+    shows: ClassVar[tuple[tuple[Split, str], ...]] = ()
     positive: ClassVar[tuple[str, ...]] = ()
     log_odds: ClassVar[float] = 0.0
     inexact: ClassVar[float] = 0.0
-    simpler: ClassVar[Mapping[str, float]] = {}
-    split_by: ClassVar[str]
+    simpler: ClassVar[tuple[tuple[str, float], ...]] = ()
+    form: ClassVar[str] = ""
+    sudden: ClassVar[bool] = False
+    passing: ClassVar[bool] = False
+    watched: ClassVar[bool] = False
+    bundled: ClassVar[bool] = False
+    over_angle: ClassVar[bool] = False
+    is_theta: ClassVar[bool] = False
+
+    @property
+    def log_odds_of_start(self) -> float:
+        """ln of how often it starts while an arm is being recorded."""
+        return START_ODDS if self.sudden else RARE_START_ODDS
 
     def templates(self) -> tuple[Template, ...]:
-        """Ways to look for it; one parameter, linear, of typical size `typical` by default."""
+        """Ways to look for it; one parameter, linear, by default."""
         key = self.parameters[0].key
-        return (Template((self.typical,), lambda x: {key: float(x[0])}),)
+        return (Template((self.prior_std,), lambda x: {key: float(x[0])}),)
+
+    def columns(
+        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
+    ) -> tuple[Array, ...]:
+        """Torque (..., n) on each joint per unit of each coefficient of the first template.
+
+        Only for effects of a joint that are linear; tau is the rigid torque.
+        """
+        return ()
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """A template with the nonlinear setting in `values` times `ratio`; None without one."""
@@ -146,6 +214,25 @@ class Effect:
     def possible(self, values: Values) -> bool:
         """Whether physics allows these parameters; a fit may ask for others."""
         return all(float(values[key]) > 0.0 for key in self.positive)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """Add what one instant shows of the effect to tables; False where it shows nothing.
+
+        `joint` from 0, or all of them.
+        """
+        return False
+
+    def simulated(self, values: Values) -> dict[str, Any]:
+        """What a simulator that does not know the name needs beside the entry."""
+        return {}
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Put itself into what a simulator's file holds (joint from 0, -1 without one).
+
+        Returns:
+            None where all of it found a place; else what did, `NO_PLACE` where nothing.
+        """
+        return NO_PLACE
 
     def check(self, values: Values) -> None:
         """Raises ModelError for a parameter that is missing, unknown or out of range."""
@@ -194,7 +281,13 @@ class BodyEffect(Effect):
 
 
 class TorqueEffect(Effect):
-    """Adds torque at the joints."""
+    """Adds torque at the joints.
+
+    Attributes:
+        after_sensors: whether it is added to what the torque sensors say, last of all.
+    """
+
+    after_sensors: ClassVar[bool] = False
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(m, n) N m that it adds; tau (m, n) is the rigid torque."""
@@ -219,6 +312,22 @@ def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 
 
+def late_jit(function: Kernel) -> Kernel:
+    """Compile a function when it is first called: the catalogue is read by who needs no numba."""
+
+    @cache
+    def compiled() -> Any:
+        from numba import njit
+
+        return njit(cache=True, error_model="numpy")(function)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        return compiled()(*args)
+
+    return cast(Kernel, call)
+
+
 def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -> Array:
     """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s.
 
@@ -232,7 +341,13 @@ def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -
 
 
 class JointTorque(TorqueEffect):
-    """A torque effect that each joint has for itself, by its own signals and numbers alone."""
+    """A torque effect that each joint has for itself, by its own signals and numbers alone.
+
+    Attributes:
+        by_load: whether its law depends on the rigid torque.
+    """
+
+    by_load: ClassVar[bool] = False
 
     def law(
         self,
@@ -257,15 +372,23 @@ class JointTorque(TorqueEffect):
         numbers = {key: float(value) for key, value in values.items()}
         return on_joint(motion, joint, self.law(q, dq, ddq, own, numbers))
 
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The law itself."""
+        assert isinstance(joint, int)
+        tables.add_law(self, joint, values)
+        return True
+
+    def simulated(self, values: Values) -> dict[str, Any]:
+        """The law on one joint."""
+        return {"law": lambda q, dq, ddq, tau: float(self.law(q, dq, ddq, tau, values))}
+
+    def absent(self, n: int) -> dict[str, Array]:
+        """Parameters (n,) each of joints without it; what may not be zero stands at its least."""
+        return {p.key: np.full(n, np.clip(0.0, p.lower, p.upper)) for p in self.parameters}
+
 
 class LinearEffect(JointTorque):
-    """A torque effect with one parameter per joint in which it is linear; the learner has these.
-
-    Attributes:
-        prior_std: how large the parameter may well be, in its unit; the prior's mean is zero.
-    """
-
-    prior_std: ClassVar[float]
+    """A torque effect with one parameter per joint in which it is linear; the learner has these."""
 
     @property
     def key(self) -> str:
@@ -280,6 +403,12 @@ class LinearEffect(JointTorque):
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """Torque per unit of the parameter; the arguments are those of `law`."""
         raise NotImplementedError
+
+    def columns(
+        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
+    ) -> tuple[Array, ...]:
+        """The one column."""
+        return (self.column(q, dq, ddq, smoothing_s),)
 
     def law(
         self,

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from adapter.effects.base import BASE, Array, BodyEffect, Parameter, Template, Values
-from adapter.spatial import exp_rotation
+from adapter.effects.phrases import Length, Phrase
+from adapter.effects.splits import LEVELLED, LOADS
+from adapter.model.spatial import exp_rotation
+from adapter.model.urdf_text import NO_PLACE, Additions
 
 
 class BaseTilt(BodyEffect):
@@ -17,7 +21,11 @@ class BaseTilt(BodyEffect):
     title = "base tilt"
     scope = BASE
     parameters = (Parameter("rx", "rad"), Parameter("ry", "rad"))
-    split_by = "turn joint 1 through its range with the arm stretched out, or measure the base"
+    phrase = Phrase(
+        "the base is tilted by {length}",
+        lengths=(Length(("rx", "ry"), "°", 180.0 / math.pi, name="tilt"),),
+    )
+    shows = ((LOADS, "grows with the load"), (LEVELLED, "shows"))
 
     def templates(self) -> tuple[Template, ...]:
         """Both angles."""
@@ -31,6 +39,13 @@ class BaseTilt(BodyEffect):
     def turn(values: Values) -> Array:
         """Orientation (3, 3) of the base against one that stands as the model says."""
         return exp_rotation([float(values["rx"]), float(values["ry"]), 0.0])
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """A base that stands on an upright link."""
+        if more.floating:
+            return NO_PLACE
+        more.turn_base(self.turn(values))
+        return None
 
 
 def _decode(x: Array) -> dict[str, Any]:

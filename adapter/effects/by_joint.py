@@ -1,40 +1,105 @@
 """Lasting effects as tables over the joints: for one sample at a time, in real time.
 
-What an effect does over a recording is in its own file; here is what one instant allows of it:
-entries of all joints go through one call, and nothing is looked up by name on the way.
+What an effect does over a recording is in its own file, and so is what one instant shows of it
+(`Effect.at_instant`): it adds itself to the tables here, entries of all joints go through one
+call, and nothing is looked up by name on the way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.active import Active
-from adapter.effects.base import Array, JointTorque, Values
-from adapter.fast import jit
+from adapter.model.spatial import Array
 
-Laws = tuple[tuple[JointTorque, dict[str, Array]], ...]
+
+class Law(Protocol):
+    """A torque that a joint has by its own signals; see `effects.base.JointTorque`."""
+
+    by_load: ClassVar[bool]
+
+    @property
+    def law(self) -> Callable[..., Array]: ...
+
+    def absent(self, n: int) -> dict[str, Array]: ...
 
 
 @dataclass(eq=False)
-class ByJoint:
-    """Effects of n joints; what a joint has none of is zero.
+class Tables:
+    """Sums over the effects of n joints, to which each effect adds its own.
 
     Attributes:
-        laws: effects at the joints with each parameter (n,); one twice where a joint has two.
         wrench: (6,) [f; m] on the last link, base axes.
-        offset: (n,) rad, q_measured - q; ripple, phase: (n,) of `encoder_ripple`, rad.
-        half_play: (n,) half a backlash, rad.
-        compliance: (n,) 1/k of the gears, rad/(N m).
-        gain: (n,) of the torque sensors; delay_s: (n,) of theirs.
+        offset: (n,) rad, q_measured - q.
+        wave: (n,) complex rad, size and phase of what an encoder adds once a turn.
+        half_play: (n,) rad, half the width of the gears' play.
+        compliance: (n,) rad/(N m), 1/k of the gears.
+        log_gain: (n,) ln of the torque sensors' gains.
+        delay_s: (n,) of the torque sensors.
+        laws: torques at the joints with each parameter (n,); one twice where a joint has two.
+    """
+
+    wrench: Array
+    offset: Array
+    wave: NDArray[np.complex128]
+    half_play: Array
+    compliance: Array
+    log_gain: Array
+    delay_s: Array
+    laws: list[tuple[Law, dict[str, Array]]] = field(default_factory=list)
+    _taken: list[set[int]] = field(default_factory=list)
+
+    @classmethod
+    def zero(cls, n: int) -> Tables:
+        """Of n joints without effects."""
+        offset, half_play, compliance, log_gain, delay_s = np.zeros((5, n))
+        wave = np.zeros(n, dtype=complex)
+        return cls(np.zeros(6), offset, wave, half_play, compliance, log_gain, delay_s)
+
+    def add_law(self, effect: Law, joint: int, values: Mapping[str, Any]) -> None:
+        """A law on one joint: beside its like on other joints, in a new table where taken."""
+        free = (k for k, (own, _) in enumerate(self.laws) if own is effect)
+        at = next((k for k in free if joint not in self._taken[k]), len(self.laws))
+        if at == len(self.laws):
+            self.laws.append((effect, effect.absent(len(self.offset))))
+            self._taken.append(set())
+        self._taken[at].add(joint)
+        for key, value in values.items():
+            self.laws[at][1][key][joint] = float(value)
+
+    def by_joint(self, left_out: Iterable[str]) -> ByJoint:
+        """All that was added; `left_out`: names of what was not."""
+        return ByJoint(
+            laws=tuple(self.laws),
+            wrench=self.wrench,
+            offset=self.offset,
+            ripple=np.abs(self.wave),
+            phase=np.angle(self.wave),
+            half_play=self.half_play,
+            compliance=self.compliance,
+            gain=np.expm1(self.log_gain),
+            delay_s=self.delay_s,
+            left_out=tuple(sorted(left_out)),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class ByJoint:
+    """Effects of n joints at one instant; what a joint has none of is zero.
+
+    Attributes:
+        laws, wrench, offset, half_play, compliance, delay_s: see `Tables`.
+        ripple, phase: (n,) rad, of what an encoder adds once a turn.
+        gain: (n,) of the torque sensors.
         left_out: names of what a single instant cannot show.
     """
 
-    laws: Laws
+    laws: tuple[tuple[Law, dict[str, Array]], ...]
     wrench: Array
     offset: Array
     ripple: Array
@@ -44,28 +109,6 @@ class ByJoint:
     gain: Array
     delay_s: Array
     left_out: tuple[str, ...]
-
-    @classmethod
-    def of(cls, effects: Sequence[Active], n: int) -> ByJoint:
-        """The effects, whatever their intervals; those of bodies are not for here."""
-        read = partial(_total, effects, n)
-        wave = read("encoder_ripple", lambda v: v["a"] * np.exp(1j * v["phase"]))
-        pull = [a.values for a in effects if a.effect.name == "external_wrench"]
-        keys = ("fx", "fy", "fz", "mx", "my", "mz")
-        wrench = np.array([[v[key] for key in keys] for v in pull], dtype=np.float64)
-        names = {a.effect.name for a in effects if not isinstance(a.effect, JointTorque)}
-        return cls(
-            laws=_laws(effects, n),
-            wrench=wrench.reshape(-1, 6).sum(axis=0),
-            offset=read("encoder_offset", lambda v: v["o"]).real.copy(),
-            ripple=np.abs(wave),
-            phase=np.angle(wave),
-            half_play=read("backlash", lambda v: 0.5 * v["b"]).real.copy(),
-            compliance=read("joint_elasticity", lambda v: 1.0 / v["k"]).real.copy(),
-            gain=np.expm1(read("torque_gain", lambda v: np.log1p(v["g"])).real),
-            delay_s=read("signal_delay", lambda v: v["d"]).real.copy(),
-            left_out=tuple(sorted(names - _SHOWN)),
-        )
 
     @cached_property
     def moves(self) -> bool:
@@ -78,6 +121,11 @@ class ByJoint:
         """Whether there is a wrench on the last link."""
         return bool(np.any(self.wrench))
 
+    @cached_property
+    def by_load(self) -> bool:
+        """Whether a law depends on the rigid torque."""
+        return any(effect.by_load for effect, _ in self.laws)
+
     def torque(
         self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
     ) -> Array | float:
@@ -86,61 +134,3 @@ class ByJoint:
         for effect, values in self.laws:
             total = total + effect.law(q, dq, ddq, tau, values, smoothing_s)
         return total
-
-
-_SHOWN = {
-    "backlash",
-    "encoder_offset",
-    "encoder_ripple",
-    "external_wrench",
-    "joint_elasticity",
-    "signal_delay",
-    "torque_gain",
-}
-
-
-def _total(
-    effects: Sequence[Active], n: int, name: str, read: Callable[[Values], complex]
-) -> NDArray[np.complex128]:
-    """(n,) complex sum over the effects of this name; one without a joint counts on all."""
-    out = np.zeros(n, dtype=complex)
-    for active in effects:
-        if active.effect.name == name:
-            out[slice(None) if active.joint < 0 else active.joint] += read(active.values)
-    return out
-
-
-def _laws(effects: Sequence[Active], n: int) -> Laws:
-    """Entries of one effect side by side in one table, a second one where a joint is taken."""
-    found: list[tuple[JointTorque, dict[str, Array]]] = []
-    taken: list[set[int]] = []
-    for active in effects:
-        effect = active.effect
-        if not isinstance(effect, JointTorque):
-            continue
-        free = (k for k, (own, _) in enumerate(found) if own is effect)
-        at = next((k for k in free if active.joint not in taken[k]), len(found))
-        if at == len(found):
-            # what zero is not allowed for (a velocity scale) stands at its least
-            absent = {p.key: np.full(n, np.clip(0.0, p.lower, p.upper)) for p in effect.parameters}
-            found.append((effect, absent))
-            taken.append(set())
-        taken[at].add(active.joint)
-        for key, value in active.values.items():
-            found[at][1][key][active.joint] = float(value)
-    return tuple(found)
-
-
-@jit
-def to_links(q, dq, ddq, tau, dtau, ddtau, offset, ripple, phase, compliance):
-    """Turn the motion q, dq, ddq (n,) that encoders say into that of the links, in place.
-
-    tau, dtau, ddtau (n,): joint torque and its rates, which twist the gears.
-    """
-    for j in range(q.shape[0]):
-        sine = ripple[j] * np.sin(q[j] + phase[j])
-        cosine = ripple[j] * np.cos(q[j] + phase[j])
-        v = dq[j]
-        q[j] -= offset[j] + sine + compliance[j] * tau[j]
-        dq[j] -= cosine * v + compliance[j] * dtau[j]
-        ddq[j] -= cosine * ddq[j] - sine * v * v + compliance[j] * ddtau[j]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from adapter.effects.asymmetric_friction import AsymmetricFriction
 from adapter.effects.backlash import Backlash
@@ -57,6 +58,32 @@ CATALOGUE: dict[str, Effect] = {
 LEARNED: dict[str, LinearEffect] = {
     name: effect for name, effect in CATALOGUE.items() if isinstance(effect, LinearEffect)
 }
+
+# What a real arm's joints have, as far as anybody knows before it has moved. Those that the data
+# do not show fade.
+REAL_ARM_EFFECTS = ("viscous_friction", "coulomb_friction", "torque_offset", "motor_inertia")
+
+# Effects that parts of the program need as such.
+LATENESS = CATALOGUE["signal_delay"]  # what samples look like whose torques come late
+WRONG_LINK = CATALOGUE["link_inertia"]  # what inertias are that are wrong altogether
+
+
+@contextmanager
+def registered(effect: Effect) -> Iterator[Effect]:
+    """The catalogue with one effect more, as long as the block lasts.
+
+    For an effect of one's own: it is learned, looked for, simulated and exported like the others.
+    """
+    if effect.name in CATALOGUE:
+        raise SettingsError(f"there is an effect '{effect.name}' already")
+    CATALOGUE[effect.name] = effect
+    if isinstance(effect, LinearEffect):
+        LEARNED[effect.name] = effect
+    try:
+        yield effect
+    finally:
+        del CATALOGUE[effect.name]
+        LEARNED.pop(effect.name, None)
 
 
 def effects_by_name(names: Iterable[str]) -> tuple[LinearEffect, ...]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, LinearEffect, Parameter, smooth_sign
+from adapter.effects.base import LEVEL, Array, LinearEffect, Parameter, Values, smooth_sign
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import STILL
+from adapter.model.urdf_text import FRICTION, Additions
 
 
 class CoulombFriction(LinearEffect):
@@ -12,11 +15,23 @@ class CoulombFriction(LinearEffect):
     title = "Coulomb friction"
     parameters = (Parameter("Fc", "N m"),)
     prior_std = 1.0  # published Panda values are 0.2 to 0.5 (Knezevic)
-    typical = 1.0
     positive = ("Fc",)
     inexact = 0.02
-    split_by = "repeat the motion with a ladder of loads at the flange, at the same speed"
+    phrase = Phrase(
+        "{who} {lacks} {x} of Coulomb friction",
+        "Fc",
+        "{who} {has} {x} less Coulomb friction than the model says",
+    )
+    form = LEVEL
+    shows = ((STILL, "fades or changes sign"),)
+    sudden = True
+    watched = True
+    bundled = True
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """tanh(dq / w) with w = 0.01 rad/s, or as far as dq goes within the smoothing time."""
         return smooth_sign(dq, ddq, smoothing_s)
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"])

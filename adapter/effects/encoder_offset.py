@@ -5,6 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS
+from adapter.model.urdf_text import Additions
 
 
 class EncoderOffset(MotionEffect):
@@ -13,10 +17,25 @@ class EncoderOffset(MotionEffect):
     name = "encoder_offset"
     title = "encoder offset"
     parameters = (Parameter("o", "rad"),)
-    typical = 0.012
-    split_by = "move the joint over a wider range, and repeat with another load at the flange"
+    prior_std = 0.012
+    phrase = Phrase(
+        "the encoder of {who} reads {x} too much",
+        "o",
+        "the encoder of {who} reads {x} too little",
+    )
+    shows = ((LOADS, "grows with the load"),)
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - o."""
         still = np.zeros(len(motion.t))
         return motion.moved(joint, still - float(values["o"]), still, still)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The offset."""
+        tables.offset[joint] += float(values["o"])
+        return True
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """The zero of the joint."""
+        more.offset[joint] += values["o"]
+        return None

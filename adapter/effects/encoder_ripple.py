@@ -15,6 +15,9 @@ from adapter.effects.base import (
     Values,
     polar,
 )
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS, TURN
 
 
 class EncoderRipple(MotionEffect):
@@ -25,7 +28,8 @@ class EncoderRipple(MotionEffect):
     parameters = (Parameter("a", "rad"), Parameter("phase", "rad"))
     log_odds = -2.0
     inexact = 0.02
-    split_by = "move the joint over a whole turn, faster"
+    phrase = Phrase("the encoder of {who} errs by {a} once per turn")
+    shows = ((LOADS, "grows with the load"), (TURN, "changes sign along the turn"))
 
     def templates(self) -> tuple[Template, ...]:
         """Sine and cosine."""
@@ -37,6 +41,11 @@ class EncoderRipple(MotionEffect):
         dq, ddq = motion.dq[:, joint], motion.ddq[:, joint]
         sine, cosine = a * np.sin(angle), a * np.cos(angle)
         return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The wave."""
+        tables.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
+        return True
 
 
 def _decode(x: Array) -> dict[str, Any]:

@@ -15,6 +15,9 @@ from adapter.effects.base import (
     TorqueEffect,
     Values,
 )
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Length, Phrase
+from adapter.effects.splits import ALONE
 
 KEYS = ("fx", "fy", "fz", "mx", "my", "mz")
 
@@ -30,7 +33,14 @@ class ExternalWrench(TorqueEffect):
         *(Parameter(key, "N m") for key in KEYS[3:]),
     )
     inexact = 0.05
-    split_by = "repeat the motion with nothing near the arm"
+    phrase = Phrase(
+        "something pushes the flange with {length}",
+        lengths=(Length(KEYS[:3], "N"), Length(KEYS[3:], "N m", before="a moment of ")),
+    )
+    shows = ((ALONE, "is gone"),)
+    sudden = True
+    passing = True
+    watched = True
 
     def templates(self) -> tuple[Template, ...]:
         """Force and moment."""
@@ -40,6 +50,11 @@ class ExternalWrench(TorqueEffect):
         """-J^T w."""
         wrench = np.array([values[key] for key in KEYS], dtype=float)
         return -motion.arm.wrench_torque(motion.q, wrench)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The wrench."""
+        tables.wrench += np.array([values[key] for key in KEYS], dtype=float)
+        return True
 
 
 def _decode(x: Array) -> dict[str, Any]:

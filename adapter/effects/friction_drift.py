@@ -11,6 +11,8 @@ from adapter.effects.base import (
     on_joint,
     smooth_sign,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LATER, STILL
 
 SLOWEST = 0.008  # N m/s
 
@@ -21,10 +23,13 @@ class FrictionDrift(TorqueEffect):
     name = "friction_drift"
     title = "friction drift"
     parameters = (Parameter("dFc", "N m/s"),)
-    typical = 0.05
+    prior_std = 0.05
     log_odds = -5.0
     inexact = 0.03
-    split_by = "repeat the motion after the arm has moved for ten minutes"
+    phrase = Phrase(
+        "the friction of {who} rises by {x}", "dFc", "the friction of {who} falls by {x}"
+    )
+    shows = ((STILL, "fades or changes sign"), (LATER, "has gone on"))
 
     def possible(self, values: Values) -> bool:
         """What drifts more slowly is not told from a velocity signal that is not quite right."""

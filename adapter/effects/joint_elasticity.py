@@ -6,6 +6,9 @@ import math
 from typing import Any
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Template, Values
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS
 
 COMPLIANCE = 2e-4  # rad/(N m), typical: 1/k of a harmonic drive of 5000 N m/rad
 
@@ -18,7 +21,8 @@ class JointElasticity(MotionEffect):
     parameters = (Parameter("k", "N m/rad"),)
     positive = ("k",)
     inexact = 0.05
-    split_by = "move faster, and repeat with and without a load at the flange"
+    phrase = Phrase("{who} {is} elastic, with a stiffness of {k}")
+    shows = ((LOADS, "grows with the square of the load"),)
 
     def templates(self) -> tuple[Template, ...]:
         """In 1/k, which is zero where the gear is rigid."""
@@ -29,6 +33,11 @@ class JointElasticity(MotionEffect):
         twist = -motion.inside_band(tau[:, joint]) / float(values["k"])
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The compliance."""
+        tables.compliance[joint] += 1.0 / float(values["k"])
+        return True
 
 
 def _decode(x: Array) -> dict[str, Any]:

@@ -13,6 +13,9 @@ from adapter.effects.base import (
     Template,
     Values,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import TURN
+from adapter.model.urdf_text import STIFFNESS, Additions
 
 
 class JointSpring(JointTorque):
@@ -21,11 +24,22 @@ class JointSpring(JointTorque):
     name = "joint_spring"
     title = "joint spring"
     parameters = (Parameter("k", "N m/rad"), Parameter("q0", "rad"))
-    split_by = "move the joint over a wider range, and repeat with the base rotated"
+    phrase = Phrase(
+        "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"
+    )
+    shows = ((TURN, "keeps growing with the angle"),)
+    watched = True
+    over_angle = True
 
     def templates(self) -> tuple[Template, ...]:
         """Coefficients of the springs that rest at 0 and at 1 rad."""
         return (Template((1.0, 1.0), _decode),)
+
+    def columns(
+        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
+    ) -> tuple[Array, ...]:
+        """q and q - 1 rad."""
+        return q, q - 1.0
 
     def law(
         self,
@@ -38,6 +52,13 @@ class JointSpring(JointTorque):
     ) -> Array:
         """k (q - q0)."""
         return np.asarray(values["k"] * (q - values["q0"]))
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Stiffness, which MJCF has and URDF has not."""
+        part = more.at_joint(STIFFNESS, joint, values["k"])
+        if part is None:
+            more.pull[joint] -= values["k"] * values["q0"]
+        return part
 
 
 def _decode(x: Array) -> dict[str, Any]:

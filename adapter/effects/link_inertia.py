@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.base import LINK, Array, BodyEffect, Parameter, Template, Values
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import WEIGHED
+from adapter.model.urdf_text import Additions
 
 
 class LinkInertia(BodyEffect):
@@ -17,7 +20,9 @@ class LinkInertia(BodyEffect):
     scope = LINK
     parameters = (Parameter("dtheta", "kg, kg m, kg m2", count=10),)
     log_odds = -2.0
-    split_by = "weigh the link, or repeat the motion with the base rotated and a wider range"
+    phrase = Phrase("{who} {has} other inertias than the model says ({torque})")
+    shows = ((WEIGHED, "shows"),)
+    is_theta = True
 
     def templates(self) -> tuple[Template, ...]:
         """Ten inertial parameters."""
@@ -29,6 +34,11 @@ class LinkInertia(BodyEffect):
         changed = theta.copy()
         changed[joint] += np.asarray(values["dtheta"], dtype=float)
         return changed, gravity
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Part of the link."""
+        more.dtheta[joint] += np.asarray(values["dtheta"], dtype=float)
+        return None
 
 
 def _decode(x: Array) -> dict[str, Any]:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import (
+    LEVEL_BY_LOAD,
     Array,
     JointTorque,
     Parameter,
     Values,
     smooth_sign,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS, STILL
 
 
 class LoadDependentFriction(JointTorque):
@@ -19,11 +22,18 @@ class LoadDependentFriction(JointTorque):
     name = "load_dependent_friction"
     title = "load-dependent friction"
     parameters = (Parameter("Fl", "1"),)
-    typical = 0.05
+    prior_std = 0.05
     positive = ("Fl",)
     log_odds = -1.0
     inexact = 0.03
-    split_by = "repeat the motion with a ladder of loads at the flange, at the same speed"
+    phrase = Phrase(
+        "{who} {lacks} friction of {x} of its load",
+        "Fl",
+        "{who} {has} less friction than the model says, by {x} of its load",
+    )
+    form = LEVEL_BY_LOAD
+    by_load = True
+    shows = ((LOADS, "grows with the load"), (STILL, "fades or changes sign"))
 
     def law(
         self,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, LinearEffect, Parameter
+from adapter.effects.base import Array, LinearEffect, Parameter, Values
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import SPEEDS, STILL
+from adapter.model.urdf_text import ARMATURE, Additions
 
 
 class MotorInertia(LinearEffect):
@@ -12,10 +15,19 @@ class MotorInertia(LinearEffect):
     title = "reflected motor inertia"
     parameters = (Parameter("B", "kg m2"),)
     prior_std = 0.1  # a link-side sensor should see none; catalogue sizes are 0.05 to 0.3
-    typical = 0.15
     positive = ("B",)
-    split_by = "repeat the motion in postures with another load inertia about this joint"
+    phrase = Phrase(
+        "{who} {lacks} {x} of reflected motor inertia",
+        "B",
+        "{who} {has} {x} less motor inertia than the model says",
+    )
+    shows = ((SPEEDS, "is gone"), (STILL, "is gone"))
+    watched = True
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """ddq."""
         return ddq
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Armature, which MJCF has and URDF has not."""
+        return more.at_joint(ARMATURE, joint, values["B"])

@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.base import FLANGE, Array, BodyEffect, Parameter, Template, Values
-from adapter.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import BARE
+from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
+from adapter.model.urdf_text import Additions
 
 
 class Payload(BodyEffect):
@@ -24,7 +27,13 @@ class Payload(BodyEffect):
         Parameter("inertia", "kg m2", count=6, optional=True),
     )
     positive = ("m",)
-    split_by = "weigh the last link apart, or repeat the motion with the tool taken off"
+    phrase = Phrase(
+        "the flange carries {x}", "m", "the flange carries {x} less than the model says"
+    )
+    shows = ((BARE, "is gone"),)
+    sudden = True
+    watched = True
+    is_theta = True
 
     def templates(self) -> tuple[Template, ...]:
         """Ten inertial parameters."""
@@ -36,6 +45,11 @@ class Payload(BodyEffect):
         changed = theta.copy()
         changed[-1] += theta_of(values)
         return changed, gravity
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """A body of its own where it can be one."""
+        alone = more.carry(theta_of(values))
+        return None if alone else "it has no inertia that could be a body's; the last link has it"
 
 
 def theta_of(values: Values) -> Array:

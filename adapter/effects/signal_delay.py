@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import ALL, Array, Motion, Parameter, SensorEffect, Values
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS, SPEEDS, STILL
 
 MOST_S = 0.012  # a bus, a filter and a hold together are faster
 
@@ -16,9 +19,18 @@ class SignalDelay(SensorEffect):
     title = "signal delay"
     scope = ALL
     parameters = (Parameter("d", "s", lower=-0.1, upper=0.1),)
-    typical = 3e-3
+    prior_std = 3e-3
     inexact = 0.02
-    split_by = "move faster, with sharp reversals"
+    phrase = Phrase(
+        "the torque of {who} comes {x} after the position",
+        "d",
+        "the torque of {who} comes {x} before the position",
+    )
+    shows = (
+        (LOADS, "grows with the load"),
+        (SPEEDS, "rises in proportion to the speed"),
+        (STILL, "is gone"),
+    )
 
     def possible(self, values: Values) -> bool:
         """Late, by a dozen milliseconds at most; what asks for more is something else."""
@@ -32,3 +44,8 @@ class SignalDelay(SensorEffect):
         out = tau.copy()
         out[:, joint] = late[:, joint]
         return np.asarray(out)
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The delay."""
+        tables.delay_s[joint] += float(values["d"])
+        return True

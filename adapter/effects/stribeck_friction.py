@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from adapter.effects.base import (
+    LEVEL,
+    TWO_LEVELS,
     Array,
     JointTorque,
     Parameter,
@@ -16,6 +17,9 @@ from adapter.effects.base import (
     Values,
     smooth_sign,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import SPEEDS, STILL
+from adapter.model.urdf_text import FRICTION, Additions
 
 VELOCITIES = (0.03, 0.06, 0.12, 0.25)  # rad/s, tried for vs
 
@@ -28,13 +32,14 @@ class StribeckFriction(JointTorque):
     parameters = (
         Parameter("Fc", "N m"),
         Parameter("Fs", "N m"),
-        Parameter("vs", "rad/s", lower=1e-3, upper=10.0),
+        Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03),
     )
     positive = ("Fc", "Fs")
     log_odds = -3.0
     inexact = 0.03
-    simpler: ClassVar[Mapping[str, float]] = {"coulomb_friction": 0.01, "asymmetric_friction": 0.01}
-    split_by = "move the joint at constant speeds from 0.01 to 0.5 rad/s"
+    simpler = ((LEVEL, 0.01), (TWO_LEVELS, 0.01))
+    phrase = Phrase("{who} {lacks} Stribeck friction of {Fs} at rest and {Fc} in motion")
+    shows = ((SPEEDS, "falls as the joint gets faster"), (STILL, "fades or changes sign"))
 
     def templates(self) -> tuple[Template, ...]:
         """Both levels at several velocity scales."""
@@ -64,6 +69,10 @@ class StribeckFriction(JointTorque):
         level, rest, vs = (values[key] for key in ("Fc", "Fs", "vs"))
         curve = level + (rest - level) * np.exp(-((dq / vs) ** 2))
         return np.asarray(curve * smooth_sign(dq, ddq, smoothing_s))
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """What stays in motion, as dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
 
 def _decode(vs: float, x: Array) -> dict[str, Any]:

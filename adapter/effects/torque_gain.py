@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from adapter.effects.base import Array, Motion, Parameter, SensorEffect, Values
+from adapter.effects.by_joint import Tables
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import KNOWN_WEIGHT, LOADS
 
 
 class TorqueGain(SensorEffect):
@@ -11,11 +16,28 @@ class TorqueGain(SensorEffect):
     name = "torque_gain"
     title = "torque sensor gain"
     parameters = (Parameter("g", "1", lower=-0.95),)
-    typical = 0.05
-    split_by = "repeat the motion with and without a known load at the flange"
+    prior_std = 0.05
+    phrase = Phrase(
+        "the torque sensor of {who} reads {x} too much",
+        "g",
+        "the torque sensor of {who} reads {x} too little",
+    )
+    shows = ((LOADS, "grows with the load"), (KNOWN_WEIGHT, "misreads it in proportion"))
+    watched = True
+
+    def columns(
+        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
+    ) -> tuple[Array, ...]:
+        """The torque itself."""
+        return (tau,)
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(1 + g) tau on the joint."""
         out = tau.copy()
         out[:, joint] *= 1.0 + float(values["g"])
         return out
+
+    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+        """The gain."""
+        tables.log_gain[joint] += np.log1p(float(values["g"]))
+        return True

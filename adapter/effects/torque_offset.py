@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, LinearEffect, Parameter
+from adapter.effects.phrases import Phrase
 
 
 class TorqueOffset(LinearEffect):
@@ -14,8 +15,15 @@ class TorqueOffset(LinearEffect):
     title = "torque sensor offset"
     parameters = (Parameter("o", "N m"),)
     prior_std = 1.0
-    typical = 0.5
-    split_by = "move the joint over a wider range, or read the sensor with the base rotated"
+    phrase = Phrase(
+        "the torque sensor of {who} reads {x} too much",
+        "o",
+        "the torque sensor of {who} reads {x} too little",
+    )
+    after_sensors = True  # whatever else the sensors do
+    sudden = True
+    watched = True
+    bundled = True
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """One."""

@@ -15,6 +15,8 @@ from adapter.effects.base import (
     Values,
     polar,
 )
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import TURN
 
 # Harmonic drives and motors give 1, 2, 4 and the numbers of poles and rollers.
 NUMBERS = tuple(range(1, 31))
@@ -31,7 +33,9 @@ class TorqueRipple(JointTorque):
         Parameter("phase", "rad"),
     )
     inexact = 0.01
-    split_by = "move the joint over a wider range, slowly and at several speeds"
+    phrase = Phrase("{who} {has} a torque ripple of {a}, {n}")
+    shows = ((TURN, "repeats along the turn"),)
+    over_angle = True
 
     def templates(self) -> tuple[Template, ...]:
         """Sine and cosine of each number per turn."""

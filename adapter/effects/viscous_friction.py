@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, LinearEffect, Parameter
+from adapter.effects.base import Array, LinearEffect, Parameter, Values
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import SPEEDS, STILL
+from adapter.model.urdf_text import DAMPING, Additions
 
 
 class ViscousFriction(LinearEffect):
@@ -12,11 +15,22 @@ class ViscousFriction(LinearEffect):
     title = "viscous friction"
     parameters = (Parameter("Fv", "N m s/rad"),)
     prior_std = 1.0  # published Panda values are 0.03 to 0.09 (Knezevic)
-    typical = 0.5
     positive = ("Fv",)
     inexact = 0.02
-    split_by = "move the joint at several constant speeds, slow to fast, over the same range"
+    phrase = Phrase(
+        "{who} {lacks} {x} of viscous friction",
+        "Fv",
+        "{who} {has} {x} less viscous friction than the model says",
+    )
+    shows = ((SPEEDS, "rises in proportion to the speed"), (STILL, "is gone"))
+    sudden = True
+    watched = True
+    bundled = True
 
     def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
         """dq."""
         return dq
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """Damping."""
+        return more.at_joint(DAMPING, joint, values["Fv"])

@@ -6,10 +6,12 @@ model as it stands, by finite differences of the same stages that predict torque
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import BSpline
 
 from adapter.effects import CATALOGUE
 from adapter.effects.active import Active
@@ -18,18 +20,26 @@ from adapter.effects.base import (
     BASE,
     FLANGE,
     LINK,
+    ArmDynamics,
+    BodyEffect,
     Effect,
     Motion,
     MotionEffect,
+    Parameter,
     SensorEffect,
     Template,
     TorqueEffect,
+    Values,
+    on_joint,
+    smooth_sign,
 )
+from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.signals import Signals
-from adapter.records import Array
-from adapter.torque import added, bodies, moved_links
+from adapter.model.spatial import Array
 
-THETA_EFFECTS = ("payload", "link_inertia")
+PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
+ALONE_NATS = 4.0  # signals of one bus are late together, not one joint's alone
+ALWAYS_NATS = 6.0  # what pushes for a whole recording is rather a tilted base
 STEP = 0.02  # of a coefficient's typical size, for the differences
 
 
@@ -41,12 +51,14 @@ class Candidate:
         effect: of the catalogue; template: how its coefficients are read.
         joint: from 0; -1 where the effect has none.
         columns: places of its signatures in the table of all signatures.
+        log_odds: ln of what it is worth before the data where it acts all the time.
     """
 
     effect: Effect
     template: Template
     joint: int
     columns: tuple[int, ...]
+    log_odds: float = 0.0
 
     @property
     def key(self) -> tuple[str, int]:
@@ -56,7 +68,7 @@ class Candidate:
     @property
     def columns_are_theta(self) -> bool:
         """Whether its coefficients are inertial parameters of a link."""
-        return self.effect.name in THETA_EFFECTS
+        return self.effect.is_theta
 
     @property
     def prior_std(self) -> Array:
@@ -65,27 +77,47 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Base:
-    """The model as it stands on a recording: what it predicts, stage by stage, at 250 Hz.
+class Stages:
+    """What a model predicts on a recording, stage by stage, at the motion's rate.
 
     Attributes:
-        links: motion of the links.
-        rigid: (m, n) torque of the bodies; total: with what acts at the joints.
-        regressor: (m, n, 10 n).
+        signals: the recording.
+        links: motion of the links, with the model's arm.
+        rigid: (m, n) torque of the bodies; total: with what acts at the joints; sensed: as the
+            sensors read it.
+        bare: (m, n) torque of the arm alone, without effects on its bodies.
     """
 
+    signals: Signals
     links: Motion
     rigid: Array
     total: Array
-    regressor: Array
+    sensed: Array
+    bare: Array
+
+    def low_regressor(self, link: int | None = None, gate: Array | None = None) -> Array:
+        """(c, k, n) regressor in the band: of one link (from 0) or all, while a gate is open."""
+        rows = slice(None) if link is None else slice(10 * link, 10 * link + 10)
+        unmoved = self.links.q is self.signals.motion.q
+        if unmoved and gate is None:
+            return self.signals.low_regressor[rows]
+        Y = self.links.arm.regressor(self.links.q, self.links.dq, self.links.ddq)
+        Y = Y[:, :, rows] if gate is None else Y[:, :, rows] * gate[:, :, None]
+        return np.moveaxis(self.signals.low(Y), 2, 0)
 
 
-def base_of(signals: Signals, effects: Sequence[Active]) -> Base:
-    """Evaluate the model with the effects named so far."""
-    links = moved_links(signals.motion, effects)
+def stages_of(
+    signals: Signals, effects: Sequence[Active], arm: ArmDynamics | None = None
+) -> Stages:
+    """Evaluate an arm (that of the recording's motion where None is given) with effects."""
+    motion = signals.motion if arm is None else replace(signals.motion, arm=arm)
+    links = moved_links(motion, effects)
     rigid = bodies(links, effects)
-    Y = links.arm.regressor(links.q, links.dq, links.ddq)
-    return Base(links, rigid, added(links, rigid, effects), Y)
+    bare = rigid
+    if any(isinstance(active.effect, BodyEffect) for active in effects):
+        bare = links.arm.torque(links.q, links.dq, links.ddq)
+    total = added(links, rigid, effects)
+    return Stages(signals, links, rigid, total, sensors(links, total, effects), bare)
 
 
 def places(effect: Effect, n: int) -> tuple[int, ...]:
@@ -96,11 +128,12 @@ def places(effect: Effect, n: int) -> tuple[int, ...]:
 
 
 def signatures(
-    signals: Signals, base: Base, joints: Sequence[int], extra: Sequence[tuple[Effect, int]] = ()
+    at: Stages, joints: Sequence[int], extra: Sequence[tuple[Effect, int]] = ()
 ) -> tuple[Array, list[Candidate]]:
     """Every signature in the band, and what each belongs to.
 
     Args:
+        at: the model as it stands on a recording.
         joints: (from 0) that move; effects of others cannot be told.
         extra: further effects, each with its joint.
 
@@ -108,62 +141,215 @@ def signatures(
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
         those of θ.
     """
-    n = signals.motion.arm.n
-    theta = np.moveaxis(signals.low(base.regressor), 2, 0)
-    tables, candidates, size = [theta], [], 10 * n
-    for effect in CATALOGUE.values():
-        for joint in places(effect, n):
-            if joint >= 0 and effect.scope != LINK and joint not in joints:
-                continue
-            for template in effect.templates():
-                count = len(template.prior_std)
-                if effect.name in THETA_EFFECTS:
-                    k = 10 * (joint if joint >= 0 else n - 1)
-                    columns = tuple(range(k, k + 10))
-                else:
-                    tables.append(_differences(signals, base, effect, template, joint))
-                    columns = tuple(range(size, size + count))
-                    size += count
-                candidates.append(Candidate(effect, template, joint, columns))
-    for effect, joint in extra:
-        template = effect.templates()[0]
-        tables.append(_differences(signals, base, effect, template, joint))
-        columns = tuple(range(size, size + len(template.prior_std)))
-        size += len(columns)
-        candidates.append(Candidate(effect, template, joint, columns))
+    n = at.links.arm.n
+    tables, candidates, size = [at.low_regressor()], [], 10 * n
+    ways = [
+        (effect, joint, template)
+        for effect in CATALOGUE.values()
+        for joint in places(effect, n)
+        if joint < 0 or effect.scope == LINK or joint in joints
+        for template in effect.templates()
+    ]
+    ways += [(effect, joint, effect.templates()[0]) for effect, joint in extra]
+    for effect, joint, template in ways:
+        if effect.is_theta:
+            k = 10 * (joint if joint >= 0 else n - 1)
+            columns = tuple(range(k, k + 10))
+        else:
+            tables.append(_differences(at, effect, template, joint))
+            columns = tuple(range(size, size + len(template.prior_std)))
+            size += len(columns)
+        odds = _log_odds(effect, joint, n)
+        candidates.append(Candidate(effect, template, joint, columns, odds))
     return np.concatenate(tables), candidates
 
 
-def _differences(
-    signals: Signals, base: Base, effect: Effect, template: Template, joint: int
-) -> Array:
+def _differences(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
     """(c, k, n) change of the torque per unit of each coefficient, at zero."""
+    if isinstance(effect, Pattern):
+        return at.signals.low_basis(effect.basis(at.links, at.rigid, joint), joint)
+    own = joint if isinstance(effect, TorqueEffect | SensorEffect) else -1
     out = []
     for i, std in enumerate(template.prior_std):
         x = np.zeros(len(template.prior_std))
         x[i] = STEP * std
-        change = _change(base, effect, joint, template.decode(x)) / x[i]
-        if joint >= 0 and isinstance(effect, TorqueEffect | SensorEffect):
-            table = np.zeros((*signals.tau.shape,))
-            table[:, joint] = signals.low(change[:, joint])
-            out.append(table)
-        else:
-            out.append(signals.low(change))
+        change = _change(at, effect, joint, template.decode(x)) / x[i]
+        out.append(at.signals.low_on(change, own))
     return np.array(out)
 
 
-def _change(base: Base, effect: Effect, joint: int, values: dict) -> Array:
+def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
     """(m, n) by how much a small effect changes the torque."""
-    links = base.links
+    links = at.links
     if isinstance(effect, TorqueEffect):
-        return effect.torque(links, base.rigid, joint, values)
+        return effect.torque(links, at.rigid, joint, values)
     if isinstance(effect, SensorEffect):
         # not of the total: friction that was named would make a gain look like friction
-        return effect.measured(links, base.rigid, joint, values) - base.rigid
+        return effect.measured(links, at.rigid, joint, values) - at.rigid
     if isinstance(effect, MotionEffect):
-        moved = effect.link_side(links, base.rigid, joint, values)
-        return links.arm.torque(moved.q, moved.dq, moved.ddq) - links.arm.torque(
-            links.q, links.dq, links.ddq
-        )
-    tilted = bodies(links, (Active(effect, joint, values),))
-    return tilted - links.arm.torque(links.q, links.dq, links.ddq)
+        moved = effect.link_side(links, at.rigid, joint, values)
+        return links.arm.torque(moved.q, moved.dq, moved.ddq) - at.bare
+    return bodies(links, (Active(effect, joint, values),)) - at.bare
+
+
+UNEXPLAINED = "unexplained"
+PIECES, DEGREE = 5, 3  # of a spline over a signal's range
+SLOW_PIECES = 10  # over time
+SIZE_NM = 0.3
+LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
+LINE_HZ = (0.15, 9.0)
+
+
+class Pattern(TorqueEffect):
+    """A torque on one joint, linear in basis functions of the arm's signals.
+
+    Args:
+        label: tells patterns apart; depends_on: signals that it follows ("dq3"), own joint first.
+        basis: motion and rigid torque to basis functions (m, k) at the joint.
+        count: k; log_odds: before any data.
+    """
+
+    title = "something that is not in the catalogue"
+
+    def __init__(
+        self,
+        label: str,
+        depends_on: tuple[str, ...],
+        basis: Callable[[Motion, Array, int], Array],
+        count: int,
+        log_odds: float = -7.0,
+    ) -> None:
+        self.name = f"{UNEXPLAINED}:{label}"  # type: ignore[misc]
+        self.parameters = (Parameter("x", "N m", count=count),)  # type: ignore[misc]
+        self.depends_on, self.basis, self._count = depends_on, basis, count
+        self.log_odds = log_odds  # type: ignore[misc]
+
+    @property
+    def is_line(self) -> bool:
+        """Whether it is a sine in time."""
+        return self.name.endswith("Hz")
+
+    def templates(self) -> tuple[Template, ...]:
+        """All its coefficients at once."""
+        return (Template((SIZE_NM,) * self._count, _decode),)
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """Coefficients times basis."""
+        return on_joint(motion, joint, self.basis(motion, tau, joint) @ np.asarray(values["x"]))
+
+
+def _decode(x: Array) -> dict[str, Any]:
+    return {"x": np.asarray(x)}
+
+
+def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
+    """What the torque on a joint (from 0) of n may follow."""
+    k = joint + 1
+    own = [
+        Pattern(f"q{k}", (f"q{k}",), _curve("q"), PIECES + DEGREE),
+        Pattern(f"dq{k}", (f"dq{k}",), _curve("dq"), PIECES + DEGREE),
+        Pattern(f"ddq{k}", (f"ddq{k}",), _curve("ddq"), PIECES + DEGREE),
+        Pattern(f"tau{k}", (f"tau{k}",), _curve("tau"), PIECES + DEGREE),
+        Pattern(f"q{k},sign", (f"q{k}", f"dq{k}"), _times_sign, PIECES + DEGREE),
+        Pattern(f"q{k},dq", (f"q{k}", f"dq{k}"), _times_speed, PIECES + DEGREE),
+        Pattern("t", ("t",), _over_time, SLOW_PIECES + DEGREE),
+    ]
+    for i in range(n):
+        if i != joint:
+            own.append(Pattern(f"dq{i + 1}", (f"dq{i + 1}",), _other("dq", i), 1, -7.0))
+            own.append(Pattern(f"tau{i + 1}", (f"tau{i + 1}",), _other("tau", i), 1, -7.0))
+    return tuple(own)
+
+
+def line(residual: Array, rate_hz: float) -> Pattern | None:
+    """A sine in time at the frequency that stands out of a residual (k,), if one does."""
+    power = np.abs(np.fft.rfft(residual * np.hanning(len(residual)))) ** 2
+    f = np.fft.rfftfreq(len(residual), 1.0 / rate_hz)
+    inside = (f > LINE_HZ[0]) & (f < LINE_HZ[1])
+    peak = int(np.argmax(np.where(inside, power, 0.0)))
+    near = power[max(peak - 20, 1) : peak + 20]
+    if power[peak] < LINE_RATIO * np.median(near):
+        return None
+    # the top of the parabola through the peak's logarithms
+    a, b, c = np.log(power[peak - 1 : peak + 2] + 1e-300)
+    hz = float(f[peak] + 0.5 * (a - c) / (a - 2 * b + c) * (f[1] - f[0]))
+    return Pattern(f"t at {hz:.2f} Hz", ("t",), _sine(hz), 2, -7.0)
+
+
+def _signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:
+    return np.asarray(tau[:, joint] if name == "tau" else getattr(motion, name)[:, joint])
+
+
+def _spline(x: Array, pieces: int) -> Array:
+    """Cubic B-splines (m, pieces + 3) over the range of x (m,)."""
+    low, high = float(x.min()), float(x.max())
+    step = max(high - low, 1e-9) / pieces
+    knots = low + step * np.arange(-DEGREE, pieces + DEGREE + 1)
+    inside = np.clip(x, low, high - 1e-9 * step)
+    return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
+
+
+def _curve(name: str) -> Callable[[Motion, Array, int], Array]:
+    return lambda motion, tau, joint: _spline(_signal_of(name, motion, tau, joint), PIECES)
+
+
+def _times_sign(motion: Motion, tau: Array, joint: int) -> Array:
+    return _spline(motion.q[:, joint], PIECES) * smooth_sign(motion.dq[:, joint])[:, None]
+
+
+def _times_speed(motion: Motion, tau: Array, joint: int) -> Array:
+    return _spline(motion.q[:, joint], PIECES) * motion.dq[:, joint, None]
+
+
+def _over_time(motion: Motion, tau: Array, joint: int) -> Array:
+    return _spline(motion.t, SLOW_PIECES)
+
+
+def _other(name: str, i: int) -> Callable[[Motion, Array, int], Array]:
+    def basis(motion: Motion, tau: Array, joint: int) -> Array:
+        x = _signal_of(name, motion, tau, i)
+        return np.asarray(((x - x.mean()) / (x.std() + 1e-9))[:, None])
+
+    return basis
+
+
+def _sine(hz: float) -> Callable[[Motion, Array, int], Array]:
+    def basis(motion: Motion, tau: Array, joint: int) -> Array:
+        angle = 2.0 * np.pi * hz * motion.t
+        return np.column_stack([np.sin(angle), np.cos(angle)])
+
+    return basis
+
+
+def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]) -> bool:
+    """Whether `simple` is the simpler of two candidates, and explains (chi2) all but as much.
+
+    Its finer form must add a share to what an effect explains, and a pattern must explain
+    clearly more than an effect of the catalogue.
+    """
+    (a, mine), (b, theirs) = simple, other
+    if isinstance(b.effect, Pattern):
+        beside = a.joint in (b.joint, -1) and not isinstance(a.effect, Pattern)
+        return beside and mine > PATTERN_SHARE * theirs
+    share = dict(b.effect.simpler).get(a.effect.form)
+    return share is not None and a.joint == b.joint and theirs < (1.0 + share) * mine
+
+
+def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
+    """ln of what a candidate is worth before the data, the ways to look for it included."""
+    odds = c.log_odds
+    if c.effect.passing and not passing:
+        odds -= ALWAYS_NATS
+    if timed or passing:
+        odds += c.effect.log_odds_of_start
+    return float(odds)
+
+
+def _log_odds(effect: Effect, joint: int, n: int) -> float:
+    """Of one effect of all, at one joint of n, in one of the ways to look for it."""
+    odds = effect.log_odds - np.log(len(CATALOGUE)) - np.log(len(effect.templates()))
+    if joint >= 0:
+        odds -= np.log(n)
+        if effect.scope == ALL:
+            odds -= ALONE_NATS
+    return float(odds)

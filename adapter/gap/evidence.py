@@ -12,9 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
+from scipy.signal import welch
 
-from adapter.records import Array
+from adapter.model.spatial import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +44,16 @@ def score(G: Array, g: Array, prior_std: Array) -> Score:
     return Score(0.5 * (chi2 - log_det), chi2, prior_std * x)
 
 
-def scores(G: Array, g: Array, prior_std: Array) -> tuple[Array, Array]:
-    """(log_evidence, chi2), (b,) each, of stacks G (b, k, k), g (b, k)."""
-    A = prior_std[:, None] * G * prior_std + np.eye(G.shape[-1])
+def scores(G: Array, g: Array, prior_std: Array) -> tuple[Array, Array, Array]:
+    """(log_evidence (b,), chi2 (b,), x (b, k)) of stacks G (b, k, k), g (b, k).
+
+    `prior_std` is (k,), or (b, k) where each has its own.
+    """
+    A = prior_std[..., :, None] * G * prior_std[..., None, :] + np.eye(G.shape[-1])
     right = prior_std * g
-    chi2 = np.einsum("bi,bi->b", right, np.linalg.solve(A, right[..., None])[..., 0])
-    return 0.5 * (chi2 - np.linalg.slogdet(A)[1]), chi2
+    x = np.linalg.solve(A, right[..., None])[..., 0]
+    chi2 = np.einsum("bi,bi->b", right, x)
+    return 0.5 * (chi2 - np.linalg.slogdet(A)[1]), chi2, prior_std * x
 
 
 class Carried:
@@ -80,6 +85,84 @@ class Carried:
 
     def reduced(self, G: Array, C: Array, g: Array) -> tuple[Array, Array]:
         """The same from products: G (..., k, k), C (..., k, c) with the carried, g (..., k)."""
-        flat = C.reshape(-1, C.shape[-1])
-        solved = cho_solve(self._factor, flat.T).T.reshape(C.shape)
+        solved = self.solved(C)
         return G - solved @ np.swapaxes(C, -1, -2), g - solved @ self.g
+
+    def solved(self, C: Array) -> Array:
+        """C A^-1 of products C (..., c) with the carried, A their information."""
+        flat = C.reshape(-1, C.shape[-1])
+        return np.asarray(cho_solve(self._factor, flat.T).T.reshape(C.shape))
+
+
+ORDER = 6  # at 25 Hz
+AT_ONCE = 8  # signatures that are whitened together
+WHITE = 0.02  # share of white noise added: edges of models are not known any better
+NOISE_WINDOW, SHORTEST_WINDOW = 128, 32  # samples, 5 s at most, and the least
+ROBUST, PLAIN = 5, 2  # windows at least: where something may be in a few of them, and else
+LEAST_NM = 1e-4  # N m; no torque sensor is quieter
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """What the residual is made of once everything that can be explained is.
+
+    Attributes:
+        ar: (n, p) coefficients; x_t = sum ar_i x_(t-i) + e_t.
+        sigma: (n,) standard deviation of e, N m.
+        level: (n,) standard deviation of x in the band, N m.
+    """
+
+    ar: Array
+    sigma: Array
+    level: Array
+
+    def flat(self) -> Noise:
+        """White noise of the same size in the band."""
+        return Noise(np.zeros_like(self.ar), self.level, self.level)
+
+    def whiten(self, x: Array) -> Array:
+        """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""
+        n, p = self.ar.shape
+        k = x.shape[-2] - p
+        flat = x.reshape(-1, (k + p) * n)  # long rows: numpy is slow along a handful of joints
+        ratio = np.tile(np.column_stack([np.ones(n), -self.ar]).T / self.sigma, k)
+        out, part = np.empty((len(flat), k * n)), np.empty((AT_ONCE, k * n))
+        for first in range(0, len(flat), AT_ONCE):  # few enough to stay in the cache
+            rows = flat[first : first + AT_ONCE]
+            mine, scratch = out[first : first + AT_ONCE], part[: len(rows)]
+            np.multiply(rows[:, p * n :], ratio[0], out=mine)
+            for i in range(1, p + 1):
+                np.multiply(rows[:, (p - i) * n : (p - i + k) * n], ratio[i], out=scratch)
+                mine += scratch
+        return np.asarray(out.reshape(*x.shape[:-2], k, n))
+
+
+def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> Noise:
+    """Noise model of a residual (k, n), N m.
+
+    The spectrum is the median over windows of 5 s, so that what happens but once, a contact or
+    a load that is picked up, does not count as noise.
+
+    Args:
+        floor: least standard deviation, N m.
+        windows: at least so many; the more, the less does slow noise count in short recordings.
+    """
+    window = min(NOISE_WINDOW, max(len(residual) // windows, SHORTEST_WINDOW))
+    _, power = welch(
+        residual,
+        window="hann",
+        nperseg=window,
+        axis=0,
+        average="median",
+        detrend="constant",
+        return_onesided=False,
+    )
+    covariance = np.fft.ifft(power, axis=0).real[: ORDER + 1]
+    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + WHITE * covariance[0]
+    n = residual.shape[1]
+    ar, sigma = np.zeros((n, ORDER)), np.empty(n)
+    for j in range(n):
+        r = covariance[:, j]
+        ar[j] = solve_toeplitz(r[:-1], r[1:])
+        sigma[j] = np.sqrt(r[0] - ar[j] @ r[1:])
+    return Noise(ar, sigma, np.sqrt(covariance[0]))

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK
+from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.splits import experiments
+from adapter.gap.candidates import Pattern
 from adapter.gap.fit import Fit, Named, place_of
-from adapter.gap.patterns import Pattern
-from adapter.gap.result import Finding, Leftover
+from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Standing
 from adapter.gap.search import Found
-from adapter.gap.where import explained
-from adapter.records import Array
+from adapter.model.spatial import Array
 
 OVERLAP = 0.9
 MOST_RIVALS = 3
@@ -26,7 +27,6 @@ OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
 SMOOTH = 3.5  # level of a residual over what the samples before it do not foretell
 FOLLOWS = 0.05  # share of its power that a signal must explain to be named
 FEW_ROWS, FEW_SPANS = 12, 5
-SHAPES, SHAPE_STEP = ("vs",), 0.03
 VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
 
 
@@ -67,18 +67,47 @@ def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
     )
     deviations = np.sqrt(np.einsum("ip,ij,jp->p", slopes, covariance[np.ix_(own, own)], slopes))
     std, place = {}, 0
+    on_grid = {p.key: p.grid_share for p in named.candidate.effect.parameters if p.grid_share}
     for key, value in named.values.items():
         size = np.size(value)
         part = deviations[place : place + size]
         std[key] = float(part[0]) if np.ndim(value) == 0 else [float(x) for x in part]
-        if key in SHAPES:  # found on a grid
-            std[key] = SHAPE_STEP * abs(float(value))
+        if key in on_grid:
+            std[key] = on_grid[key] * abs(float(value))
         place += size
     return std
 
 
 def _flat(values: dict[str, Any]) -> Array:
     return np.concatenate([np.atleast_1d(np.asarray(v, dtype=float)) for v in values.values()])
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a search comes to.
+
+    Attributes:
+        findings: effects that the model lacks; unexplained: what no effect explains.
+        where: what the nominal model's residual follows, see `disagreement`.
+        noise_floor_nm: (n,) of the torques.
+    """
+
+    findings: tuple[Finding, ...]
+    unexplained: tuple[Leftover, ...]
+    where: tuple[dict[str, Any], ...]
+    noise_floor_nm: Array
+
+
+def told_of(found: Found, ends: Sequence[float], curves: Curves) -> Told:
+    """What there is to tell.
+
+    Args:
+        found: of the search; ends: (recordings,) s, when each ends.
+        curves: of the first recording.
+    """
+    left, floor = leftovers_of(found, ends), noise_floor(found.fit)
+    findings = doubted(findings_of(found, ends), left)
+    return Told(findings, left, tuple(disagreement(curves, floor)), floor)
 
 
 def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
@@ -91,9 +120,10 @@ def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
             continue
         recording = named.recording or 0
         begin, end = named.interval_s
-        torque = fit.contribution(recording, k)
+        torque = fit.model.contribution(recording, k)
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
+        overlaps = _overlaps(standing, named)
         out.append(
             Finding(
                 effect=effect.name,
@@ -105,8 +135,8 @@ def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
                 std=parameter_std(fit, covariance, k),
                 units=effect.units(),
                 evidence=standing.probability,
-                overlaps=_overlaps(standing, named),
-                split_by=effect.split_by,
+                overlaps=overlaps,
+                split_by="; ".join(experiments(effect, [CATALOGUE[x] for x in overlaps])),
                 detectability=float(np.sqrt(standing.chi2)),
                 torque_rms_nm=np.sqrt(np.mean(torque[on] ** 2, axis=0)),
             )
@@ -131,7 +161,7 @@ def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
 
 def noise_floor(fit: Fit) -> Array:
     """(n,) rms in the band of what is left when all is explained that can be, N m."""
-    left = np.concatenate(fit.residuals())
+    left = np.concatenate(fit.model.residuals())
     levels = [noise.level for noise in fit.noise]
     return np.minimum(np.max(levels, axis=0), np.sqrt(np.mean(left**2, axis=0)))
 
@@ -150,7 +180,7 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
     Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
     """
     out = []
-    noise, residual = fit.noise[0], fit.residual(0)
+    noise, residual = fit.noise[0], fit.model.residual(0)
     motion = fit.recordings[0].motion
     rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
     for j in range(fit.n):
@@ -169,7 +199,7 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
 def _outbursts(fit: Fit) -> list[Leftover]:
     """Joints whose residual is much larger for a while than it is usually."""
     out = []
-    t, residual = fit.recordings[0].t, fit.residual(0)
+    t, residual = fit.recordings[0].t, fit.model.residual(0)
     counted = fit.weights[0] > 0.0 if fit.weights else np.ones_like(residual, dtype=bool)
     window = (t // OUTBURST_S).astype(int)
     for j in range(fit.n):
@@ -211,11 +241,11 @@ def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
         ]
         if not own:
             continue
-        parts = [fit.contribution(0, k)[:, j] for k, _ in own]
-        left, pattern = fit.residual(0)[:, j], np.sum(parts, axis=0)
+        parts = [fit.model.contribution(0, k)[:, j] for k, _ in own]
+        left, pattern = fit.model.residual(0)[:, j], np.sum(parts, axis=0)
         floor, rmse = (float(np.sqrt(np.mean(x**2))) for x in (left, left + pattern))
         named = [
-            float(np.sqrt(np.mean(fit.contribution(e.recording or 0, k)[:, j] ** 2)))
+            float(np.sqrt(np.mean(fit.model.contribution(e.recording or 0, k)[:, j] ** 2)))
             for k, e in enumerate(fit.named)
             if e.candidate.effect.inexact
         ]
@@ -235,3 +265,45 @@ def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
             )
         )
     return tuple(out)
+
+
+BINS = 12
+SIGNALS = ("q", "dq", "ddq", "tau")
+
+
+def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
+    """Of the nominal model, joint by joint.
+
+    Returns:
+        One entry a joint (from 1): `rmse_nm`, `times_noise`, and `follows`: the share of the
+        residual's power that its mean by velocity, position, acceleration, load (the joint's
+        own) and time explains, beyond what as many bins of pure noise would.
+    """
+    out = []
+    for j in range(curves.before.shape[1]):
+        residual = curves.before[:, j]
+        rmse = float(np.sqrt(np.mean(residual**2)))
+        signals = {f"{name}{j + 1}": getattr(curves, name)[:, j] for name in SIGNALS}
+        signals["t"] = curves.t
+        shares = {name: explained(residual, x) for name, x in signals.items()}
+        out.append(
+            {
+                "joint": j + 1,
+                "rmse_nm": rmse,
+                "times_noise": rmse / float(noise_floor_nm[j]),
+                "follows": dict(sorted(shares.items(), key=lambda pair: -pair[1])),
+            }
+        )
+    return out
+
+
+def explained(residual: Array, x: Array) -> float:
+    """Share of the power of a residual (k,) in its means over bins of x (k,), noise discounted."""
+    order = np.argsort(x, kind="stable")
+    parts = np.array_split(residual[order], BINS)
+    between = sum(len(p) * float(p.mean()) ** 2 for p in parts)
+    whole = float(residual @ residual)
+    if not whole > 0.0:
+        return 0.0
+    by_chance = BINS * (whole - between) / max(len(residual) - BINS, 1)
+    return float(np.clip((between - by_chance) / whole, 0.0, 1.0))

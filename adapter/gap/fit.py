@@ -1,28 +1,28 @@
 """The model as it stands: nominal, its small inertial corrections, and the effects named so far.
 
 Everything is refitted together and exactly: Gauss and Newton on the torque that the stages of
-`adapter.torque` predict, with the inertias held to their prior and the noise coloured.
+`adapter.effects.torque` predict, with the inertias held to their prior and the noise coloured.
+`Model` is what predicts, and remembers what it predicted; `Fit` adds priors and noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from adapter.effects import CATALOGUE
 from adapter.effects.active import WHOLE, Active
-from adapter.effects.base import Motion, TorqueEffect
-from adapter.gap.candidates import Candidate
-from adapter.gap.evidence import Carried, Score, score
-from adapter.gap.noise import LEAST_NM, ORDER, Noise, noise_of
+from adapter.effects.base import ArmDynamics, TorqueEffect
+from adapter.effects.catalogue import CATALOGUE, LATENESS
+from adapter.effects.torque import added, sensors
+from adapter.gap.candidates import Candidate, Stages, stages_of
+from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of, score
 from adapter.gap.signals import Signals
-from adapter.records import Array
-from adapter.rigid_arm import RigidArm
-from adapter.torque import bodies, moved_links, sensed_torque
+from adapter.model.spatial import Array
 
 TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
@@ -32,6 +32,8 @@ EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BAND_HZ = 25.0  # samples a second
 LIGHT_KG, SMALL_M = 0.1, 0.05
 SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
+DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
+SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,11 @@ class Named:
         """With other coefficients."""
         return replace(self, x=x)
 
+    def gate(self, t: Array) -> Array:
+        """(m, 1) one where it acts, zero elsewhere."""
+        begin, end = self.interval_s
+        return np.asarray(((t >= begin) & (t < end)).astype(float)[:, None])
+
 
 def theta_prior(theta: Array, share: float) -> Array:
     """(n, 10) standard deviation of inertial parameters that are known to a `share` of their size.
@@ -76,7 +83,6 @@ def theta_prior(theta: Array, share: float) -> Array:
     lighter than 0.1 kg or smaller than 5 cm for that.
     """
     kind = np.empty_like(theta)
-    kind[:, 0] = theta[:, 0]
     mass = np.maximum(theta[:, :1], LIGHT_KG)
     kind[:, :1] = mass
     first, second = np.linalg.norm(theta[:, 1:4], axis=1), theta[:, [4, 7, 9]].mean(axis=1)
@@ -86,44 +92,193 @@ def theta_prior(theta: Array, share: float) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """A model fitted to recordings.
+class Model:
+    """A nominal arm with corrections and effects, on recordings.
+
+    It never changes: what it predicts is computed once and kept.
 
     Attributes:
         recordings: as the search sees them; their arm is the nominal one.
-        prior: (n, 10) standard deviation of the nominal inertias.
-        noise: one model per recording.
         dtheta: (n, 10) correction of the nominal inertias.
         delay_s: by how much torques are late, within the timing of a sample.
         named: effects named so far.
         known: effects that the nominal model has already.
+    """
+
+    recordings: tuple[Signals, ...]
+    dtheta: Array
+    delay_s: float = 0.0
+    named: tuple[Named, ...] = ()
+    known: tuple[Active, ...] = ()
+    _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @cached_property
+    def arm(self) -> ArmDynamics:
+        """With its corrections."""
+        nominal = self.recordings[0].motion.arm
+        return nominal.changed(nominal.theta + self.dtheta)
+
+    @property
+    def coefficients(self) -> Array:
+        """All that is fitted: corrections, delay, coefficients of the named effects."""
+        return np.concatenate([self.dtheta.ravel(), [self.delay_s], *(e.x for e in self.named)])
+
+    def at(self, x: Array) -> Model:
+        """The same model with other coefficients."""
+        size = self.dtheta.size
+        named, k = [], size + 1
+        for e in self.named:
+            named.append(e.at(x[k : k + len(e.x)]))
+            k += len(e.x)
+        dtheta = x[:size].reshape(self.dtheta.shape)
+        return replace(self, dtheta=dtheta, delay_s=float(x[size]), named=tuple(named))
+
+    def actives(self, recording: int, but: int | None = None) -> tuple[Active, ...]:
+        """Effects at work in a recording, the timing's error among them; one may be left out."""
+        own = [*self.known]
+        for k, e in enumerate(self.named):
+            if k != but and e.recording in (None, recording):
+                own.append(e.active())
+        own.append(Active(LATENESS, -1, {"d": self.delay_s}))
+        return tuple(own)
+
+    def _once(self, key: Hashable, compute: Callable[[], Any]) -> Any:
+        if key not in self._kept:
+            self._kept[key] = compute()
+        return self._kept[key]
+
+    def stages(self, recording: int) -> Stages:
+        """What it predicts stage by stage, at the motion's rate."""
+        own = self.recordings[recording]
+        made: Stages = self._once(
+            ("stages", recording), lambda: stages_of(own, self.actives(recording), self.arm)
+        )
+        return made
+
+    def predicted(self, recording: int) -> Array:
+        """(k, n) torque in the band, N m."""
+        own = self.recordings[recording]
+        return np.asarray(
+            self._once(("low", recording), lambda: own.low(self.stages(recording).sensed))
+        )
+
+    def residual(self, recording: int) -> Array:
+        """(k, n) measured less predicted, N m."""
+        return self.recordings[recording].tau - self.predicted(recording)
+
+    def residuals(self) -> list[Array]:
+        """Of every recording."""
+        return [self.residual(i) for i in range(len(self.recordings))]
+
+    def contribution(self, recording: int, place: int) -> Array:
+        """(k, n) what a named effect adds to the torque in the band, N m."""
+        key = ("contribution", recording, place)
+        return np.asarray(self._once(key, lambda: self._contribution(recording, place)))
+
+    def _contribution(self, recording: int, place: int) -> Array:
+        e, own = self.named[place], self.recordings[recording]
+        if e.recording not in (None, recording):
+            return np.zeros_like(own.tau)
+        at, others = self.stages(recording), self.actives(recording, but=place)
+        if isinstance(e.candidate.effect, TorqueEffect):  # bodies and motion stay as they are
+            alone = added(at.links, at.rigid, (e.active(),)) - at.rigid
+            return own.low(at.sensed - sensors(at.links, at.total - alone, others))
+        return own.low(at.sensed - stages_of(own, others, self.arm).sensed)
+
+    def signatures(self, recording: int) -> Array:
+        """(c, k, n) change of the torque per unit of each coefficient, where they are."""
+        made = self._once(("signatures", recording), lambda: self._signatures(recording))
+        return np.asarray(made)
+
+    def _signatures(self, recording: int) -> Array:
+        own, at = self.recordings[recording], self.stages(recording)
+        tables = [at.low_regressor(), -own.low(own.motion.rate(at.sensed))[None]]
+        for place, e in enumerate(self.named):
+            if e.recording not in (None, recording):
+                tables.append(np.zeros((len(e.x), *own.tau.shape)))
+            elif isinstance(e.candidate.effect, TorqueEffect):
+                tables.append(self._torque_slopes(e, at))
+            elif e.candidate.columns_are_theta:
+                link = e.candidate.joint if e.candidate.joint >= 0 else len(self.dtheta) - 1
+                gate = None if e.interval_s == WHOLE else e.gate(at.links.t)
+                tables.append(at.low_regressor(link, gate))
+            else:
+                tables.append(self._slopes(recording, place))
+        return np.concatenate(tables)
+
+    def _torque_slopes(self, e: Named, at: Stages) -> Array:
+        """(c, k, n) change of an added torque per unit of each of its coefficients."""
+        effect, decode, joint = e.candidate.effect, e.candidate.template.decode, e.candidate.joint
+        assert isinstance(effect, TorqueEffect)
+        links = at.links
+        if np.isfinite(e.interval_s[0]):
+            links = replace(links, t=links.t - e.interval_s[0])
+        torque = effect.torque(links, at.rigid, joint, decode(e.x))
+        gate, out = e.gate(at.links.t), []
+        for i, std in enumerate(e.candidate.prior_std):
+            x = e.x.copy()
+            x[i] += STEP * std
+            moved = effect.torque(links, at.rigid, joint, decode(x))
+            out.append(at.signals.low_on((moved - torque) / (STEP * std) * gate, joint))
+        return np.array(out)
+
+    def _slopes(self, recording: int, place: int) -> Array:
+        """(c, k, n) change of the whole torque per unit of each coefficient of an effect."""
+        e, own, out = self.named[place], self.recordings[recording], []
+        for i, std in enumerate(e.candidate.prior_std):
+            x = e.x.copy()
+            x[i] += STEP * std
+            other = replace(self, named=(*self.named[:place], e.at(x), *self.named[place + 1 :]))
+            change = other.stages(recording).sensed - self.stages(recording).sensed
+            out.append(own.low(change / (STEP * std)))
+        return np.array(out)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model under noise and priors.
+
+    Attributes:
+        model: that is fitted.
+        prior: (n, 10) standard deviation of the nominal inertias.
+        noise: one model per recording.
         still: joints (from 0) that stand, per recording: their friction takes whatever torque
             there is.
         timing_std_s: how far the torques' timing may be off without being an effect.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
-    recordings: tuple[Signals, ...]
+    model: Model
     prior: Array
-    noise: tuple[Noise, ...]
-    dtheta: Array
-    delay_s: float = 0.0
-    named: tuple[Named, ...] = ()
-    weights: tuple[Array, ...] = ()
-    known: tuple[Active, ...] = ()
+    noise: tuple[Noise, ...] = ()
     still: tuple[tuple[int, ...], ...] = ()
     timing_std_s: float = TIMING_STD_S
+    weights: tuple[Array, ...] = ()
 
     @property
-    def arm(self) -> RigidArm:
-        """With its corrections."""
-        nominal = self.recordings[0].motion.arm
-        return nominal.changed(nominal.theta + self.dtheta)
+    def recordings(self) -> tuple[Signals, ...]:
+        """As the search sees them."""
+        return self.model.recordings
+
+    @property
+    def named(self) -> tuple[Named, ...]:
+        """Effects named so far."""
+        return self.model.named
+
+    @property
+    def dtheta(self) -> Array:
+        """(n, 10) correction of the nominal inertias."""
+        return self.model.dtheta
+
+    @property
+    def coefficients(self) -> Array:
+        """All that is fitted."""
+        return self.model.coefficients
 
     @property
     def n(self) -> int:
         """Number of joints."""
-        return self.recordings[0].motion.arm.n
+        return len(self.dtheta)
 
     @property
     def is_linear(self) -> bool:
@@ -133,36 +288,39 @@ class Fit:
             for e in self.named
         )
 
+    @property
+    def prior_std(self) -> Array:
+        """Of the coefficients."""
+        own = [e.candidate.prior_std for e in self.named]
+        return np.concatenate([self.prior.ravel(), [self.timing_std_s], *own])
+
+    def at(self, x: Array) -> Fit:
+        """The same with other coefficients."""
+        return replace(self, model=self.model.at(x))
+
+    def with_named(self, named: Sequence[Named]) -> Fit:
+        """The same with these effects."""
+        return replace(self, model=replace(self.model, named=tuple(named)))
+
+    def without(self, place: int) -> Fit:
+        """The same without one of its effects."""
+        return self.with_named(self.named[:place] + self.named[place + 1 :])
+
+    def instead(self, place: int, other: Named) -> Fit:
+        """The same with another effect in the place of one."""
+        return self.with_named((*self.named[:place], other, *self.named[place + 1 :]))
+
     def without_patterns(self) -> Fit:
         """With the effects of the catalogue alone."""
-        return replace(self, named=tuple(e for e in self.named if not e.is_pattern))
+        return self.with_named([e for e in self.named if not e.is_pattern])
 
-    def actives(self, recording: int) -> tuple[Active, ...]:
-        """Effects at work in a recording, the timing's error among them."""
-        own = [*self.known]
-        own += [e.active() for e in self.named if e.recording in (None, recording)]
-        own.append(Active(CATALOGUE["signal_delay"], -1, {"d": self.delay_s}))
-        return tuple(own)
-
-    def signals(self, recording: int) -> Signals:
-        """A recording with the corrected arm."""
-        own = self.recordings[recording]
-        return replace(own, motion=replace(own.motion, arm=self.arm))
-
-    def predicted(self, recording: int) -> Array:
-        """(k, n) torque in the band."""
-        own = self.signals(recording)
-        return own.low(sensed_torque(own.motion, self.actives(recording)))
-
-    def residual(self, recording: int) -> Array:
-        """(k, n) measured less predicted, N m."""
-        return self.recordings[recording].tau - self.predicted(recording)
+    def own_noise(self) -> tuple[Noise, ...]:
+        """Noise that its residuals show."""
+        return tuple(noise_of(r, LEAST_NM) for r in self.model.residuals())
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
-        if noise is None:
-            noise = [noise_of(r, LEAST_NM) for r in self.residuals()]
-        fit = replace(self, noise=tuple(noise))
+        fit = replace(self, noise=self.own_noise() if noise is None else tuple(noise))
         return replace(fit, weights=tuple(fit._weights(i) for i in range(len(fit.recordings))))
 
     def _weights(self, recording: int) -> Array:
@@ -178,7 +336,7 @@ class Fit:
             if e.recording not in (None, recording):
                 continue
             if e.candidate.effect.inexact:
-                torque = self.contribution(recording, k)
+                torque = self.model.contribution(recording, k)
                 unsure = np.hypot(e.candidate.effect.inexact * torque, EDGE * _jumps(torque))
                 weight /= np.sqrt(1.0 + (unsure / level) ** 2)
             for edge in e.interval_s:
@@ -186,103 +344,19 @@ class Fit:
                 weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
         return weight
 
-    def contribution(self, recording: int, place: int) -> Array:
-        """(k, n) what a named effect adds to the torque in the band, N m."""
-        others = self.named[:place] + self.named[place + 1 :]
-        return self.predicted(recording) - replace(self, named=others).predicted(recording)
-
-    def residuals(self) -> list[Array]:
-        """Of every recording."""
-        return [self.residual(i) for i in range(len(self.recordings))]
-
     def whiten(self, tables: Sequence[Array]) -> Array:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
         if self.weights:
             white = [x * w[ORDER:] for x, w in zip(white, self.weights, strict=True)]
-        return np.concatenate([x.reshape(*x.shape[:-2], -1) for x in white], axis=-1)
+        flat = [x.reshape(*x.shape[:-2], -1) for x in white]
+        return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 
-    @property
-    def coefficients(self) -> Array:
-        """All that is fitted: corrections, delay, coefficients of the named effects."""
-        return np.concatenate([self.dtheta.ravel(), [self.delay_s], *(e.x for e in self.named)])
-
-    @property
-    def prior_std(self) -> Array:
-        """Of the coefficients."""
-        own = [e.candidate.prior_std for e in self.named]
-        return np.concatenate([self.prior.ravel(), [self.timing_std_s], *own])
-
-    def at(self, x: Array) -> Fit:
-        """The same model with other coefficients."""
-        size = self.dtheta.size
-        named, k = [], size + 1
-        for e in self.named:
-            named.append(e.at(x[k : k + len(e.x)]))
-            k += len(e.x)
-        dtheta = x[:size].reshape(self.dtheta.shape)
-        return replace(self, dtheta=dtheta, delay_s=float(x[size]), named=tuple(named))
-
-    def carried_signatures(self, recording: int) -> Array:
-        """(c, k, n) change of the torque per unit of each coefficient, where they are."""
-        own, effects = self.signals(recording), self.actives(recording)
-        links = moved_links(own.motion, effects)
-        rigid = bodies(links, effects)
-        Y = links.arm.regressor(links.q, links.dq, links.ddq)
-        total = sensed_torque(own.motion, effects)
-        tables = [np.moveaxis(own.low(Y), 2, 0), -own.low(own.motion.rate(total))[None]]
-        for place, e in enumerate(self.named):
-            shape = (len(e.x), *own.tau.shape)
-            if e.recording not in (None, recording):
-                tables.append(np.zeros(shape))
-            elif isinstance(e.candidate.effect, TorqueEffect):
-                tables.append(own.low_all(self._added(e, links, rigid)))
-            elif e.candidate.columns_are_theta:
-                k = 10 * e.candidate.joint if e.candidate.joint >= 0 else Y.shape[2] - 10
-                columns = np.moveaxis(Y[:, :, k : k + 10], 2, 0)
-                tables.append(own.low_all(columns * self._gate(e, links.t)))
-            else:
-                changes = [self._difference(recording, place, i, total) for i in range(len(e.x))]
-                tables.append(np.array(changes))
-        return np.concatenate(tables)
-
-    @staticmethod
-    def _gate(e: Named, t: Array) -> Array:
-        begin, end = e.interval_s
-        return np.asarray(((t >= begin) & (t < end)).astype(float)[:, None])
-
-    def _added(self, e: Named, links: Motion, rigid: Array) -> Array:
-        """(c, m, n) change of an added torque per unit of each of its coefficients."""
-        gate = self._gate(e, links.t)
-        effect, decode = e.candidate.effect, e.candidate.template.decode
-        assert isinstance(effect, TorqueEffect)
-        if np.isfinite(e.interval_s[0]):
-            links = replace(links, t=links.t - e.interval_s[0])
-        at = effect.torque(links, rigid, e.candidate.joint, decode(e.x))
-        out = []
-        for i, std in enumerate(e.candidate.prior_std):
-            x = e.x.copy()
-            x[i] += STEP * std
-            moved = effect.torque(links, rigid, e.candidate.joint, decode(x))
-            out.append((moved - at) / (STEP * std) * gate)
-        return np.array(out)
-
-    def _difference(self, recording: int, place: int, i: int, total: Array) -> Array:
-        e = self.named[place]
-        x = e.x.copy()
-        h = STEP * e.candidate.prior_std[i]
-        x[i] += h
-        named = [*self.named[:place], e.at(x), *self.named[place + 1 :]]
-        other = replace(self, named=tuple(named))
-        own = other.signals(recording)
-        return own.low((sensed_torque(own.motion, other.actives(recording)) - total) / h)
-
-    def carried(self, tables: Sequence[Array] | None = None) -> Carried:
+    def carried(self) -> Carried:
         """What is carried along when further effects are sought, about the present model."""
-        if tables is None:
-            tables = [self.carried_signatures(i) for i in range(len(self.recordings))]
-        N = self.whiten(tables)
-        data = self.whiten(self.residuals()) + self.coefficients @ N
+        model = self.model
+        N = self.whiten([model.signatures(i) for i in range(len(self.recordings))])
+        data = self.whiten(model.residuals()) + self.coefficients @ N
         return Carried(N, self.prior_std, data)
 
 
@@ -293,7 +367,7 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
     coloured noise, and again, what a model gets slightly wrong would turn into noise step by
     step, and the effect with it.
     """
-    flat = [noise.flat() for noise in fit.with_noise().noise]
+    flat = [noise.flat() for noise in fit.own_noise()]
     fit, _ = refitted(fit.with_noise(flat))
     return refitted(fit.with_noise())
 
@@ -344,3 +418,56 @@ def refitted(fit: Fit, rounds: int = 3) -> tuple[Fit, Carried]:
         if np.all(np.abs(carried.x - before) < 0.02 * carried.std()):
             break
     return fit, carried
+
+
+def dated(fit: Fit, place: int) -> Fit:
+    """A named effect with the start (and end) that the data like best, on a grid of 8 ms.
+
+    All rows count here, those around the dates above all.
+    """
+    fit = replace(fit, weights=())
+    for reach in DATE_REACHES_S:
+        for side in (0, 1):
+            centre = fit.named[place].interval_s[side]
+            if np.isfinite(centre):
+                steps = range(-DATE_REACH, DATE_REACH + 1)
+                trials = [_moved(fit, place, side, centre + reach * k) for k in steps]
+                fit = min(trials, key=_distance)
+        fit, _ = refitted(fit, 1)
+    return fit
+
+
+def dated_anew(fit: Fit) -> Fit:
+    """With the dates of all named effects sought again: one of them has another name now."""
+    fit, _ = refitted(fit)
+    for k, e in enumerate(fit.named):
+        if e.interval_s != WHOLE:
+            fit = dated(fit, k)
+    return fit
+
+
+def shaped(fit: Fit, place: int) -> Fit:
+    """A named effect with the nonlinear setting that the data like best."""
+    for step in SHAPE_STEPS:
+        named = fit.named[place]
+        trials = [fit]
+        for ratio in (step**-2, 1.0 / step, step, step**2):
+            template = named.candidate.effect.reshaped(named.values, ratio)
+            if template is None:
+                return fit
+            other = replace(named, candidate=replace(named.candidate, template=template))
+            trials.append(refitted(fit.instead(place, other), 1)[0])
+        fit = min(trials, key=_distance)
+    return fit
+
+
+def _moved(fit: Fit, place: int, side: int, t: float) -> Fit:
+    own = fit.named[place]
+    begin, end = own.interval_s
+    return fit.instead(place, replace(own, interval_s=(t, end) if side == 0 else (begin, t)))
+
+
+def _distance(fit: Fit) -> float:
+    """Squared distance, in units of the noise, with what the coefficients cost."""
+    white = fit.whiten(fit.model.residuals())
+    return float(white @ white + np.sum((fit.coefficients / fit.prior_std) ** 2))

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from adapter.gap.monitor_book import Book
-from adapter.gap.monitor_evidence import Belief
-from adapter.gap.monitor_intake import ROWS_PER_GROUP, Blocks, Group, Level
-from adapter.gap.monitor_judge import GROUPS, Judge
+from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Blocks, Group, Level
+from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
 from adapter.gap.monitor_signatures import Frames
-from adapter.learner import Learner
-from adapter.records import Array
+from adapter.learning.learner import Learner
+from adapter.model.spatial import Array
 
 ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
@@ -49,7 +47,7 @@ class Monitor:
     ) -> None:
         self._n, self._delay_s = n, delay_s
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
-        self._blocks, self._book = Blocks(n), Book(say)
+        self._blocks, self._found = Blocks(n), DisagreementList(say)
         self._frames: Frames | None = None
         self._groups: list[Group] = []
         self._rows: list[tuple[float, Array]] = []
@@ -63,7 +61,7 @@ class Monitor:
         clock, "size" (parameters of the catalogue), "score" (standard deviations),
         "ambiguous_with" (what else it may be: "what" and "joints").
         """
-        return self._book.reports
+        return self._found.reports
 
     def __call__(self, learner: Learner, table: Array) -> None:
         """Look at states (m, size) that the learner has just learned from."""
@@ -85,7 +83,7 @@ class Monitor:
             return True
         R0, p = learner.frames
         moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
-        return bool(moved > MOVED) and not self._book.active
+        return bool(moved > MOVED) and not self._found.active
 
     def _take_over(self, learner: Learner) -> None:
         """Start from what the learner knows."""
@@ -102,7 +100,7 @@ class Monitor:
         R0, p = learner.frames
         self._frames = Frames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
         self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
-        self._judge = Judge(n, self._belief, self._level, self._book)
+        self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
 
     def _take(self, learner: Learner, frames: Frames) -> None:
@@ -113,7 +111,7 @@ class Monitor:
         if len(self._groups) > GROUPS:
             self._absorb(self._groups.pop(0))
         if len(self._groups) == GROUPS:
-            self._judge.judge(self._groups, float(t[-1]) + self._delay_s)
+            self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
     def _group(self, learner: Learner, frames: Frames, t: Array, table: Array) -> Group:
         q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
@@ -130,11 +128,11 @@ class Monitor:
 
     def _absorb(self, group: Group) -> None:
         """Learn from a group that left the window, and its noise."""
-        Z = self._book.columns(group.t, group.Z, group.S)
-        weight = self._book.weights(group.t, self._level.weight)
+        Z = self._found.columns(group.t, group.Z, group.S)
+        weight = self._found.weights(group.t, self._level.weight)
         residual = group.tau - Z @ self._belief.mean()
         if (weight == self._level.weight).all():
             self._level.look(residual)
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
-        self._book.forget_before(float(group.t[0]), self._belief)
+        self._found.forget_before(float(group.t[0]), self._belief)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from adapter.gap.monitor_book import EDGE_S, Book, Disagreement
 from adapter.gap.monitor_evidence import (
+    ROWS_PER_GROUP,
     Belief,
     Evidence,
+    Group,
+    Level,
     Rows,
     coefficients,
     log_evidence,
 )
-from adapter.gap.monitor_intake import ROWS_PER_GROUP, Group, Level
-from adapter.gap.monitor_signatures import Candidate, candidates
-from adapter.records import Array
+from adapter.gap.monitor_signatures import Signature, candidates
+from adapter.model.spatial import Array
 
 GROUPS = 10  # in the window, 0.2 s each
 THRESHOLD = 12.0  # log evidence of a report
@@ -37,7 +40,7 @@ POWER_ROWS = 25
 MOST = 6  # disagreements at a time
 
 
-class Judge:
+class DisagreementDetector:
     """Judges one window after the other.
 
     Args:
@@ -45,9 +48,9 @@ class Judge:
         belief: from before the window; level: of the noise; book: takes the reports.
     """
 
-    def __init__(self, n: int, belief: Belief, level: Level, book: Book) -> None:
+    def __init__(self, n: int, belief: Belief, level: Level, found: DisagreementList) -> None:
         self._candidates = candidates(n)
-        self._belief, self._level, self._book = belief, level, book
+        self._belief, self._level, self._found = belief, level, found
         self._peaks, self._power_peak = np.zeros(len(self._candidates)), np.ones(n)
         self._recent: list[Array] = []
         self._powers: list[Array] = []
@@ -59,7 +62,7 @@ class Judge:
         """Look at a window: what is over, what is new."""
         self._groups, self._now_s = groups, now_s
         self._judged += 1
-        before = len(self._book.reports)
+        before = len(self._found.reports)
         evidence = self._evidence()
         G, b = evidence.information(ROWS_PER_GROUP)
         scores = np.array(
@@ -69,12 +72,12 @@ class Judge:
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
         ended = self._end_something(evidence, scores, power)
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
-        if not ended and ready and len(self._book.active) < MOST:
+        if not ended and ready and len(self._found.active) < MOST:
             self._report_something(evidence, scores, power)
         self._remember(scores.max(axis=1), power)
-        if ended or len(self._book.reports) > before:
+        if ended or len(self._found.reports) > before:
             self._rest()
-        self._book.refresh(self._belief, evidence)
+        self._found.refresh(self._belief, evidence)
 
     def _rest(self) -> None:
         """What led to a report was no burst that passed; what follows it has to wait."""
@@ -88,17 +91,17 @@ class Judge:
             for key in ("t", "Z", "S", "tau")
         )
         if weight is None:
-            weight = self._book.weights(t, self._level.weight)
-        return Evidence(Rows(t, self._book.columns(t, Z, S), S, tau, weight), self._belief)
+            weight = self._found.weights(t, self._level.weight)
+        return Evidence(Rows(t, self._found.columns(t, Z, S), S, tau, weight), self._belief)
 
     def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
         """Notice that something reported acts no more."""
-        for found in self._book.active:
+        for found in self._found.active:
             if not found.lasts:
                 continue
             over_s = self._end_of(found, evidence, scores, power)
             if over_s is not None:
-                self._book.close(found, over_s)
+                self._found.close(found, over_s)
                 return True
         return False
 
@@ -171,12 +174,12 @@ class Judge:
         a = coefficients(candidate, fits[which][0][0], fits[which][1][0])
         joints = self._left(clear, candidate, a, first)
         if joints:
-            self._book.unexplained(joints, since_s, self._now_s, score)
+            self._found.unexplained(joints, since_s, self._now_s, score)
             return
-        size = candidate.decode(a)
-        self._book.name(self._belief, candidate, since_s, self._now_s, score, size, close)
+        told = Report(candidate, since_s, self._now_s, score, candidate.decode(a), close)
+        self._found.name(self._belief, told)
 
-    def _left(self, evidence: Evidence, candidate: Candidate, a: Array, first: int) -> list[int]:
+    def _left(self, evidence: Evidence, candidate: Signature, a: Array, first: int) -> list[int]:
         """Joints (from 0) where much of the residual stays when the candidate is in."""
         late = slice(first + EDGE_ROWS, None)
         left = evidence.leftover(candidate, a, first)[late] ** 2
@@ -189,16 +192,16 @@ class Judge:
 
     def _report_power(self, power: Array) -> None:
         """Something that no candidate looks like, but that is there for a second."""
-        known = {j for found in self._book.active for j in found.joints if found.lasts}
+        known = {j for found in self._found.active for j in found.joints if found.lasts}
         loud = np.flatnonzero(power > np.maximum(POWER, PEAK_FACTOR * self._power_peak))
         joints = [int(j) for j in loud if int(j) not in known]
         if joints:
             score = float(np.sqrt(power[joints].max()))
-            self._book.unexplained(joints, self._now_s - POWER_S, self._now_s, score)
+            self._found.unexplained(joints, self._now_s - POWER_S, self._now_s, score)
 
     def _remember(self, best: Array, power: Array) -> None:
         """Evidence that left the window without a report raises the bar; it fades in a minute."""
-        quiet = not self._book.active and self._now_s > self._quiet_until_s
+        quiet = not self._found.active and self._now_s > self._quiet_until_s
         self._recent.append(best if quiet else np.zeros_like(best))
         self._powers.append(power if quiet else np.ones_like(power))
         self._peaks *= PEAK_KEEP
@@ -210,3 +213,153 @@ class Judge:
 
 def _block(G: Array, columns: np.ndarray) -> Array:
     return np.asarray(G[:, columns[:, None], columns])
+
+
+UNEXPLAINED = "unexplained"
+EDGE_S = 0.1  # around starts and ends, where the filter is between two states
+MUTED = 1e-3  # weight of a joint with something unexplained
+
+
+@dataclass(eq=False)
+class Disagreement:
+    """Something new.
+
+    Attributes:
+        candidate: None for what is unexplained.
+        entry: what is told, see `adapter.gap.monitor.Monitor`.
+        since_s, over_s: on the arm's clock.
+        at: first of its coefficients in the belief, -1 where it has none.
+        joints: from 0, of what is unexplained.
+    """
+
+    candidate: Signature | None
+    entry: dict[str, Any]
+    since_s: float
+    over_s: float = np.inf
+    at: int = -1
+    joints: list[int] = field(default_factory=list)
+
+    @property
+    def lasts(self) -> bool:
+        """Whether its end was not seen yet."""
+        return bool(self.over_s == np.inf)
+
+    def on(self, t: Array) -> Array:
+        """(m,) 1 where it acts."""
+        return np.asarray((t >= self.since_s) & (t < self.over_s), dtype=float)
+
+
+class Report(NamedTuple):
+    """An effect that is to be told: since when, seen when, how sure, its size, and its rivals."""
+
+    candidate: Signature
+    since_s: float
+    now_s: float
+    score: float
+    size: Mapping[str, Any]
+    close: Sequence[Signature]
+
+
+class DisagreementList:
+    """All disagreements of a run.
+
+    Args:
+        say: takes a sentence when something is reported, and when it is over.
+
+    Attributes:
+        reports: every entry ever made.
+        active: those that last, and those that ended within the window.
+    """
+
+    def __init__(self, say: Callable[[str], None] | None = None) -> None:
+        self.reports: list[dict[str, Any]] = []
+        self.active: list[Disagreement] = []
+        self._say = say or (lambda line: None)
+
+    def name(self, belief: Belief, told: Report) -> None:
+        """Report an effect; the belief gets its coefficients."""
+        candidate = told.candidate
+        entry = self._entry(candidate.name, candidate.joints, told.since_s, told.now_s, told.score)
+        entry["size"] = dict(told.size)
+        entry["ambiguous_with"] = [{"what": c.name, "joints": c.joints} for c in told.close]
+        self.active.append(Disagreement(candidate, entry, told.since_s, at=len(belief.rhs)))
+        belief.extend(candidate.std)
+        self._say(sentence(entry))
+
+    def unexplained(self, joints: list[int], since_s: float, now_s: float, score: float) -> None:
+        """Report that nothing explains what is new on these joints (from 0)."""
+        entry = self._entry(UNEXPLAINED, [j + 1 for j in joints], since_s, now_s, score)
+        self.active.append(Disagreement(None, entry, since_s, joints=joints))
+        self._say(sentence(entry))
+
+    def _entry(
+        self, what: str, joints: list[int], since_s: float, now_s: float, score: float
+    ) -> dict[str, Any]:
+        entry: dict[str, Any] = {
+            "what": what,
+            "joints": joints,
+            "since_s": since_s,
+            "reported_s": now_s,
+            "over_s": None,
+            "size": {},
+            "score": score,
+            "ambiguous_with": [],
+        }
+        self.reports.append(entry)
+        return entry
+
+    def close(self, found: Disagreement, over_s: float) -> None:
+        """Something acts no more."""
+        found.over_s = found.entry["over_s"] = over_s
+        self._say(sentence(found.entry))
+
+    def columns(self, t: Array, Z: Array, S: Array) -> Array:
+        """Z (m, n, D0) with the columns of what was reported, where it acts."""
+        parts = [Z]
+        for found in self.active:
+            if found.candidate is not None:
+                on = found.on(t)[:, None, None]
+                parts.append(S[:, :, found.candidate.columns] * on)
+        return np.concatenate(parts, axis=2) if len(parts) > 1 else Z
+
+    def weights(self, t: Array, level: Array) -> Array:
+        """(m, n); next to nothing for joints that nothing explains, nothing around the edges."""
+        weight = np.tile(level, (len(t), 1))
+        for found in self.active:
+            if found.candidate is None:
+                weight[:, found.joints] *= MUTED
+            for edge in (found.since_s, found.over_s):
+                weight[np.abs(t - edge) < EDGE_S] = 0.0
+        return weight
+
+    def forget_before(self, t_s: float, belief: Belief) -> None:
+        """What was over then needs no coefficients any more."""
+        for found in [f for f in self.active if f.over_s < t_s]:
+            self.active.remove(found)
+            if found.candidate is None:
+                continue
+            size = len(found.candidate.columns)
+            belief.drop(slice(found.at, found.at + size))
+            for other in self.active:
+                if other.at > found.at:
+                    other.at -= size
+
+    def refresh(self, belief: Belief, evidence: Evidence) -> None:
+        """Sizes as the newest rows have them."""
+        for found in self.active:
+            if found.candidate is None or found.at >= len(evidence.shift):
+                continue
+            inside = slice(found.at, found.at + len(found.candidate.columns))
+            a = belief.mean()[inside] + evidence.shift[inside]
+            found.entry["size"] = found.candidate.decode(a)
+
+
+def sentence(report: Mapping[str, Any]) -> str:
+    """One line on a report, for people."""
+    where = f" on joint {', '.join(map(str, report['joints']))}" if report["joints"] else ""
+    size = ", ".join(f"{key} {value:.3g}" for key, value in report["size"].items())
+    over = "" if report["over_s"] is None else f", over at {report['over_s']:.2f} s"
+    also = " or ".join(other["what"] for other in report["ambiguous_with"])
+    what = report["what"] + (f" (or {also})" if also else "")
+    line = f"{what.replace('_', ' ')}{where} since {report['since_s']:.2f} s{over}"
+    return f"{line}{': ' + size if size else ''} (seen at {report['reported_s']:.2f} s)"

@@ -1,114 +1,22 @@
-"""Numbers with their units and doubt, and what each effect is called in a sentence."""
+"""Numbers with their units and doubt, and the sentence that says what was found."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from adapter.effects.base import ALL, BASE, FLANGE, LINK
 from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.phrases import Length, Phrase
 from adapter.gap.result import Finding
 
 DASH = "–"
 MOST_DIGITS = 5  # of a value, however small its standard deviation
 SMALL_RAD = 0.1  # angles below it are shown in mrad
 SHOWN_UNITS = {"1": (100.0, "%"), "s": (1e3, "ms"), "m": (1e3, "mm"), "kg m2": (1.0, "kg m²")}
-FORCE, MOMENT, TILT = ("fx", "fy", "fz"), ("mx", "my", "mz"), ("rx", "ry")
-LACKED = frozenset(
-    (
-        "viscous_friction",
-        "coulomb_friction",
-        "asymmetric_friction",
-        "stribeck_friction",
-        "load_dependent_friction",
-        "motor_inertia",
-    )
-)  # what a model lacks; of the others it is said that a joint shows them
-
-
-@dataclass(frozen=True)
-class Phrase:
-    """How to say that an effect is there.
-
-    Attributes:
-        more: names of parameters in braces stand for their values, {x} for the size of that of
-            `key`; {lacks} and {has} follow the number of joints.
-        key: parameter whose sign decides; less: said where that is negative.
-    """
-
-    more: str
-    key: str = ""
-    less: str = ""
-
-
-PHRASES = {
-    "viscous_friction": Phrase(
-        "{who} {lacks} {x} of viscous friction",
-        "Fv",
-        "{who} {has} {x} less viscous friction than the model says",
-    ),
-    "coulomb_friction": Phrase(
-        "{who} {lacks} {x} of Coulomb friction",
-        "Fc",
-        "{who} {has} {x} less Coulomb friction than the model says",
-    ),
-    "asymmetric_friction": Phrase(
-        "{who} {lacks} Coulomb friction of {Fc_pos} forwards and {Fc_neg} backwards"
-    ),
-    "stribeck_friction": Phrase(
-        "{who} {lacks} Stribeck friction of {Fs} at rest and {Fc} in motion"
-    ),
-    "load_dependent_friction": Phrase(
-        "{who} {lacks} friction of {x} of its load",
-        "Fl",
-        "{who} {has} less friction than the model says, by {x} of its load",
-    ),
-    "motor_inertia": Phrase(
-        "{who} {lacks} {x} of reflected motor inertia",
-        "B",
-        "{who} {has} {x} less motor inertia than the model says",
-    ),
-    "joint_elasticity": Phrase("{who} {is} elastic, with a stiffness of {k}"),
-    "backlash": Phrase("{who} {has} {b} of backlash"),
-    "torque_ripple": Phrase("{who} {has} a torque ripple of {a}, {n}"),
-    "joint_spring": Phrase(
-        "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"
-    ),
-    "torque_offset": Phrase(
-        "the torque sensor of {who} reads {x} too much",
-        "o",
-        "the torque sensor of {who} reads {x} too little",
-    ),
-    "torque_gain": Phrase(
-        "the torque sensor of {who} reads {x} too much",
-        "g",
-        "the torque sensor of {who} reads {x} too little",
-    ),
-    "encoder_offset": Phrase(
-        "the encoder of {who} reads {x} too much",
-        "o",
-        "the encoder of {who} reads {x} too little",
-    ),
-    "encoder_ripple": Phrase("the encoder of {who} errs by {a} once per turn"),
-    "signal_delay": Phrase(
-        "the torque of {who} comes {x} after the position",
-        "d",
-        "the torque of {who} comes {x} before the position",
-    ),
-    "payload": Phrase(
-        "the flange carries {x}", "m", "the flange carries {x} less than the model says"
-    ),
-    "link_inertia": Phrase("{who} {has} other inertias than the model says ({torque})"),
-    "base_tilt": Phrase("the base is tilted by {tilt}"),
-    "external_wrench": Phrase("something pushes the flange with {force}"),
-    "friction_drift": Phrase(
-        "the friction of {who} rises by {x}", "dFc", "the friction of {who} falls by {x}"
-    ),
-}
 
 
 def plain(value: Any, digits: int = 3) -> str:
@@ -172,8 +80,9 @@ def parameter_lines(finding: Finding) -> list[str]:
     for key, value in finding.parameters.items():
         if np.ndim(value) == 0:
             lines.append(f"{key} = {parameter(finding, key)}")
-    if "rx" in finding.parameters:
-        lines.append(f"tilt {norm(finding, TILT, 180.0 / math.pi, '°')}")
+    for length in phrase_of(finding).lengths:
+        if length.name:
+            lines.append(f"{length.name} {norm(finding, length)}")
     if "dtheta" in finding.parameters:
         lines += inertia_lines(finding.parameters["dtheta"], finding.std.get("dtheta"))
     return lines
@@ -198,14 +107,23 @@ def inertia_lines(dtheta: Sequence[float], std: Any) -> list[str]:
     ]
 
 
-def norm(finding: Finding, keys: Sequence[str], factor: float, unit: str) -> str:
-    """Length of a vector of parameters ± its standard deviation, times a factor."""
-    value = np.array([finding.parameters.get(key, np.nan) for key in keys], dtype=float)
-    std = np.array([_number(finding.std.get(key)) for key in keys], dtype=float)
-    length = float(np.linalg.norm(value))
-    doubt = float(np.linalg.norm(value * std)) / length if length > 0.0 else math.nan
-    text = plus_minus(factor * length, factor * doubt)
-    return f"{text}{unit}" if unit == "°" else f"{text} {unit}"
+def norm(finding: Finding, length: Length) -> str:
+    """Length of a vector of parameters ± its standard deviation, in the unit it is shown in."""
+    value = _components(finding, length)
+    std = np.array([_number(finding.std.get(key)) for key in length.keys], dtype=float)
+    size = float(np.linalg.norm(value))
+    doubt = float(np.linalg.norm(value * std)) / size if size > 0.0 else math.nan
+    text = plus_minus(length.factor * size, length.factor * doubt)
+    return f"{text}{length.unit}" if length.unit == "°" else f"{text} {length.unit}"
+
+
+def _components(finding: Finding, length: Length) -> np.ndarray:
+    return np.array([_number(finding.parameters.get(key)) for key in length.keys])
+
+
+def phrase_of(finding: Finding) -> Phrase:
+    """How the effect of a finding is said to be there."""
+    return CATALOGUE[finding.effect].phrase if finding.effect in CATALOGUE else Phrase()
 
 
 def who(effect: str, joints: Sequence[int]) -> str:
@@ -236,7 +154,7 @@ def listed(items: Sequence[str]) -> str:
 
 def phrase(finding: Finding) -> str:
     """What is missing and how much of it, without when."""
-    known = PHRASES.get(finding.effect, Phrase("{who} {has} " + finding.title))
+    known = phrase_of(finding)
     main = finding.parameters.get(known.key)
     template = known.less if known.less and _number(main) < 0.0 else known.more
     several = len(finding.joints) > 1
@@ -252,19 +170,13 @@ def phrase(finding: Finding) -> str:
         "is": "are" if several else "is",
         "x": parameter(finding, known.key, size=True) if known.key else "",
         "torque": _worth(finding),
+        "title": finding.title,
     }
-    if finding.effect == "base_tilt":
-        derived["tilt"] = norm(finding, TILT, 180.0 / math.pi, "°")
-    if finding.effect == "external_wrench":
-        derived["force"] = _push(finding)
+    if known.lengths:
+        shown = (x for x in known.lengths if np.nan_to_num(_components(finding, x)).any())
+        length = next(shown, known.lengths[-1])
+        derived["length"] = length.before + norm(finding, length)
     return template.format_map({**values, **derived})
-
-
-def _push(finding: Finding) -> str:
-    force = [_number(finding.parameters.get(key)) for key in FORCE]
-    if np.any(np.nan_to_num(force) != 0.0):
-        return norm(finding, FORCE, 1.0, "N")
-    return "a moment of " + norm(finding, MOMENT, 1.0, "N m")
 
 
 def _worth(finding: Finding) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.records import Array
+from adapter.model.spatial import Array
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Shortfall:
     """How far model and data are apart on data that the fit never saw, by joint.
 
     Attributes:
-        torque_rmse_nm: (n,) inverse dynamics, by the recipe of `adapter.validation`.
+        torque_rmse_nm: (n,) inverse dynamics, by the recipe of `adapter.signals.validation`.
         rollout_rmse_rad, rollout_rmse_rad_s: (n,) forward simulation restarted every 0.5 s;
             None where it was not asked for.
     """
@@ -180,6 +180,10 @@ class GapResult:
         curves: one per recording; rollouts: one per recording that was simulated.
         model_out: where the new model is.
         what_next: experiments worth making, best first.
+        where: what the nominal model's residual follows, one entry a joint.
+        stopped_after_rounds: the search had to stop then, and might have found more; None where
+            it came to its end.
+        wall_s: how long all that took.
     """
 
     joint_names: tuple[str, ...]
@@ -199,7 +203,16 @@ class GapResult:
     rollouts: tuple[RolloutCurves, ...] = ()
     model_out: str | None = None
     what_next: tuple[str, ...] = field(default=())
+    where: tuple[dict[str, Any], ...] = ()
+    stopped_after_rounds: int | None = None
     wall_s: float = 0.0
+
+    def __repr__(self) -> str:
+        if self.problem is not None:
+            return f"GapResult({self.problem})"
+        before, after = (np.max(part.torque_rmse_nm) for part in (self.before, self.after))
+        names = ", ".join(dict.fromkeys(finding.effect for finding in self.findings)) or "nothing"
+        return f"GapResult({names} found, torque error at most {before:.2g} -> {after:.2g} N m)"
 
     @classmethod
     def untold(
@@ -225,11 +238,8 @@ class GapResult:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """As in the JSON file."""
-        from adapter.gap.words import headline  # words are made of results
-
+        """All but the curves; `adapter.gap.words.as_json` adds the headline."""
         return {
-            "headline": headline(self),
             "problem": self.problem,
             "noise_floor_nm": self.noise_floor_nm.tolist(),
             "before": self.before.as_dict(),
@@ -237,20 +247,16 @@ class GapResult:
             "findings": [finding.as_dict() for finding in self.findings],
             "unexplained": [leftover.as_dict() for leftover in self.unexplained],
             "model_out": self.model_out,
-            "where": self._where(),
+            "where": [dict(entry) for entry in self.where],
             "inertial_correction": self._correction(),
             "what_next": list(self.what_next),
+            "stopped_after_rounds": self.stopped_after_rounds,
             "notes": list(self.notes),
             "recordings": list(self.recordings),
             "model_in": self.model_in,
             "joint_names": list(self.joint_names),
             "wall_s": self.wall_s,
         }
-
-    def _where(self) -> list[dict[str, Any]]:
-        from adapter.gap.where import disagreement  # which builds on results
-
-        return disagreement(self.curves[0], self.noise_floor_nm) if self.curves else []
 
     def _correction(self) -> dict[str, Any] | None:
         if self.corrections is None or self.corrections_prior is None:

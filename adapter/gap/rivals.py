@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.gap.candidates import Candidate
-from adapter.gap.evidence import Carried, score
+from adapter.effects.catalogue import LATENESS
+from adapter.gap.candidates import Candidate, log_odds, simpler_wins
+from adapter.gap.evidence import ORDER, Carried, score, scores
 from adapter.gap.fit import Fit, Named, beside
-from adapter.gap.noise import ORDER
-from adapter.gap.patterns import Pattern
-from adapter.gap.scan import Field, log_odds
-from adapter.records import Array
+from adapter.gap.scan import SignatureTable
+from adapter.model.spatial import Array
 
 FOLDS = 4
 FOLD_S = 2.0  # a block of time is held out as a whole: neighbours know each other
 WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
 SHORTEST_S = 0.2
 TIE_CHI2 = 2.0  # by which held-out data may be worse and still leave it to the evidence
-PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
 DATES = 50.0  # starts that were looked at
 
 
@@ -75,20 +74,6 @@ class Standing:
         return rival.log_evidence - self.log_evidence
 
 
-def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]) -> bool:
-    """Whether `simple` is the simpler of two candidates, and explains (chi2) all but as much.
-
-    Its finer form must add a share to what an effect explains, and a pattern must explain
-    clearly more than an effect of the catalogue.
-    """
-    (a, mine), (b, theirs) = simple, other
-    if isinstance(b.effect, Pattern):
-        beside = a.joint in (b.joint, -1) and not isinstance(a.effect, Pattern)
-        return beside and mine > PATTERN_SHARE * theirs
-    share = b.effect.simpler.get(a.effect.name)
-    return share is not None and a.joint == b.joint and theirs < (1.0 + share) * mine
-
-
 def price(named: Named) -> float:
     """ln of what a named effect was worth before the data (negative), dates included."""
     timed, passing = named.interval_s != WHOLE, bool(np.isfinite(named.interval_s[1]))
@@ -96,38 +81,79 @@ def price(named: Named) -> float:
     return float(odds - np.log(DATES) * (timed + passing))
 
 
-def standing(fit: Fit, carried: Carried, field: Field, k: int) -> Standing:
-    """The k-th named effect of a fit against all candidates in its interval."""
+@dataclass(frozen=True, eq=False)
+class _Products:
+    """Products of all candidates' white signatures in one interval.
+
+    Attributes:
+        X: (c, r) signatures; carried: (c, p) with the fit's own; data: (c,) with the data.
+        own: of each candidate with itself, (k, k).
+    """
+
+    X: Array
+    carried: Array
+    data: Array
+    own: tuple[Array, ...]
+
+
+def standings(fit: Fit, carried: Carried, field: SignatureTable) -> tuple[Standing, ...]:
+    """Each named effect of a fit against all candidates in its interval."""
+    products: dict[object, _Products] = {}
+    out = []
+    for k, named in enumerate(fit.named):
+        when = (named.interval_s, named.recording)
+        if when not in products:
+            X = fit.whiten(field.within(*when))
+            own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in field.candidates)
+            products[when] = _Products(X, X @ carried.N.T, X @ carried.data, own)
+        out.append(_standing(fit, carried, field.candidates, products[when], k))
+    return tuple(out)
+
+
+def _standing(
+    fit: Fit, carried: Carried, candidates: Sequence[Candidate], products: _Products, k: int
+) -> Standing:
+    """The k-th named effect of a fit among the candidates."""
     named = fit.named[k]
     own, rest = beside(fit, k)
     others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
     mine = score(*others.without(carried.N[own]), named.candidate.prior_std)
-    X = fit.whiten(field.within(named.interval_s, named.recording))
     signature = named.x @ carried.N[own]
-    G, g = others.without(np.vstack([X, signature]))
-    found, taken = [], {e.candidate.key for e in fit.named}
-    for c in field.candidates:
-        if c.key == named.candidate.key:
-            continue
-        at = list(c.columns)
-        block, cross = G[np.ix_(at, at)], G[at, -1]
-        wide = block + np.diag((WIDE * c.prior_std) ** -2.0)
-        overlap = float(cross @ np.linalg.solve(wide, cross) / G[-1, -1])
-        other = score(block, g[at], c.prior_std)
-        odds = price(Named(c, other.x, named.interval_s, named.recording))
-        credible = c.key not in taken and c.effect.possible(c.template.decode(other.x))
-        found.append(Rival(c, other.log_evidence + odds, other.chi2, overlap, other.x, credible))
-    found.sort(key=lambda rival: -rival.log_evidence)
-    return Standing(
-        named.candidate, mine.log_evidence + price(named), mine.chi2, tuple(_best_of_each(found))
-    )
-
-
-def _best_of_each(rivals: list[Rival]) -> list[Rival]:
+    size = others.without(signature[None])[0][0, 0]
+    C = products.carried[:, rest]
+    solved = others.solved(C)
+    g = products.data - solved @ others.g
+    cross = products.X @ signature - solved @ (others.N @ signature)
+    found = []
+    taken = {e.candidate.key for e in fit.named}
+    for places in _alike(candidates):
+        at = np.array([candidates[i].columns for i in places])
+        std = np.array([candidates[i].prior_std for i in places])
+        G = np.array([products.own[i] for i in places]) - solved[at] @ C[at].swapaxes(1, 2)
+        evidence, chi2, x = scores(G, g[at], std)
+        wide = G + (WIDE * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])
+        reached = np.linalg.solve(wide, cross[at][..., None])[..., 0]
+        overlap = np.einsum("bi,bi->b", cross[at], reached) / size
+        for b, i in enumerate(places):
+            c = candidates[i]
+            odds = price(replace(named, candidate=c))
+            found.append((float(evidence[b]) + odds, i, float(chi2[b]), float(overlap[b]), x[b]))
     best: dict[tuple[str, int], Rival] = {}
-    for rival in rivals:
-        best.setdefault(rival.candidate.key, rival)
-    return list(best.values())
+    for worth, i, fall, share, at_best in sorted(found, key=lambda entry: (-entry[0], entry[1])):
+        c = candidates[i]
+        if c.key not in best and c.key != named.candidate.key:
+            credible = c.key not in taken and c.effect.possible(c.template.decode(at_best))
+            best[c.key] = Rival(c, worth, fall, share, at_best, credible)
+    evidence_of_mine = mine.log_evidence + price(named)
+    return Standing(named.candidate, evidence_of_mine, mine.chi2, tuple(best.values()))
+
+
+def _alike(candidates: Sequence[Candidate]) -> list[list[int]]:
+    """Places of the candidates, those of as many coefficients together."""
+    groups: dict[int, list[int]] = {}
+    for i, c in enumerate(candidates):
+        groups.setdefault(len(c.columns), []).append(i)
+    return list(groups.values())
 
 
 def block_s(fit: Fit) -> float:
@@ -153,7 +179,7 @@ def pays_held_out(fit: Fit, carried: Carried, k: int) -> bool:
     """Whether the k-th named effect predicts blocks that its fit has not seen."""
     fold = fold_rows(fit)
     own, rest = beside(fit, k)
-    if fit.named[k].candidate.effect.name == "signal_delay":  # the carried error would stand for it
+    if fit.named[k].candidate.effect is LATENESS:  # the carried error would stand for it
         rest = rest[rest != fit.dtheta.size]
     gain = 0.0
     for f in range(FOLDS):

@@ -6,32 +6,56 @@ no more than a small solve.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from adapter.effects.active import WHOLE
-from adapter.effects.base import ALL, Effect
-from adapter.gap.candidates import Candidate, base_of, signatures
-from adapter.gap.evidence import Carried, Score, score, scores
+from adapter.effects.base import JOINT, Effect, TorqueEffect
+from adapter.gap.candidates import (
+    Candidate,
+    Pattern,
+    line,
+    log_odds,
+    patterns,
+    signatures,
+    simpler_wins,
+)
+from adapter.gap.evidence import (
+    LEAST_NM,
+    ORDER,
+    ROBUST,
+    Carried,
+    Noise,
+    Score,
+    noise_of,
+    score,
+    scores,
+)
 from adapter.gap.fit import BAND_HZ, Fit
-from adapter.gap.noise import LEAST_NM, ORDER, ROBUST, Noise, noise_of
-from adapter.gap.patterns import Pattern, line, patterns
-from adapter.records import Array
+from adapter.model.spatial import Array
 
 CATALOGUED, PATTERNS = "catalogued", "patterns"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
-# What does come in mid-recording; a base that tilts or an encoder that slips is rarer.
-SUDDEN = ("payload", "external_wrench", "torque_offset", "coulomb_friction", "viscous_friction")
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 FEWEST_BLOCKS = 1  # nothing shorter is dated
 FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
 RICH_ROUNDS = 2
 LONGEST_CONTACT_S = 8.0
 MARGIN_S = 0.8  # a start so near either end is no change
+
+
+BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
+# Fall of the squared distance below which nothing is named: always there, of what does come in
+# mid-recording, of what rarely does. Slow noise looks like a small start.
+CHI2_LEAST, CHI2_LEAST_SUDDEN, CHI2_LEAST_DATED = 30.0, 90.0, 250.0
+BEST_OF_ALL, BEST_OF_JOINT = 6, 4  # leads that are looked at under their own noise
+CHANGE_NATS = 6.0  # by which acting from some time on must beat acting always
+CHANGE_SHARE = 0.1  # of the squared distance explained, a nat each: no arm is quite steady
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +100,7 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> No
     return noise
 
 
-class Field:
+class SignatureTable:
     """All signatures of the recordings about the present model, white.
 
     The noise that whitens them is what the richest model of all leaves: whatever the catalogue
@@ -96,20 +120,19 @@ class Field:
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
-            own = fit.signals(i)
-            table, self.candidates = signatures(own, base_of(own, fit.actives(i)), joints, extra)
+            table, self.candidates = signatures(fit.model.stages(i), joints, extra)
             tables.append(table)
             if rich:
-                noise.append(rich_noise(table, self.candidates, fit.residual(i)))
+                noise.append(rich_noise(table, self.candidates, fit.model.residual(i)))
         if kind == PATTERNS:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
         self.fit = fit.with_noise(noise) if rich else fit
         self.tables = tables
-        self.carried_tables = [self.fit.carried_signatures(i) for i in range(len(tables))]
-        self.carried = self.fit.carried(self.carried_tables)
+        self.carried_tables = [self.fit.model.signatures(i) for i in range(len(tables))]
+        self.carried = self.fit.carried()
         self.targets = [
             r + np.tensordot(self.fit.coefficients, c, 1)
-            for r, c in zip(self.fit.residuals(), self.carried_tables, strict=True)
+            for r, c in zip(self.fit.model.residuals(), self.carried_tables, strict=True)
         ]
         self.X = self.fit.whiten(tables)
         self.weights = self.fit.weights or tuple(np.ones_like(r.tau) for r in fit.recordings)
@@ -118,7 +141,7 @@ class Field:
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
         """What no effect of the catalogue has: patterns of each joint, and lines in time."""
         found: list[tuple[Effect, int]] = [(p, j) for j in joints for p in patterns(fit.n, j)]
-        longest = max(fit.residuals(), key=len)
+        longest = max(fit.model.residuals(), key=len)
         for j in joints:
             peak = line(longest[:, j], BAND_HZ)
             if peak is not None:
@@ -133,6 +156,8 @@ class Field:
         self, interval_s: tuple[float, float], recording: int | None, columns: Any = slice(None)
     ) -> list[Array]:
         """Signatures (c, k, n) of each recording, zero outside an interval."""
+        if interval_s == WHOLE and recording is None:
+            return [table[columns] for table in self.tables]
         out = []
         for i, (table, own) in enumerate(zip(self.tables, self.fit.recordings, strict=True)):
             on = (own.t >= interval_s[0]) & (own.t < interval_s[1])
@@ -219,89 +244,194 @@ class Field:
     def timed(self, candidates: Sequence[Candidate]) -> list[Lead]:
         """The best start of each candidate in each recording."""
         leads = []
-        for i in range(len(self.fit.recordings)):
-            edges, C, g, self_products = self._running(i, candidates)
-            keep = self._starts(i, edges)
-            if not len(keep):
-                continue
-            for c, G in zip(candidates, self_products, strict=True):
-                k = list(c.columns)
-                reduced = self.carried.reduced(G[keep], C[keep][:, k], g[keep][:, k])
-                evidence, _ = scores(*reduced, c.prior_std)
-                best = int(np.argmax(evidence))
-                found = score(reduced[0][best], reduced[1][best], c.prior_std)
-                odds = log_odds(c, timed=True) - float(np.log(len(keep)))
-                when = (float(edges[keep[best]]), np.inf)
-                worth = found.log_evidence + odds
-                leads.append(Lead(c, worth, found.chi2, found.x, when, i, odds))
+        for i, t in enumerate(self.times):
+            edges = _edges(t)
+            inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
+            pairs = [(int(a), len(edges) - 1) for a in np.flatnonzero(inside)]
+            leads += self._best_intervals(i, candidates, pairs, passing=False)
         return leads
 
     def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
         """The best interval of each candidate in each recording: it comes and goes."""
         leads = []
         longest = round(LONGEST_CONTACT_S / BLOCK_S)
-        for i in range(len(self.fit.recordings)):
-            edges, C, g, self_products = self._running(i, candidates)
-            last = len(edges) - 1
-            pairs = np.array(
-                [
-                    (a, b)
-                    for a in range(last)
-                    for b in range(a + FEWEST_BLOCKS, min(a + longest, last) + 1)
-                ]
-            )
-            for c, G in zip(candidates if len(pairs) else [], self_products, strict=False):
-                k = list(c.columns)
-                parts = (G, C[:, k], g[:, k])
-                reduced = self.carried.reduced(*(p[pairs[:, 0]] - p[pairs[:, 1]] for p in parts))
-                evidence, _ = scores(*reduced, c.prior_std)
-                best = int(np.argmax(evidence))
-                found = score(reduced[0][best], reduced[1][best], c.prior_std)
-                begin, end = (float(edges[x]) for x in pairs[best])
-                odds = log_odds(c, passing=True) - float(np.log(len(pairs)))
-                worth = found.log_evidence + odds
-                leads.append(Lead(c, worth, found.chi2, found.x, (begin, end), i, odds))
+        for i, t in enumerate(self.times):
+            last = len(_edges(t)) - 1
+            ends = [(a, min(a + longest, last)) for a in range(last)]
+            pairs = [(a, b) for a, end in ends for b in range(a + FEWEST_BLOCKS, end + 1)]
+            leads += self._best_intervals(i, candidates, pairs, passing=True)
         return leads
 
-    def _starts(self, recording: int, edges: Array) -> np.ndarray:
-        t = self.times[recording]
-        inside = (edges > t[0] + MARGIN_S) & (edges < t[-1] - MARGIN_S)
-        return np.flatnonzero(inside)
+    def _best_intervals(
+        self,
+        recording: int,
+        candidates: Sequence[Candidate],
+        pairs: Sequence[tuple[int, int]],
+        passing: bool,
+    ) -> list[Lead]:
+        """Of each candidate the best of the intervals between these edges of a recording."""
+        if not pairs:
+            return []
+        edges, first, last = _edges(self.times[recording]), *np.array(pairs).T
+        leads = []
+        for c, sums in zip(candidates, self._running(recording, candidates), strict=True):
+            reduced = self.carried.reduced(*(x[first] - x[last] for x in sums))
+            evidences, chi2, x = scores(*reduced, c.prior_std)
+            best = int(np.argmax(evidences))
+            odds = log_odds(c, timed=not passing, passing=passing) - float(np.log(len(pairs)))
+            when = (float(edges[first[best]]), float(edges[last[best]]) if passing else np.inf)
+            worth = float(evidences[best]) + odds
+            leads.append(Lead(c, worth, float(chi2[best]), x[best], when, recording, odds))
+        return leads
 
     def _running(
         self, recording: int, candidates: Sequence[Candidate]
-    ) -> tuple[Array, Array, Array, list[Array]]:
-        """Sums from each edge to the end: with the carried (b, c, N), the data (b, c), itself."""
+    ) -> Iterator[tuple[Array, Array, Array]]:
+        """Of each candidate sums from each edge to the end of its products.
+
+        Yields:
+            with itself (b, k, k), with the carried signatures (b, k, c), with the data (b, k).
+        """
         t, n = self.times[recording], self.fit.n
         begin = sum(len(x) for x in self.times[:recording]) * n
         rows = slice(begin, begin + len(t) * n)
-        edges = np.append(np.arange(t[0], t[-1], BLOCK_S), t[-1] + 1.0)
+        edges = _edges(t)
         block = np.repeat(np.searchsorted(edges, t, side="right") - 1, n)
         cuts = np.searchsorted(block, np.arange(len(edges)))
-        X, N, data = self.X[:, rows], self.carried.N[:, rows], self.carried.data[rows]
-        size = len(edges)
-        C, g = np.zeros((size, len(X), len(N))), np.zeros((size, len(X)))
-        own = [np.zeros((size, len(c.columns), len(c.columns))) for c in candidates]
-        for b in range(size - 2, -1, -1):
-            part = slice(cuts[b], cuts[b + 1])
-            C[b] = C[b + 1] + X[:, part] @ N[:, part].T
-            g[b] = g[b + 1] + X[:, part] @ data[part]
-            for G, c in zip(own, candidates, strict=True):
-                x = X[list(c.columns), part]
-                G[b] = G[b + 1] + x @ x.T
-        return edges, C, g, own
+        parts = [slice(a, b) for a, b in pairwise(cuts)]
+        columns = sorted({k for c in candidates for k in c.columns})
+        X, data = self.X[columns, rows], self.carried.data[rows]
+        N = self.carried.N[:, rows]
+        right = np.vstack([N, data])
+        whole = _from_the_end([X[:, part] @ right[:, part].T for part in parts])
+        place = {k: at for at, k in enumerate(columns)}
+        for c in candidates:
+            at = [place[k] for k in c.columns]
+            own = _from_the_end([X[at, part] @ X[at, part].T for part in parts])
+            yield own, whole[:, at, :-1], whole[:, at, -1]
 
 
-def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
-    """ln of what a candidate is worth before the data, the ways to look for it included."""
-    odds = -np.log(20.0) + c.effect.log_odds
-    if c.joint >= 0:
-        odds -= np.log(7.0)
-    odds -= np.log(len(c.effect.templates()))
-    if c.effect.scope == ALL and c.joint >= 0:
-        odds -= 4.0  # signals of one bus are late together
-    if c.effect.name == "external_wrench" and not passing:
-        odds -= 6.0  # what pushes for a whole recording is rather a tilted base
-    if timed or passing:
-        odds -= 2.0 if c.effect.name in SUDDEN else 10.0
-    return float(odds)
+def _edges(t: Array) -> Array:
+    """(b,) edges of the blocks of a recording's instants, the last one behind its end."""
+    return np.append(np.arange(t[0], t[-1], BLOCK_S), t[-1] + 1.0)
+
+
+def _from_the_end(parts: Sequence[Array]) -> Array:
+    """(b + 1, ...) sums of the parts from each of b on, and nothing behind the last."""
+    table = np.array([*parts, np.zeros_like(parts[0])])
+    return np.asarray(np.cumsum(table[::-1], axis=0)[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Leads to be named together, and their evidence."""
+
+    leads: tuple[Lead, ...]
+    log_evidence: float
+
+    @property
+    def joint(self) -> int:
+        """Where they are, from 0; -1 for the arm."""
+        return self.leads[0].candidate.joint
+
+    @property
+    def plain(self) -> bool:
+        """Whether they only add torque on their joint, all the time."""
+        return all(
+            isinstance(x.candidate.effect, TorqueEffect)
+            and x.candidate.effect.scope == JOINT
+            and x.interval_s == WHOLE
+            for x in self.leads
+        )
+
+
+def leads_of(field: SignatureTable) -> list[Lead]:
+    """The best leads first, no two of one effect on one joint and of one kind of interval."""
+    best: dict[tuple[str, int, str], Lead] = {}
+    for lead in field.whole():
+        if lead.candidate.effect.possible(_values(lead)):
+            _keep(best, lead, "whole")
+    # a pattern may change in mid-recording as well, but then it is a pattern all the more
+    chosen = [x.candidate for x in best.values() if not isinstance(x.candidate.effect, Pattern)]
+    for lead in field.timed(chosen):
+        if lead.candidate.effect.possible(_values(lead)):
+            _keep(best, lead, "timed")
+    for lead in field.passing([c for c in chosen if c.effect.passing]):
+        _keep(best, lead, "passing")
+    return sorted(best.values(), key=lambda lead: -lead.log_evidence)
+
+
+def honest_moves(field: SignatureTable, refused: set[tuple[str, int]]) -> list[Move]:
+    """What is worth trying, under its own noise, in the order in which to try it.
+
+    What is simpler goes first: always before from some time on, an effect before its finer
+    form, unless the other explains clearly more. Friction and an offset can hide each other:
+    they are also tried together.
+    """
+    leads = [x for x in leads_of(field) if x.candidate.key not in refused]
+    found = [x for x in map(field.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
+    found = [x for x in found if x.chi2 > least_chi2(x.candidate.effect, x.interval_s)]
+    found = [x for x in found if not any(outdone(x, y) for y in found)]
+    moves = [Move((x,), x.log_evidence) for x in found] + _bundles(field, leads, found)
+    return sorted(moves, key=lambda x: -x.log_evidence)
+
+
+def least_chi2(effect: Effect, interval_s: tuple[float, float]) -> float:
+    """What an effect must explain to be named."""
+    if interval_s == WHOLE:
+        return CHI2_LEAST
+    return CHI2_LEAST_SUDDEN if effect.sudden else CHI2_LEAST_DATED
+
+
+def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
+    """The best leads of each joint and the best of all."""
+    seen: dict[int, int] = {}
+    chosen = []
+    for place, lead in enumerate(leads):
+        if lead.log_evidence < BELIEF:
+            break
+        joint = lead.candidate.joint
+        plain = lead.candidate.effect.bundled and lead.interval_s == WHOLE
+        if plain or place < BEST_OF_ALL or seen.get(joint, 0) < BEST_OF_JOINT:
+            chosen.append(lead)
+            seen[joint] = seen.get(joint, 0) + 1
+    return chosen
+
+
+def _bundles(field: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
+    """Friction with an offset, on each joint where they say more together than one of them."""
+    moves = []
+    for joint in {x.candidate.joint for x in leads}:
+        own = [
+            x
+            for x in leads
+            if x.candidate.joint == joint and x.candidate.effect.bundled and x.interval_s == WHOLE
+        ]
+        if len(own) < 2 or max(x.log_evidence for x in own) < BELIEF:
+            continue
+        worth_it = field.together(own).log_evidence + sum(x.odds for x in own)
+        alone = max((x.log_evidence for x in found if x.candidate.joint == joint), default=BELIEF)
+        if worth_it > alone + BELIEF:
+            moves.append(Move(tuple(own), worth_it))
+    return moves
+
+
+def outdone(lead: Lead, by: Lead) -> bool:
+    """Whether a simpler lead says all but the same."""
+    a, b = lead.candidate, by.candidate
+    if lead is by:
+        return False
+    if a.key == b.key:
+        more = lead.interval_s != WHOLE and by.interval_s == WHOLE
+        return more and lead.log_evidence < by.log_evidence + CHANGE_NATS + CHANGE_SHARE * by.chi2
+    return simpler_wins((b, by.chi2), (a, lead.chi2))
+
+
+def _keep(best: dict[tuple[str, int, str], Lead], lead: Lead, kind: str) -> None:
+    key = (*lead.candidate.key, kind)
+    if key not in best or lead.log_evidence > best[key].log_evidence:
+        best[key] = lead
+
+
+def _values(lead: Lead) -> dict[str, Any]:
+    return lead.candidate.template.decode(lead.x)

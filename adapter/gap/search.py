@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from adapter.effects.active import WHOLE
 from adapter.effects.base import TorqueEffect
-from adapter.gap.adjust import dated, dated_anew, shaped
-from adapter.gap.evidence import Carried
-from adapter.gap.fit import Fit, Named, refitted, under_own_noise, worth
-from adapter.gap.moves import BELIEF, Move, honest_moves, least_chi2
-from adapter.gap.noise import Noise
-from adapter.gap.patterns import Pattern
+from adapter.effects.catalogue import WRONG_LINK
+from adapter.gap.candidates import PATTERN_SHARE, Candidate, Pattern
+from adapter.gap.evidence import Carried, Noise, score
+from adapter.gap.fit import Fit, Named, dated, dated_anew, refitted, shaped, under_own_noise, worth
 from adapter.gap.rivals import (
-    PATTERN_SHARE,
     Standing,
     pays_held_out,
     price,
-    standing,
+    standings,
 )
-from adapter.gap.scan import CATALOGUED, PATTERNS, Field
+from adapter.gap.scan import (
+    BELIEF,
+    CATALOGUED,
+    PATTERNS,
+    Move,
+    SignatureTable,
+    honest_moves,
+    least_chi2,
+)
 
-PATIENCE_S = 35.0  # of processor time, so that load changes no verdict; then nothing more is sought
 TRIED = 3  # moves of a round
-ROUNDS = 12
-CURVE, CURVE_SHARE = {"joint_spring", "torque_ripple"}, 1.1  # one curve over the angle
+ROUNDS = 24  # some seven are made where every joint has friction of its own
+CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 4, 1.0  # names that are exchanged for better ones, and by how much
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
@@ -42,40 +47,69 @@ class Found:
         standings: of each named effect among its rivals.
         known: what is known of them with the inertias free within their prior, where `carried`
             holds these fast.
+        rounds: that were made; ran_out: and there was none left where one was wanted.
     """
 
     fit: Fit
     carried: Carried
     standings: tuple[Standing, ...]
     known: Carried | None = None
+    rounds: int = 0
+    ran_out: bool = False
 
 
-def search(fit: Fit, joints: Sequence[int], progress: Progress = lambda text: None) -> Found:
+@dataclass
+class Budget:
+    """Rounds that a search may make. Counted, not timed: no verdict hangs on a machine's speed.
+
+    Attributes:
+        rounds: in all; made: so far; ran_out: whether one was wanted when none was left.
+    """
+
+    rounds: int
+    made: int = 0
+    ran_out: bool = False
+
+    def spend(self) -> bool:
+        """Whether one more round may be made."""
+        self.ran_out = self.made >= self.rounds
+        self.made += not self.ran_out
+        return not self.ran_out
+
+
+def search(
+    fit: Fit, joints: Sequence[int], rounds: int = ROUNDS, progress: Progress = lambda text: None
+) -> Found:
     """Name what is missing.
 
     The catalogue goes first. What is left then may follow a pattern that no effect has; and
-    where an effect was named for want of a better word, the pattern takes its place.
+    where an effect was named for want of a better word, the pattern takes its place. Where all
+    links' inertias turn out to be wrong, these are the findings.
 
     Args:
         fit: the nominal model on the recordings, with any noise model.
         joints: (from 0) that move.
+        rounds: that may be made, each with the best of what is worth naming.
         progress: hears what is being tried.
     """
-    begun = time.thread_time()
+    nominal, budget = fit, Budget(rounds)
     fit, _ = refitted(fit)
-    fit = settled(_extended(fit, joints, CATALOGUED, progress, begun), joints).fit
+    fit = settled(_extended(fit, joints, CATALOGUED, budget, progress), joints).fit
     if fit.named:  # noise that was taken for the first effect's may have hidden another one
-        fit = _extended(fit, joints, CATALOGUED, progress, begun)
-    fit = _extended(fit, joints, PATTERNS, progress, begun)
-    fit = _renamed(fit, joints)
-    return settled(fit, joints)
+        fit = _extended(fit, joints, CATALOGUED, budget, progress)
+    fit = _extended(fit, joints, PATTERNS, budget, progress)
+    found = settled(_renamed(fit, joints), joints)
+    found = wrong_inertias(nominal, found) or found
+    return replace(found, rounds=budget.made, ran_out=budget.ran_out)
 
 
-def _extended(fit: Fit, joints: Sequence[int], kind: str, progress: Progress, begun: float) -> Fit:
+def _extended(
+    fit: Fit, joints: Sequence[int], kind: str, budget: Budget, progress: Progress
+) -> Fit:
     """With all that pays of one kind of candidates."""
     refused: set[tuple[str, int]] = set()
-    for _ in range(ROUNDS):
-        field = Field(fit, joints, kind)
+    while budget.spend():
+        field = SignatureTable(fit, joints, kind)
         fit, accepted = field.fit, False
         moves = honest_moves(field, refused | {e.candidate.key for e in fit.named})
         for move in moves[:TRIED]:
@@ -85,7 +119,7 @@ def _extended(fit: Fit, joints: Sequence[int], kind: str, progress: Progress, be
                 continue
             fit, accepted = _alongside(trial, move, moves, field, progress), True
             break
-        if not accepted or time.thread_time() - begun > PATIENCE_S:
+        if not accepted:
             break
     return fit
 
@@ -103,14 +137,15 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
             if e.candidate.joint == joint and isinstance(e.candidate.effect, TorqueEffect)
         ]
         words = [e for e in names if not e.is_pattern and e.interval_s == WHOLE]
-        curve = {e.candidate.effect.name for e in words} == CURVE
+        curve = len({e.candidate.effect.name for e in words if e.candidate.effect.over_angle}) > 1
+        curve = curve and all(e.candidate.effect.over_angle for e in words)
         if not curve and (len(words) != 1 or len(names) == 1):
             continue
-        bare = replace(fit, named=tuple(e for e in fit.named if e not in names)).with_noise()
+        bare = fit.with_named([e for e in fit.named if e not in names]).with_noise()
         bare, _ = refitted(bare)
-        catalogued = Field(bare, joints, CATALOGUED)
+        catalogued = SignatureTable(bare, joints, CATALOGUED)
         named = catalogued.together([catalogued.lead_of(e.candidate) for e in words])
-        field = Field(bare, joints, PATTERNS)
+        field = SignatureTable(bare, joints, PATTERNS)
         patterns = [field.lead_of(c) for c in field.candidates if c.joint == joint]
         best = max(map(field.honest, patterns), key=lambda x: x.chi2)
         if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
@@ -119,7 +154,7 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
 
 
 def _alongside(
-    fit: Fit, first: Move, moves: Sequence[Move], field: Field, progress: Progress
+    fit: Fit, first: Move, moves: Sequence[Move], field: SignatureTable, progress: Progress
 ) -> Fit:
     """With the plain moves of other joints, which do not touch the first one."""
     taken = {first.joint, -1}
@@ -143,7 +178,7 @@ def _with(
     progress(", ".join(f"{x.candidate.effect.title} {x.candidate.joint + 1}" for x in move.leads))
     before = len(fit.named)
     new = tuple(Named(x.candidate, x.x, x.interval_s, x.recording) for x in move.leads)
-    trial, _ = refitted(replace(fit, named=(*fit.named, *new)).with_noise(rich))
+    trial, _ = refitted(fit.with_named((*fit.named, *new)).with_noise(rich))
     last = len(trial.named) - 1
     if new[-1].interval_s != WHOLE:
         trial = dated(trial, last)
@@ -153,7 +188,7 @@ def _with(
         bad = _worst(trial, carried, before)
         if bad is None:
             break
-        trial = replace(trial, named=trial.named[:bad] + trial.named[bad + 1 :])
+        trial = trial.without(bad)
         if len(trial.named) == before:
             return None
     return trial if all(e.candidate.effect.possible(e.values) for e in trial.named) else None
@@ -166,13 +201,13 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         fit, carried = under_own_noise(fit)
         bad = _worst(fit, carried)
         if bad is not None:
-            fit = replace(fit, named=fit.named[:bad] + fit.named[bad + 1 :])
+            fit = fit.without(bad)
             continue
-        field = Field(fit, joints, CATALOGUED, rich=False)
-        standings = tuple(standing(fit, carried, field, k) for k in range(len(fit.named)))
-        swapped = _swapped(fit, standings) if swaps < MOST_SWAPS else None
+        field = SignatureTable(fit, joints, CATALOGUED, rich=False)
+        ranked = standings(fit, carried, field)
+        swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
-            return Found(fit, carried, standings)
+            return Found(fit, carried, ranked)
         fit, swaps = dated_anew(swapped), swaps + 1
 
 
@@ -184,7 +219,7 @@ def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
         value = found.log_evidence + price(e)
         if (
             value < BELIEF
-            or found.chi2 < least_chi2(e.candidate.effect.name, e.interval_s)
+            or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.candidate.effect.possible(e.values)
             or not pays_held_out(fit, carried, k)
         ):
@@ -205,5 +240,60 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
     if best is None:
         return None
     k, rival = best
-    other = replace(fit.named[k], candidate=rival.candidate, x=rival.x)
-    return replace(fit, named=(*fit.named[:k], other, *fit.named[k + 1 :]))
+    return fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x))
+
+
+WIDE = 25.0  # times the prior: inertias of which next to nothing is known
+FEWEST_LINKS = 3  # fewer wrong links than that can be named one by one
+RATIO = 8.0  # of the squared torque of wrong bodies over that of all else that was named
+ODD = 3.0  # prior deviations from which on a link's inertia is wrong
+
+
+def wrong_inertias(fit: Fit, found: Found) -> Found | None:
+    """The links' inertias as findings, where they explain more than all that was named.
+
+    Args:
+        fit: the nominal model; found: what a search with trusted inertias ended with.
+    """
+    if not _all_over(found.fit):
+        return None
+    wide, carried = refitted(replace(fit, prior=WIDE * fit.prior))
+    for _ in range(2):
+        wide, carried = refitted(wide.with_noise())
+    return _as_findings(fit, wide, carried)
+
+
+def _all_over(fit: Fit) -> bool:
+    """Whether bodies are what is wrong, on several links, and anything else is small beside."""
+    sizes = [float(np.mean(fit.model.contribution(0, k) ** 2)) for k in range(len(fit.named))]
+    wrong = [e.candidate.columns_are_theta and e.interval_s == WHOLE for e in fit.named]
+    bodies = sum(size for size, body in zip(sizes, wrong, strict=True) if body)
+    others = sum(size for size, body in zip(sizes, wrong, strict=True) if not body)
+    return sum(wrong) >= FEWEST_LINKS and bodies > RATIO * others
+
+
+def _standing(wide: Fit, carried: Carried, named: Named) -> Standing:
+    """What the link's correction is worth, the other links' carried along."""
+    own = np.array(named.candidate.columns)
+    rest = np.delete(np.arange(len(carried.N)), own)
+    others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
+    found = score(*others.without(carried.N[own]), carried.prior_std[own])
+    return Standing(named.candidate, found.log_evidence, found.chi2, ())
+
+
+def _as_findings(fit: Fit, wide: Fit, carried: Carried) -> Found:
+    """Links that are off by more than their prior allows, named one by one."""
+    named, standings, dtheta = [], [], wide.dtheta.copy()
+    for k in range(fit.n):
+        if np.abs(wide.dtheta[k] / fit.prior[k]).max() < ODD:
+            continue
+        effect = WRONG_LINK
+        columns = tuple(range(10 * k, 10 * k + 10))
+        scale = tuple(float(x) for x in wide.prior[k])
+        template = replace(effect.templates()[0], prior_std=scale)
+        named.append(Named(Candidate(effect, template, k, columns), wide.dtheta[k].copy()))
+        standings.append(_standing(wide, carried, named[-1]))
+        dtheta[k] = 0.0
+    model = replace(wide.model, dtheta=dtheta, named=tuple(named))
+    final = replace(wide, model=model, prior=fit.prior)
+    return Found(final, final.carried(), tuple(standings))

@@ -8,18 +8,26 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
+from scipy.sparse import diags
 
 from adapter.effects.base import Motion
-from adapter.gap.recorded import Recorded
-from adapter.records import Array
-from adapter.rigid_arm import RigidArm
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.filters import noise_from_samples
+from drivers.files.mcap import Log
 
 RATE_HZ = 250.0  # of the models
-STEP = 10  # from there to the band: 25 Hz
+DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
@@ -32,10 +40,10 @@ _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat = x.reshape(len(x), -1)
-    whole = (len(x) - TAPS) // STEP + 1
-    # output k STEP + TAPS - 1 of the causal filter is the first that knows all its neighbours
-    padded = upfirdn(_LOW, flat[(TAPS - 1) % STEP :], down=STEP, axis=0)
-    first = (TAPS - 1) // STEP
+    whole = (len(x) - TAPS) // DECIMATION + 1
+    # output k DECIMATION + TAPS - 1 of the causal filter is the first that knows all its neighbours
+    padded = upfirdn(_LOW, flat[(TAPS - 1) % DECIMATION :], down=DECIMATION, axis=0)
+    first = (TAPS - 1) // DECIMATION
     return padded[first : first + whole].reshape(-1, *x.shape[1:])
 
 
@@ -57,9 +65,25 @@ class Signals:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
         return low(x)
 
-    def low_all(self, x: Array) -> Array:
-        """Torques (c, m, n) in the band (c, k, n)."""
-        return np.moveaxis(low(np.moveaxis(x, 0, -1)), -1, 0)
+    def low_on(self, x: Array, joint: int) -> Array:
+        """A torque (m, n) that acts on one joint (-1: on all) in the band (k, n)."""
+        if joint < 0:
+            return low(x)
+        out = np.zeros_like(self.tau)
+        out[:, joint] = low(x[:, joint])
+        return out
+
+    def low_basis(self, basis: Array, joint: int) -> Array:
+        """Torques (m, c) on one joint in the band (c, k, n)."""
+        out = np.zeros((basis.shape[1], *self.tau.shape))
+        out[:, :, joint] = low(basis).T
+        return out
+
+    @cached_property
+    def low_regressor(self) -> Array:
+        """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""
+        m = self.motion
+        return np.ascontiguousarray(np.moveaxis(low(m.arm.regressor(m.q, m.dq, m.ddq)), 2, 0))
 
 
 def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) -> Signals:
@@ -79,7 +103,7 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
     smoothed = (repeat or recording).smoothed().at(grid)
     motion = Motion(grid, *smoothed, arm, _band(smoothed[1]))
-    band_t = grid[TAPS // 2 : -(TAPS // 2)][::STEP]
+    band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
     return Signals(motion, low(_at(grid, t, recording.tau)), band_t)
 
 
@@ -97,3 +121,226 @@ def _at(grid: Array, t: Array, tau: Array) -> Array:
     fine = np.arange(len(grid) * factor + 2 * (len(_ANTI_ALIAS) // 2)) / RAW_HZ + grid[0] - pad
     raw = np.column_stack([np.interp(fine, t, column) for column in tau.T])
     return oaconvolve(raw, _ANTI_ALIAS[:, None], mode="valid", axes=0)[::factor][: len(grid)]
+
+
+COMMANDS, MEASURED = "commands", "measured"
+ROLLOUT_STEP_S = 1e-3
+SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
+SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
+COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
+UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
+FAR_S = 0.05  # a command older than that does not drive any more
+HOLE_S = 0.05  # between samples: what happened in there is not known
+ROLLOUT_EDGE_S = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """One recording.
+
+    Attributes:
+        name: of the file.
+        t: (m,) s since its first sample, increasing; q, dq, tau: (m, n).
+        command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
+        dq_late_s: how much later dq is than q.
+    """
+
+    name: str
+    t: Array
+    q: Array
+    dq: Array
+    tau: Array
+    command_t: Array | None = None
+    commands: Array | None = None
+    dq_late_s: float = 0.0
+
+    @classmethod
+    def of(cls, log: Log, dq_late_s: float = 0.0) -> Recorded:
+        """From a screened log."""
+        start = log.stamp_ns[0]
+        command_t = commands = None
+        if log.commands is not None and len(log.commands.stamp_ns) > 1:
+            stamps, first = np.unique(log.commands.stamp_ns, return_index=True)
+            known = np.isfinite(log.commands.tau[first]).all(axis=1)
+            command_t = 1e-9 * (stamps[known] - start).astype(float)
+            commands = log.commands.tau[first][known]
+        t = 1e-9 * (log.stamp_ns - start).astype(float)
+        return cls(log.path.name, t, log.q, log.dq, log.tau, command_t, commands, dq_late_s)
+
+    def part(self, rows: slice) -> Recorded:
+        """Some of its rows; times stay those of the whole."""
+        return Recorded(
+            self.name,
+            self.t[rows],
+            self.q[rows],
+            self.dq[rows],
+            self.tau[rows],
+            self.command_t,
+            self.commands,
+            self.dq_late_s,
+        )
+
+    def repeated_in(self, others: Sequence[Recorded]) -> Recorded | None:
+        """Another recording of the same motion, if one of these is."""
+        return next((x for x in others if x is not self and self._repeats(x)), None)
+
+    def _repeats(self, other: Recorded) -> bool:
+        if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
+            return False
+        span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])
+        t = np.arange(span[0], span[1], SAME_STEP_S)
+        mine, theirs = self.smoothed().at(t), other.smoothed().at(t)
+        off = [np.sqrt(np.mean((a - b) ** 2)) for a, b in zip(mine, theirs, strict=True)]
+        return bool(off[0] < SAME_RAD and off[1] < SAME_RAD_S)
+
+    def smoothed(self) -> Smoothed:
+        """Splines through its motion."""
+        return smooth_motion(self.t, self.q, self.dq, self.dq_late_s)
+
+    def grid(self) -> Array:
+        """(m,) s, even times 1 ms apart within the recording, its edges left out."""
+        span = self.t[-1] - self.t[0] - 2 * ROLLOUT_EDGE_S
+        return (
+            self.t[0]
+            + ROLLOUT_EDGE_S
+            + ROLLOUT_STEP_S * np.arange(max(int(span / ROLLOUT_STEP_S), 0))
+        )
+
+    def is_whole(self, begin_s: float, end_s: float) -> bool:
+        """Whether there are samples all the way between two of its times."""
+        first, last = np.searchsorted(self.t, (begin_s, end_s))
+        around = self.t[max(first - 1, 0) : last + 1]
+        return bool(len(around) > 1 and np.diff(around).max() < HOLE_S)
+
+    def drive(self, t: Array) -> tuple[Array, str]:
+        """Torque (m, n) that moved the arm at times t, and which of `COMMANDS`, `MEASURED` it is.
+
+        Commands that are far from the measured torques (without gravity, of motors, positions)
+        or that leave out parts of the time are no drive.
+        """
+        measured = np.column_stack([np.interp(t, self.t, column) for column in self.tau.T])
+        given = self._commanded(t)
+        if given is None:
+            return measured, MEASURED
+        size = float(np.sqrt(np.mean(measured**2)))
+        off = float(np.sqrt(np.mean((given - measured) ** 2)))
+        return (given, COMMANDS) if off < UNLIKE * size else (measured, MEASURED)
+
+    def _commanded(self, t: Array) -> Array | None:
+        """Commands (m, n) at times t; None where there are none for part of the time."""
+        if self.command_t is None or self.commands is None or len(self.command_t) < 2:
+            return None
+        at = self.command_t + COMMAND_DELAY_S
+        inside = at[(at > t[0] - FAR_S) & (at < t[-1] + FAR_S)] if len(t) else at[:0]
+        if len(inside) < 2 or inside[0] > t[0] + FAR_S or inside[-1] < t[-1] - FAR_S:
+            return None
+        if np.diff(inside).max() > FAR_S:
+            return None
+        return np.column_stack([np.interp(t, at, column) for column in self.commands.T])
+
+
+SPLINE_DEGREE = 5
+KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
+Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
+STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """Splines of all joints.
+
+    Attributes:
+        spline: q(t), (n,) at a time; its derivatives are dq and ddq.
+        q_noise, dq_noise: (n,) noise levels that were assumed.
+    """
+
+    spline: BSpline
+    q_noise: Array
+    dq_noise: Array
+
+    def at(self, t: Array) -> tuple[Array, Array, Array]:
+        """q, dq, ddq (m, n) at times t (m,), s."""
+        return tuple(np.asarray(self.spline(t, nu)) for nu in range(3))  # type: ignore[return-value]
+
+
+def smooth_motion(t: Array, q: Array, dq: Array, dq_late_s: float = 0.0) -> Smoothed:
+    """Splines through q and dq.
+
+    Args:
+        t: (m,) s, increasing; q, dq: (m, n) rad, rad/s.
+        dq_late_s: how much later dq is than q.
+    """
+    count = max(2, int(np.ceil((t[-1] - t[0]) / KNOT_S)))
+    inner = np.linspace(t[0], t[-1], count + 1)
+    knots = np.concatenate([np.full(SPLINE_DEGREE, t[0]), inner, np.full(SPLINE_DEGREE, t[-1])])
+    level = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
+    when = np.clip(t - dq_late_s, t[0], t[-1])
+    slope = _derivative_design(when, knots)
+    q_noise = np.maximum(noise_from_samples(q), Q_NOISE_FLOOR)
+    dq_noise = np.maximum(noise_from_samples(dq), DQ_NOISE_FLOOR)
+    rough = _roughness(knots)
+    bands_q, bands_dq, bands_rough = (_bands(x) for x in (level.T @ level, slope.T @ slope, rough))
+    coefficients = np.empty((level.shape[1], q.shape[1]))
+    for j in range(q.shape[1]):
+        wq, wdq = q_noise[j] ** -2, dq_noise[j] ** -2
+        data = wq * bands_q + wdq * bands_dq
+        right = wq * (level.T @ q[:, j]) + wdq * (slope.T @ dq[:, j])
+        coefficients[:, j] = _stiffest(data, right, bands_rough)
+    return Smoothed(BSpline(knots, coefficients, SPLINE_DEGREE), q_noise, dq_noise)
+
+
+def _stiffest(data: Array, right: Array, rough: Array) -> Array:
+    """Coefficients at the penalty with the highest marginal likelihood."""
+    rank = data.shape[1] - 3
+
+    def cost(log_penalty: float) -> float:
+        factor = cholesky_banded(data + np.exp(log_penalty) * rough, lower=True)
+        solution = cho_solve_banded((factor, True), right)
+        return float(2.0 * np.log(factor[0]).sum() - rank * log_penalty - right @ solution)
+
+    best = minimize_scalar(cost, bounds=STIFFNESS, method="bounded", options={"xatol": 0.2})
+    factor = cholesky_banded(data + np.exp(best.x) * rough, lower=True)
+    return np.asarray(cho_solve_banded((factor, True), right))
+
+
+def _derivative_design(t: Array, knots: Array) -> Any:
+    """Sparse matrix of the basis functions' first derivatives at t."""
+    lower = BSpline.design_matrix(t, knots[1:-1], SPLINE_DEGREE - 1)
+    size = len(knots) - SPLINE_DEGREE - 1
+    gain = SPLINE_DEGREE / (knots[SPLINE_DEGREE + 1 : SPLINE_DEGREE + size] - knots[1:size])
+    return lower @ _neighbours(gain, size)
+
+
+def _neighbours(gain: Array, size: int) -> Any:
+    """Sparse (size - 1, size): differences of neighbours times gain (size - 1,)."""
+    bands: Any = [-gain, gain]
+    return diags(bands, offsets=[0, 1], shape=(size - 1, size))
+
+
+def _roughness(knots: Array) -> Any:
+    """Integral of products of third derivatives of the basis functions, sparse."""
+    degree, size = SPLINE_DEGREE, len(knots) - SPLINE_DEGREE - 1
+    product: Any = None
+    inner = knots
+    for _ in range(3):
+        gain = degree / (inner[degree + 1 : degree + size] - inner[1:size])
+        step = _neighbours(gain, size)
+        product = step if product is None else step @ product
+        inner, degree, size = inner[1:-1], degree - 1, size - 1
+    # degree-2 splines: exact with three Gauss points per knot interval
+    edges = np.unique(inner)
+    nodes, weights = np.polynomial.legendre.leggauss(3)
+    half = 0.5 * np.diff(edges)
+    points = (edges[:-1, None] + half[:, None] * (1.0 + nodes)).ravel()
+    basis = BSpline.design_matrix(points, inner, degree)
+    mass = basis.T @ diags((half[:, None] * weights).ravel()) @ basis
+    return product.T @ mass @ product
+
+
+def _bands(matrix: Any) -> Array:
+    """Lower bands (SPLINE_DEGREE + 1, size) of a sparse symmetric matrix."""
+    size = matrix.shape[0]
+    out = np.zeros((SPLINE_DEGREE + 1, size))
+    for k in range(SPLINE_DEGREE + 1):
+        out[k, : size - k] = matrix.diagonal(-k)
+    return out

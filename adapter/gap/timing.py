@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
-from adapter.records import Array
+from adapter.model.spatial import Array
 
 HOLE_PERIODS = 3.0  # a step longer than so many median periods is a hole
 FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, not a repeat

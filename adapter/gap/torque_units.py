@@ -19,8 +19,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 
 from adapter.effects.base import smooth_sign
-from adapter.records import Array
-from adapter.rigid_arm import RigidArm
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.rigid_arm import RigidArm
 
 EFFECTIVE = 50.0  # independent samples per joint: more would let the data pay for negative masses
 FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # what no correction explains: N m, and share of the torque
@@ -69,7 +70,7 @@ class Reading:
     detail: Array
 
 
-class Judge:
+class TorqueComparison:
     """Costs of readings of one recording.
 
     Args:
@@ -149,7 +150,10 @@ def _inertial_std(arm: RigidArm) -> Array:
 
 
 def readings(
-    judge: Judge, tau: Array, gravity_only: Array, per_gravity: Callable[[Array], Array]
+    comparison: TorqueComparison,
+    tau: Array,
+    gravity_only: Array,
+    per_gravity: Callable[[Array], Array],
 ) -> list[Reading]:
     """All readings of tau (m, n), the recorded one first, then by cost.
 
@@ -158,63 +162,69 @@ def readings(
         per_gravity: the model's gravity torque (m, n) for another gravity (3,).
     """
     n = tau.shape[1]
-    as_is = Reading("as recorded", tau, judge.cost(tau), tuple(range(n)), np.ones(n))
-    others = [*_signs(judge, tau, as_is.cost), *_scales(judge, tau), *_orders(judge, tau)]
+    as_is = Reading("as recorded", tau, comparison.cost(tau), tuple(range(n)), np.ones(n))
+    others = [
+        *_signs(comparison, tau, as_is.cost),
+        *_scales(comparison, tau),
+        *_orders(comparison, tau),
+    ]
     free = tau + gravity_only
-    others.append(Reading("gravity", free, judge.cost(free), as_is.joints, np.ones(n)))
-    others.append(_mounting(judge, tau, gravity_only, per_gravity))
-    other_size = _other_size(judge, tau)
+    others.append(Reading("gravity", free, comparison.cost(free), as_is.joints, np.ones(n)))
+    others.append(_mounting(comparison, tau, gravity_only, per_gravity))
+    other_size = _other_size(comparison, tau)
     others.sort(key=lambda reading: (reading.kind != "scale" if other_size else 0, reading.cost))
     return [as_is, *others]
 
 
-def _sizes(judge: Judge, tau: Array) -> tuple[NDArray[np.bool_], Array]:
+def _sizes(comparison: TorqueComparison, tau: Array) -> tuple[NDArray[np.bool_], Array]:
     """(n,) joints whose model torque says something, and how large tau is against it."""
-    model = np.sqrt(np.mean(judge.model**2, axis=0))
+    model = np.sqrt(np.mean(comparison.model**2, axis=0))
     return model > SEEN_NM, np.sqrt(np.mean(tau**2, axis=0)) / np.maximum(model, 1e-6)
 
 
-def _other_size(judge: Judge, tau: Array) -> bool:
+def _other_size(comparison: TorqueComparison, tau: Array) -> bool:
     """Whether all joints' torques have the model's shape in much another size.
 
     Torques without gravity are small, too, but have another shape.
     """
-    seen, size = _sizes(judge, tau)
+    seen, size = _sizes(comparison, tau)
     if not seen.any() or not np.all(size[seen] > 0):
         return False
     factor = np.log(size[seen])
     middle = float(np.median(factor))
-    a, b = ((x / judge.sigma)[:, seen].ravel() for x in (tau / np.exp(middle), judge.model))
+    a, b = (
+        (x / comparison.sigma)[:, seen].ravel() for x in (tau / np.exp(middle), comparison.model)
+    )
     alike = abs(float(a @ b)) / float(np.linalg.norm(a) * np.linalg.norm(b))
     one_way = np.all(factor * np.sign(middle) > 0.5 * np.log(LARGE_FACTOR))
     return bool(one_way and abs(middle) > np.log(LARGE_FACTOR) and alike > ALIKE)
 
 
-def convincing(judge: Judge, best: Reading, as_is: Reading) -> bool:
+def convincing(comparison: TorqueComparison, best: Reading, as_is: Reading) -> bool:
     """Whether another reading is so much better than the recorded one that it must be told."""
-    if best.kind == "scale" and _other_size(judge, as_is.tau):
+    if best.kind == "scale" and _other_size(comparison, as_is.tau):
         return True
     if best.cost > as_is.cost - GAIN_OF_EVIDENCE:
         return False
     if best.kind == "scale" or best.cost < CLEAR_SHARE_OF_COST * as_is.cost:
         return True
-    before, after = (judge.misfit(r.tau, best.joints) for r in (as_is, best))
+    before, after = (comparison.misfit(r.tau, best.joints) for r in (as_is, best))
     if best.cost > SHARE_OF_COST * as_is.cost:  # much is left, which no reading explains
         return after < FAR_SHARE_OF_MISFIT * before
     return after < SHARE_OF_MISFIT * before
 
 
-def _signs(judge: Judge, tau: Array, cost: float) -> Iterator[Reading]:
+def _signs(comparison: TorqueComparison, tau: Array, cost: float) -> Iterator[Reading]:
     """All joints negated; and those, one after the other, that it pays to negate."""
     n = tau.shape[1]
-    yield Reading("sign", -tau, judge.cost(-tau), tuple(range(n)), -np.ones(n))
+    yield Reading("sign", -tau, comparison.cost(-tau), tuple(range(n)), -np.ones(n))
     sign = np.ones(n)
     for _ in range(n - 1):
         trials = []
         for j in np.flatnonzero(sign > 0):
             trial = sign.copy()
             trial[j] = -1.0
-            trials.append((judge.cost(tau * trial), int(j)))
+            trials.append((comparison.cost(tau * trial), int(j)))
         lowest, joint = min(trials)
         if lowest > cost - GAIN_OF_EVIDENCE:
             break
@@ -222,10 +232,10 @@ def _signs(judge: Judge, tau: Array, cost: float) -> Iterator[Reading]:
         yield Reading("sign", tau * sign, cost, tuple(np.flatnonzero(sign < 0).tolist()), sign)
 
 
-def _scales(judge: Judge, tau: Array) -> Iterator[Reading]:
+def _scales(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
     """One large factor on all joints, or each joint its own (gears, motor currents)."""
-    model, n = judge.model, tau.shape[1]
-    seen, own = _sizes(judge, tau)
+    model, n = comparison.model, tau.shape[1]
+    seen, own = _sizes(comparison, tau)
     if not seen.any() or not np.all(own[seen] > 0):
         return
     common = float(np.median(own[seen]))
@@ -237,21 +247,21 @@ def _scales(judge: Judge, tau: Array) -> Iterator[Reading]:
     factors += [np.full(n, side * size) for size in (*near, common) for side in (1.0, -1.0)]
     for factor in factors:
         read = tau / factor
-        yield Reading("scale", read, judge.cost(read), tuple(range(n)), factor)
+        yield Reading("scale", read, comparison.cost(read), tuple(range(n)), factor)
 
 
-def _orders(judge: Judge, tau: Array) -> Iterator[Reading]:
+def _orders(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
     """The columns in the order that fits best: column by column first, then by swaps."""
     n = tau.shape[1]
-    apart = np.abs(tau[:, None, :] - judge.model[:, :, None]) / judge.sigma[:, None]
+    apart = np.abs(tau[:, None, :] - comparison.model[:, :, None]) / comparison.sigma[:, None]
     order = linear_sum_assignment(np.mean(np.minimum(apart, 20.0) ** 2, axis=0))[1]
-    cost = judge.cost(tau[:, order])
+    cost = comparison.cost(tau[:, order])
     while n > 1:
         swaps = []
         for a, b in combinations(range(n), 2):
             trial = order.copy()
             trial[[a, b]] = trial[[b, a]]
-            swaps.append((judge.cost(tau[:, trial]), trial.tolist()))
+            swaps.append((comparison.cost(tau[:, trial]), trial.tolist()))
         lowest, trial_order = min(swaps)
         if lowest >= cost - 1.0:
             break
@@ -262,15 +272,76 @@ def _orders(judge: Judge, tau: Array) -> Iterator[Reading]:
 
 
 def _mounting(
-    judge: Judge, tau: Array, gravity_only: Array, per_gravity: Callable[[Array], Array]
+    comparison: TorqueComparison,
+    tau: Array,
+    gravity_only: Array,
+    per_gravity: Callable[[Array], Array],
 ) -> Reading:
     """Gravity of the usual size along another direction of the base."""
     n = tau.shape[1]
     axes = np.stack([per_gravity(axis) for axis in np.eye(3)], axis=2)
-    dynamic = judge.model - gravity_only
-    rows = (axes / judge.sigma[None, :, None]).reshape(-1, 3)
-    found = np.linalg.lstsq(rows, ((tau - dynamic) / judge.sigma).ravel(), rcond=None)[0]
+    dynamic = comparison.model - gravity_only
+    rows = (axes / comparison.sigma[None, :, None]).reshape(-1, 3)
+    found = np.linalg.lstsq(rows, ((tau - dynamic) / comparison.sigma).ravel(), rcond=None)[0]
     size = float(np.linalg.norm(found))
     gravity = found * (9.81 / size) if size else found
     read = tau + gravity_only - axes @ gravity
-    return Reading("mounting", read, judge.cost(read), tuple(range(n)), gravity)
+    return Reading("mounting", read, comparison.cost(read), tuple(range(n)), gravity)
+
+
+def unit(reading: Reading) -> str | None:
+    """Name of the unit whose factor all joints have, whatever the sign."""
+    size = np.abs(reading.detail)
+    return UNITS.get(float(size[0])) if np.ptp(size) == 0 else None
+
+
+def in_words(
+    best: Reading, as_is: Reading, comparison: TorqueComparison, tree: Tree, tau: Array
+) -> str:
+    """What a reading says, with the evidence and what to do."""
+    names = [tree.joint_names[j] for j in best.joints]
+    before, after = (comparison.error(r.tau) for r in (as_is, best))
+    joints = slice(None) if len(best.joints) == len(before) else list(best.joints)
+    worst = f"the model is off by {rms(before[joints]):.3g} N m"
+    if best.kind == "sign":
+        which = "all joints" if len(names) == tree.n else ", ".join(names)
+        return (
+            f"the torque of {which} has the wrong sign: {worst} there as recorded and by "
+            f"{rms(after[joints]):.3g} N m with the sign turned; turn it in the recording, tau "
+            "is positive along the joint's axis and holds the arm against gravity."
+        )
+    if best.kind == "scale":
+        name, size = unit(best), np.abs(best.detail)
+        same = np.ptp(size) == 0
+        what = f"{size[0]:.4g} times" if same else ", ".join(f"{x:.3g}" for x in size) + " times"
+        turned = " and with the opposite sign" if np.all(best.detail < 0) else ""
+        guess = name or "gears (torque of the motors), motor currents or another unit"
+        return (
+            f"the torques are {what} what the model needs{turned} (rms {rms(tau):.3g} against "
+            f"{rms(comparison.model):.3g} N m, {rms(after):.3g} N m off after division): {guess}? "
+            "Convert them to N m at the link side (`adapter import` does)."
+        )
+    if best.kind == "gravity":
+        return (
+            f"the torques hold no gravity: {worst} as recorded and by {rms(after):.3g} N m when "
+            "the model's gravity torque is added; record the measured joint torques, gravity "
+            "included."
+        )
+    if best.kind == "mounting":
+        g = ", ".join(f"{x:.1f}" for x in best.detail)
+        return (
+            f"gravity acts along [{g}] m/s² of the base and not as in the model: {worst} as "
+            f"recorded and by {rms(after):.3g} N m so; give the model the gravity of the mounting."
+        )
+    order = [tree.joint_names[int(k)] for k in best.detail]
+    pairs = ", ".join(f"{order[j]} holds that of {tree.joint_names[j]}" for j in best.joints)
+    return (
+        f"the torques are in another order than the positions, the column of {pairs}: {worst} "
+        f"there as recorded and by {rms(after[joints]):.3g} N m put in order; record them in the "
+        "order of the joint names."
+    )
+
+
+def rms(x: Array) -> float:
+    """Root of the mean square of all of x."""
+    return float(np.sqrt(np.mean(np.square(x))))

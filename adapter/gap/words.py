@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from rich.markup import escape
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.gap.phrases import LACKED, PHRASES, listed, numbered, phrase, plain, shown_unit, who
+from adapter.gap.phrases import listed, numbered, phrase, phrase_of, plain, shown_unit, who
 from adapter.gap.result import Finding, GapResult, Leftover
+from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
@@ -28,12 +31,23 @@ def headline(result: GapResult) -> str:
     if result.problem is not None:
         return result.problem
     if not result.findings and not result.unexplained:
-        return _nothing(result)
+        return "; ".join(filter(None, (_nothing(result), stopped(result))))
     parts = _finding_parts(result.findings)
     if result.findings:
         parts.append(_shrink(result))
-    parts.append(_left(result.unexplained))
+    parts += [_left(result.unexplained), stopped(result)]
     return "; ".join(part for part in parts if part)
+
+
+def stopped(result: GapResult) -> str:
+    """That the search did not come to its end; empty where it did."""
+    rounds = result.stopped_after_rounds
+    return f"the search stopped after {rounds} rounds, there may be more" if rounds else ""
+
+
+def as_json(result: GapResult) -> dict[str, Any]:
+    """What the JSON file holds: the outcome in a sentence, and all figures."""
+    return {"headline": headline(result), **result.as_dict()}
 
 
 def sentence(finding: Finding) -> str:
@@ -144,15 +158,14 @@ def _group(findings: Sequence[Finding]) -> str:
     first = findings[0]
     ordered = sorted(findings, key=lambda f: f.joints)
     joints = [j for f in ordered for j in f.joints]
-    verb = "lack" if first.effect in LACKED else "show"
+    verb = phrase_of(first).verb
     said = f"{who(first.effect, joints)} {verb} {first.title}{_values(ordered)}"
     return f"{span(first)} {said}" if span(first) else said
 
 
 def _values(findings: Sequence[Finding]) -> str:
     """Main parameters of findings of one kind, in brackets."""
-    name = findings[0].effect
-    key = PHRASES[name].key if name in PHRASES else ""
+    key = phrase_of(findings[0]).key
     values = [float(f.parameters[key]) for f in findings if f.parameters.get(key) is not None]
     if len(values) < len(findings):
         return ""
@@ -201,3 +214,45 @@ def _follows(leftover: Leftover) -> str:
 
 def _instant(t: float) -> str:
     return f"{t:.2f}".rstrip("0").rstrip(".")
+
+
+LABEL = 26  # characters
+
+
+def console_summary(result: GapResult) -> list[str]:
+    """Headline, findings, figures by joint, what to do next; for `rich.console.Console.print`."""
+    color = "red" if result.problem is not None else "bold"
+    lines = [f"[{color}]{escape(headline(result))}[/{color}]"]
+    for finding in result.findings:
+        lines += _finding(finding)
+    lines += [f"[yellow]?[/yellow] {escape(leftover_sentence(x))}" for x in result.unexplained]
+    lines += _figures(result)
+    lines += [f"[cyan]next[/cyan] {escape(text)}" for text in result.what_next]
+    lines += [f"[dim]note[/dim] {escape(text)}" for text in result.notes]
+    if result.model_out is not None:
+        lines.append(f"model {escape(result.model_out)}")
+    return lines
+
+
+def _finding(finding: Finding) -> list[str]:
+    sure = f"evidence {percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
+    lines = [f"[green]•[/green] {escape(sentence(finding))} [dim]({sure})[/dim]"]
+    other = rivals(finding)
+    return [*lines, f"  [dim]{escape(other)}[/dim]"] if other else lines
+
+
+def _figures(result: GapResult) -> list[str]:
+    """One line per figure, joints in order; none where nothing is known."""
+    before, after = result.before, result.after
+    rows: list[tuple[str, Array | None, float]] = [
+        ("torque noise, N m", result.noise_floor_nm, 1.0),
+        ("torque error before, N m", before.torque_rmse_nm, 1.0),
+        ("             after, N m", after.torque_rmse_nm, 1.0),
+        ("rollout error before, mrad", before.rollout_rmse_rad, 1e3),
+        ("              after, mrad", after.rollout_rmse_rad, 1e3),
+    ]
+    return [
+        f"{name:<{LABEL}} " + " ".join(f"{plain(factor * x, 3):>7}" for x in values)
+        for name, values, factor in rows
+        if values is not None and np.isfinite(values).any()
+    ]

@@ -1,8 +1,11 @@
 """Where simulation and data disagree, which effect is missing, what the gap is with it.
 
-    recordings, nominal model -> screened -> smooth -> searched -> named -> added -> measured again
+A log passes through each station once, left to right:
 
-Reads nothing but the recordings and the model.
+    screen -> signals -> search (candidates, evidence) -> held out -> findings -> words
+
+Reads nothing but the recordings and the model, no clock but for the time taken, and writes
+nothing but the new model where it is told where.
 """
 
 from __future__ import annotations
@@ -14,36 +17,24 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.gap.evidence import Carried
-from adapter.gap.findings import doubted, findings_of, leftovers_of, noise_floor
-from adapter.gap.fit import TIMING_STD_S, Fit, refitted, theta_prior
-from adapter.gap.inertias import wrong_inertias
-from adapter.gap.recorded import Recorded
-from adapter.gap.refusals import Refusal, refuse
-from adapter.gap.result import Curves, GapResult, RolloutCurves, Shortfall
-from adapter.gap.rivals import block_s, fold_of
-from adapter.gap.search import Found, search
-from adapter.gap.shrink import (
-    Simulate,
-    held_out_coefficients,
-    held_out_models,
-    model_of,
-    rms,
-    rollout_errors,
-    torque_errors,
-)
-from adapter.gap.signals import Signals, prepare
+from adapter.effects.torque import active_effects
+from adapter.gap.findings import told_of
+from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
+from adapter.gap.held_out import HeldOut, Simulate, Task, lasting, measure, model_of
+from adapter.gap.result import GapResult
+from adapter.gap.screen import Refusal, Screened, refuse
+from adapter.gap.search import ROUNDS, search
+from adapter.gap.signals import Recorded, prepare
 from adapter.gap.timing import Timing
-from adapter.model import SelfModel
-from adapter.rigid_arm import RigidArm
-from adapter.robots import documented
-from adapter.torque import active_effects
-from drivers.mcap_file import read_log
+from adapter.model.model_file import save_model
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
+from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import Log, read_log
 
 SIGNIFICANT = 3.0  # standard deviations
 TIMING_SHARE = 0.4  # of a sample period: holds of half a sample are no effect of the arm
-NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
-NOT_TOLD = ("motion",)  # refusals that are an answer: the recording holds too little
+FIT_S, SCORE_S = 3.0, 2.0  # the least of a recording that is fitted; and scored
 
 Progress = Callable[[str], None]
 
@@ -55,45 +46,23 @@ class GapSettings:
     Attributes:
         inertia_prior: by which share the model's inertias may be off, one standard deviation.
         validate_from_s: with one recording: fit before it, score after it; None: by blocks.
+        rounds: of the search, each of which may name something; where they do not suffice the
+            result says so. Counted, not timed: the same log gives the same result anywhere.
     """
 
     inertia_prior: float = 0.02
     validate_from_s: float | None = None
+    rounds: int = ROUNDS
 
     def __post_init__(self) -> None:
         if not 0.0 < self.inertia_prior <= 1.0:
             raise ValueError(f"the inertias' prior must be in (0, 1], got {self.inertia_prior}")
+        if self.rounds < 1:
+            raise ValueError(f"the search needs at least one round, got {self.rounds}")
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """What is there to work with.
-
-    Attributes:
-        model: the nominal one.
-        fitted, scored: recordings to fit and to score on; the same ones where blocks are held out.
-        moving: joints (from 0) that move, per fitted recording.
-        period_s: the longest sample period.
-        one_clock: what is scored belongs to the recording that is fitted.
-        notes: what is known of the logs.
-    """
-
-    model: SelfModel
-    fitted: tuple[Recorded, ...]
-    scored: tuple[Recorded, ...]
-    moving: tuple[tuple[int, ...], ...]
-    period_s: float
-    one_clock: bool
-    notes: tuple[str, ...]
-
-    @property
-    def folds(self) -> bool:
-        """The fit's own recordings are scored, each block by a fit without it."""
-        return self.fitted == self.scored
-
-
-def analyse(
-    logs: Sequence[Path | str],
+def find_gap(
+    logs: Sequence[Path | str | Log],
     model: Path | str | SelfModel,
     settings: GapSettings | None = None,
     simulate: Simulate | None = None,
@@ -103,7 +72,7 @@ def analyse(
     """Find what the model lacks.
 
     Args:
-        logs: MCAP recordings; of several the last one is held out.
+        logs: MCAP recordings, or read ones; of several the last one is held out.
         model: self model, or a file of one, or a URDF, or a known robot's name.
         settings: see there.
         simulate: forward simulation; without it only torques are compared.
@@ -120,44 +89,55 @@ def analyse(
     # dates of an earlier recording mean nothing in this one
     nominal = lasting(model if isinstance(model, SelfModel) else documented(str(model)))
     try:
-        task = _task([Path(log) for log in logs], nominal, settings, progress)
+        task = _task(logs, nominal, settings, progress)
     except Refusal as refusal:
-        if refusal.kind not in NOT_TOLD:
+        if not refusal.kind.is_an_answer:
             raise
-        names = [Path(log).name for log in logs]
+        names = [log.path.name if isinstance(log, Log) else Path(log).name for log in logs]
         joints = nominal.tree.joint_names
         return GapResult.untold(joints, nominal.name, names, name, str(refusal))
     progress("smoothing")
-    found = _corrected_where_it_pays(task, _searched(task, settings, progress))
-    result = _measured(task, found, simulate, progress)
+    fit = _nominal_fit(task, settings)
+    progress("searching")
+    moving = sorted({j for joints in task.moving for j in joints})
+    measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
+    result = replace(_result(task, measured), model_in=name)
     if model_out is not None:
-        model_of(nominal, found.fit).save(model_out)
+        save_model(model_of(nominal, measured.found.fit), model_out)
         result = replace(result, model_out=str(model_out))
-    return replace(result, model_in=name, wall_s=time.monotonic() - begun)
+    return replace(result, wall_s=time.monotonic() - begun)
 
 
 def _task(
-    logs: Sequence[Path], model: SelfModel, settings: GapSettings, progress: Progress
+    logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
 ) -> Task:
     """Read and screen. Raises Refusal."""
     arm = RigidArm.of(model)
-    recordings, moving, periods, notes = [], [], [], []
-    for path in logs:
-        progress(f"reading {path.name}")
-        screened = refuse(read_log(path), model, arm)
-        recordings.append(Recorded.of(screened.log, _lateness(screened.timing)))
-        moving.append(screened.moving)
-        periods.append(screened.timing.period_s)
-        prefix = f"{path.name}: " if len(logs) > 1 else ""
-        notes += [prefix + sentence for sentence in screened.notes]
+    screened: list[Screened] = []
+    for log in logs:
+        name = log.path.name if isinstance(log, Log) else Path(log).name
+        progress(f"reading {name}")
+        screened.append(refuse(log if isinstance(log, Log) else read_log(Path(log)), model, arm))
+    recordings = tuple(Recorded.of(x.log, _lateness(x.timing)) for x in screened)
     if len(recordings) > 1:
-        fitted, scored = tuple(recordings[:-1]), tuple(recordings[-1:])
+        fitted, scored = recordings[:-1], recordings[-1:]
     elif settings.validate_from_s is not None:
         fitted, scored = _split(recordings[0], settings.validate_from_s)
     else:
-        fitted = scored = tuple(recordings)
-    stay = moving[: len(fitted)]
-    return Task(model, fitted, scored, tuple(stay), max(periods), len(logs) == 1, tuple(notes))
+        fitted = scored = recordings
+    return Task(
+        model,
+        fitted,
+        scored,
+        moving=tuple(x.moving for x in screened[: len(fitted)]),
+        period_s=max(x.timing.period_s for x in screened),
+        one_clock=len(logs) == 1,
+        notes=tuple(
+            f"{x.log.path.name}: {note}" if len(logs) > 1 else note
+            for x in screened
+            for note in x.notes
+        ),
+    )
 
 
 def _lateness(timing: Timing) -> float:
@@ -166,130 +146,52 @@ def _lateness(timing: Timing) -> float:
     return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
 
 
-def lasting(model: SelfModel) -> SelfModel:
-    """The model in another recording: its effects that had not ended, at all times."""
-    kept = []
-    for entry in model.effects:
-        begin, end = entry.get("interval_s") or (None, None)
-        if end is None:
-            kept.append(dict(entry, interval_s=None) if begin is not None else entry)
-    return replace(model, effects=tuple(kept))
-
-
 def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorded]]:
-    if not whole.t[0] + 3.0 < at_s < whole.t[-1] - 2.0:
+    if not whole.t[0] + FIT_S < at_s < whole.t[-1] - SCORE_S:
         raise ValueError(
-            f"validation from {at_s} s needs 3 s before and 2 s after it; "
+            f"validation from {at_s} s needs {FIT_S:g} s before and {SCORE_S:g} s after it; "
             f"{whole.name} has {whole.t[-1]:.1f} s"
         )
     cut = int(np.searchsorted(whole.t, at_s))
     return (whole.part(slice(cut)),), (whole.part(slice(cut, None)),)
 
 
-def _searched(task: Task, settings: GapSettings, progress: Progress) -> Found:
+def _nominal_fit(task: Task, settings: GapSettings) -> Fit:
+    """The nominal model on the smoothed recordings, under the noise that it leaves."""
     arm = RigidArm.of(task.model)
-    known = active_effects(task.model.effects, arm.n)
-    anywhere = sorted({j for joints in task.moving for j in joints})
     everything = tuple(dict.fromkeys((*task.fitted, *task.scored)))
     signals = tuple(prepare(r, arm, r.repeated_in(everything)) for r in task.fitted)
-    prior = theta_prior(arm.theta, settings.inertia_prior)
-    zero = np.zeros_like(arm.theta)
+    known = active_effects(task.model.effects, arm.n)
     still = tuple(tuple(j for j in range(arm.n) if j not in m) for m in task.moving)
-    timing = max(TIMING_STD_S, TIMING_SHARE * task.period_s)
-    fit = Fit(signals, prior, (), zero, known=known, still=still, timing_std_s=timing)
-    fit = fit.with_noise()
-    progress("searching")
-    found = search(fit, anywhere, progress)
-    return wrong_inertias(fit, found, anywhere) or found
+    return Fit(
+        Model(signals, np.zeros_like(arm.theta), known=known),
+        theta_prior(arm.theta, settings.inertia_prior),
+        still=still,
+        timing_std_s=max(TIMING_STD_S, TIMING_SHARE * task.period_s),
+    ).with_noise()
 
 
-def _corrected_where_it_pays(task: Task, found: Found) -> Found:
-    """Without the corrections of the inertias where they do not pay on held-out data."""
-    fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
-    costs = []
-    for own, known in ((found.fit, found.carried), (fit, carried)):
-        folds = held_out_models(task.model, own, known)
-        errors = [torque_errors(r, task.model, folds, block_s(own)) for r in task.fitted]
-        level = noise_floor(found.fit)
-        costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
-    if costs[0] <= costs[1]:
-        return found
-    kept = replace(fit, dtheta=np.zeros_like(fit.dtheta), prior=found.fit.prior)
-    return replace(found, fit=kept, carried=carried, known=kept.carried())
-
-
-def _after(task: Task, fit: Fit, carried: Carried) -> list[SelfModel]:
-    """The models to score: one per fold, or one where the data are apart from the fit's."""
-    if task.folds:
-        return held_out_models(task.model, fit, carried)
-    model = model_of(task.model, fit)
-    return [model if task.one_clock else lasting(model)]
-
-
-def _measured(task: Task, found: Found, simulate: Simulate | None, progress: Progress) -> GapResult:
-    """Before and after on held-out data, and all that was found."""
-    after = _after(task, found.fit, found.carried)
-    errors = [torque_errors(r, task.model, after, block_s(found.fit)) for r in task.scored]
-    before = Shortfall(rms([e.before for e in errors]))
-    behind = Shortfall(rms([e.after for e in errors]))
-    rollouts: tuple[RolloutCurves, ...] = ()
-    if simulate is not None:
-        progress("simulating forward")
-        runs = [
-            rollout_errors(r, task.model, after, simulate, block_s(found.fit)) for r in task.scored
-        ]
-        before = replace(
-            before,
-            rollout_rmse_rad=rms([x.before_q for x in runs]),
-            rollout_rmse_rad_s=rms([x.before_dq for x in runs]),
-        )
-        behind = replace(
-            behind,
-            rollout_rmse_rad=rms([x.after_q for x in runs]),
-            rollout_rmse_rad_s=rms([x.after_dq for x in runs]),
-        )
-        rollouts = tuple(x.curves for x in runs)
-    ends = [float(r.t[-1]) for r in task.fitted]
-    unexplained = leftovers_of(found, ends)
-    findings = doubted(findings_of(found, ends), unexplained)
+def _result(task: Task, measured: HeldOut) -> GapResult:
+    """All that was found and measured."""
+    found = measured.found
+    told = told_of(found, [float(r.t[-1]) for r in task.fitted], measured.curves[0])
+    splits = (x for f in told.findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,
         model_name=task.model.name,
         recordings=tuple(dict.fromkeys(r.name for r in (*task.fitted, *task.scored))),
         model_in="",
-        noise_floor_nm=noise_floor(found.fit),
-        before=before,
-        after=behind,
-        findings=findings,
-        unexplained=unexplained,
+        noise_floor_nm=told.noise_floor_nm,
+        before=measured.before,
+        after=measured.after,
+        findings=told.findings,
+        unexplained=told.unexplained,
+        where=told.where,
         corrections=found.fit.dtheta,
         corrections_prior=found.fit.prior,
+        stopped_after_rounds=found.rounds if found.ran_out else None,
         notes=task.notes,
-        curves=tuple(_curves(task, found, i) for i in range(len(task.fitted))),
-        rollouts=rollouts,
-        what_next=tuple(dict.fromkeys(f.split_by for f in findings if f.overlaps)),
-    )
-
-
-def _curves(task: Task, found: Found, i: int) -> Curves:
-    own: Signals = found.fit.recordings[i]
-    nominal = Fit(
-        (own,), found.fit.prior, (), np.zeros_like(found.fit.dtheta), known=found.fit.known
-    )
-    after = np.empty_like(own.tau)
-    for f, x in enumerate(held_out_coefficients(found.fit, found.carried)):
-        rows = fold_of(own.t, block_s(found.fit)) == f
-        after[rows] = found.fit.at(x).without_patterns().residual(i)[rows]
-    rows = np.searchsorted(own.motion.t, own.t - 1e-9)
-    motion = own.motion
-    return Curves(
-        task.fitted[i].name,
-        own.t,
-        motion.q[rows],
-        motion.dq[rows],
-        motion.ddq[rows],
-        own.tau,
-        nominal.residual(0),
-        after,
-        np.zeros(len(own.t), dtype=bool),
+        curves=measured.curves,
+        rollouts=measured.rollouts,
+        what_next=tuple(dict.fromkeys(splits)),
     )

@@ -1,20 +1,39 @@
-"""What the workers are asked to do: learn, record, show. All of it is picklable."""
+"""What the workers are asked to do, and what their processes run until their ring is drained.
+
+A `...Job` says what to learn, record or show; all of it is picklable. A `...Task` runs in the
+worker's process.
+
+A learner that dies is succeeded by one that takes its last kept state and, from the ring, all
+that came after it. The name of a kept state is the number of records behind it, and a record is
+given back only when a state that has learned it is kept: nothing is learned twice, and what the
+ring no longer holds is counted as skipped.
+"""
 
 from __future__ import annotations
 
+import shutil
+import sys
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from adapter.realtime.snapshot import Snapshot
-from adapter.records import Array
+import numpy as np
+
+from adapter.model.spatial import Array
+from adapter.realtime.ring import Ring
+from adapter.realtime.shared import leave
+from adapter.realtime.snapshot import Snapshot, SnapshotReader, SnapshotWriter
+from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
+from drivers.files.mcap import FLUSH_S, McapWriter
+from drivers.interface import JointSample, LinkMotion
 
 
 class LearnerLike(Protocol):
     """What is fed: every filtered state once, in order. It must copy what it keeps."""
 
-    def step(self, record: Array) -> None:
+    def step(self, state: Array, /) -> object:
         """Learn from one record of `StateLayout`."""
 
 
@@ -94,7 +113,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class WatchJob:
+class DisplayJob:
     """A display in its own process, so that a slow terminal never holds up the loop.
 
     Attributes:
@@ -105,3 +124,271 @@ class WatchJob:
 
     make: Callable[[], Callable[[View], None]]
     period_s: float = 0.25
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """What the workers of a run do; None leaves a worker out."""
+
+    learner: LearnerJob | None = None
+    recording: RecordingJob | None = None
+    display: DisplayJob | None = None
+
+
+UNFINISHED = "next"
+
+
+@dataclass(frozen=True)
+class LearnerTask:
+    """Run by the learner process.
+
+    Attributes:
+        job: what to do.
+        ring: name of the ring; snapshot: of the estimate's board.
+        keep_in: private folder for kept states; None keeps none.
+    """
+
+    job: LearnerJob
+    ring: str
+    snapshot: str | None
+    keep_in: Path | None = None
+
+    def __call__(self, port: Port) -> Any:
+        """Learn until the ring is finished and drained; returns what `collect` gives."""
+        ring = Ring.attach(self.ring)
+        board = None if self.snapshot is None else SnapshotWriter.attach(self.snapshot)
+        try:
+            learner = self.job.make()
+            if "torch" in sys.modules:
+                sys.modules["torch"].set_num_threads(1)
+            self._take_over(learner, ring)
+            port.ready()
+            self._feed(learner, ring, board, port)
+            return self.job.collect(learner)
+        finally:
+            names = [self.ring] if self.snapshot is None else [self.ring, self.snapshot]
+            leave(port.orphaned, names, ring, board)
+            if port.orphaned and self.keep_in is not None:
+                shutil.rmtree(self.keep_in, ignore_errors=True)
+
+    def _take_over(self, learner: Any, ring: Ring) -> None:
+        """Go on where a dead predecessor's last kept state ends."""
+        index = 0
+        if self.keep_in is not None and self.job.restore is not None:
+            index = max(
+                (int(p.name) for p in self.keep_in.iterdir() if p.name.isdigit()), default=0
+            )
+            if index:
+                self.job.restore(learner, self.keep_in / str(index))
+        ring.resume(index)
+
+    def _feed(self, learner: Any, ring: Ring, board: SnapshotWriter | None, port: Port) -> None:
+        job = self.job
+        keeping = self.keep_in is not None and job.keep is not None
+        own = np.zeros(ring.size)  # the learner never sees memory that the loop writes to
+        fresh, publish_at = False, 0.0
+        save_at = keep_at = time.monotonic() + job.save_s
+        while True:
+            finished = ring.finished
+            rows = ring.peek(ROWS_AT_ONCE)
+            for row in rows:
+                own[:] = row
+                learner.step(own)
+            count = len(rows)
+            del rows
+            ring.take(count)
+            if not keeping:
+                ring.give_back()
+            fresh = fresh or count > 0
+            now = time.monotonic()
+            drained = not count and (finished or port.orphaned)
+            due = fresh and (now >= publish_at or drained)
+            if due and board is not None and job.publish is not None:
+                board.publish(job.publish(learner))
+                fresh, publish_at = False, now + job.publish_s
+            if keeping and (now >= keep_at or 2 * ring.kept > ring.rows):
+                self._keep(learner, ring)
+                keep_at = now + job.save_s
+            if job.save is not None and (now >= save_at or drained):
+                job.save(learner)
+                save_at = now + job.save_s
+            if drained:
+                return
+            if not count:
+                time.sleep(IDLE_S)
+
+    def _keep(self, learner: Any, ring: Ring) -> None:
+        """Keep a state, then give back what it has learned and remove those before it."""
+        folder, job, index = self.keep_in, self.job, ring.taken
+        assert folder is not None and job.keep is not None
+        place = folder / UNFINISHED
+        try:
+            shutil.rmtree(place, ignore_errors=True)
+            place.mkdir()
+            job.keep(learner, place)
+            if not (folder / str(index)).exists():
+                place.rename(folder / str(index))
+        except OSError:  # no room: the loop's need of the ring goes before a successor's
+            if 2 * ring.kept > ring.rows:
+                ring.give_back()
+            return
+        ring.give_back()
+        for old in folder.iterdir():
+            if old.name != str(index):
+                shutil.rmtree(old, ignore_errors=True)
+
+
+HAS_LINKS, HAS_COMMAND = 1, 2
+
+
+class RawLayout:
+    """Where a raw sample lies in `size` float64: stamp (int64 bits, ns), flags (int64 bits),
+    q, dq, tau, command (n each), and link motion [twist accel] (links, 12) where links > 0.
+    """
+
+    def __init__(self, n: int, links: int = 0) -> None:
+        self.n, self.links = n, links
+        self.size = 2 + 4 * n + 12 * links
+        self.q, self.dq, self.tau, self.command = (
+            slice(2 + k * n, 2 + (k + 1) * n) for k in range(4)
+        )
+        self.motion = slice(2 + 4 * n, self.size)
+
+    def new(self) -> Array:
+        """An empty record."""
+        return np.zeros(self.size)
+
+    def fill(self, record: Array, sample: JointSample, command: Array | None) -> None:
+        """Write a sample and the torques (n,) commanded upon it."""
+        flags = 0
+        record[self.q], record[self.dq], record[self.tau] = sample.q, sample.dq, sample.tau
+        if command is not None:
+            record[self.command] = command
+            flags |= HAS_COMMAND
+        if sample.links is not None and self.links:
+            motion = record[self.motion].reshape(self.links, 12)
+            motion[:, :6], motion[:, 6:] = sample.links.twist, sample.links.accel
+            flags |= HAS_LINKS
+        words = record[:2].view(np.int64)
+        words[0], words[1] = sample.stamp_ns, flags
+
+    def sample(self, record: Array) -> tuple[JointSample, Array | None]:
+        """The sample and the command of a record; arrays are views of it."""
+        stamp_ns, flags = (int(word) for word in record[:2].view(np.int64))
+        links = None
+        if flags & HAS_LINKS:
+            motion = record[self.motion].reshape(self.links, 12)
+            links = LinkMotion(motion[:, :6], motion[:, 6:])
+        command = record[self.command] if flags & HAS_COMMAND else None
+        parts = record[self.q], record[self.dq], record[self.tau]
+        return JointSample(stamp_ns, *parts, links), command
+
+
+HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
+
+
+@dataclass(frozen=True)
+class RecorderTask:
+    """Run by the recorder process."""
+
+    job: RecordingJob
+    ring: str
+    snapshot: str | None
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+
+    def __call__(self, port: Port) -> int:
+        """Record until the ring is finished and drained; returns the samples written.
+
+        What is written is given back once the system has it, so that the successor of a recorder
+        that died goes on without a hole. A recording without a single sample is removed. Raises
+        DriverError.
+        """
+        ring = Ring.attach(self.ring)
+        reader = None if self.snapshot is None else SnapshotReader(self.snapshot)
+        job = self.job
+        ring.resume(ring.released)
+        try:
+            writer = McapWriter(
+                job.path, self.joint_names, self.link_names, job.metadata, overwrite=job.overwrite
+            )
+            with writer:
+                for name, data in job.attachments.items():
+                    writer.attach(name, data, "application/octet-stream")
+                port.ready()
+                written = self._drain(writer, ring, reader, port)
+            ring.give_back()
+            if not written:
+                job.path.unlink(missing_ok=True)
+            return written
+        finally:
+            leave(port.orphaned, [self.ring], ring, reader)
+
+    def _drain(
+        self, writer: McapWriter, ring: Ring, reader: SnapshotReader | None, port: Port
+    ) -> int:
+        layout = RawLayout(len(self.joint_names), len(self.link_names))
+        own, written, version = layout.new(), 0, 0
+        flush_at = estimate_at = time.monotonic()
+        while True:
+            finished = ring.finished
+            rows = ring.peek(ROWS_AT_ONCE)
+            for row in rows:
+                own[:] = row
+                sample, command = layout.sample(own)
+                writer.write(sample)
+                if command is not None:
+                    writer.write_command(sample.stamp_ns, command)
+            count = len(rows)
+            del rows
+            ring.take(count)
+            written += count
+            now = time.monotonic()
+            drained = not count and (finished or port.orphaned)
+            if reader is not None and (now >= estimate_at or drained):
+                version = self._estimate(writer, reader, version)
+                estimate_at = now + self.job.estimate_s
+            if now >= flush_at or 2 * ring.kept > ring.rows:
+                writer.flush()
+                ring.give_back()
+                flush_at = now + HAND_OVER_S
+            if drained:
+                return written
+            if not count:
+                time.sleep(IDLE_S)
+
+    def _estimate(self, writer: McapWriter, reader: SnapshotReader, version: int) -> int:
+        snapshot = reader.read()
+        if snapshot.version == version:
+            return version
+        describe = asdict if self.job.describe is None else self.job.describe
+        writer.write_estimate(snapshot.stamp_ns, dict(describe(snapshot)))
+        return snapshot.version
+
+
+@dataclass(frozen=True)
+class DisplayTask:
+    """Run by the display's process."""
+
+    job: DisplayJob
+    ring: str
+    snapshot: str | None
+
+    def __call__(self, port: Port) -> None:
+        """Show until the ring is finished and drained."""
+        ring = Ring.attach(self.ring, touch=False)
+        reader = None if self.snapshot is None else SnapshotReader(self.snapshot)
+        try:
+            show = self.job.make()
+            port.ready()
+            begin = time.monotonic()
+            done = False
+            while not done:
+                done = (ring.finished and not ring.unread) or port.orphaned
+                snapshot = None if reader is None else reader.read()
+                elapsed_s = time.monotonic() - begin
+                show(View(ring.pushed, ring.unread, elapsed_s, snapshot, done))
+                if not done:
+                    time.sleep(self.job.period_s)
+        finally:
+            leave(False, [], ring, reader)

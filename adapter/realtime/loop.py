@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import os
+import select
 import signal
 import threading
 import time
@@ -14,20 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from adapter.controller import Controller
+from adapter.control.controller import Controller
 from adapter.realtime.clock import Clock
-from adapter.realtime.crew import Crew, CrewOptions
-from adapter.realtime.deadman import Deadman
-from adapter.realtime.jobs import LearnerJob, RecordingJob, WatchJob
-from adapter.realtime.rt import DEFAULT_PRIORITY, Grant, RealTime, split_cores
-from adapter.realtime.session import (
-    DURATION,
-    INTERRUPTED,
-    OPERATOR_GONE,
-    FrontEndLike,
-    Session,
-    stop_arm,
-)
+from adapter.realtime.jobs import Jobs
+from adapter.realtime.real_time import DEFAULT_PRIORITY, Grant, RealTime, split_cores
+from adapter.realtime.session import Ended, FrontEndLike, Session, stop_arm
+from adapter.realtime.supervisor import SharedMemoryOptions, Supervisor
 from adapter.realtime.timing import Timing, TimingReport
 from drivers.interface import Driver, DriverError, Intake, JointSample
 
@@ -35,6 +29,7 @@ LOOK_EVERY = 256  # ticks between two looks at the workers
 WALL_SHARE, WALL_EXTRA_S = 1.1, 2.0  # a run whose stamps stand still ends by the clock on the wall
 WARM_UP_TICKS = 500  # of made-up motion, for the compiler
 WARM_UP_REACH, WARM_UP_RATE = 0.02, 10.0  # rad, rad/s
+HUNG_UP = select.POLLHUP | select.POLLERR | select.POLLNVAL
 
 
 @dataclass(frozen=True)
@@ -46,14 +41,17 @@ class LiveOptions:
         priority: of SCHED_FIFO; None stays ordinary.
         lock_memory: whether to ask for it.
         deadman: stop safely as well when the operator's terminal or the parent process is gone.
-        crew: sizes and names of shared memory.
+        shared_memory: sizes and names.
+        before_motion: called once the motion is drawn (the controller knows it) and before the
+            first command; what it raises ends the run with the arm at rest.
     """
 
     duration_s: float | None = None
     priority: int | None = DEFAULT_PRIORITY
     lock_memory: bool = True
     deadman: bool = False
-    crew: CrewOptions = field(default_factory=CrewOptions)
+    shared_memory: SharedMemoryOptions = field(default_factory=SharedMemoryOptions)
+    before_motion: Callable[[], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class LiveResult:
         restarts: learners and recorders that followed one that died.
         recorded: samples in files; None without a recorder.
         unrecorded: the other samples: the recorder's ring had no room, or there was none.
-        ended: "duration", "interrupted", "operator_gone", "driver_error" or "end_of_stream".
+        ended: why.
         fault: what the driver or the controller said; None where all was well.
         timing: report.
         grants: what the operating system granted.
@@ -88,7 +86,7 @@ class LiveResult:
     restarts: int
     recorded: int | None
     unrecorded: int
-    ended: str
+    ended: Ended
     fault: str | None
     timing: TimingReport
     grants: list[Grant]
@@ -129,16 +127,38 @@ class StopSignals:
         self.count += 1
 
 
+class Deadman:
+    """Looks whether the operator is still there, some 2 µs a look.
+
+    The operator is gone when the terminal was closed, or the program that started this one ended.
+    Where standard input is no terminal (a service, a pipe), the parent process alone is watched.
+
+    Args:
+        terminal: file descriptor of the operator's terminal.
+    """
+
+    def __init__(self, terminal: int = 0) -> None:
+        self._parent = os.getppid()
+        self._poll: select.poll | None = None
+        if os.isatty(terminal):
+            self._poll = select.poll()
+            self._poll.register(terminal, 0)  # a hang-up is told without being asked for
+
+    def gone(self) -> bool:
+        """Whether nobody is there to stop the arm any more."""
+        if os.getppid() != self._parent:
+            return True
+        if self._poll is None:
+            return False
+        return any(event & HUNG_UP for _, event in self._poll.poll(0))
+
+
 def run_live(
     driver: Driver,
     front_end: FrontEndLike,
-    *,
     controller: Controller | None = None,
-    learner: LearnerJob | None = None,
-    recording: RecordingJob | None = None,
-    watch: WatchJob | None = None,
+    jobs: Jobs | None = None,
     options: LiveOptions | None = None,
-    before_motion: Callable[[], None] | None = None,
     say: Callable[[str], None] = print,
 ) -> LiveResult:
     """Run an arm live until the duration is over, somebody stops it or the driver fails.
@@ -152,10 +172,8 @@ def run_live(
         driver: not connected yet; closed at the end.
         front_end: fresh; takes the samples.
         controller: moves the arm; None only listens.
-        learner, recording, watch: jobs of the workers; None leaves them out.
+        jobs: of the workers.
         options: of the run.
-        before_motion: called once the motion is drawn (`controller` knows it) and before the
-            first command; what it raises ends the run with the arm at rest.
         say: takes lines for people; called in the loop only when a worker died.
 
     Raises:
@@ -164,56 +182,62 @@ def run_live(
         SharedMemoryError, SnapshotError, WorkerError: no memory, no workers.
         SettingsError: the arm cannot start from where it stands.
     """
-    options = options or LiveOptions()
+    options, jobs = options or LiveOptions(), jobs or Jobs()
     if controller is not None and not driver.can_move:
         raise DriverError("this source cannot move; run it in passive mode")
     tell = _without_fail(say)
-    watchman = Deadman() if options.deadman else None
+    deadman = Deadman() if options.deadman else None
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignals())
-        crew = Crew(driver, front_end.layout.size, learner, recording, watch, options.crew, tell)
-        stack.callback(crew.close)
-        crew.start(cancelled=lambda: stop.count > 0)
+        size = front_end.layout.size
+        supervisor = Supervisor(driver, size, jobs, options.shared_memory, tell)
+        stack.callback(supervisor.close)
+        supervisor.start(cancelled=lambda: stop.count > 0)
         stack.callback(driver.close)
         driver.connect()
-        clock, timing = Clock(driver.period_ns), Timing()
         real_time = RealTime(min(split_cores()[0]), options.priority, options.lock_memory)
         session = None
         try:
             session = Session(
-                driver, front_end, controller, crew.pass_on, crew.keep, options.duration_s
+                driver,
+                front_end,
+                controller,
+                supervisor.pass_on,
+                supervisor.keep,
+                options.duration_s,
             )
-            _prepare(driver, front_end, controller, crew, session)
-            if before_motion is not None:
-                before_motion()
+            loop = _Loop(driver, session, supervisor, stop, deadman)
+            _prepare(driver, front_end, controller, supervisor, session)
+            if options.before_motion is not None:
+                options.before_motion()
             with real_time:
                 for grant in real_time.grants:
                     tell(grant.line)
                 session.catch_up()
                 try:
-                    _loop(driver, session, crew, stop, watchman, clock, timing, options.duration_s)
+                    loop.run(options.duration_s)
                 finally:  # at once: an arm that hears nothing for 20 ms trips
                     stop_arm(driver, session)
         finally:
             stop_arm(driver, session)
             if controller is not None:
                 controller.detach()
-            collected = crew.finish(hurry=lambda: stop.count > 2)
+            collected = supervisor.finish(hurry=lambda: stop.count > 2)
         return LiveResult(
             samples=session.samples,
             set_aside=session.set_aside,
-            passed_on=crew.passed_on,
-            skipped=crew.skipped,
-            unlearned=crew.unlearned,
-            restarts=crew.restarts,
-            recorded=crew.recorded,
-            unrecorded=crew.unrecorded,
+            passed_on=supervisor.passed_on,
+            skipped=supervisor.skipped,
+            unlearned=supervisor.unlearned,
+            restarts=supervisor.restarts,
+            recorded=supervisor.recorded,
+            unrecorded=supervisor.unrecorded,
             ended=session.ended,
             fault=session.fault,
-            timing=timing.report(clock.missed, clock.missed_own),
+            timing=loop.report(),
             grants=real_time.grants,
             collected=collected,
-            troubles=crew.troubles,
+            troubles=supervisor.troubles,
             tracking=None if controller is None else controller.tracking(),
             intake=copy.deepcopy(driver.intake),
         )
@@ -233,12 +257,12 @@ def _prepare(
     driver: Driver,
     front_end: FrontEndLike,
     controller: Controller | None,
-    crew: Crew,
+    supervisor: Supervisor,
     session: Session,
 ) -> None:
     """All that takes long and only once: compile, draw the motion, attach the estimate."""
-    if controller is not None and crew.board is not None:
-        controller.attach(crew.board.name)
+    if controller is not None and supervisor.board is not None:
+        controller.attach(supervisor.board.name)
 
     def prepare(sample: JointSample) -> None:
         if controller is not None:
@@ -260,37 +284,53 @@ def _warm_up(front_end: FrontEndLike, sample: JointSample, period_ns: int) -> No
         front_end.step(replace(sample, stamp_ns=stamp_ns, q=q, dq=dq))
 
 
-def _loop(
-    driver: Driver,
-    session: Session,
-    crew: Crew,
-    stop: StopSignals,
-    watchman: Deadman | None,
-    clock: Clock,
-    timing: Timing,
-    duration_s: float | None,
-) -> None:
-    begin, ticks = time.monotonic(), 0
-    wall_s = None if duration_s is None else WALL_SHARE * duration_s + WALL_EXTRA_S
-    goes_on = True
-    while goes_on and stop.count < 2:
-        if not driver.paced:
-            timing.late(clock.wait())
-        samples = session.samples
-        goes_on = session.tick()
-        if session.samples > samples:
-            plant_ns = getattr(driver, "plant_time_ns", 0) if ticks else 0
-            age_ns = session.had_ns - driver.arrived_ns if driver.arrived_ns else None
-            ended_ns = time.monotonic_ns()
-            timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
-        ticks += 1
-        if stop.count:
-            session.begin_stop(INTERRUPTED)
-        if ticks % LOOK_EVERY == 0:
-            crew.look_after()
-            if watchman is not None and watchman.gone():
-                session.begin_stop(OPERATOR_GONE)
-            if wall_s is not None and time.monotonic() - begin > wall_s:
-                session.begin_stop(DURATION)
-    if stop.count > 1:
-        session.begin_stop(INTERRUPTED)
+class _Loop:
+    """The ticks of a run, each at its time."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        session: Session,
+        supervisor: Supervisor,
+        stop: StopSignals,
+        deadman: Deadman | None,
+    ) -> None:
+        self._driver, self._session, self._supervisor = driver, session, supervisor
+        self._stop, self._deadman = stop, deadman
+        self._clock, self._timing = Clock(driver.period_ns), Timing()
+
+    def run(self, duration_s: float | None) -> None:
+        """Tick until the session has come to its end, or somebody has no patience."""
+        driver, session, stop = self._driver, self._session, self._stop
+        begin, ticks = time.monotonic(), 0
+        wall_s = None if duration_s is None else WALL_SHARE * duration_s + WALL_EXTRA_S
+        goes_on = True
+        while goes_on and stop.count < 2:
+            if not driver.paced:
+                self._timing.late(self._clock.wait())
+            samples = session.samples
+            goes_on = session.tick()
+            if session.samples > samples:
+                self._note_times(first=not ticks)
+            ticks += 1
+            if stop.count:
+                session.begin_stop(Ended.INTERRUPTED)
+            if ticks % LOOK_EVERY == 0:
+                self._supervisor.look_after()
+                if self._deadman is not None and self._deadman.gone():
+                    session.begin_stop(Ended.OPERATOR_GONE)
+                if wall_s is not None and time.monotonic() - begin > wall_s:
+                    session.begin_stop(Ended.DURATION)
+        if stop.count > 1:
+            session.begin_stop(Ended.INTERRUPTED)
+
+    def _note_times(self, first: bool) -> None:
+        driver, session = self._driver, self._session
+        plant_ns = 0 if first else getattr(driver, "plant_time_ns", 0)
+        age_ns = session.had_ns - driver.arrived_ns if driver.arrived_ns else None
+        ended_ns = time.monotonic_ns()
+        self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
+
+    def report(self) -> TimingReport:
+        """What the timing was so far."""
+        return self._timing.report(self._clock.missed, self._clock.missed_own)

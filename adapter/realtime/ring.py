@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.fast import jit
+from adapter.model.spatial import Array
+from adapter.physics.kernels import jit
 from adapter.realtime.shared import SharedBlock, fence, free_bytes
-from adapter.records import Array
 
 # Places in the header; what different processes write lies in different cache lines.
 HEAD, TAIL, TAKEN, SKIPPED, OVERRUNS, FINISHED, ROWS, SIZE = 0, 8, 9, 10, 16, 17, 24, 25

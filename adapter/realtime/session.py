@@ -1,27 +1,42 @@
-"""One tick of an arm being learned, and when it ends: the same live and in lockstep."""
+"""One tick of an arm being learned, and when it ends: the same live and in lockstep.
+
+`run_lockstep` runs the ticks in one thread and without a clock, for trials and tests.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Protocol
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
 
-from adapter.controller import ControlError, Controller
-from adapter.errors import SettingsError
-from adapter.pace import Pace
-from adapter.records import Array, StateLayout
+from adapter.control.controller import Controller
+from adapter.control.sample_clock import SampleClock
+from adapter.errors import ControlError, SettingsError
+from adapter.model.spatial import Array
+from adapter.realtime.jobs import LearnerLike
+from adapter.signals.records import StateLayout
 from drivers.interface import Driver, DriverError, EndOfStream, JointSample
 
-DURATION, INTERRUPTED = "duration", "interrupted"
-DRIVER_ERROR, END_OF_STREAM, OPERATOR_GONE = "driver_error", "end_of_stream", "operator_gone"
 STOP_LIMIT_S = 5.0  # a safe stop that takes longer is left to the driver
 LEAP_NS = 1_000_000_000  # a longer step of the stamps is a clock that was set, not time gone by
 CATCH_UP_READS, FRESH_READS = 5000, 3  # at most, and at least: a driver may look one tick back
 START_READS = 200  # samples among which there has to be one that a motion can start from
 
 
+class Ended(StrEnum):
+    """Why a run came to its end."""
+
+    DURATION = "duration"
+    INTERRUPTED = "interrupted"
+    OPERATOR_GONE = "operator_gone"
+    DRIVER_ERROR = "driver_error"
+    END_OF_STREAM = "end_of_stream"
+
+
 class FrontEndLike(Protocol):
-    """What turns samples into filtered states; `adapter.front_end.FrontEnd` for one."""
+    """What turns samples into filtered states; `adapter.signals.front_end.FrontEnd` for one."""
 
     layout: StateLayout
 
@@ -44,7 +59,7 @@ class Session:
         samples: read so far.
         set_aside: read to get ready, before the first tick; nobody else saw them.
         elapsed_s: on the arm's own stamps; one that leaps by more than a second counts a period.
-        ended: why the run came to its end, one of the five constants above.
+        ended: why the run came to its end, see `Ended`.
         fault: what the driver or the controller said, or None.
         began_ns, had_ns, stepped_ns: instants (CLOCK_MONOTONIC) of the begin of the last tick's
             compute, of its sample being there and of its filtered state.
@@ -63,11 +78,11 @@ class Session:
         self._driver, self._front_end, self._controller = driver, front_end, controller
         self._pass_on, self._keep, self._duration_s = pass_on, keep, duration_s
         self.samples, self.set_aside, self.elapsed_s = 0, 0, 0.0
-        self.ended = DURATION
+        self.ended = Ended.DURATION
         self.fault: str | None = None
         self.began_ns = self.had_ns = self.stepped_ns = 0
         self.stopped = False
-        self._elapsed_ns, self._pace = 0, Pace(driver.period_ns, LEAP_NS)
+        self._elapsed_ns, self._clock = 0, SampleClock(driver.period_ns, LEAP_NS)
         self._stopping_at_s: float | None = None
         self._ready_sample: JointSample | None = None
         if controller is not None:
@@ -131,9 +146,9 @@ class Session:
         try:
             sample, self._ready_sample = self._ready_sample or driver.read(), None
         except EndOfStream as end:
-            return self._end(END_OF_STREAM, str(end))
+            return self._end(Ended.END_OF_STREAM, str(end))
         except DriverError as error:
-            return self._end(DRIVER_ERROR, str(error))
+            return self._end(Ended.DRIVER_ERROR, str(error))
         self.had_ns = time.monotonic_ns()
         if driver.paced:
             self.began_ns = self.had_ns  # until here it waited for the arm
@@ -145,7 +160,7 @@ class Session:
         command, trouble = self._move(sample)
         self._keep(sample, command)
         if trouble is not None:
-            return self._end(DRIVER_ERROR, trouble)
+            return self._end(Ended.DRIVER_ERROR, trouble)
         return self._goes_on(sample.stamp_ns)
 
     def _move(self, sample: JointSample) -> tuple[Array | None, str | None]:
@@ -159,7 +174,7 @@ class Session:
             return None, str(error)
         return tau, None
 
-    def begin_stop(self, why: str) -> None:
+    def begin_stop(self, why: Ended) -> None:
         """Begin the safe stop; the run ends when the arm rests. Later calls change nothing."""
         if self._stopping_at_s is None:
             self._stopping_at_s, self.ended = self.elapsed_s, why
@@ -167,18 +182,18 @@ class Session:
                 self._controller.begin_stop()
 
     def _goes_on(self, stamp_ns: int) -> bool:
-        self._elapsed_ns += self._pace.step(stamp_ns)
+        self._elapsed_ns += self._clock.step(stamp_ns)
         self.elapsed_s = 1e-9 * self._elapsed_ns
         if self._duration_s is not None and self.elapsed_s >= self._duration_s:
-            self.begin_stop(DURATION)
+            self.begin_stop(Ended.DURATION)
         if self._stopping_at_s is None:
             return True
         if self._controller is None or self._controller.at_rest:
             return False
         return self.elapsed_s < self._stopping_at_s + STOP_LIMIT_S
 
-    def _end(self, why: str, fault: str) -> bool:
-        self.ended, self.fault = why, None if why == END_OF_STREAM else fault
+    def _end(self, why: Ended, fault: str) -> bool:
+        self.ended, self.fault = why, None if why == Ended.END_OF_STREAM else fault
         return False
 
 
@@ -192,4 +207,66 @@ def stop_arm(driver: Driver, session: Session | None) -> None:
         driver.stop()
     except Exception as error:  # whatever it is, the files still have to be closed
         if session is not None and session.fault is None:
-            session.ended, session.fault = DRIVER_ERROR, str(error) or type(error).__name__
+            session.ended, session.fault = Ended.DRIVER_ERROR, str(error) or type(error).__name__
+
+
+@dataclass(frozen=True)
+class LockstepResult:
+    """What a lockstep run did; fields as in `LiveResult`."""
+
+    samples: int
+    set_aside: int
+    passed_on: int
+    ended: Ended
+    fault: str | None
+    tracking: dict[str, Any] | None
+
+
+def run_lockstep(
+    driver: Driver,
+    front_end: FrontEndLike,
+    learner: LearnerLike | None = None,
+    controller: Controller | None = None,
+    duration_s: float | None = None,
+    *,
+    each: Callable[[JointSample, Array | None], None] | None = None,
+) -> LockstepResult:
+    """Run an arm as fast as it goes; the learner sees what it would see live.
+
+    Args:
+        driver: not connected yet; stopped but left open at the end, for questions to it.
+        front_end: fresh.
+        learner: takes each filtered state before the next sample is read.
+        controller: moves the arm; None listens.
+        duration_s: of the arm's own stamps, until the safe stop begins; None runs to the end of
+            the stream.
+        each: called at the end of each tick with the sample and the command.
+
+    Raises:
+        DriverError: the arm cannot be reached.
+    """
+    passed_on = 0
+
+    def learn(record: Array) -> None:
+        nonlocal passed_on
+        passed_on += 1
+        if learner is not None:
+            learner.step(record)
+
+    def keep(sample: JointSample, command: Array | None) -> None:
+        if each is not None:
+            each(sample, command)
+
+    driver.connect()
+    session = Session(driver, front_end, controller, learn, keep, duration_s)
+    try:
+        if controller is not None:
+            session.get_ready(controller.prepare)
+        while session.tick():
+            pass
+    finally:
+        stop_arm(driver, session)
+    tracking = None if controller is None else controller.tracking()
+    return LockstepResult(
+        session.samples, session.set_aside, passed_on, session.ended, session.fault, tracking
+    )

@@ -16,6 +16,8 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from adapter.errors import MeansError
+
 SHM_FOLDER = Path("/dev/shm")
 KEEP_FREE = 4 << 20  # bytes of shared memory left to others
 _TRACKED_ALWAYS = sys.version_info < (3, 13)
@@ -39,7 +41,7 @@ def _fence(typing_context: Any) -> Any:
 fence: Any = _fence  # compiled code calls it without arguments
 
 
-class SharedMemoryError(RuntimeError):
+class SharedMemoryError(MeansError):
     """A block cannot be created or found; the message says what would do."""
 
 

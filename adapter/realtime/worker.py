@@ -1,4 +1,7 @@
-"""Processes beside the loop: started clean, watched, ended through their own handle alone."""
+"""Processes beside the loop: started clean, watched, followed by another where they die.
+
+A process is ended through its own handle alone.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,14 @@ import signal
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from enum import StrEnum
 from multiprocessing.connection import Connection
 from typing import Any
 
+from adapter.errors import MeansError
 from drivers.interface import DriverError
 
 # One thread per worker: libraries that bring a pool of their own read this when they are loaded.
@@ -22,12 +29,20 @@ KILL_WAIT_S = 5.0
 POLL_S = 0.05
 IDLE_S = 1e-3  # a worker without work looks again after so long
 ROWS_AT_ONCE = 16  # records between two looks at the clock
-READY, DONE, FAILED, REFUSED = "ready", "done", "failed", "refused"
 
-Body = Callable[["Port"], Any]
+Task = Callable[["Port"], Any]
 
 
-class WorkerError(RuntimeError):
+class Answer(StrEnum):
+    """What comes back from a worker process."""
+
+    READY = "ready"
+    DONE = "done"
+    FAILED = "failed"
+    REFUSED = "refused"
+
+
+class WorkerError(MeansError):
     """A worker could not start; the message says why."""
 
 
@@ -39,7 +54,7 @@ class Port:
 
     def ready(self) -> None:
         """The loop may begin."""
-        self._connection.send((READY, None))
+        self._connection.send((Answer.READY, None))
 
     @property
     def orphaned(self) -> bool:
@@ -47,8 +62,8 @@ class Port:
         return os.getppid() != self._parent
 
 
-def main(connection: Connection, parent: int, cores: set[int], nice: int, body: Body) -> None:
-    """What a worker process runs: `body`, and its result or its error back through the pipe."""
+def main(connection: Connection, parent: int, cores: set[int], nice: int, task: Task) -> None:
+    """What a worker process runs: `task`, and its result or its error back through the pipe."""
     # Ctrl-C and `kill` reach the whole process group; a worker ends when the loop says so.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -57,11 +72,11 @@ def main(connection: Connection, parent: int, cores: set[int], nice: int, body: 
         os.nice(nice)
     port = Port(connection, parent)
     try:
-        answer = DONE, body(port)
+        answer = Answer.DONE, task(port)
     except DriverError as error:
-        answer = REFUSED, str(error)
+        answer = Answer.REFUSED, str(error)
     except Exception:
-        answer = FAILED, traceback.format_exc()
+        answer = Answer.FAILED, traceback.format_exc()
     with suppress(BrokenPipeError, ConnectionResetError):  # nobody may be left to hear it
         connection.send(answer)
     connection.close()
@@ -72,27 +87,27 @@ class Worker:
 
     Args:
         name: for messages.
-        body: what it does; picklable, by name. Takes the `Port`, returns the result.
+        task: what it does; picklable, by name. Takes the `Port`, returns the result.
         cores: where it may run.
         nice: how much it yields.
 
     Attributes:
         trouble: why it ended without a result, or None.
         result: what it returned.
-        mortal: it failed in a way that a successor need not: it died or had an error, and was
-            not refused what it needs, nor given up.
+        replaceable: it died or had an error, which a successor need not; it was not refused what
+            it needs, nor given up.
     """
 
-    def __init__(self, name: str, body: Body, cores: set[int], nice: int = 0) -> None:
+    def __init__(self, name: str, task: Task, cores: set[int], nice: int = 0) -> None:
         self.name = name
         self.trouble: str | None = None
         self.result: Any = None
-        self.mortal = False
+        self.replaceable = False
         self._is_ready = False
         self._finished = False
         context = multiprocessing.get_context("spawn")
         self._connection, there = context.Pipe()
-        arguments = (there, os.getpid(), cores, nice, body)
+        arguments = (there, os.getpid(), cores, nice, task)
         self.process = context.Process(target=main, args=arguments, name=name, daemon=True)
         with _environment(ONE_THREAD):
             self.process.start()
@@ -121,10 +136,10 @@ class Worker:
                 self.kill()
                 raise WorkerError(f"the {self.name} was not ready within {timeout_s:.0f} s")
         kind, value = self._receive()
-        if kind == READY:
+        if kind == Answer.READY:
             self._is_ready = True
             return
-        if kind == REFUSED:
+        if kind == Answer.REFUSED:
             raise DriverError(value)
         raise WorkerError(f"the {self.name} could not start: {value}")
 
@@ -145,15 +160,15 @@ class Worker:
             self.kill()
             return
         kind, value = self._receive()
-        if kind == READY:  # nobody waited for it
+        if kind == Answer.READY:  # nobody waited for it
             self._is_ready = True
             self.finish(progress, stall_s, hurry)
             return
-        if kind == DONE:
+        if kind == Answer.DONE:
             self.result = value
         else:
             self.trouble = f"the {self.name} failed: {value}"
-            self.mortal = kind == FAILED
+            self.replaceable = kind == Answer.FAILED
         self.process.join(KILL_WAIT_S)
         self.kill()
 
@@ -186,7 +201,7 @@ class Worker:
             message: tuple[str, Any] = self._connection.recv()
         except (EOFError, OSError):
             self.process.join(KILL_WAIT_S)
-            return FAILED, f"its process died (exit code {self.process.exitcode})"
+            return Answer.FAILED, f"its process died (exit code {self.process.exitcode})"
         return message
 
 
@@ -203,3 +218,137 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ.pop(key, None)
             else:
                 os.environ[key] = value
+
+
+RESTARTS = 3  # successors of a worker; a fourth death is no accident
+
+
+class WorkerStarter:
+    """A thread that starts workers: that takes milliseconds, which a tick does not have.
+
+    It stays off the loop's core and takes no priority. Created before the loop asks for its own,
+    so that it inherits none of that.
+
+    Args:
+        cores: where it may run.
+    """
+
+    def __init__(self, cores: set[int]) -> None:
+        self._pool = ThreadPoolExecutor(1, "worker starter", _keep_to, (cores,))
+        self._pool.submit(int).result()  # the thread exists from here on
+
+    def start_worker(self, build: Callable[[], Worker]) -> Future[Worker]:
+        """Have a worker started; returns at once."""
+        return self._pool.submit(build)
+
+    def close(self) -> None:
+        """Let the thread end; may be called more than once."""
+        self._pool.shutdown()
+
+
+def _keep_to(cores: set[int]) -> None:
+    with suppress(OSError):
+        os.sched_setaffinity(0, cores)
+
+
+@dataclass(frozen=True)
+class RestartPolicy:
+    """What happens when a worker dies.
+
+    Attributes:
+        starter: starts those that follow.
+        most: how many may follow.
+        tell: takes a sentence on each that died.
+        lost: what it means for the run when nobody follows.
+    """
+
+    starter: WorkerStarter
+    most: int
+    tell: Callable[[str], None]
+    lost: str
+
+
+class RestartableWorker:
+    """A worker that is followed by another when it dies.
+
+    Args:
+        name: of the worker, for messages.
+        build: starts worker number k = 0, 1, ...
+        policy: what happens when it dies.
+
+    Attributes:
+        restarts: how many followed.
+        worker: the present one, None while there is none.
+    """
+
+    def __init__(self, name: str, build: Callable[[int], Worker], policy: RestartPolicy) -> None:
+        self.name, self.restarts = name, 0
+        self._build, self._policy = build, policy
+        self._next: Future[Worker] | None = None  # being started
+        self._started: list[Future[Worker]] = []
+        self.worker: Worker | None = build(0)
+
+    @property
+    def held(self) -> bool:
+        """A worker is here, or will be soon."""
+        return self.worker is not None or self._next is not None
+
+    def look_after(self) -> None:
+        """Notice a death and have a successor started; never waits."""
+        if self._next is not None:
+            if self._next.done():
+                self._take(self._next)
+        elif self.worker is not None and not self.worker.alive:
+            worker, self.worker = self.worker, None
+            worker.finish(lambda: 0, stall_s=0.0)
+            self._replace(worker)
+
+    def finish(self, progress: Callable[[], int], hurry: Callable[[], bool]) -> Worker | None:
+        """Wait for the end of the work, whoever does it; the worker that did, or None."""
+        while self.held:
+            if self._next is not None:
+                self._await(self._next, hurry)
+                continue
+            worker = self.worker
+            assert worker is not None
+            worker.finish(progress, hurry=hurry)
+            if worker.trouble is None:
+                return worker
+            self.worker = None
+            self._replace(worker)
+        return None
+
+    def kill(self) -> None:
+        """End every worker started, once the starter is closed; may be called more than once."""
+        if self.worker is not None:
+            self.worker.kill()
+        for future in self._started:
+            if future.exception() is None:
+                future.result().kill()
+
+    def _replace(self, worker: Worker) -> None:
+        policy, trouble = self._policy, worker.trouble or f"the {self.name} ended early"
+        if worker.replaceable and self.restarts < policy.most:
+            self.restarts += 1
+            k = self.restarts
+            policy.tell(f"{trouble}; a new one starts ({k} of {policy.most})")
+            self._next = policy.starter.start_worker(lambda: self._build(k))
+            self._started.append(self._next)
+        else:
+            policy.tell(f"{trouble}; {policy.lost}")
+
+    def _await(self, future: Future[Worker], hurry: Callable[[], bool]) -> None:
+        while not wait([future], POLL_S).done:
+            if hurry():
+                self._next = None
+                self._policy.tell(f"nobody waited for a new {self.name}; {self._policy.lost}")
+                return
+        self._take(future)
+
+    def _take(self, future: Future[Worker]) -> None:
+        self._next, error = None, future.exception()
+        if error is None:
+            self.worker = future.result()
+        else:
+            why = f"{type(error).__name__}: {error}"
+            self._policy.tell(f"a new {self.name} could not start: {why}; {self._policy.lost}")

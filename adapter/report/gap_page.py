@@ -11,7 +11,7 @@ import numpy as np
 from adapter.gap.phrases import DASH, listed, plain
 from adapter.gap.result import GapResult, Leftover
 from adapter.gap.words import fall, headline, signal_words
-from adapter.records import Array
+from adapter.model.spatial import Array
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
 from adapter.report.gap_tables import (

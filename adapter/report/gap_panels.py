@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from adapter.gap.result import GapResult
-from adapter.records import Array
+from adapter.model.spatial import Array
 from adapter.report.style import ACCENT, GOAL, GRID, MUTED, Drawing, Panel, power_of_ten, time_axis
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def error_panels(result: GapResult) -> list[Panel]:
@@ -35,6 +37,8 @@ def _any(values: Array) -> bool:
 
 def _steps(before: Array, after: Array, noise: Array | None) -> Drawing:
     """An arrow per joint from its error before to that after, on a logarithmic scale."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter
+
     drawing = Drawing("half")
     ax = drawing.axes[0]
     ax.set_yscale("log")
@@ -58,6 +62,8 @@ def _steps(before: Array, after: Array, noise: Array | None) -> Drawing:
 
 def _log_scale(ax: Axes, tables: Sequence[Array]) -> None:
     """Limits that hold everything, and ticks at 1, 2 and 5 times powers of ten."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
     values = np.concatenate([np.asarray(x, dtype=float) for x in tables])
     values = values[np.isfinite(values) & (values > 0.0)]
     low, high = values.min() / 1.5, values.max() * 1.5

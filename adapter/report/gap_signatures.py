@@ -5,16 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 
 from adapter.gap.phrases import plain
 from adapter.gap.result import Curves, GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
-from adapter.records import Array
+from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
     GOAL,
@@ -26,6 +24,9 @@ from adapter.report.style import (
     thin,
     time_axis,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 MOST_JOINTS = 3  # with signatures
 MOST_DOTS = 500  # of one cloud; a panel shows no more
@@ -138,6 +139,9 @@ def _noise_band(ax: Axes, noise: float) -> None:
 
 def _dots(ax: Axes, x: Array, y: Array, color: str) -> None:
     """A cloud as one path of round dots: a marker each would make the page ten times as long."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
     keep = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not keep.size:
         return

@@ -10,7 +10,7 @@ import numpy as np
 from adapter.gap.phrases import DASH, THETA, THETA_UNITS, parameter_lines, plain, who
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.words import percent, span, title_of
-from adapter.records import Array
+from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW
 

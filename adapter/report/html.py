@@ -6,15 +6,21 @@ import os
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from adapter.run_folder import RunFolderError
+from adapter.runs.run_folder import RunFolderError
 
 
-def fill(template: str, context: dict[str, Any]) -> str:
-    """The page as HTML text; everything that is not markup already is escaped."""
+def fill(template: str, context: dict[str, Any], package: str = "adapter.report") -> str:
+    """The page as HTML text; everything that is not markup already is escaped.
+
+    Args:
+        template: file name in a folder `templates` of `package`, or of this one.
+        context: what it shows.
+        package: for pages of other rooms; they may include the macros and the style from here.
+    """
     environment = Environment(
-        loader=PackageLoader("adapter", "templates"),
+        loader=ChoiceLoader([PackageLoader(p, "templates") for p in (package, __package__)]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from adapter.gap.monitor_book import sentence
-from adapter.model import LAMBDA_MEASURED
+from adapter.gap.monitor_judge import sentence
+from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report import tables, words
 from adapter.report.html import fill, write_whole
 from adapter.report.schema_panels import schema_panels
@@ -23,8 +23,8 @@ from adapter.report.torque_panels import (
     theta_panels,
     theta_started,
 )
-from adapter.run_folder import RunData
-from adapter.score import TORQUE_GOAL
+from adapter.runs.run_folder import RunData
+from adapter.runs.score import TORQUE_GOAL
 
 TEMPLATE = "report.html"
 MOST_TILES = 5  # side by side

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.identifiability import FrameObservability, frame_observability
-from adapter.outcome import frame_errors
-from adapter.records import Array
+from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
+from adapter.physics.identifiability import FrameObservability, frame_observability
 from adapter.report.style import (
     Drawing,
     Panel,
@@ -19,9 +18,9 @@ from adapter.report.style import (
     thin_rows,
     time_axis,
 )
-from adapter.run_folder import RunData
-from adapter.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
-from adapter.spatial import log_rotation, matrix_from_zxz
+from adapter.runs.outcome import frame_errors
+from adapter.runs.run_folder import RunData
+from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
 SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge

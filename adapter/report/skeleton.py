@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
 
-from adapter.records import Array
+from adapter.model.spatial import Array, exp_rotation, log_rotation, matrix_from_zxz, rot_z
+from adapter.model.tree import BASE, Tree
 from adapter.report.schema_panels import observable
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
-from adapter.run_folder import RunData
-from adapter.spatial import exp_rotation, log_rotation, matrix_from_zxz, rot_z
-from adapter.tree import BASE, Tree
+from adapter.runs.run_folder import RunData
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Projection = Callable[[Array], Array]  # points (..., 3) to the drawing plane (..., 2)
 STYLES: dict[str, dict[str, Any]] = {

@@ -11,16 +11,16 @@ import itertools
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 from markupsafe import Markup, escape
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from adapter.records import Array
+from adapter.model.spatial import Array
+
+if TYPE_CHECKING:  # loaded where a panel is drawn: takes long, and not every run has a page
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 JOINT_COLORS = 8  # the page defines --j1 to --j8; more joints go round again
 _NAMES = ("ink", "muted", "grid", "accent", "goal", *(f"j{k + 1}" for k in range(JOINT_COLORS)))
@@ -65,11 +65,15 @@ class Drawing:
     def __init__(
         self, size: str, rows: Sequence[float] = (1.0,), bare: bool = False, stretch: float = 1.0
     ) -> None:
+        from matplotlib import rc_context
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+        from matplotlib.figure import Figure
+
         width, height, text = SIZES[size]
         self.size = size
         self.figure = Figure(figsize=(width, height * stretch))
         FigureCanvasSVG(self.figure)
-        with mpl.rc_context({"font.size": text, "axes.linewidth": 0.6}):
+        with rc_context({"font.size": text, "axes.linewidth": 0.6}):
             self.axes: list[Axes] = list(
                 np.ravel(
                     self.figure.subplots(
@@ -93,6 +97,8 @@ class Drawing:
 
 
 def _dress(ax: Axes, text: float, bare: bool) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     ax.set_facecolor("none")
     if bare:
         ax.set_axis_off()
@@ -119,6 +125,8 @@ def time_axis(drawing: Drawing, label: str = "time after the first motion, s") -
 
 def log_axis(ax: Axes, low: float, high: float) -> None:
     """A logarithmic y axis with powers of ten written out."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
     ax.set_yscale("log")
     ax.set_ylim(low, high)
     ax.yaxis.set_major_locator(LogLocator(10, numticks=7))
@@ -128,6 +136,8 @@ def log_axis(ax: Axes, low: float, high: float) -> None:
 
 def log_time(ax: Axes, first_s: float, last_s: float) -> None:
     """A logarithmic time axis from `first_s` to `last_s`."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
     ax.set_xscale("log")
     ax.set_xlim(first_s, max(last_s, 2 * first_s))
     ax.xaxis.set_major_locator(LogLocator(10, subs=(1.0, 2.0, 5.0), numticks=12))
@@ -203,9 +213,11 @@ def thin_rows(t: Array, rows: Array, most: int = MOST_POINTS) -> tuple[Array, Ar
 
 def _svg(figure: Figure, label: str, size: str) -> Markup:
     """The figure as inline SVG in the page's colours, without any reference to the outside."""
+    from matplotlib import rc_context
+
     buffer = io.StringIO()
     names = ("Date", "Creator", "Format", "Type")
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "panda-adapter"}):
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "panda-adapter"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata=dict.fromkeys(names))
     text = buffer.getvalue()
     box = re.search(r'viewBox="([^"]+)"', text)

@@ -13,7 +13,7 @@ from adapter.effects.active import active_effects
 from adapter.effects.base import ALL
 from adapter.report.torque_panels import EFFECT_UNITS, SHARE_ALONE, theta_started
 from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
-from adapter.run_folder import RunData
+from adapter.runs.run_folder import RunData
 
 THETA_NAMES = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from adapter.effects import effects_by_name
-from adapter.records import Array
+from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
     GOAL,
@@ -21,8 +20,8 @@ from adapter.report.style import (
     thin_rows,
     time_axis,
 )
-from adapter.run_folder import RunData
-from adapter.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
+from adapter.runs.run_folder import RunData
+from adapter.runs.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
 
 SHOWN_FIT_S = 20.0  # of the end of the run
 SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
@@ -168,6 +167,8 @@ def fit_window(data: RunData) -> Array:
 
 def fit_panels(data: RunData) -> list[Panel]:
     """Measured torque, the learned model's, and what is left, one panel per joint."""
+    from matplotlib.ticker import MaxNLocator
+
     rows = fit_window(data)
     t = data.times(data.score_trace)[rows]
     tau, fit = data.score_signals()[3][rows], data.fit[rows]

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from adapter.model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.model import LAMBDA_MEASURED
-from adapter.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL
+from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
+from adapter.model.self_model import LAMBDA_MEASURED
+from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here

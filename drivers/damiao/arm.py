@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -10,31 +9,22 @@ import can
 import numpy as np
 
 from drivers.damiao import codec
-from drivers.damiao.brake import Braker
 from drivers.damiao.bus import MulticastWire, Wire, open_bus, wire_of
-from drivers.damiao.bus_time import budget
-from drivers.damiao.codec import CODES, MIT_MODE, TIMEOUT_UNIT_S, Limits
-from drivers.damiao.dialogue import Dialogue
-from drivers.damiao.guard import Guard, former_guardian
-from drivers.damiao.holding import brake, settle
-from drivers.damiao.inbox import Inbox
-from drivers.damiao.link import Link
-from drivers.damiao.motors import type_of
-from drivers.damiao.post import DRIVE
+from drivers.damiao.codec import MIT_MODE, TIMEOUT_UNIT_S, Scales
+from drivers.damiao.connect import Dialogue
+from drivers.damiao.guardian import GuardianMode
+from drivers.damiao.guardian_client import GuardianClient, former_guardian
+from drivers.damiao.holding import Braker, brake, settle
+from drivers.damiao.limits import torque_frames
 from drivers.damiao.settings import VIRTUAL, BusSettings
 from drivers.damiao.speed_check import SpeedCheck
+from drivers.damiao.stream import MotorStream, ReplyIntake
+from drivers.damiao.tables import type_of
 from drivers.interface import Array, DriverError, Intake, JointSample
 
 WATCHDOG_S = 0.5  # without a command for so long a motor lets go: a last resort, own choice
 FIRST_ROUNDS, ROUND_TIMEOUT_S = 2, 0.1  # replies that the first sample lies between
 CARRIED_SHARE = 0.02  # of each tick's torque in the mean that carries a braked arm: 50 ms
-# The torque command of each code, with nothing else: q, dq, kp, kd zero. The same for all types.
-TORQUE_FRAMES = [
-    codec.mit_command(Limits(1.0, 1.0, 1.0))[:6] + code.to_bytes(2, "big")
-    for code in range(CODES + 1)
-]
-
-
 DELAY_PERIODS = 5  # halves of one: a sample is one old, a command on the bus most of one, held one
 
 
@@ -76,9 +66,7 @@ class DamiaoArm:
     ) -> None:
         self.settings = settings = BusSettings.of(address, joint_names)
         self._joints = n = settings.joints
-        self.budget = budget(
-            n, settings.rate_hz, settings.fd, settings.bitrate, settings.data_bitrate
-        )
+        self.budget = settings.budget
         self.joint_names = tuple(joint_names or (f"joint{j + 1}" for j in range(n)))
         self.link_names = tuple(f"link{j + 1}" for j in range(n))
         self.period_ns = 1_000_000_000 // settings.rate_hz
@@ -86,15 +74,15 @@ class DamiaoArm:
         self.can_move = allow_motion
         self.intake = Intake()
         self.arrived_ns = 0
-        self.limits: list[Limits] = []
+        self.limits: list[Scales] = []
         self._given_bus, self._now_ns, self._wall_ns = bus, now_ns, wall_ns
         self._bus: can.BusABC | None = None
-        self._guard: Guard | None = None
+        self._guardian: GuardianClient | None = None
 
     @property
     def guardian_pid(self) -> int | None:
         """See the class."""
-        return None if self._guard is None else self._guard.pid
+        return None if self._guardian is None else self._guardian.pid
 
     def connect(self) -> None:
         """Open the bus, ask the motors who they are; with leave to move, enable and hold them.
@@ -126,34 +114,33 @@ class DamiaoArm:
             self._take_charge(talk, mode)
         else:
             talk.need_health(talk.refresh(self.limits))
-        self._inbox = inbox = Inbox(
+        self._replies = replies = ReplyIntake(
             self._wire,
             self.settings,
             self.limits,
             self.intake,
             talk.echoes or (self.settings.guardian and self.settings.interface != VIRTUAL),
             self.can_move,
-            round(1e3 * self.budget.reply_us),
         )
-        self._link = Link(self._wire, self.settings, inbox, self._now_ns, self._wall_ns)
+        self._stream = MotorStream(self._wire, self.settings, replies, self._now_ns, self._wall_ns)
         if isinstance(self._wire, MulticastWire):
             self._wire.ignore(self.settings.ids[-1] + 1)
-        inbox.others_ask = self._guard is not None
+        replies.others_ask = self._guardian is not None
         self._say_what_is_unusual()
         self._say_who_holds()
-        self._link.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
+        self._stream.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
         if self.can_move:
             self._settle()
-            self._link.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
+            self._stream.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
 
     def _take_charge(self, talk: Dialogue, mode: Sequence[float]) -> None:
         """Enable the motors and hold the arm where it is."""
         self._relieved: int | None = None
         if self.settings.guardian and self.settings.interface != VIRTUAL:
-            self._guard = Guard(self.settings, self.limits)
+            self._guardian = GuardianClient(self.settings, self.limits)
         if any(value != MIT_MODE for value in mode):
             talk.write(codec.CTRL_MODE, MIT_MODE)
-        if self._guard is None and any(talk.register(codec.TIMEOUT)):
+        if self._guardian is None and any(talk.register(codec.TIMEOUT)):
             talk.write(codec.TIMEOUT, 0)  # nobody feeds it while the loop prepares
         states = talk.enable(self.limits)
         q, dq = [now.q for now in states], [now.dq for now in states]
@@ -161,42 +148,42 @@ class DamiaoArm:
         hold = Braker(self.limits, self._carried, q).commands(0.0, q, dq)
         requests = list(zip(self.settings.ids, hold, strict=True))
         talk.need_health(talk.states(self.limits, requests))
-        if self._guard is not None:
-            self._guard.post.put(q, dq, self._carried)
-            self._guard.post.hold(q)
-            self._relieved = self._guard.relieve_former()
+        if self._guardian is not None:
+            self._guardian.memory.put(q, dq, self._carried)
+            self._guardian.memory.hold(q)
+            self._relieved = self._guardian.relieve_former()
             talk.write(codec.TIMEOUT, round(WATCHDOG_S / TIMEOUT_UNIT_S))
 
     def _settle(self) -> None:
         """See `holding.settle`; the guardian watches meanwhile and holds afterwards."""
         self._driving = True
         self._beat()
-        if self._guard is not None:
-            self._guard.post.mode = DRIVE
-        hold, self._carried = settle(self._link, self.limits, self._carried, self._beat)
+        if self._guardian is not None:
+            self._guardian.memory.mode = GuardianMode.DRIVE
+        hold, self._carried = settle(self._stream, self.limits, self._carried, self._beat)
         self._hand_over(hold)
 
     def _hand_over(self, hold: Sequence[float]) -> None:
         """From driving to holding at these angles."""
         self._driving = False
-        if self._guard is not None:
-            self._guard.post.put(*self._link.motion(), self._carried)
-            self._guard.post.hold(hold)
-            self._inbox.others_ask = True
+        if self._guardian is not None:
+            self._guardian.memory.put(*self._stream.motion(), self._carried)
+            self._guardian.memory.hold(hold)
+            self._replies.others_ask = True
 
     def _say_what_is_unusual(self) -> None:
         strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
         if strange:
-            self._inbox.note(
+            self._replies.note(
                 "type",
                 f"motors {', '.join(map(str, strange))} scale as no known type does (motor "
                 f"{strange[0]}: {self.limits[strange[0] - 1]}); their own registers are used",
             )
 
     def _say_who_holds(self) -> None:
-        say = self._inbox.note
-        if self._guard is not None:
-            pid = self._guard.pid
+        say = self._replies.note
+        if self._guardian is not None:
+            pid = self._guardian.pid
             former = f" (it has relieved process {self._relieved})" if self._relieved else ""
             say(
                 "guardian",
@@ -213,7 +200,7 @@ class DamiaoArm:
         elif self.settings.interface != VIRTUAL:
             holder = former_guardian(self.settings)
             if holder is not None:
-                self._inbox.others_ask = True
+                self._replies.others_ask = True
                 say("held", f"process {holder} holds this arm; this program only listens")
 
     def read(self) -> JointSample:
@@ -225,13 +212,13 @@ class DamiaoArm:
             DriverError: a motor is silent, hot or in a fault, or the bus is off or gone.
         """
         self._need_open()
-        link = self._link
-        link.receive()
-        stamp_ns = link.asked_ns if link.fresh else self._now_ns() - self.period_ns
+        stream = self._stream
+        stream.receive()
+        stamp_ns = stream.asked_ns if stream.fresh else self._now_ns() - self.period_ns
         if stamp_ns <= self._last_ns:
             stamp_ns = self._last_ns + 1
-        self._last_ns, link.fresh = stamp_ns, False
-        values, whole = self._inbox.sample_at(stamp_ns)
+        self._last_ns, stream.fresh = stamp_ns, False
+        values, whole = self._replies.sample_at(stamp_ns)
         n = self._joints
         table = np.array(values)
         q, dq, tau = table[:n], table[n : 2 * n], table[2 * n :]
@@ -241,9 +228,9 @@ class DamiaoArm:
                 self._report(values)
         else:
             self._speed.skip()
-        self.arrived_ns = self._inbox.arrived_ns
+        self.arrived_ns = self._replies.arrived_ns
         if not self._commanded:
-            link.ask()
+            stream.ask()
         self._commanded = False
         return JointSample(stamp_ns, q, dq, tau)
 
@@ -257,19 +244,14 @@ class DamiaoArm:
         self._need_open()
         if not self.can_move:
             raise DriverError("this CAN arm may not be moved; allow motion first")
-        wanted = np.asarray(tau, dtype=np.float64).tolist()
-        if not isinstance(wanted, list) or len(wanted) != len(self._tau_max):
-            raise DriverError(f"a command is {len(self._tau_max)} torques, N m")
-        frames = []
-        for value, most in zip(wanted, self._tau_max, strict=True):
-            if not -most <= value <= most:
-                value = self._cut(value, most)
-            frames.append(TORQUE_FRAMES[int((value + most) / (most + most) * CODES)])
+        frames, cut = torque_frames(tau, self._tau_max)
+        if cut:
+            self._replies.note("cut", "a torque beyond a motor's TMAX was cut")
         if not self._driving:
             self._start_driving()
         self._beat()
         self._commanded = True
-        self._link.command(frames)
+        self._stream.command(frames)
 
     def stop(self) -> None:
         """Brake a driven arm and hold it where it comes to rest; it goes on being held.
@@ -279,11 +261,11 @@ class DamiaoArm:
         if self._bus is None or not self._driving:
             return
         self._driving = False
-        if self._guard is not None and not self._guard.alive:
-            self._inbox.note("guardian gone", "the process that held the arm is gone; start anew")
-        self._hand_over(brake(self._link, self.limits, self._carried, self._beat))
-        held = "the guardian process" if self._guard is not None else "its motors' last command"
-        self._inbox.note("stopped", f"the arm was braked and stands; {held} holds it")
+        if self._guardian is not None and not self._guardian.alive:
+            self._replies.note("guardian gone", "the process that held the arm is gone; start anew")
+        self._hand_over(brake(self._stream, self.limits, self._carried, self._beat))
+        held = "the guardian process" if self._guardian is not None else "its motors' last command"
+        self._replies.note("stopped", f"the arm was braked and stands; {held} holds it")
 
     def close(self) -> None:
         """Release the bus; a driven arm is stopped first, and goes on being held."""
@@ -292,7 +274,7 @@ class DamiaoArm:
         try:
             self.stop()
         finally:
-            self._inbox.finish(on_the_way=self._link.fresh)
+            self._replies.finish(on_the_way=self._stream.fresh)
             self._shut()
 
     def _need_open(self) -> None:
@@ -304,33 +286,27 @@ class DamiaoArm:
         if self._bus is not None and self._given_bus is None:
             self._bus.shutdown()
         self._bus = None
-        if self._guard is not None:
-            self._guard.leave()
-            self._guard = None
+        if self._guardian is not None:
+            self._guardian.leave()
+            self._guardian = None
 
     def _beat(self) -> None:
         """Tell the guardian that commands come."""
-        if self._guard is None:
+        if self._guardian is None:
             return
-        self._guard.post.beat_ns = self._now_ns()
-        if self._guard.post.taken:
-            self._inbox.note(
+        self._guardian.memory.beat_ns = self._now_ns()
+        if self._guardian.memory.taken:
+            self._replies.note(
                 "taken", "no command came for 50 ms; the guardian braked the arm until the next one"
             )
 
-    def _cut(self, value: float, most: float) -> float:
-        if not math.isfinite(value):
-            raise DriverError("a torque to be commanded is not a finite number")
-        self._inbox.note("cut", "a torque beyond a motor's TMAX was cut")
-        return math.copysign(most, value)
-
     def _start_driving(self) -> None:
         """From holding to driving: the guardian's replies are not ours."""
-        if self._guard is not None:
-            self._inbox.discard()
+        if self._guardian is not None:
+            self._replies.discard()
             self._beat()
-            self._guard.post.mode = DRIVE
-        self._driving, self._inbox.others_ask = True, False
+            self._guardian.memory.mode = GuardianMode.DRIVE
+        self._driving, self._replies.others_ask = True, False
 
     def _report(self, values: list[float]) -> None:
         """Keep what the arm must be carried with, here and with the guardian."""
@@ -339,5 +315,5 @@ class DamiaoArm:
             old + CARRIED_SHARE * (new - old)
             for old, new in zip(self._carried, values[2 * n :], strict=True)
         ]
-        if self._guard is not None:
-            self._guard.post.put(values[:n], values[n : 2 * n], self._carried)
+        if self._guardian is not None:
+            self._guardian.memory.put(values[:n], values[n : 2 * n], self._carried)

@@ -35,7 +35,7 @@ class WireError(ValueError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class Scales:
     """What full scale means, from the motor's registers 21, 22 and 23.
 
     Attributes:
@@ -60,7 +60,7 @@ class State:
     """A motor's reply.
 
     Attributes:
-        status: high nibble of byte 0, see `drivers.damiao.motors`.
+        status: high nibble of byte 0, see `drivers.damiao.tables`.
         motor: low four bits of the motor's id.
         q, dq, tau: rad, rad/s, N m at the output shaft.
         mosfet_degc, rotor_degc: temperatures.
@@ -93,7 +93,7 @@ def value_of(code: int, low: float, high: float, top: int) -> float:
 
 
 def mit_command(
-    limits: Limits,
+    limits: Scales,
     q: float = 0.0,
     dq: float = 0.0,
     kp: float = 0.0,
@@ -122,7 +122,7 @@ def mit_command(
     return word.to_bytes(FRAME_BYTES, "big")
 
 
-def state(limits: Limits, data: bytes | bytearray) -> State:
+def state(limits: Scales, data: bytes | bytearray) -> State:
     """What a motor replied. Raises WireError where there are not eight bytes."""
     _need_eight(data)
     word = int.from_bytes(data, "big")

@@ -1,4 +1,6 @@
-"""A process of its own that brakes and holds the arm where the loop's process does not.
+"""What the loop's process tells its guardian, in memory that both have mapped.
+
+A process of its own that brakes and holds the arm where the loop's process does not.
 
 These motors have no brakes. A motor that hears nothing keeps its last command until its time-out
 (register 9), and then lets go: after a `kill -9` of the loop the arm would first go on as it was
@@ -8,7 +10,7 @@ driven and then fall. So this process, with its own handle on the bus, takes ove
 - when no command has come for `SILENCE_NS` although the arm is being driven;
 - when the loop asks for it: before its first command, and after its stop.
 
-It sends the commands of `drivers.damiao.brake` at 200 Hz, until
+It sends the commands of `drivers.damiao.holding` at 200 Hz, until
 
 - the next driver connects with leave to move and sends SIGUSR1 once it holds the arm itself;
 - SIGTERM: it lets the arm sink over 3 s against damping, then disables the motors;
@@ -19,25 +21,115 @@ from __future__ import annotations
 
 import fcntl
 import json
+import mmap
 import os
 import signal
 import stat
+import struct
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from enum import IntEnum
 from pathlib import Path
 from types import FrameType
+from typing import IO
 
 import can
 
 from drivers.damiao import codec
-from drivers.damiao.brake import SINK_S, Braker
 from drivers.damiao.bus import message_for, open_bus, wire_of
-from drivers.damiao.codec import Limits, WireError
-from drivers.damiao.post import DRIVE, HOLD, IDLE, RELEASED, Post
+from drivers.damiao.codec import Scales, WireError
+from drivers.damiao.holding import SINK_S, Braker
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
+
+
+class GuardianMode(IntEnum):
+    """What the guardian is to do."""
+
+    IDLE = 0  # nothing
+    DRIVE = 1  # take over when commands stop coming
+    HOLD = 2  # hold the arm now
+    RELEASED = 3  # go
+
+
+MOST_JOINTS = 15
+HEAD_BYTES = 64
+ROWS = 4  # held angle, angle, speed, torque
+BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
+
+
+class GuardianMemory:
+    """The shared block.
+
+    The loop writes, the guardian reads, except for `taken`. Each number is written as a whole;
+    numbers of one tick may be mixed with the next one's, which is 1 ms later.
+
+    Args:
+        file: of `BLOCK_BYTES`, open for reading and writing.
+        joints: of the arm.
+    """
+
+    def __init__(self, file: IO[bytes] | int, joints: int) -> None:
+        fileno = file if isinstance(file, int) else file.fileno()
+        self._map = mmap.mmap(fileno, BLOCK_BYTES)
+        self._head = memoryview(self._map)[:HEAD_BYTES].cast("q")
+        self._joints = joints
+        self._row = struct.Struct(f"{joints}d")
+        self._rows = struct.Struct(f"{3 * joints}d")
+
+    @property
+    def mode(self) -> GuardianMode:
+        """What the guardian is to do."""
+        return GuardianMode(self._head[0])
+
+    @mode.setter
+    def mode(self, mode: GuardianMode) -> None:
+        self._head[0] = mode
+
+    @property
+    def beat_ns(self) -> int:
+        """CLOCK_MONOTONIC instant of the last command."""
+        return self._head[1]
+
+    @beat_ns.setter
+    def beat_ns(self, now_ns: int) -> None:
+        self._head[1] = now_ns
+
+    @property
+    def taken(self) -> int:
+        """How often the guardian has taken a driven arm over."""
+        return self._head[2]
+
+    def count_taken(self) -> None:
+        """The guardian takes over."""
+        self._head[2] += 1
+
+    def put(self, q: Sequence[float], dq: Sequence[float], tau: Sequence[float]) -> None:
+        """Where the arm is, rad, how fast, rad/s, and what carries it, N m."""
+        self._rows.pack_into(self._map, HEAD_BYTES + self._row.size, *q, *dq, *tau)
+
+    def motion(self) -> tuple[list[float], list[float], list[float]]:
+        """(q, dq, tau) as `put` wrote them."""
+        values = self._rows.unpack_from(self._map, HEAD_BYTES + self._row.size)
+        n = self._joints
+        return list(values[:n]), list(values[n : 2 * n]), list(values[2 * n :])
+
+    def hold(self, q: Sequence[float]) -> None:
+        """Hold these angles from now on, rad."""
+        self._row.pack_into(self._map, HEAD_BYTES, *q)
+        self.mode = GuardianMode.HOLD
+
+    def held(self) -> list[float]:
+        """Angles to hold, rad."""
+        return list(self._row.unpack_from(self._map, HEAD_BYTES))
+
+    def close(self) -> None:
+        """Unmap; may be called more than once."""
+        self._head.release()
+        self._map.close()
+
 
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
@@ -51,20 +143,20 @@ class Guardian:
     Args:
         settings: of the bus, which it opens itself.
         limits: of each motor.
-        post: from the loop.
+        memory: from the loop.
         parent: process id of the loop.
     """
 
     def __init__(
-        self, settings: BusSettings, limits: Sequence[Limits], post: Post, parent: int
+        self, settings: BusSettings, limits: Sequence[Scales], memory: GuardianMemory, parent: int
     ) -> None:
-        self._settings, self._limits, self._post, self._parent = settings, limits, post, parent
+        self._settings, self._limits, self._memory, self._parent = settings, limits, memory, parent
         self._bus = open_bus(settings)
         self._wire = wire_of(self._bus)
         self._messages = [message_for(settings, can_id, codec.ENABLE) for can_id in settings.ids]
         self._index = {can_id: j for j, can_id in enumerate(settings.reply_ids)}
         self._braker: Braker | None = None
-        self._mode = IDLE
+        self._mode = GuardianMode.IDLE
         self._q: list[float] = []
         self._dq: list[float] = []
         self._heard_s = 0.0
@@ -75,12 +167,14 @@ class Guardian:
         """Watch, brake, hold; returns when nobody needs it any more."""
         while not self.relieved:
             self._take_lock()
-            post, mode = self._post, self._post.mode
+            memory, mode = self._memory, self._memory.mode
             alive = os.getppid() == self._parent
-            if mode == RELEASED or (mode == IDLE and not alive):
+            if mode == GuardianMode.RELEASED or (mode == GuardianMode.IDLE and not alive):
                 return
-            driven = alive and mode == DRIVE
-            if mode == IDLE or (driven and time.monotonic_ns() - post.beat_ns < SILENCE_NS):
+            driven = alive and mode == GuardianMode.DRIVE
+            if mode == GuardianMode.IDLE or (
+                driven and time.monotonic_ns() - memory.beat_ns < SILENCE_NS
+            ):
                 self._braker = None
                 time.sleep(WATCH_S)
                 continue
@@ -102,13 +196,15 @@ class Guardian:
         self._wire.close()
         self._bus.shutdown()
 
-    def _begin(self, mode: int, alive: bool) -> None:
+    def _begin(self, mode: GuardianMode, alive: bool) -> None:
         self._wire.waiting()  # old replies
-        self._q, self._dq, tau = self._post.motion()
+        self._q, self._dq, tau = self._memory.motion()
         self._mode, self._heard_s = mode, time.monotonic()
-        self._braker = Braker(self._limits, tau, self._post.held() if mode == HOLD else None)
-        if mode == DRIVE:
-            self._post.count_taken()
+        self._braker = Braker(
+            self._limits, tau, self._memory.held() if mode == GuardianMode.HOLD else None
+        )
+        if mode == GuardianMode.DRIVE:
+            self._memory.count_taken()
             why = "the loop has sent nothing for 50 ms" if alive else "the loop's process is gone"
             self._say(f"{why}; the arm is braked and held. Support it, then: kill {os.getpid()}")
 
@@ -198,9 +294,11 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     settings = BusSettings(**said["settings"])
-    limits = [Limits(*values) for values in said["limits"]]
+    limits = [Scales(*values) for values in said["limits"]]
     try:
-        guardian = Guardian(settings, limits, Post(said["block"], settings.joints), said["parent"])
+        guardian = Guardian(
+            settings, limits, GuardianMemory(said["block"], settings.joints), said["parent"]
+        )
     except DriverError as error:
         print(error, flush=True)
         return

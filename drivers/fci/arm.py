@@ -6,15 +6,14 @@ import contextlib
 import time
 from collections.abc import Sequence
 
-from drivers.fci import ledger, tables
+from drivers.fci import tables
 from drivers.fci.codec import JOINTS, State, Status
-from drivers.fci.flags import told
-from drivers.fci.guard import checked
-from drivers.fci.handshake import Link, open_link, parse, recover
-from drivers.fci.interpreter import QUICK_SWITCHING
-from drivers.fci.ledger import Ledger
-from drivers.fci.motion import Motion
-from drivers.fci.stream import StateStream
+from drivers.fci.connect import Connection, open_connection, parse, recover
+from drivers.fci.limits import checked
+from drivers.fci.reader_client import QUICK_SWITCHING
+from drivers.fci.stream import STALE_NS, TICK_NS, Refusal, StateIntake, StateStream
+from drivers.fci.tables import told
+from drivers.fci.torque_control import TorqueControl
 from drivers.interface import Array, DriverError, Intake, JointSample
 
 SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
@@ -57,7 +56,7 @@ class FciArm:
     paced = True
     adds_gravity = True
     delay_ns = 1_000_000  # a command counts from the next tick on
-    period_ns = ledger.TICK_NS
+    period_ns = TICK_NS
     link_names: tuple[str, ...] = ()
 
     def __init__(
@@ -66,32 +65,32 @@ class FciArm:
         joint_names: Sequence[str] | None = None,
         allow_motion: bool = False,
     ) -> None:
-        self._wanted = parse(address)
+        self._target = parse(address)
         self._named = joint_names is not None
-        names = _NAMES[self._wanted.version or tables.PANDA] if joint_names is None else joint_names
+        names = _NAMES[self._target.version or tables.PANDA] if joint_names is None else joint_names
         self.joint_names: tuple[str, ...] = tuple(names)
         if len(self.joint_names) != JOINTS:
             raise DriverError(f"the robot has {JOINTS} joints, got {len(self.joint_names)} names")
         self.can_move = allow_motion
         self.version: int | None = None
         self.arrived_ns = 0
-        self._ledger = Ledger()
-        self.intake: Intake = self._ledger.intake
-        self._link: Link | None = None
+        self._account = StateIntake()
+        self.intake: Intake = self._account.intake
+        self._connection: Connection | None = None
         self._stream: StateStream | None = None
-        self._motion: Motion | None = None
+        self._control: TorqueControl | None = None
         self._first: State | None = None  # read by connect, not handed out yet
         self._state: State | None = None
 
     @property
     def kernel_drops(self) -> int:
         """Datagrams that the operating system dropped; part of `intake.lost`."""
-        return self._ledger.kernel_drops
+        return self._account.kernel_drops
 
     @property
     def reader_pid(self) -> int | None:
         """Process id of the reader; None when not connected."""
-        return None if self._link is None else self._link.feed.pid
+        return None if self._connection is None else self._connection.reader.pid
 
     def connect(self) -> None:
         """Open the connection and wait for a state; an open one is closed before.
@@ -99,21 +98,21 @@ class FciArm:
         Raises DriverError, which says what to do.
         """
         self.close()
-        self._ledger, self._state = Ledger(), None
-        self.intake = self._ledger.intake
-        link = self._link = open_link(self._wanted)
+        self._account, self._state = StateIntake(), None
+        self.intake = self._account.intake
+        connection = self._connection = open_connection(self._target)
         QUICK_SWITCHING.begin()
         try:
-            stream = self._stream = StateStream(link, self._ledger)
-            self._motion = Motion(link.version, link.channel, stream.send)
+            stream = self._stream = StateStream(connection, self._account)
+            self._control = TorqueControl(connection.version, connection.channel, stream.send)
             self._first = self._make_ready(stream)
         except BaseException:
             self.close()
             raise
         self.arrived_ns = stream.arrived_ns
-        self.version = link.version
+        self.version = connection.version
         if not self._named:
-            self.joint_names = _NAMES[link.version]
+            self.joint_names = _NAMES[connection.version]
 
     def read(self) -> JointSample:
         """The next state's sample; waits for it, a second at most. Raises DriverError."""
@@ -130,7 +129,7 @@ class FciArm:
         elif self._state is None or state.status is not self._state.status:
             self._note_status(state.status)
         self._state = state
-        return JointSample(state.message_id * ledger.TICK_NS, state.q, state.dq, state.tau_J)
+        return JointSample(state.message_id * TICK_NS, state.q, state.dq, state.tau_J)
 
     def command(self, tau: Array) -> None:
         """Answer the state read last with (7,) N m on top of the arm's weight and friction.
@@ -148,35 +147,35 @@ class FciArm:
 
     def stop(self) -> None:
         """Brake the arm and end the motion, if there is one. Raises DriverError."""
-        if self._motion is not None:
-            self._motion.stop(self._state_while_stopping)
+        if self._control is not None:
+            self._control.stop(self._state_while_stopping)
 
     def close(self) -> None:
         """Stop, then release everything; may be called more than once."""
-        link, motion = self._link, self._motion
-        if link is None:
+        connection, motion = self._connection, self._control
+        if connection is None:
             return
         try:
             if motion is not None and motion.active:
                 self.stop()
         except DriverError as error:
-            self._ledger.note("close", str(error))
+            self._account.note("close", str(error))
         finally:
-            self._link = self._stream = self._motion = self._first = None
-            link.close()
+            self._connection = self._stream = self._control = self._first = None
+            connection.close()
             QUICK_SWITCHING.end()
 
-    def _need_open(self) -> tuple[StateStream, Motion]:
-        if self._stream is None or self._motion is None:
-            raise DriverError(f"{self._wanted.host}: not connected; call connect first")
-        return self._stream, self._motion
+    def _need_open(self) -> tuple[StateStream, TorqueControl]:
+        if self._stream is None or self._control is None:
+            raise DriverError(f"{self._target.host}: not connected; call connect first")
+        return self._stream, self._control
 
     def _make_ready(self, stream: StateStream) -> State:
         """The first state, after a recovery where that was asked for. Raises DriverError."""
         state = stream.next(SILENCE_S)
         if state is None:
             raise DriverError(stream.silence())
-        if state.status.robot_mode == tables.ROBOT_REFLEX and self._wanted.recover:
+        if state.status.robot_mode == tables.ROBOT_REFLEX and self._target.recover:
             state = self._recovered(stream, state)
         self._note_status(state.status)
         mode = state.status.robot_mode
@@ -186,8 +185,8 @@ class FciArm:
 
     def _recovered(self, stream: StateStream, first: State) -> State:
         """The first state that shows no reflex any more. Raises DriverError."""
-        assert self._link is not None
-        recover(self._link)
+        assert self._connection is not None
+        recover(self._connection)
         state: State | None = first
         deadline = time.monotonic() + RECOVERED_S
         while state is not None and state.status.robot_mode in _RECOVERING_MODES:
@@ -196,7 +195,7 @@ class FciArm:
                     f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
                     "that it recovered, but does not show it"
                 )
-            self.intake.refused[ledger.RECOVERING] += 1
+            self.intake.refused[Refusal.RECOVERING] += 1
             state = stream.next(SILENCE_S)
         if state is None:
             raise DriverError(stream.silence())
@@ -205,8 +204,8 @@ class FciArm:
     def _take_first(self) -> State | None:
         """The state that connect has read, unless it waited for too long."""
         first, self._first = self._first, None
-        if first is not None and time.monotonic_ns() - self.arrived_ns > ledger.STALE_NS:
-            self.intake.refused[ledger.STALE] += 1
+        if first is not None and time.monotonic_ns() - self.arrived_ns > STALE_NS:
+            self.intake.refused[Refusal.STALE] += 1
             return None
         return first
 
@@ -216,7 +215,7 @@ class FciArm:
         with contextlib.suppress(DriverError):  # the motion is then ended over TCP
             state = stream.next(wait_s)
             while state is not None:
-                self.intake.refused[ledger.STOPPING] += 1
+                self.intake.refused[Refusal.STOPPING] += 1
                 self._state = state
                 if not stream.behind:
                     return state
@@ -229,4 +228,4 @@ class FciArm:
         if mode in _LIMP_MODES:
             why = f" ({told(status.reflex_reason)})" if any(status.reflex_reason) else ""
             sentence = f"the robot {tables.ROBOT_MODE_MEANING[mode]}{why}"
-            self._ledger.note(f"mode {mode}", sentence)
+            self._account.note(f"mode {mode}", sentence)

@@ -1,9 +1,11 @@
-"""Bytes of Damiao frames as a motor reads and writes them; the opposite side of a host's codec."""
+"""Frames of Damiao motors as a motor reads and writes them; the opposite side of a host's codec."""
 
 from __future__ import annotations
 
 import struct
 from typing import NamedTuple
+
+import can
 
 FRAME_BYTES = 8
 SERVICE_ID = 0x7FF  # register access, refresh and save; the motor's id is in the data
@@ -111,3 +113,30 @@ def encode_register_reply(motor_id: int, what: int, register: int, value: float)
 def encode_save_reply(motor_id: int) -> bytes:
     """The reply to a save; its layout is this simulator's choice, no source describes it."""
     return bytes([motor_id & 0xFF, motor_id >> 8, SAVE, 1, 0, 0, 0, 0])
+
+
+BUS_OFF, BUS_ERROR = 0x040, 0x080  # error classes of Linux's linux/can/error.h
+
+
+def data_frame(reply_id: int, data: bytes, fd: bool) -> can.Message:
+    """A data frame with an 11-bit id; an FD frame has its bit-rate switch set."""
+    return can.Message(
+        arbitration_id=reply_id, data=data, is_extended_id=False, is_fd=fd, bitrate_switch=fd
+    )
+
+
+def error_frame(kind: int) -> can.Message:
+    """An error frame as socketcan gives it to a receiver."""
+    return can.Message(
+        arbitration_id=kind, data=bytes(FRAME_BYTES), is_extended_id=False, is_error_frame=True
+    )
+
+
+def is_command(message: can.Message) -> bool:
+    """Whether a motor can have an opinion on a message: 8 data bytes under an 11-bit id."""
+    return not (
+        message.is_error_frame
+        or message.is_remote_frame
+        or message.is_extended_id
+        or len(message.data) != FRAME_BYTES
+    )

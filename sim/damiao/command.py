@@ -7,21 +7,13 @@ import json
 import signal
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
-from sim.damiao.boards import Boards
-from sim.damiao.faults import MOTORS, SECONDS, SHARES
-from sim.damiao.motor_types import SETS
-from sim.damiao.open_bus import (
-    INTERFACES,
-    MULTICAST_GROUP,
-    MULTICAST_PORT,
-    address_of,
-    check_alone,
-    open_bus,
-)
-from sim.scenarios import SCENARIOS, build, options_of
+from sim.damiao.bus import address_of, check_alone, open_bus
+from sim.damiao.options import check
+from sim.damiao.server import BoardOptions, Boards
+from sim.options import options_of
+from sim.scenarios import build
 
 
 class Ending:
@@ -40,53 +32,9 @@ class Ending:
         return self._event.is_set() or (self._end is not None and time.monotonic() >= self._end)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument(
-        "--interface", choices=INTERFACES, default=INTERFACES[0], help=f"default {INTERFACES[0]}"
-    )
-    parser.add_argument(
-        "--channel",
-        default=MULTICAST_GROUP,
-        metavar="WHERE",
-        help=f"multicast group (default {MULTICAST_GROUP}) or CAN interface, as in vcan0",
-    )
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=MULTICAST_PORT,
-        help=f"of the multicast group, default {MULTICAST_PORT}",
-    )
-    parser.add_argument("--fd", type=int, choices=(0, 1), default=1, help="CAN FD, default 1")
-    parser.add_argument("--motors", choices=tuple(SETS), default="panda", help="default panda")
-    parser.add_argument(
-        "--scenario", default="nominal", metavar="NAME", help=f"{', '.join(SCENARIOS)}"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="option of the scenario; noise=real adds a Panda's sensor noise to the quantisation",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="of the arm, noise and faults")
-    parser.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="NAME[=VALUE][@SECONDS]",
-        help="seconds count from the first frame. VALUE is a share of frames: "
-        f"{', '.join(key for key in SHARES if key != 'enobufs')}; the number of a motor: "
-        f"{', '.join(MOTORS)}; or seconds: {', '.join(SECONDS)}",
-    )
-    parser.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
-
-
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal comes or the time is over. Raises ValueError for wrong options."""
-    if any(text.startswith("enobufs") for text in args.fault):
-        raise ValueError("fault 'enobufs' strikes a host's own controller, not the boards")
+    check(args)
     options = options_of(args.set)
     scenario = build(args.scenario, args.seed, **options)
     noise = scenario.noise if options.keys() & {"noise", "levels"} else None
@@ -96,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
     try:
         bus = open_bus(args.interface, args.channel, args.port, fd)
         try:
-            boards = Boards(bus, scenario, args.seed, args.motors, args.fault, noise=noise)
+            chosen = BoardOptions(args.motors, noise)
+            boards = Boards(bus, scenario, chosen, args.fault)
             try:
                 check_alone(bus, boards.motors[0].motor_id, boards.motors[0].reply_id, fd)
                 address = address_of(args.interface, args.channel, args.port, fd)

@@ -35,7 +35,6 @@ import can
 
 from sim.damiao.bit_times import frame_ns
 from sim.damiao.faults import Faults
-from sim.damiao.host_bus import refuse
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000  # bit/s, OpenArm's
 HOST_QUEUE = 64  # frames that the host's controller holds; then it refuses
@@ -51,6 +50,11 @@ class Node(Protocol):
 
     def next_ns(self) -> int | None:
         """When it sends unasked; None for never."""
+
+
+def refuse() -> can.CanOperationError:
+    """What socketcan raises where the controller's queue is full."""
+    return can.CanOperationError("Failed to transmit: No buffer space available", errno.ENOBUFS)
 
 
 class LineEnd(can.BusABC):
@@ -102,8 +106,6 @@ class Line:
         fd: bool = True,
         bitrate: int = BITRATE,
         data_bitrate: int = DATA_BITRATE,
-        reaction_ns: int = 0,
-        start_ns: int = START_NS,
         epoch_s: float = 0.0,
         faults: Faults | None = None,
     ) -> None:
@@ -113,16 +115,14 @@ class Line:
             fd: whether FD frames may be sent.
             bitrate: bit/s of classic frames and arbitration.
             data_bitrate: bit/s of FD data.
-            reaction_ns: from a command's arrival to the reply's readiness.
-            start_ns: the clock's first reading.
             epoch_s: added to the clock where it becomes a frame's timestamp (end of the frame).
             faults: the boards' own; `enobufs` strikes the host's sends.
         """
         self.host, self.boards = LineEnd(self, "host", fd), LineEnd(self, "motors", fd)
-        self.start_ns, self.busy_ns = start_ns, 0
-        self._fd, self._rates, self._reaction_ns = fd, (bitrate, data_bitrate), reaction_ns
+        self.start_ns, self.busy_ns = START_NS, 0
+        self._fd, self._rates = fd, (bitrate, data_bitrate)
         self._epoch_s, self._faults = epoch_s, faults
-        self._now_ns = self._free_ns = start_ns
+        self._now_ns = self._free_ns = START_NS
         self._node: Node | None = None
         self._from_host: deque[tuple[int, can.Message]] = deque()
         self._from_boards: list[tuple[int, int, int, can.Message]] = []
@@ -171,8 +171,7 @@ class Line:
             raise can.CanOperationError("FD frame on a classic line", errno.EINVAL)
         if end is self.boards:
             self._count += 1
-            ready = self._now_ns + self._reaction_ns
-            entry = (message.arbitration_id, self._count, ready, message)
+            entry = (message.arbitration_id, self._count, self._now_ns, message)
             heapq.heappush(self._from_boards, entry)
             return
         since_s = (self._now_ns - self.start_ns) * 1e-9

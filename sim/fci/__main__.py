@@ -3,7 +3,8 @@
 import argparse
 import sys
 
-from sim.fci.command import add_arguments, run
+from sim.fci.command import run
+from sim.fci.options import add_arguments
 
 parser = argparse.ArgumentParser("python -m sim.fci", description=__doc__)
 add_arguments(parser)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from drivers.interface import DriverError, JointSample
-from sim.fci.dynamics import flange, mass_matrix, torques, wrench_at
+from sim.dynamics import cross, end_effector, mass_matrix, torques
+from sim.effects import payload
+from sim.fci.codec import TICK_S
 from sim.fci.settings import Settings
 from sim.plant import Plant
+from sim.rigid_bodies import payload_theta
 from sim.scenarios import FLANGE_M, Scenario
-from sim.stages import payload_theta
-from sim.truth import Array, Payload, Truth
+from sim.truth import Array, Truth
 
-TICK_S = 1e-3
 EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
 EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
 # is what a command per millisecond holds stable on a rigid arm.
 FASTEST_RATE = 60.0  # 1/s
+FLANGE = np.eye(4)  # in the last link's frame
+FLANGE[2, 3] = FLANGE_M
 SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told; 0.08 when ready
 
 
@@ -62,13 +66,11 @@ class Arm:
 
     def refresh(self, settings: Settings) -> None:
         """Take over what a client set: end effector, stiffness frame and load."""
-        self._tool, self._to_K = settings.F_T_EE, settings.EE_T_K
+        self._tool, self._to_K = FLANGE @ settings.F_T_EE, settings.EE_T_K
         self._theta = self.truth.theta.copy()
         m, com, inertia = settings.load
         if m > 0.0:
-            self._theta[-1] += payload_theta(
-                Payload(0.0, m, com + np.array([0.0, 0.0, FLANGE_M]), inertia)
-            )
+            self._theta[-1] += payload_theta(payload(m, FLANGE[:3, 3] + com, inertia))
 
     def drive(self, tau: Array) -> None:
         """Torques on top of gravity, reached at the end of the next tick; brakes open."""
@@ -110,15 +112,15 @@ class Arm:
     def model(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (7,) of the internal model for a motion, N m."""
         truth = self.truth
-        return np.asarray(torques(truth.R, truth.p, self._theta, truth.gravity, q, dq, ddq))
+        return np.asarray(torques(truth.frames, self._theta, truth.base, q, dq, ddq))
 
     def mass(self, q: Array) -> Array:
         """(7, 7) mass matrix of the internal model, kg m²."""
-        return np.asarray(mass_matrix(self.truth.R, self.truth.p, self._theta, q))
+        return np.asarray(mass_matrix(self.truth.frames, self._theta, q))
 
     def frame(self, q: Array) -> tuple[Array, Array]:
         """Pose (4, 4) of the end effector and Jacobian (6, 7) at a posture."""
-        pose, J = flange(self.truth.R, self.truth.p, q, FLANGE_M, self._tool)
+        pose, J = end_effector(self.truth.frames, q, self._tool)
         return pose, J
 
     def close(self) -> None:
@@ -137,8 +139,31 @@ class Arm:
 
 
 def known_arm(truth: Truth) -> Truth:
-    """What the robot knows of itself: the rigid arm as it starts, without losses."""
-    nothing = np.zeros(truth.n)
-    return truth.with_changes(
-        events=(), effects=(), Fv=nothing, Fc=nothing, torque_offset=nothing, motor_inertia=nothing
-    )
+    """What the robot knows of itself: the rigid arm as it starts, without effects."""
+    return truth.with_changes(effects=())
+
+
+@njit(cache=True)
+def wrench_at(pose: Array, jacobian: Array, tool: Array, torque: Array, least: float) -> Array:
+    """Wrench (6,) [f; m] at a frame whose joint torques come nearest to `torque`, base axes.
+
+    Args:
+        pose: (4, 4) of the end effector.
+        jacobian: (6, n) of its origin.
+        tool: (4, 4), the frame in the end effector; the wrench acts at its origin.
+        torque: (n,) N m.
+        least: manipulability, the root of det(J J^T), below which there is no telling: zeros.
+    """
+    J, lever, shift = jacobian.copy(), np.zeros(3), np.empty(3)
+    for i in range(3):
+        for k in range(3):
+            lever[i] += pose[i, k] * tool[k, 3]
+    for j in range(J.shape[1]):
+        cross(J[3:, j], lever, shift)
+        for i in range(3):
+            J[i, j] += shift[i]
+    square = J @ J.T
+    wrench = np.zeros(6)
+    if np.linalg.det(square) >= least * least:
+        wrench[:] = np.linalg.solve(square, J @ torque)
+    return wrench

@@ -1,4 +1,4 @@
-"""The simulated robot from a shell: options, one line when it is ready, a summary at the end."""
+"""The simulated robot from a shell: one line when it is ready, a summary at the end."""
 
 from __future__ import annotations
 
@@ -8,44 +8,20 @@ import signal
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-from sim.fci.faults import describe
-from sim.fci.layout import VERSIONS
-from sim.fci.server import HOST, PORT, FciServer
-from sim.scenarios import options_of
+from sim.fci.codec import HOST
+from sim.fci.server import FciServer
+from sim.options import options_of
+from sim.scenarios import build
 
 EXIT_OK, EXIT_USAGE = 0, 2
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe()
-    add = parser.add_argument
-    add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
-    add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
-    add("--scenario", default="nominal", help="which arm; an unknown name lists them")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="option of the scenario")
-    add("--seed", type=int, default=0, help="of noise, truth and faults")
-    add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
-    add("--core", type=int, default=None, help="processor to stay on")
-    add("--duration", type=float, default=None, metavar="S", help="stop after so many seconds")
-    add("--json", type=Path, default=None, metavar="FILE", help="write the summary there as well")
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until SIGTERM, SIGINT or the end of the duration; the process's exit code."""
     try:
-        server = FciServer(
-            args.port,
-            args.protocol,
-            args.scenario,
-            args.seed,
-            args.fault,
-            options_of(args.set),
-            args.core,
-        )
+        scenario = build(args.scenario, args.seed, **options_of(args.set))
+        server = FciServer(scenario, args.port, args.protocol, args.fault, args.core)
     except (ValueError, OSError) as error:
         print(f"error: {_sentence(error, args.port)}", file=sys.stderr)
         return EXIT_USAGE

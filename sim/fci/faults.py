@@ -1,11 +1,17 @@
-"""Faults that can be switched on, as they are written: NAME[=VALUE][@SECONDS]."""
+"""Faults that can be switched on, written NAME[=VALUE][@SECONDS], and what they do.
+
+They change measured values, datagrams or the robot itself.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sim.fci.layout import ERRORS, JOINTS
+import numpy as np
+
+from sim.fci.codec import ERRORS, JOINTS, TICK_S, Floats, StateFrame
 
 RATE, JOINT, ONCE, WORDS = "a share from 0 to 1", "a joint from 1 to 7", "", "an error's name"
 SECONDS, COUNT, NUMBER = "seconds", "a count of ticks, not 0", "a version from 0 to 65535"
@@ -101,3 +107,123 @@ def describe() -> str:
         f"  {name}{'=' + usual if usual else ''}: {what}" + (f" ({kind})" if kind else "")
         for name, (kind, usual, what) in KINDS.items()
     )
+
+
+LATEST_TICKS = 5
+FLIPPED_BYTES = 8  # at most
+SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
+JUMP_RAD = 0.05
+AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
+
+
+class Spoiler:
+    """The faults of one server, with a random source of its own.
+
+    Attributes:
+        counts: how often each fault has acted.
+    """
+
+    def __init__(self, faults: Sequence[Fault], seed: int) -> None:
+        self._rng = np.random.default_rng([seed, 1337])
+        self._lasting = [fault for fault in faults if fault.name not in (*AT_A_TIME, "version")]
+        self._waiting = [fault for fault in faults if fault.name in AT_A_TIME]
+        self.counts: dict[str, int] = {fault.name: 0 for fault in faults}
+        self._frozen: dict[int, float] = {}
+        self._later: list[tuple[int, bytes]] = []
+        self._held: bytes | None = None
+
+    def due(self, tick: int) -> list[Fault]:
+        """The faults that happen once and whose time has come."""
+        if not self._waiting:
+            return []
+        now_s = tick * TICK_S
+        due = [fault for fault in self._waiting if fault.at_s <= now_s]
+        for fault in due:
+            self._waiting.remove(fault)
+            self.counts[fault.name] += 1
+        return due
+
+    def spoil_values(self, frame: StateFrame, tick: int) -> None:
+        """Change measured values in a state, as a broken sensor would."""
+        for fault in self._lasting:
+            if fault.at_s > tick * TICK_S:
+                continue
+            if fault.name in ("stuck", "jump"):
+                self._disturb_encoder(fault, frame.fields["q"], frame.fields["theta"])
+            elif fault.name in ("nan", "spike") and self._happens(fault):
+                name = ("q", "dq", "tau_J")[self._rng.integers(3)]
+                joint = self._rng.integers(JOINTS)
+                if fault.name == "nan":
+                    frame.fields[name][joint] = np.nan
+                else:
+                    frame.fields[name][joint] += SPIKES[name] * self._rng.choice((-1.0, 1.0))
+
+    def loses_command(self, tick: int) -> bool:
+        """Whether the network loses the command of this tick."""
+        return any(
+            fault.name == "drop_commands" and fault.at_s <= tick * TICK_S and self._happens(fault)
+            for fault in self._lasting
+        )
+
+    def deliver(self, state: bytearray, tick: int) -> Sequence[bytes | bytearray]:
+        """The datagrams that leave in this tick for this state and those held back before."""
+        if not self._lasting:
+            return (state,)
+        out: list[bytes] = [data for when, data in self._later if when <= tick]
+        self._later = [item for item in self._later if item[0] > tick]
+        held, self._held = self._held, None
+        out.extend(self._pass_on(bytes(state), tick))
+        if held is not None:
+            out.append(held)
+        return out
+
+    def forget(self) -> None:
+        """The connection is gone, and with it whatever was under way."""
+        self._later, self._held = [], None
+
+    def _pass_on(self, data: bytes, tick: int) -> list[bytes]:
+        """One datagram through the network."""
+        copies = [data]
+        for fault in self._lasting:
+            if fault.at_s > tick * TICK_S or not copies:
+                continue
+            if fault.name not in ("drop", "late", "repeat", "reorder", "corrupt"):
+                continue
+            if not self._happens(fault):
+                continue
+            if fault.name == "repeat":
+                copies = copies * 2
+            elif fault.name == "corrupt":
+                copies = [self._corrupt(item) for item in copies]
+            elif fault.name == "reorder":
+                self._held, copies = copies[0], []
+            else:
+                if fault.name == "late":
+                    when = tick + int(self._rng.integers(1, LATEST_TICKS + 1))
+                    self._later.extend((when, item) for item in copies)
+                copies = []
+        return copies
+
+    def _corrupt(self, data: bytes) -> bytes:
+        if self._rng.random() < 0.5:
+            return data[: self._rng.integers(len(data))]
+        changed = bytearray(data)
+        for at in self._rng.integers(len(data), size=self._rng.integers(1, FLIPPED_BYTES + 1)):
+            changed[at] ^= int(self._rng.integers(1, 256))
+        return bytes(changed)
+
+    def _disturb_encoder(self, fault: Fault, *readings: Floats) -> None:
+        joint = int(fault.value) - 1
+        if not self.counts[fault.name]:
+            self.counts[fault.name] = 1
+            self._frozen[joint] = float(readings[0][joint])
+        for reading in readings:
+            if fault.name == "jump":
+                reading[joint] += JUMP_RAD
+            else:
+                reading[joint] = self._frozen[joint]
+
+    def _happens(self, fault: Fault) -> bool:
+        hit = bool(self._rng.random() < fault.value)
+        self.counts[fault.name] += hit
+        return hit

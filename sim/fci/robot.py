@@ -1,25 +1,27 @@
-"""The robot: modes, motions, reflexes and recovery, tick by tick; knows no sockets, no clock."""
+"""The robot: modes, motions, reflexes and recovery, tick by tick, and what it says of itself.
+
+Knows no sockets and no clock.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from sim.fci.arm import Arm
-from sim.fci.layout import ERRORS, RobotCommand, RobotMode
-from sim.fci.motion import Motion, allowed
-from sim.fci.requests import Request, reply
-from sim.fci.settings import Settings
-from sim.fci.statuses import (
-    ABORTED,
-    EMERGENCY,
-    INVALID,
-    MANUAL,
-    NOT_POSSIBLE,
-    OK,
-    PREEMPTED,
-    REFLEX,
-    STARTED,
+from sim.fci.codec import (
+    ERRORS,
+    TICK_S,
+    Controller,
+    Floats,
+    Request,
+    RobotCommand,
+    RobotMode,
+    StateFrame,
+    Status,
+    reply,
 )
+from sim.fci.motion import CommandedMotion, allowed
+from sim.fci.settings import Settings
 from sim.scenarios import Scenario
 from sim.truth import Array
 
@@ -56,7 +58,7 @@ class Robot:
         self.version, self.settings = version, Settings()
         self.arm = Arm(scenario, self.settings)
         self.mode = RobotMode.IDLE
-        self.motion: Motion | None = None
+        self.motion: CommandedMotion | None = None
         self.errors = np.zeros(len(ERRORS), dtype=np.uint8)
         self.reflex_reason = np.zeros(len(ERRORS), dtype=np.uint8)
         self.tau_desired = np.zeros(self.arm.truth.n)
@@ -86,8 +88,8 @@ class Robot:
             return reply(request, self._cancel(), self.version)
         if request.name == "AutomaticErrorRecovery":
             return self._recover(request)
-        status = NOT_POSSIBLE if self.motion is not None else self.settings.apply(request)
-        if status == OK:
+        status = Status.NOT_POSSIBLE if self.motion is not None else self.settings.apply(request)
+        if status == Status.OK:
             self.arm.refresh(self.settings)
         return reply(request, status, self.version)
 
@@ -110,48 +112,48 @@ class Robot:
         self.errors[flags] = 1
         self.reflex_reason[flags] = 1
         self.mode = RobotMode.REFLEX if self.mode != RobotMode.USER_STOPPED else self.mode
-        self._end(REFLEX)
+        self._end(Status.REFLEX)
 
     def stop_by_user(self, ticks: int) -> None:
         """The user stop is pressed for so long."""
         self.mode, self._user_stop_left = RobotMode.USER_STOPPED, ticks
-        self._end(EMERGENCY)
+        self._end(Status.EMERGENCY)
 
     def drop_client(self) -> None:
         """The client is gone: its motion ends, nothing is replied any more."""
-        self._end(ABORTED)
+        self._end(Status.ABORTED)
         self._recovery = None
         self._replies = []
         if self.mode == RobotMode.RECOVERY:
             self.mode = RobotMode.REFLEX
 
-    def _start(self, request: Request) -> str:
+    def _start(self, request: Request) -> Status:
         if self.mode != RobotMode.IDLE or self.motion is not None:
-            return NOT_POSSIBLE
+            return Status.NOT_POSSIBLE
         if not allowed(*request.move_modes(), self.version):
-            return INVALID
-        self.motion = Motion(request, self.arm.q, self.arm.truth.limits)
+            return Status.INVALID
+        self.motion = CommandedMotion(request, self.arm.q, self.arm.truth.limits)
         self.mode = RobotMode.MOVE
         self.reflex_reason[:] = 0
-        return STARTED
+        return Status.STARTED
 
-    def _cancel(self) -> str:
+    def _cancel(self) -> Status:
         if self.mode == RobotMode.REFLEX:
-            return REFLEX
+            return Status.REFLEX
         if self.mode == RobotMode.USER_STOPPED:
-            return EMERGENCY
-        self._end(PREEMPTED)
-        return OK
+            return Status.EMERGENCY
+        self._end(Status.PREEMPTED)
+        return Status.OK
 
     def _recover(self, request: Request) -> bytes | None:
         if self.mode == RobotMode.USER_STOPPED:
-            return reply(request, EMERGENCY, self.version)
+            return reply(request, Status.EMERGENCY, self.version)
         if self.motion is not None or self._recovery is not None:
-            return reply(request, NOT_POSSIBLE, self.version)
+            return reply(request, Status.NOT_POSSIBLE, self.version)
         if not self.arm.release():
-            return reply(request, MANUAL, self.version)
+            return reply(request, Status.MANUAL, self.version)
         if self.mode != RobotMode.REFLEX:
-            return reply(request, OK, self.version)
+            return reply(request, Status.OK, self.version)
         self.mode, self._recovery = RobotMode.RECOVERY, request
         self._recovered_in = RECOVERY_TICKS
         return None
@@ -161,13 +163,13 @@ class Robot:
             return
         self._recovered_in -= 1
         if self.mode != RobotMode.RECOVERY:  # a reflex or the user stop came in between
-            status = EMERGENCY if self.mode == RobotMode.USER_STOPPED else REFLEX
+            status = Status.EMERGENCY if self.mode == RobotMode.USER_STOPPED else Status.REFLEX
         elif self._recovered_in > 0 or self.moving:
             return
         elif not self.arm.release():  # asked again: only a standing arm stays within its limits
-            status, self.mode = MANUAL, RobotMode.REFLEX
+            status, self.mode = Status.MANUAL, RobotMode.REFLEX
         else:
-            status, self.mode = OK, RobotMode.IDLE
+            status, self.mode = Status.OK, RobotMode.IDLE
             self.errors[:] = 0
             self.joint_collision[:], self.cartesian_collision[:] = 0.0, 0.0
         self._replies.append(reply(self._recovery, status, self.version))
@@ -180,7 +182,7 @@ class Robot:
         if self._user_stop_left <= 0:
             self.mode = RobotMode.REFLEX if self.errors.any() else RobotMode.IDLE
 
-    def _move(self, motion: Motion, command: RobotCommand | None) -> None:
+    def _move(self, motion: CommandedMotion, command: RobotCommand | None) -> None:
         """Drive the arm for one tick of a motion, or end it."""
         self.received += command is not None
         self.missed += command is None and motion.begun
@@ -190,7 +192,7 @@ class Robot:
             return
         self.q_desired = motion.path.q
         if motion.finished:
-            self._end(OK)
+            self._end(Status.OK)
             return
         self.tau_desired = motion.tau
         if motion.by_torque:
@@ -220,7 +222,7 @@ class Robot:
         if found:
             self.trip(*found)
 
-    def _end(self, status: str) -> None:
+    def _end(self, status: Status) -> None:
         """Brake; the motion's second reply goes out after the next state."""
         self.arm.brake()
         self.tau_desired = np.zeros(self.arm.truth.n)
@@ -230,3 +232,84 @@ class Robot:
         self.motion = None
         if self.mode == RobotMode.MOVE:
             self.mode = RobotMode.IDLE
+
+
+ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
+
+
+class Reporter:
+    """Fills one frame in place, tick after tick.
+
+    Attributes:
+        frame: the datagram.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.frame = StateFrame(robot.version)
+        self._robot = robot
+        self._tau = robot.arm.sample.tau
+
+    def refresh(self) -> None:
+        """Write what changes only when a client sets it."""
+        settings, fields = self._robot.settings, self.frame.fields
+        for name in ("F_T_NE", "NE_T_EE", "EE_T_K", "F_T_EE"):
+            fields[name][:] = getattr(settings, name).ravel("F")
+        mass, com, inertia = settings.load
+        fields["m_load"][0] = mass
+        fields["F_x_Cload"][:] = com
+        fields["I_load"][:] = inertia.ravel("F")
+        fields["O_ddP_O"][:] = self._robot.arm.truth.gravity
+
+    def fill(self, message_id: int) -> None:
+        """Write the present tick."""
+        robot, frame = self._robot, self.frame
+        self._measured(robot.arm)
+        self._desired(robot)
+        frame.errors[:], frame.reflex_reason[:] = robot.errors, robot.reflex_reason
+        frame.set_id(message_id)
+        motion = robot.motion
+        if motion is None:
+            frame.set_modes(0, Controller.OTHER, robot.mode, 0.0)
+        else:
+            generator = motion.generator + 1
+            frame.set_modes(generator, motion.controller, robot.mode, motion.success_rate)
+
+    def _measured(self, arm: Arm) -> None:
+        fields, sample, settings = self.frame.fields, arm.sample, self._robot.settings
+        fields["q"][:] = fields["theta"][:] = sample.q
+        fields["dq"][:] = fields["dtheta"][:] = sample.dq
+        fields["tau_J"][:] = sample.tau
+        fields["dtau_J"][:] = (sample.tau - self._tau) / TICK_S
+        self._tau = sample.tau
+        fields["O_T_EE"][:] = arm.pose.ravel("F")
+        _elbow(fields["elbow"], sample.q)
+        outer = arm.tau_external
+        fields["tau_ext_hat_filtered"][:] = outer
+        fields["O_F_ext_hat_K"][:] = arm.wrench
+        R = arm.pose[:3, :3] @ settings.EE_T_K[:3, :3]
+        local = fields["K_F_ext_hat_K"]
+        local[:3], local[3:] = arm.wrench[:3] @ R, arm.wrench[3:] @ R
+        fields["joint_contact"][:] = np.abs(outer) > settings.lower_torque
+        fields["cartesian_contact"][:] = np.abs(arm.wrench) > settings.lower_force
+
+    def _desired(self, robot: Robot) -> None:
+        fields, motion = self.frame.fields, robot.motion
+        fields["tau_J_d"][:] = robot.tau_desired
+        fields["q_d"][:] = robot.q_desired
+        fields["joint_collision"][:] = robot.joint_collision
+        fields["cartesian_collision"][:] = robot.cartesian_collision
+        if motion is None:
+            for name in ("dq_d", "ddq_d", "O_dP_EE_d", "O_dP_EE_c"):
+                fields[name][:] = 0.0
+            pose = robot.arm.pose
+        else:
+            pose, J = robot.arm.frame(robot.q_desired)
+            fields["dq_d"][:], fields["ddq_d"][:] = motion.path.dq, motion.path.ddq
+            fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = J @ motion.path.dq
+        fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = pose.ravel("F")
+        _elbow(fields["elbow_d"], robot.q_desired)
+        _elbow(fields["elbow_c"], robot.q_desired)
+
+
+def _elbow(field: Floats, q: Array) -> None:  # position of joint 3, side of joint 4's flip
+    field[0], field[1] = q[2], 1.0 if q[3] > ELBOW_FLIP else -1.0

@@ -1,27 +1,147 @@
-"""The robot on a network: one client at a time, one state per millisecond."""
+"""The robot on a network: one client at a time, one state per millisecond; nothing blocks."""
 
 from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from sim.fci.clock import Ticks, undisturbed
-from sim.fci.faults import Fault
-from sim.fci.layout import VERSIONS
-from sim.fci.model_library import model_library
-from sim.fci.report import Reporter
-from sim.fci.requests import BadRequest, Request, connect_reply, limit_reply, reply
-from sim.fci.robot import Robot
-from sim.fci.robot_urdf import robot_urdf
-from sim.fci.session import Session
-from sim.fci.spoil import Spoiler
-from sim.fci.statuses import ERROR, INCOMPATIBLE, OK
-from sim.scenarios import build
+from sim.fci.codec import (
+    COMMAND_BYTES,
+    HOST,
+    PORT,
+    VERSIONS,
+    BadRequest,
+    Request,
+    RequestReader,
+    RobotCommand,
+    Status,
+    connect_reply,
+    limit_reply,
+    read_command,
+    reply,
+)
+from sim.fci.faults import Fault, Spoiler
+from sim.fci.model import model_library, robot_urdf
+from sim.fci.robot import Reporter, Robot
+from sim.scenarios import Scenario
 
-HOST = "127.0.0.1"
-PORT = 1337  # clients know no other
+CHUNK = 4096  # bytes at a time; the longest request has 428
+MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
+QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
+
+
+class Session:
+    """A client from its TCP connection to its end.
+
+    Attributes:
+        open: the connection stands.
+        connected: the Connect request has succeeded; states are sent.
+        foreign: datagrams that were no command of this version.
+        stale: commands for a state other than the last one.
+    """
+
+    def __init__(self, tcp: socket.socket, version: int) -> None:
+        tcp.setblocking(False)
+        tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._tcp, self._version = tcp, version
+        self._udp: socket.socket | None = None
+        self._reader, self._out = RequestReader(version), bytearray()
+        self.open, self.foreign, self.stale = True, 0, 0
+
+    @property
+    def connected(self) -> bool:
+        """States are sent."""
+        return self.open and self._udp is not None
+
+    def fileno(self) -> int:
+        """Of the TCP connection, for select."""
+        return self._tcp.fileno()
+
+    def begin_states(self, port: int) -> None:
+        """Send states to this UDP port of the client."""
+        own, peer = self._tcp.getsockname()[0], self._tcp.getpeername()[0]
+        self._udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._udp.setblocking(False)
+        self._udp.bind((own, 0))
+        self._udp.connect((peer, port))
+
+    def requests(self, answer: Callable[[Request], bytes | None]) -> None:
+        """Answer what has come in over TCP; a client that leaves or talks nonsense is dropped."""
+        try:
+            data = self._tcp.recv(CHUNK)
+            if not data:
+                self.close()
+                return
+            for request in self._reader.feed(data):
+                said = answer(request)
+                if said is not None:
+                    self.reply(said)
+        except BlockingIOError:
+            pass
+        except (OSError, BadRequest):
+            self.close()
+        if self._out:
+            self._flush()
+
+    def reply(self, data: bytes) -> None:
+        """Send over TCP, now or when the client's buffer has room again."""
+        self._out += data
+        self._flush()
+        if len(self._out) > MOST_HELD:
+            self.close()
+
+    def send(self, state: bytes | bytearray) -> None:
+        """One datagram; one that the system does not take is lost, as on a network."""
+        if self._udp is None:
+            return
+        with suppress(OSError):  # buffer full, or nobody listens at that port (any more)
+            self._udp.send(state)
+
+    def command(self, message_id: int) -> RobotCommand | None:
+        """The command that answers the last state, if it is there."""
+        found = None
+        if self._udp is None:
+            return None
+        for _ in range(QUEUE):
+            try:
+                data = self._udp.recv(COMMAND_BYTES[10] + 1)
+            except BlockingIOError:
+                break
+            except OSError:  # an earlier state found nobody at the client's port
+                continue
+            command = read_command(data, self._version)
+            if command is None:
+                self.foreign += 1
+            elif command.message_id == message_id:
+                found = command
+            else:
+                self.stale += 1
+        return found
+
+    def close(self) -> None:
+        """End both connections; may be called more than once."""
+        self.open = False
+        self._tcp.close()
+        if self._udp is not None:
+            self._udp.close()
+
+    def _flush(self) -> None:
+        if not self.open:
+            return
+        try:
+            sent = self._tcp.send(self._out)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.close()
+            return
+        del self._out[:sent]
+
+
 IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
 
 
@@ -31,12 +151,10 @@ class FciServer:
     While no client is connected and the arm stands, the simulated world stands as well.
 
     Args:
+        scenario: the arm, and the seed of noise and faults.
         port: TCP port on 127.0.0.1; 0 takes a free one.
         protocol: 5 (FER/Panda) or 10 (FR3).
-        scenario: of `sim.scenarios`.
-        seed: of truth, noise and faults.
         faults: texts as in `sim.fci.faults`.
-        options: of the scenario.
         core: processor to stay on; None leaves it to the system.
 
     Attributes:
@@ -45,18 +163,16 @@ class FciServer:
         robot: the robot.
 
     Raises:
-        ValueError: no such protocol, scenario, option or fault; names the choices.
+        ValueError: no such protocol or fault; names the choices.
         OSError: the port is taken.
     """
 
     def __init__(
         self,
+        scenario: Scenario,
         port: int = PORT,
         protocol: int = 5,
-        scenario: str = "nominal",
-        seed: int = 0,
         faults: Sequence[str] = (),
-        options: Mapping[str, Any] | None = None,
         core: int | None = None,
     ) -> None:
         if protocol not in VERSIONS:
@@ -65,12 +181,12 @@ class FciServer:
         self.protocol = self._version = protocol
         self._core = core
         self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)
-        self._spoiler = Spoiler(asked, seed)
+        self._spoiler = Spoiler(asked, scenario.seed)
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._listener.bind((HOST, port))
-            self.robot = Robot(build(scenario, seed, **(options or {})), protocol)
+            self.robot = Robot(scenario, protocol)
         except BaseException:
             self._listener.close()
             raise
@@ -201,10 +317,10 @@ class FciServer:
         if request.name == "Connect":
             wanted, port = request.connect_terms()
             if wanted != self._says or port == 0:
-                return connect_reply(request, INCOMPATIBLE, version, self._says)
+                return connect_reply(request, Status.INCOMPATIBLE, version, self._says)
             if not session.connected:
                 session.begin_states(port)
-            return connect_reply(request, OK, version, self._says)
+            return connect_reply(request, Status.OK, version, self._says)
         if not session.connected:
             raise BadRequest(f"{request.name} before Connect")
         if request.name == "GetCartesianLimit":
@@ -219,8 +335,8 @@ class FciServer:
         if self._model is None or (
             request.name == "LoadModelLibrary" and request.payload != b"\0\0"
         ):
-            return reply(request, ERROR, self._version)
-        return reply(request, OK, self._version, self._model)
+            return reply(request, Status.ERROR, self._version)
+        return reply(request, Status.OK, self._version, self._model)
 
     def _model_reply(self) -> bytes | None:
         """What a client gets as a model: a library for x64 Linux, or URDF."""

@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim.fci.layout import JOINTS
-from sim.fci.requests import Request
-from sim.fci.statuses import INVALID, OK
+from sim.fci.codec import JOINTS, Request, Status
 from sim.truth import Array
 
 # Ranges: Franka FCI documentation.
@@ -57,15 +55,15 @@ class Settings:
         """(4, 4) end effector in the flange."""
         return np.asarray(self.F_T_NE @ self.NE_T_EE)
 
-    def apply(self, request: Request) -> str:
+    def apply(self, request: Request) -> Status:
         """Take over a Set* request; the status to reply: ok or invalid argument."""
         if request.name == "SetGuidingMode":
-            return OK if set(request.payload) <= {0, 1} else INVALID
+            return Status.OK if set(request.payload) <= {0, 1} else Status.INVALID
         numbers = request.numbers()
         if not np.isfinite(numbers).all():
-            return INVALID
+            return Status.INVALID
         taken: bool = getattr(self, f"_{request.name}")(numbers)
-        return OK if taken else INVALID
+        return Status.OK if taken else Status.INVALID
 
     def _SetCollisionBehavior(self, x: Array) -> bool:
         lower, upper = x[LOWER_TORQUE:UPPER_TORQUE], x[UPPER_TORQUE : UPPER_TORQUE + JOINTS]

@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from adapter.discovery import Discovery, discover
-from adapter.model import SelfModel
-from tests.discovery_data import Case, Motion, anyhow, atlas, panda, record
+from adapter.model.self_model import SelfModel
+from tests.helpers.discovery_data import Case, Motion, anyhow, atlas, panda, record
 
 TRUSTED = 0.9  # no wrong edge may have more confidence than that
 ROBOTS: dict[str, Callable[[], SelfModel]] = {"panda": cache(panda), "atlas": cache(atlas)}

@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from sim.hidden import Trial, draw, unseal
-from sim.hidden_record import Recording, pybullet_recording, write
-from tests.gap_judges import torque_judge
-from tests.gap_mujoco import mujoco_recording
-from tests.gap_oracle import detectability
-from tests.gap_scorer import Row, score_trial, summary, table
-from tests.gap_tools import pinocchio_recording
+from sim.hidden.record import Recording, pybullet_recording, write
+from tests.helpers.gap_judges import torque_judge
+from tests.helpers.gap_mujoco import mujoco_recording
+from tests.helpers.gap_oracle import detectability
+from tests.helpers.gap_scorer import Row, score_trial, summary, table
+from tests.helpers.gap_tools import pinocchio_recording
 
 SIMULATORS: dict[str, Callable[[Trial], Recording]] = {
     "pybullet": pybullet_recording,
@@ -39,13 +39,13 @@ Judge = Callable[[Trial, Recording, dict[str, Any], Path], Row]
 
 def workflow() -> Analyse:
     """The function under trial."""
-    from adapter.gap.workflow import analyse
+    from adapter.gap.workflow import find_gap
 
-    return analyse
+    return find_gap
 
 
-def run_trial(trial: Trial, simulator: str, analyse: Analyse, judges: Sequence[Judge] = ()) -> Row:
-    """Record, analyse and score one trial."""
+def run_trial(trial: Trial, simulator: str, find_gap: Analyse, judges: Sequence[Judge] = ()) -> Row:
+    """Record, find_gap and score one trial."""
     recording = SIMULATORS[simulator](trial)
     with tempfile.TemporaryDirectory() as folder:
         shown, kept = Path(folder) / "shown", Path(folder) / "kept"
@@ -53,7 +53,7 @@ def run_trial(trial: Trial, simulator: str, analyse: Analyse, judges: Sequence[J
         log, model, truth = write(trial, kept, recording, simulator)
         log, model = (path.rename(shown / path.name) for path in (log, model))
         begun = time.perf_counter()
-        answer = analyse([log], model, model_out=shown / "model.json")
+        answer = find_gap([log], model, model_out=shown / "model.json")
         seconds = time.perf_counter() - begun
         result: dict[str, Any] = answer if isinstance(answer, dict) else answer.as_dict()
         row = score_trial(result, unseal(truth), detectability(trial))

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from trials import held_out, regressor_rows
 
-from adapter.config import config_from
-from adapter.pipeline import make_front_end, make_learner
-from adapter.robots import documented
-from drivers.log import LogArm
+from adapter.model.robots import documented
+from adapter.runs.config import config_from
+from adapter.runs.pipeline import make_front_end, make_learner
+from drivers.files.log import LogArm
 from sim.scenarios import build
 
 EARLY_S, END_S = 15.0, 1.5  # the second before the end, when the arm comes to rest

@@ -22,14 +22,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from adapter.cli.experiment_atlas import Fall
-from adapter.experiment.online import noisy, online_trial, without_velocity
-from adapter.robots import documented
-from adapter.spatial import matrix_from_zxz
-from adapter.tree_data import TreeData
-from adapter.tree_learner import TreeLearner, samples_of
-from sim.free_fall_data import data_set
-from sim.tree_truth import TreeLimits, TreeTruth
+from adapter.experiments.falls import Falls
+from adapter.experiments.online import noisy, online_trial, without_velocity
+from adapter.learning.learner import Learner
+from adapter.learning.tree_data import TreeData
+from adapter.model.robots import documented
+from adapter.model.spatial import matrix_from_zxz
+from sim.falls.data_set import data_set
+from sim.falls.tree_truth import TreeLimits, TreeTruth
 
 Row = dict[str, Any]
 
@@ -37,7 +37,7 @@ Row = dict[str, Any]
 def motions(robot: str, folder: Path, count: int) -> tuple[Any, list[TreeData]]:
     """The truth, and `count` exact motions of it with no velocity measured."""
     data = data_set(floating_panda() if robot == "panda" else robot, count, folder=folder)
-    source = Fall(data, data)
+    source = Falls(data, data)
     return source.truth, [without_velocity(source.exact(k)) for k in range(count)]
 
 
@@ -59,7 +59,7 @@ def floating_panda() -> TreeTruth:
     )
 
 
-def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, TreeLearner]:
+def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, Learner]:
     """Learn sample by sample; what came of it and how long the samples took."""
     truth, parts = motions(robot, folder, round(seconds / 10.0) + 1)
     learned_from = [noisy(part, k) if noise else part for k, part in enumerate(parts[:-1])]
@@ -67,52 +67,39 @@ def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, T
     return {"robot": robot, "noise": noise, **figures}, learner
 
 
-def parts_of(learner: TreeLearner, data: TreeData, repeats: int) -> Row:
+def parts_of(learner: Learner, data: TreeData, repeats: int) -> Row:
     """Median time of each part of a sample's work, µs."""
-    schema, theta = learner.schema, learner.theta
-    samples = list(samples_of(data.take(slice(0, repeats)), first_ns=10**15))
-    spare, frames = theta.empty_moments(), learner.frames
-    links = [np.ascontiguousarray(s.links) for s in samples]
-
-    def rows(k: int, times: int) -> list[np.ndarray]:
-        s = samples[k]
-        return [np.repeat(x[None], times, axis=0) for x in (s.q, s.dq, s.ddq, s.tau, s.base)]
+    schema, theta, frames = learner.schema, learner.theta, learner.frames
+    states = data.take(slice(0, repeats)).states(first_ns=10**15)
+    spare = theta.empty_moments()
 
     def look(k: int) -> None:
-        schema.learner.updates = 0
+        schema.updates = 0
         schema.compute_gradient()
 
     def glance(k: int) -> None:
-        schema.learner.updates = 1
+        schema.updates = 1
         schema.compute_gradient()
 
+    def redo(k: int) -> None:
+        theta.absorb_again(frames, states[k : k + 3], spare)
+
     work: dict[str, Callable[[int], object]] = {
-        "moments of λ": lambda k: schema.absorb(
-            samples[k].stamp_ns,
-            samples[k].q,
-            samples[k].dq,
-            samples[k].ddq,
-            samples[k].base,
-            links[k],
-        ),
+        "moments of λ": lambda k: schema.absorb(states[k : k + 1]),
         "gradient of λ": glance,
         "gradient of λ with a look at its curvature (every 20th)": look,
-        "regressor and prediction": lambda k: theta.absorb(
-            *frames, rows(k, 1), into=(theta.A[:0], theta.C)
+        "regressor and prediction": lambda k: theta.errors(frames, states[k : k + 1]),
+        "regressor, prediction, moments of θ": lambda k: theta.absorb_again(
+            frames, states[k : k + 1], spare
         ),
-        "regressor, prediction, moments of θ": lambda k: theta.absorb(
-            *frames, rows(k, 1), into=spare
-        ),
-        "three samples redone (while a rebuild lasts)": lambda k: theta.absorb(
-            *frames, rows(k, 3), into=spare
-        ),
+        "three samples redone (while a rebuild lasts)": redo,
         "gradient of θ": lambda k: theta.compute_gradient(),
         "ADAM on λ and θ": lambda k: learner.adam.step(),
     }
     out: Row = {}
     for name, part in work.items():
         times = []
-        for k in range(len(samples)):
+        for k in range(len(states) - 3):
             before = time.perf_counter_ns()
             part(k)
             times.append(time.perf_counter_ns() - before)

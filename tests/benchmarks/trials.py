@@ -1,7 +1,7 @@
 """Statistical trials over many seeds on the simulated arm, in lockstep: `make trials`.
 
-Prints one line a trial and a table at the end; the figures in the README come from here. Each
-trial learns exactly what a live run of that seed would learn.
+Prints one line a trial; the figures in the README come from here. Each trial is what `adapter run`
+runs with the same options: model, settings, effects and driver come from the command's own code.
 """
 
 from __future__ import annotations
@@ -12,25 +12,28 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adapter.controller import ExcitationController
-from adapter.excitation import ExcitationSettings, MotionLimits
-from adapter.learner import Learner, LearnerSettings
-from adapter.outcome import collect
-from adapter.pipeline import PipelineSettings, make_front_end, make_learner
-from adapter.realtime.lockstep import run_lockstep
-from adapter.records import stamp_of
-from adapter.robots import documented
-from adapter.score import reference_from, schema_score, theta_score
-from adapter.theta_learner import ThetaLearner
-from adapter.torque import ModelTorque
+from adapter.cli.arguments import build_parser
+from adapter.cli.run import controller_of, open_arm, run_plan
+from adapter.control.excitation import ExcitationSettings, RandomMotion
+from adapter.control.limits import MotionLimits
+from adapter.effects.torque import ModelTorque
+from adapter.learning.learner import Learner
+from adapter.learning.theta import Theta
+from adapter.model.inertia import min_eigenvalue
+from adapter.model.robots import documented
+from adapter.realtime.session import run_lockstep
+from adapter.runs.outcome import collect
+from adapter.runs.pipeline import make_front_end, make_learner
+from adapter.runs.score import reference_from, schema_score, theta_score
+from adapter.signals.records import stamp_of
 from drivers.interface import Driver
-from drivers.pybullet_arm import PyBulletArm
-from sim.scenarios import build
+from sim.scenarios import Scenario, build
 
 Row = dict[str, Any]
 LATE_S, END_S = 15.0, 30.0
@@ -47,52 +50,70 @@ class Watched:
         self.learner.step(record)
 
 
-def learn(
-    scenario: str,
-    seed: int,
-    duration_s: float,
-    look: Callable[[Learner, np.ndarray], None] = lambda learner, record: None,
-    motion: dict[str, Any] | None = None,
-    mode: str = "moments",
-    arm_of: Callable[[Any, int], Driver] = lambda world, seed: PyBulletArm(world.plant()),
-    **options: Any,
-) -> tuple[Row, Learner, Any]:
-    """Run one seed; the figures of λ and θ, the learner, and the scenario's truth.
+@dataclass(frozen=True)
+class Task:
+    """What is run, as on the command line of `adapter run`.
 
-    Args:
-        arm_of: driver of a scenario and a seed.
+    Attributes:
+        scenario, seed, duration_s: of the run.
+        options: further ones of the command line.
+        rests: spans (from, to) in s during which the arm rests.
+        arm_of: driver of a scenario and a seed; the command's own where None.
     """
+
+    scenario: str
+    seed: int
+    duration_s: float
+    options: tuple[str, ...] = ()
+    rests: tuple[tuple[float, float], ...] = ()
+    arm_of: Callable[[Scenario, int], Driver] | None = None
+
+    def arguments(self) -> list[str]:
+        """Of the command."""
+        run = ["run", "--scenario", self.scenario, "--seed", str(self.seed)]
+        return [*run, "--duration", str(self.duration_s), *self.options]
+
+
+def learn(
+    task: Task, look: Callable[[Learner, np.ndarray], None] = lambda learner, record: None
+) -> tuple[Row, Learner]:
+    """Run what `adapter run` runs, without its clock; the figures of λ and θ, and the learner."""
     import torch
 
     torch.set_num_threads(1)
-    robot = documented("panda")
-    world = build(scenario, seed, **options)
-    settings = PipelineSettings(learner=LearnerSettings(seed=seed, mode=mode))
-    front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
-    excitation = ExcitationSettings(seed=seed, **(motion or {}))
-    controller = ExcitationController(MotionLimits.of(robot), excitation)
-    arm = arm_of(world, seed)
-    result = run_lockstep(arm, front_end, Watched(learner, look), controller, duration_s)
+    args = build_parser().parse_args(task.arguments())
+    plan = run_plan(args)
+    config, robot, world = plan.config, plan.robot, plan.world
+    assert world is not None
+    if task.rests:
+        config = replace(config, excitation=replace(config.excitation, rests=task.rests))
+    front_end = make_front_end(robot, config.pipeline)
+    learner = make_learner(robot, config.pipeline)
+    arm = task.arm_of(world.scenario, task.seed) if task.arm_of else open_arm(args, plan)
+    controller = controller_of(args, config, robot, arm)
+    watched = Watched(learner, look)
+    result = run_lockstep(arm, front_end, watched, controller, args.duration)
     arm.close()
     assert result.fault is None, result.fault
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder) / "truth.json"
-        world.write_truth(truth)
+        world.scenario.write_truth(truth)
         reference = reference_from(truth, robot)
     outcome = collect(learner)
     start_s = 1e-9 * (front_end.first_moving_ns or 0) - front_end.delay_s
     figures = {
-        "seed": seed,
+        "seed": task.seed,
         "lambda": schema_score(outcome, robot, reference, start_s),
         "theta": theta_score(outcome, robot, start_s),
     }
-    return figures, learner, world.truth
+    return figures, learner
 
 
 def schema_trial(job: tuple[str, int, str]) -> Row:
     """λ from synthesized or measured motion."""
     scenario, seed, mode = job
-    figures, _, _ = learn(scenario, seed, 12.0 if mode == "sample" else 8.0, mode=mode)
+    seconds = 12.0 if mode == "sample" else 8.0
+    figures, _ = learn(Task(scenario, seed, seconds, ("--mode", mode)))
     lam = figures["lambda"]
     return {
         "seed": seed,
@@ -104,13 +125,10 @@ def schema_trial(job: tuple[str, int, str]) -> Row:
     }
 
 
-def held_out(seed: int, theta: np.ndarray) -> tuple[np.ndarray, ...]:
-    """(q, dq, ddq, tau) of a motion that was never learned from, noiseless."""
-    from adapter.excitation import RandomMotion
-
-    robot = documented("panda")
+def held_out(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(q, dq, ddq) of a motion that was never learned from."""
     motion = RandomMotion(
-        MotionLimits.of(robot),
+        MotionLimits.of(documented("panda")),
         np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4]),
         ExcitationSettings(seed=10_000 + seed),
     )
@@ -119,35 +137,41 @@ def held_out(seed: int, theta: np.ndarray) -> tuple[np.ndarray, ...]:
         motion.advance(0.02)
         rows.append((motion.q.copy(), motion.dq.copy(), motion.ddq.copy()))
     q, dq, ddq = (np.array(column) for column in zip(*rows, strict=True))
-    from dataclasses import replace
-
-    return q, dq, ddq, ModelTorque(replace(robot, theta=theta))(q, dq, ddq)
+    return q, dq, ddq
 
 
-def regressor_rows(theta: ThetaLearner, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> Any:
-    """Y (m, 7, 70) of the documented Panda."""
-    from dataclasses import replace
+def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """(m, 7, P) what each parameter of the learner, effects included, adds to the torque.
 
+    Columns of the spare body are zero: these trials know no change.
+    """
     robot = documented("panda")
-    columns = []
+    out = np.zeros((*q.shape, theta.P))
     for k in range(70):
         unit = np.zeros(70)
         unit[k] = 1.0
-        model = replace(robot, theta=unit.reshape(7, 10))
-        columns.append(ModelTorque(model)(q, dq, ddq))
-    return np.stack(columns, axis=-1)
+        out[..., k] = ModelTorque(replace(robot, theta=unit.reshape(7, 10)))(q, dq, ddq)
+    for k, effect in enumerate(theta.effects):
+        for j, column in enumerate(effect.column(q, dq, ddq, theta.smoothing_s).T):
+            out[:, j, 80 + 7 * k + j] = column
+    return out
 
 
 def theta_trial(
     job: tuple[int],
-    arm_of: Callable[[Any, int], Driver] = lambda world, seed: PyBulletArm(world.plant()),
-    **options: Any,
+    arm_of: Callable[[Scenario, int], Driver] | None = None,
+    options: tuple[str, ...] = (),
 ) -> Row:
-    """θ against batch least squares on the same samples, by held-out noiseless torque."""
+    """θ against batch least squares with the same effects on the same samples.
+
+    Both are judged by torque, effects included, on a noiseless motion that neither has seen.
+    """
     (seed,) = job
-    truth = build("nominal", seed).truth
-    q, dq, ddq, tau = held_out(seed, np.array(truth.theta))
-    Y: list[Any] = []
+    q, dq, ddq = held_out(seed)
+    tau = ModelTorque(replace(documented("panda"), theta=build("nominal", seed).truth.theta))(
+        q, dq, ddq
+    )
+    Y: list[np.ndarray] = []
     ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
 
@@ -156,20 +180,18 @@ def theta_trial(
         if theta.updates % 50 or not theta.updates:
             return
         if not Y:
-            Y.append(regressor_rows(theta, q, dq, ddq))
-        from adapter.inertia import min_eigenvalue
-
+            Y.append(columns_of(theta, q, dq, ddq))
         lowest[0] = min(lowest[0], float(np.min(min_eigenvalue(theta.theta))))
         t = 1e-9 * stamp_of(record)
         if t < LATE_S - 5.0:
             return
         noise = np.sqrt(theta.variance())
-        errors = [Y[0] @ th - tau for th in (theta.theta.ravel(), theta.least_squares()[:70])]
+        errors = [Y[0] @ th - tau for th in (theta.th, theta.least_squares())]
         weighted = [float(np.sqrt(np.mean((e / noise) ** 2))) for e in errors]
         plain = [float(np.sqrt(np.mean(e**2))) for e in errors]
         ratios.append((t, weighted[0] / weighted[1], plain[0] / plain[1], *plain))
 
-    figures, _, _ = learn("nominal", seed, END_S, look, arm_of=arm_of, **options)
+    figures, learner = learn(Task("nominal", seed, END_S, options, arm_of=arm_of), look)
     table = np.array(ratios)
     late = table[table[:, 0] >= LATE_S]
     lam, theta = figures["lambda"]["converged_s"], figures["theta"]["converged_s"]
@@ -186,17 +208,26 @@ def theta_trial(
         "theta_after_lambda_s": None if theta is None or lam is None else theta - lam,
         "min_eigenvalue": lowest[0],
         "changes": len(figures["theta"]["changes"]),
+        **{
+            f"largest_{name}": float(np.abs(row).max())
+            for name, row in zip(
+                (effect.name for effect in learner.theta.effects),
+                learner.theta.effect_values,
+                strict=True,
+            )
+        },
     }
 
 
-def can_arm(world: Any, seed: int) -> Driver:
+def can_arm(world: Scenario, seed: int) -> Driver:
     """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
     from drivers.damiao.arm import DamiaoArm
-    from sim.damiao import Boards, Line
-    from sim.damiao.lockstep import Lockstep
+    from sim.damiao.host import Lockstep
+    from sim.damiao.line import Line
+    from sim.damiao.server import Boards
 
     line = Line()
-    line.attach(Boards(line.boards, world, seed, now_ns=line.now_ns))
+    line.attach(Boards(line.boards, world, now_ns=line.now_ns))
     names = world.truth.joint_names
     address = "can://line?interface=virtual"
     return Lockstep(
@@ -210,7 +241,8 @@ def wire_trial(job: tuple[str, int]) -> Row:
     wire, seed = job
     if wire == "can":
         return {"wire": wire, **theta_trial((seed,), can_arm)}
-    return {"wire": wire, **theta_trial((seed,), noise="none" if wire == "noiseless" else "real")}
+    noise = "none" if wire == "noiseless" else "real"
+    return {"wire": wire, **theta_trial((seed,), options=("--set", f"noise={noise}"))}
 
 
 def payload_trial(job: tuple[int, float]) -> Row:
@@ -234,7 +266,8 @@ def payload_trial(job: tuple[int, float]) -> Row:
             if payload is not None and t >= 20.0 + after and f"mass_{after:.0f}_s" not in marks:
                 marks[f"mass_{after:.0f}_s"] = float(payload[0][0])
 
-    figures, learner, _ = learn("payload_at_20s", seed, 26.0, look, mass=mass)
+    task = Task("payload_at_20s", seed, 26.0, ("--set", f"mass={mass}"))
+    figures, learner = learn(task, look)
     t = np.array([row[0] for row in errors])
     e = np.array([row[1] for row in errors])
 
@@ -261,7 +294,7 @@ def payload_trial(job: tuple[int, float]) -> Row:
 def null_trial(job: tuple[str, int]) -> Row:
     """No change: how many alarms."""
     scenario, seed = job
-    figures, _, _ = learn(scenario, seed, END_S)
+    figures, _ = learn(Task(scenario, seed, END_S))
     return {"scenario": scenario, "seed": seed, "alarms": len(figures["theta"]["changes"])}
 
 
@@ -283,8 +316,7 @@ def rest_trial(job: tuple[int]) -> Row:
         if key == "before" or "after" not in marks:
             marks[key] = np.concatenate([theta.mean, learner.schema.lam.ravel()])
 
-    motion = {"rests": ((20.0, 80.0),)}
-    learn("nominal", seed, 84.0, look, motion=motion)
+    learn(Task("nominal", seed, 84.0, rests=((20.0, 80.0),)), look)
     table = np.array(errors)
     before = table[(table[:, 0] > 15.0) & (table[:, 0] < 19.0), 1].mean()
     after = table[(table[:, 0] > 50.0), 1][:2000].mean()

@@ -26,7 +26,7 @@ import numpy as np
 from soak import simulated
 
 from adapter.realtime.clock import Clock
-from adapter.realtime.rt import RealTime, split_cores
+from adapter.realtime.real_time import RealTime, split_cores
 
 SHARES = (50, 99, 99.9, 100)
 FRESH_NS = 1_000_000
@@ -155,7 +155,8 @@ def can_virtual(minutes: float) -> dict[str, Any]:
     import can
 
     from drivers.damiao.arm import DamiaoArm
-    from sim.damiao import Boards, ServedBus
+    from sim.damiao.host import ServedBus
+    from sim.damiao.server import Boards
     from sim.scenarios import build
 
     far = can.Bus(interface="virtual", channel="bench")

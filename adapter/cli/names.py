@@ -1,0 +1,42 @@
+"""Names on a command line that other rooms know. Nothing here takes long to load."""
+
+from __future__ import annotations
+
+import argparse
+
+from adapter.effects import LEARNED
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.errors import SettingsError
+from drivers.faults.spec import Faults
+from sim.options import DEFAULT_SCENARIO, options_of
+from sim.options import check as check_scenario
+
+
+def check_run(args: argparse.Namespace) -> None:
+    """Scenario and faults of `run`. Raises ValueError, DriverError with the choices."""
+    if args.scenario or args.set:
+        check_scenario(args.scenario or DEFAULT_SCENARIO, options_of(args.set))
+    if args.fault is not None:
+        Faults.parse(args.fault)
+
+
+def effects_named(text: str) -> tuple[str, ...]:
+    """Names of the effects to learn: none, real, or a list with commas between.
+
+    Raises:
+        SettingsError: no such effect; with the choices.
+    """
+    if text == "none":
+        return ()
+    if text == "real":
+        return REAL_ARM_EFFECTS
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        if name not in LEARNED:
+            raise SettingsError(f"no effect '{name}'; have: none, real, {', '.join(LEARNED)}")
+    return names
+
+
+def check_effects(args: argparse.Namespace) -> None:
+    """`--effects`. Raises SettingsError."""
+    effects_named(args.effects)

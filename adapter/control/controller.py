@@ -1,0 +1,311 @@
+"""Keeps an arm on a reference by feedback alone, with a model's feed-forward on request.
+
+    tau = b + K (q_ref - q) + D (dq_ref - dq)
+
+like a joint impedance controller. No model: the constant b is the torque that the arm was
+measured to hold itself with before the start. With feed-forward, b fades out over a second while
+the model's torque fades in. An arm that carries its own weight (`Driver.adds_gravity`) is given
+no b, and the model's torque less the gravity in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from adapter.control.excitation import ExcitationSettings, RandomMotion, smooth_step
+from adapter.control.feedforward import Feedforward
+from adapter.control.limits import MotionLimits
+from adapter.control.reading_gate import ReadingGate, ReadingJudge
+from adapter.errors import ControlError, SettingsError
+from adapter.model.spatial import Array
+from drivers.interface import Driver, JointSample
+
+# N m/rad and N m s/rad. Stiffness as of a Panda's joint impedance control; damping as high as
+# the arm's smallest inertias allow at 1 kHz (D T / I < 0.5), without the help of the motors'.
+PANDA_STIFFNESS = (600.0, 700.0, 400.0, 600.0, 40.0, 50.0, 10.0)
+PANDA_DAMPING = (15.0, 25.0, 8.0, 15.0, 1.2, 1.6, 0.3)
+GAINS_DELAY_NS = 1_000_000  # from a reading to its torque, for which that holds
+STIFFNESS_PER_EFFORT = 5.0  # 1/rad, of another arm
+DAMPING_TIME_S = 0.03  # damping over stiffness, of another arm
+
+DEFAULT_PERIOD_NS = 1_000_000
+RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an arm that checks it
+START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
+FADE_S = 1.0  # from feedback alone to feed-forward
+REFRESH_TICKS = 50
+
+
+class Controller(Protocol):
+    """What the loop asks of a controller."""
+
+    @property
+    def at_rest(self) -> bool:
+        """A stop was asked for and is done."""
+
+    def attach(self, snapshot_name: str) -> None:
+        """Follow the estimate published under this name."""
+
+    def detach(self) -> None:
+        """Follow it no longer."""
+
+    def attend(self, driver: Driver) -> None:
+        """Get to know the arm; called before `prepare`, once it is connected."""
+
+    def prepare(self, sample: JointSample) -> None:
+        """Get ready to start from where this sample finds the arm; may take its time."""
+
+    def step(self, sample: JointSample, now_ns: int = 0) -> Array:
+        """Torques (n,) N m for this sample, handled at `now_ns` (0: not known). Raises
+        ControlError."""
+
+    def begin_stop(self) -> None:
+        """Come to rest from now on; `step` goes on being called."""
+
+    def tracking(self) -> dict[str, Any]:
+        """How well the arm followed, JSON values only."""
+
+
+@dataclass(frozen=True)
+class ControlSettings:
+    """Gains of the feedback; those of a Panda, or by a rule from the effort limits, where None.
+
+    Attributes:
+        stiffness: K (n), N m/rad.
+        damping: D (n), N m s/rad.
+        effort_share: of the effort limits that a command uses at most.
+    """
+
+    stiffness: Sequence[float] | None = None
+    damping: Sequence[float] | None = None
+    effort_share: float = 0.95
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping"):
+            values = getattr(self, name)
+            if values is not None and not all(value >= 0.0 for value in values):
+                raise SettingsError(f"control.{name} must not be negative, got {values}")
+        if not 0.0 < self.effort_share <= 1.0:
+            raise SettingsError(f"control.effort_share must be in (0, 1], got {self.effort_share}")
+
+    def gains(self, limits: MotionLimits) -> tuple[Array, Array]:
+        """K and D (n,) of an arm. Raises SettingsError for a wrong number of gains."""
+        n = len(limits.effort)
+        panda = limits.is_panda
+        effort = np.where(np.isfinite(limits.effort), limits.effort, 10.0)
+        rule = np.array(PANDA_STIFFNESS) if panda else STIFFNESS_PER_EFFORT * effort
+        damping_rule = np.array(PANDA_DAMPING) if panda else DAMPING_TIME_S * rule
+        chosen = []
+        for name, own in (("stiffness", rule), ("damping", damping_rule)):
+            given = getattr(self, name)
+            gains = own if given is None else np.array(given, dtype=np.float64)
+            if gains.shape != (n,):
+                raise SettingsError(f"control.{name} has {len(gains)} values; the arm {n} joints")
+            chosen.append(gains)
+        return chosen[0], chosen[1]
+
+
+class ErrorTally:
+    """Square sum and maximum of the tracking error by joint."""
+
+    def __init__(self, n: int) -> None:
+        self.count, self._square, self._max = 0, np.zeros(n), np.zeros(n)
+
+    def add(self, error: Array) -> None:
+        """Count one error (n,), rad."""
+        self.count += 1
+        self._square += error * error
+        np.maximum(self._max, np.abs(error), out=self._max)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Samples, rms and max by joint in rad; None where nothing was counted."""
+        if not self.count:
+            return {"samples": 0, "rms_rad": None, "max_rad": None}
+        rms = np.sqrt(self._square / self.count)
+        return {"samples": self.count, "rms_rad": rms.tolist(), "max_rad": self._max.tolist()}
+
+
+class ExcitationController:
+    """Random motion, kept by feedback, started softly and stopped safely.
+
+    A command differs from the last one by at most what the torque rate allows in one period (0.9
+    of it where time goes on between two reads), however much time went by: an arm compares it
+    with the last command that reached it.
+    A reading that is no number, that comes again or late, that moved as no joint moves or that
+    stands still while the arm should move is not acted upon; the last torque is repeated.
+
+    Args:
+        limits: of the arm.
+        motion: settings of the reference.
+        control: gains.
+        feedforward: a model to help, used as soon as it is ready; feedback alone where None.
+
+    Attributes:
+        reference: the motion; None before the first sample.
+        saturated: commands that were cut at the effort limit.
+        rate_limited: commands that were cut at the torque rate limit.
+    """
+
+    def __init__(
+        self,
+        limits: MotionLimits,
+        motion: ExcitationSettings | None = None,
+        control: ControlSettings | None = None,
+        feedforward: Feedforward | None = None,
+    ) -> None:
+        control = control or ControlSettings()
+        n = len(limits.effort)
+        self.limits, self.motion = limits, motion or ExcitationSettings()
+        self.feedforward = feedforward
+        self._K, self._full_D = control.gains(limits)
+        self._D = self._full_D
+        self._effort = limits.effort * control.effort_share
+        self.reference: RandomMotion | None = None
+        self.saturated = self.rate_limited = 0
+        self._tau, self._bias, self._still = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._fade_s, self._ticks = 0.0, 0
+        self._feedback_only, self._with_model = ErrorTally(n), ErrorTally(n)
+        self._take_on(DEFAULT_PERIOD_NS, False)
+
+    def attend(self, driver: Driver) -> None:
+        """Learn the arm's period, whether it carries its own weight, and how late it acts.
+
+        Where it acts later than the gains are made for, damping shrinks in that proportion.
+        """
+        self._D = self._full_D * min(1.0, GAINS_DELAY_NS / max(driver.delay_ns, 1))
+        self._take_on(driver.period_ns, driver.adds_gravity)
+
+    def _take_on(self, period_ns: int, adds_gravity: bool) -> None:
+        self._period_ns, self._adds_gravity = period_ns, adds_gravity
+        self._most = self.limits.torque_rate * (1e-9 * period_ns)
+
+    @property
+    def at_rest(self) -> bool:
+        """A stop was asked for and is done, or there never was a motion."""
+        return self.reference is None or self.reference.at_rest
+
+    def attach(self, snapshot_name: str) -> None:
+        """Let the feed-forward follow an estimate. Raises SnapshotError."""
+        if self.feedforward is not None:
+            self.feedforward.attach(snapshot_name)
+
+    def detach(self) -> None:
+        """Let the feed-forward go on with what it has."""
+        if self.feedforward is not None:
+            self.feedforward.detach()
+
+    def prepare(self, sample: JointSample) -> None:
+        """Draw the motion from here on; the arm holds itself still now.
+
+        Raises SettingsError where it stands outside its limits or says nothing usable.
+        """
+        held = self._still if self._adds_gravity else sample.tau
+        for name, values in (("position", sample.q), ("velocity", sample.dq), ("torque", held)):
+            if not np.isfinite(values).all():
+                raise SettingsError(
+                    f"joint {int(np.argmin(np.isfinite(values))) + 1} gives no {name}; a motion "
+                    "can only start where every joint is measured"
+                )
+        self.reference = ref = RandomMotion(self.limits, sample.q, self.motion)
+        self._tau = self._bias = np.array(held, dtype=np.float64)
+        self._gate = ReadingGate(self._new_judge(), self._period_ns)
+        self._started = False
+        ref.advance(0.0)  # compiles, as do the next lines, before the clock runs
+        self._new_judge().judge(ref.q, ref.dq, ref.q, (0.0, 0.0))
+        if self.feedforward is not None:
+            self.feedforward(ref.q, ref.dq, ref.ddq)
+
+    def _new_judge(self) -> ReadingJudge:
+        return ReadingJudge(self.limits.velocity, self.limits.effort, self._K)
+
+    def begin_stop(self) -> None:
+        """Slow down along the path, then hold."""
+        if self.reference is not None:
+            self.reference.begin_stop()
+
+    def step(self, sample: JointSample, now_ns: int = 0) -> Array:
+        """Torques (n,) N m. An unusable reading repeats the last; 20 ms of them are an error.
+
+        Args:
+            sample: the reading.
+            now_ns: instant at which it is there, where time goes on between two reads: it tells
+                a hole in the samples from a clock that was set. 0 goes by the stamps alone.
+
+        Raises ControlError.
+        """
+        if self.reference is None:
+            self.prepare(sample)
+        ref, gate = self.reference, self._gate
+        assert ref is not None
+        step_ns = gate.look(sample, now_ns)
+        if not self._started:
+            self._start(sample)
+        if step_ns:
+            ref.advance(1e-9 * step_ns)
+        usable = gate.usable(sample, ref.q)
+        self._ticks += 1
+        if not usable or not step_ns:
+            return self._tau.copy()
+        tau = self._wanted(sample, 1e-9 * step_ns)
+        if not np.isfinite(tau).all():
+            raise ControlError("the model's torque is not a finite number; the arm is stopped")
+        return self._limited(tau, (RATE_SHARE if now_ns else 1.0) * self._most)
+
+    def _start(self, sample: JointSample) -> None:
+        """The first reading has to be where the motion was drawn from; it may be long ago."""
+        assert self.reference is not None
+        self._started = True
+        away = np.abs(sample.q - self.reference.q)
+        if (away > START_REACH).any():
+            j = int(np.argmax(away))
+            raise ControlError(
+                f"joint {j + 1} moved by {away[j]:.3f} rad between the plan and the start; start "
+                "again and leave the arm alone"
+            )
+
+    def _wanted(self, sample: JointSample, dt_s: float) -> Array:
+        ref, model = self.reference, self.feedforward
+        assert ref is not None
+        error = ref.q - sample.q
+        tau: Array = self._K * error + self._D * (ref.dq - sample.dq)
+        share = 0.0
+        if model is not None:
+            if self._ticks % REFRESH_TICKS == 0:
+                model.refresh()
+            if model.ready:
+                self._fade_s = min(self._fade_s + dt_s, FADE_S)
+                share = smooth_step(self._fade_s / FADE_S)[0]
+                tau += share * self._of_model(model, ref)
+        if share < 1.0:
+            tau += (1.0 - share) * self._bias
+        if ref.time_s >= self.motion.start_s and share in (0.0, 1.0):
+            (self._with_model if share else self._feedback_only).add(error)
+        return tau
+
+    def _of_model(self, model: Feedforward, ref: RandomMotion) -> Array:
+        tau = model(ref.q, ref.dq, ref.ddq)
+        if self._adds_gravity:
+            tau = tau - model(ref.q, self._still, self._still)
+        return tau
+
+    def _limited(self, tau: Array, most: Array) -> Array:
+        """Within the effort limits and not further than `most` (n,) from the last command."""
+        cut = np.minimum(np.maximum(tau, -self._effort), self._effort)
+        self.saturated += bool((cut != tau).any())
+        step = np.minimum(np.maximum(cut - self._tau, -most), most)
+        self.rate_limited += bool((np.abs(cut - self._tau) > most).any())
+        self._tau = self._tau + step
+        return self._tau.copy()
+
+    def tracking(self) -> dict[str, Any]:
+        """Tracking error from the end of the soft start on, without and with feed-forward."""
+        return {
+            "feedback": self._feedback_only.as_dict(),
+            "feedforward": self._with_model.as_dict(),
+            "saturated": self.saturated,
+            "rate_limited": self.rate_limited,
+            "unusable": 0 if self.reference is None else self._gate.unusable,
+        }

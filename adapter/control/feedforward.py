@@ -1,0 +1,142 @@
+"""Torque that a model says a motion takes: gravity compensation and inverse dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
+from adapter.effects.base import smooth_sign
+from adapter.effects.by_joint import ByJoint
+from adapter.effects.catalogue import effects_by_name
+from adapter.effects.link_angles import Gears, JointTorques, to_links
+from adapter.errors import SettingsError
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, torques, wrench_torques
+
+
+class Feedforward(Protocol):
+    """What a controller asks of a model.
+
+    Attributes:
+        ready: whether its torques may be used.
+    """
+
+    @property
+    def ready(self) -> bool: ...
+
+    def attach(self, name: str) -> None:
+        """Follow the estimate published under this name, where the model is a learned one."""
+
+    def detach(self) -> None:
+        """Follow it no longer."""
+
+    def refresh(self) -> None:
+        """Take over what is new; called every 50 ticks or so."""
+
+    def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Torques (n,) N m of a motion (n,) rad, rad/s, rad/s². Raises nothing."""
+
+
+class ModelFeedforward:
+    """Inverse dynamics of a fixed-base model, compiled; some 7 µs a call for 7 joints.
+
+    What a model's effects do to a motion is computed from one instant: the links follow the
+    encoders without the rates of a gear's twist, a gear with play leans on the flank that pushes
+    it, and what needs time (a late sensor, friction that drifts) is left out. `torque.ModelTorque`
+    does all of it over tables.
+
+    Args:
+        tree: N and A.
+        gravity: (3,) m/s² in base axes.
+        effect_names: effects beside θ with one parameter per joint, from the catalogue.
+        known: further effects; those of bodies must be in θ and gravity (`with_bodies`).
+
+    Until `set` has given it parameters its torques are zero.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        gravity: Array,
+        effect_names: Sequence[str] = (),
+        known: Sequence[Active] = (),
+    ) -> None:
+        if tree.floating:
+            raise SettingsError("feed-forward needs a fixed base; this model's base floats")
+        n = tree.n
+        self._parent, self._base = tree.parent, base_at_rest(gravity)[None]
+        self._effects = effects_by_name(effect_names)
+        self._known = by_joint(known, n) if known else None
+        # position, velocity, acceleration, torque: a table of one instant each
+        self._signals, self._still = np.zeros((4, 1, n)), np.zeros(n)
+        self._motion = JointMotion(*self._signals[:3])
+        self.set(np.zeros((n, 6)), np.zeros((n, 10)), np.zeros((len(self._effects), n)))
+        self(*np.zeros((3, n)))  # compiled now, not in the first tick
+
+    @classmethod
+    def of(cls, model: SelfModel) -> ModelFeedforward:
+        """Of a model as it stands, with its tool and its effects that have no end."""
+        model = with_bodies(model)
+        known = lasting_effects(model.effects, model.tree.n)
+        forward = cls(model.tree, model.gravity, known=known)
+        forward.set(model.lam, model.theta_with_tool(), np.zeros((0, model.tree.n)))
+        return forward
+
+    @property
+    def ready(self) -> bool:
+        """A model is always ready."""
+        return True
+
+    def attach(self, name: str) -> None:
+        """This model is not learned."""
+
+    def detach(self) -> None:
+        """Nothing to let go."""
+
+    def refresh(self) -> None:
+        """Nothing is ever new."""
+
+    def set(self, lam: Array, theta: Array, effect_values: Array) -> None:
+        """Take parameters: λ (n, 6), θ (n, 10) of arm and tool, (e, n) of the named effects."""
+        self._frames = frames_of(self._parent, lam)
+        self._theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
+        self._values = np.array(effect_values, dtype=np.float64)
+
+    def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Torques (n,) N m of a motion."""
+        signals, known = self._signals, self._known
+        signals[0, 0], signals[1, 0], signals[2, 0] = q, dq, ddq
+        if known is not None and known.moves:
+            self._to_links(known)
+        tau = self._rigid()
+        if known is not None:
+            link, speed, pull = signals[0, 0], signals[1, 0], signals[2, 0]
+            total = tau + known.torque(link, speed, pull, tau)
+            if known.pushed:
+                push = np.empty((1, len(tau), 1))
+                wrench_torques(self._frames, signals[0], known.wrench[:, None], push)
+                total = total - push[0, :, 0]
+            tau = total + known.gain * total
+        for effect, value in zip(self._effects, self._values, strict=True):
+            tau = tau + value * effect.column(q, dq, ddq)
+        return tau
+
+    def _rigid(self) -> Array:
+        tau = self._signals[3]
+        torques(self._frames, self._theta, self._motion, self._base, tau)
+        return tau[0].copy()
+
+    def _to_links(self, known: ByJoint) -> None:
+        """Put the links' motion in place of what the encoders say."""
+        (q,), (dq,), (ddq,), (tau,) = self._signals
+        lag = known.half_play * smooth_sign(dq)
+        if known.compliance.any():
+            self._rigid()
+        pull = JointTorques(tau, self._still, self._still)
+        to_links(JointMotion(q, dq, ddq), pull, Gears.of(known))
+        q -= lag

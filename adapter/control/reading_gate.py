@@ -1,0 +1,190 @@
+"""Which joint readings a controller may act upon, and when it has to give up."""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+
+import numpy as np
+
+from adapter.control.sample_clock import SampleClock
+from adapter.errors import ControlError
+from adapter.model.spatial import Array
+from adapter.physics.kernels import jit
+from drivers.interface import JointSample
+
+# What an honest reading keeps between two samples. A jump that stays below the first two moves
+# the spring of a stiff joint (600 N m/rad) by 3 N m.
+JUMP = 0.005  # rad, beyond what the measured speeds say: noise, steps of the encoder
+DRIFT = 0.25  # of the documented speed, by which the measured one may be wrong or late
+FASTER = 1.5  # of the documented speed is more than a joint does
+HARDER = 100.0  # rad/s² is more than an arm does, five times what a Panda may
+STUCK_EFFORT = 0.1  # of the effort limit that the spring winds up on a reading that stands still
+STUCK_WAY = 0.02  # rad that the measured speed makes meanwhile
+
+
+class Verdict(IntEnum):
+    """What a reading is found to be."""
+
+    GOOD = 0
+    NON_FINITE = 1
+    JUMPED = 2  # moved as no joint moves
+    STUCK = 3  # stands still while the arm should move
+    REPEATED = 4  # not newer than those before it
+    BROKEN_OFF = 5  # a jump behind a leap of the stamps
+
+
+VERDICTS = tuple(Verdict)
+
+
+@jit
+def judge_reading(q, dq, q_ref, between_s, bounds, last):
+    """(verdict, joint) on a reading; `last` is overwritten if it is good.
+
+    Args:
+        q, dq: (n,) the reading; q_ref: (n,) the reference.
+        between_s: (least, most) time since the last good reading.
+        bounds: rows (2, n): documented speed, rad/s; how far the reference may move while the
+            reading stays the same to the last bit, rad.
+        last: rows (4, n): q and dq of the last good reading, NaN before the first; the reference
+            when q changed at last; the way that the measured speed has made since then, rad.
+    """
+    n = q.shape[0]
+    least_s, most_s = between_s
+    velocity, wind = bounds[0], bounds[1]
+    last_q, last_dq, reference, way = last[0], last[1], last[2], last[3]
+    for j in range(n):
+        if not (math.isfinite(q[j]) and math.isfinite(dq[j])):
+            return Verdict.NON_FINITE.value, j
+    for j in range(n):
+        if not math.isfinite(last_q[j]):
+            continue
+        moved = q[j] - last_q[j]
+        speed = 0.5 * (dq[j] + last_dq[j])
+        low, high = min(speed * least_s, speed * most_s), max(speed * least_s, speed * most_s)
+        room = JUMP + DRIFT * velocity[j] * most_s
+        if abs(dq[j]) > FASTER * velocity[j]:
+            return Verdict.JUMPED.value, j
+        if abs(dq[j] - last_dq[j]) > DRIFT * velocity[j] + HARDER * most_s:
+            return Verdict.JUMPED.value, j
+        if abs(moved) > JUMP + FASTER * velocity[j] * most_s:
+            return Verdict.JUMPED.value, j
+        if moved < low - room or moved > high + room:
+            return Verdict.JUMPED.value, j
+    for j in range(n):
+        if q[j] != last_q[j]:
+            continue
+        wound = abs(q_ref[j] - reference[j]) > wind[j]
+        if wound or abs(way[j] + dq[j] * least_s) > STUCK_WAY:
+            return Verdict.STUCK.value, j
+    for j in range(n):
+        if q[j] != last_q[j]:
+            reference[j], way[j] = q_ref[j], 0.0
+        else:
+            way[j] += dq[j] * least_s
+        last_q[j], last_dq[j] = q[j], dq[j]
+    return Verdict.GOOD.value, 0
+
+
+class ReadingJudge:
+    """Judges readings one after the other.
+
+    Args:
+        velocity: (n,) documented speeds, rad/s.
+        effort: (n,) limits, N m (may be infinite); stiffness: (n,) of the controller, N m/rad.
+
+    Attributes:
+        joint: index of the joint that the last verdict is about.
+    """
+
+    def __init__(self, velocity: Array, effort: Array, stiffness: Array) -> None:
+        n = len(velocity)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            wind = STUCK_EFFORT * np.asarray(effort) / stiffness
+        wind = np.where(np.isfinite(wind), wind, np.inf)
+        self._bounds = np.array([velocity, wind], dtype=np.float64)
+        self._last = np.full((4, n), np.nan)
+        self._last[3] = 0.0
+        self.joint = 0
+
+    def judge(self, q: Array, dq: Array, q_ref: Array, between_s: tuple[float, float]) -> Verdict:
+        """What a reading is, by its numbers: one of the first four.
+
+        Args:
+            q, dq: (n,) the reading; q_ref: (n,) the reference.
+            between_s: (least, most) time since the last good reading.
+        """
+        verdict, self.joint = judge_reading(q, dq, q_ref, between_s, self._bounds, self._last)
+        return VERDICTS[verdict]
+
+
+BLIND_NS = 20_000_000  # without a usable reading for so long, the controller gives up
+LONGEST_STEP_NS = 20_000_000  # a longer step of the stamps alone is a clock that was set
+
+_SINCE = f"for {1e-9 * BLIND_NS:g} s; the arm is stopped"
+_WHY = {
+    Verdict.NON_FINITE: f"no usable joint reading {_SINCE}",
+    Verdict.GOOD: f"no usable joint reading {_SINCE}",
+    Verdict.REPEATED: f"no newer joint reading {_SINCE}; look at the arm's clock and the "
+    "connection",
+    Verdict.JUMPED: f"joint {{}} reads what no joint can move to {_SINCE}; look at its encoder",
+    Verdict.STUCK: "joint {} reads the same while it should move; the arm is stopped; look at "
+    "its encoder",
+    Verdict.BROKEN_OFF: "the samples broke off and joint {} is elsewhere now; the arm is stopped; "
+    "look at the connection",
+}
+
+
+class ReadingGate:
+    """Takes every sample; says how far time went and whether its reading may be acted upon.
+
+    Args:
+        judge: of the numbers.
+        period_ns: of the arm.
+
+    Attributes:
+        unusable: readings that may not be acted upon.
+    """
+
+    def __init__(self, judge: ReadingJudge, period_ns: int) -> None:
+        self._judge, self._period_ns = judge, period_ns
+        self._clock = SampleClock(period_ns, LONGEST_STEP_NS)
+        self._started = self._leapt = False
+        self.unusable = 0
+        self._blind_ns = self._handled_ns = self._stamped_ns = 0
+
+    def look(self, sample: JointSample, now_ns: int) -> int:
+        """Time since the last sample, ns; see `SampleClock.step`.
+
+        Where only stamps are known, a call without a newer one still counts as a period blind.
+        """
+        step_ns = self._clock.step(sample.stamp_ns, now_ns)
+        if self._started:
+            self._blind_ns += step_ns if now_ns else max(step_ns, self._period_ns)
+            self._handled_ns += self._clock.clock_step_ns if now_ns else self._period_ns
+            self._stamped_ns += self._clock.stamp_step_ns
+            self._leapt = self._leapt or self._clock.leapt
+        self._started = True
+        return step_ns
+
+    def usable(self, sample: JointSample, q_ref: Array) -> bool:
+        """Whether to act upon the sample that was looked at; q_ref (n,) rad is the reference.
+
+        Raises ControlError after 20 ms without one, also if this one is; at once for a joint that
+        stands still, since its spring is wound up.
+        """
+        verdict = Verdict.REPEATED
+        if self._clock.fresh:
+            times = 1e-9 * self._handled_ns, 1e-9 * self._stamped_ns
+            between_s = min(times), max(times)
+            verdict = self._judge.judge(sample.q, sample.dq, q_ref, between_s)
+        if verdict == Verdict.JUMPED and self._leapt:
+            verdict = Verdict.BROKEN_OFF
+        if self._blind_ns > BLIND_NS or verdict == Verdict.STUCK:
+            raise ControlError(_WHY[verdict].format(self._judge.joint + 1))
+        if verdict != Verdict.GOOD:
+            self.unusable += 1
+            return False
+        self._blind_ns = self._handled_ns = self._stamped_ns = 0
+        self._leapt = False
+        return True

@@ -1,0 +1,98 @@
+"""Experiments that tell effects apart which look alike in a recording.
+
+Every effect says what it shows in the experiments that touch it (`Effect.shows`); in all others
+it shows what an untouched effect does. Two effects are told apart by the first experiment of
+`SPLITS` in which they show different things, so no effect has to know of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+
+@dataclass(frozen=True)
+class Split:
+    """An experiment.
+
+    Attributes:
+        do: what to do.
+        untouched: what an effect shows that the experiment does not touch.
+    """
+
+    do: str
+    untouched: str = "stays"
+
+
+ALONE = Split("repeat the motion with nothing near the arm")
+BARE = Split("take off what the flange carries and repeat the motion")
+FLANK = Split("reverse the joint slowly with and without a load that keeps the gear on one flank")
+LOADS = Split("repeat the motion with a ladder of loads at the flange, at the same speed")
+WEIGHED = Split(
+    "weigh the link apart from the arm, or compute it from its drawing", "does not show"
+)
+SPEEDS = Split(
+    "move the joint at constant speeds from 0.01 to 0.5 rad/s over the same range",
+    "is the same at all speeds",
+)
+STILL = Split("hold the joint still after moving in either direction", "is the same both times")
+BOTH_WAYS = Split(
+    "move the joint at the same speed forwards and backwards", "is as large either way"
+)
+LATER = Split("repeat the motion after the arm has moved for ten minutes", "is what it was")
+TURN = Split("move the joint over as much of a turn as it has", "is the same all along")
+LEVELLED = Split("measure with a level how the base stands", "does not show")
+KNOWN_WEIGHT = Split(
+    "hang a known weight on the flange and read the torque sensors", "leaves its reading right"
+)
+
+
+class Shown(Protocol):
+    """What is asked of an effect here."""
+
+    title: ClassVar[str]
+    shows: ClassVar[tuple[tuple[Split, str], ...]]
+
+
+# In the order of preference: what is easy to do and sure comes first.
+SPLITS = (
+    ALONE,
+    BARE,
+    FLANK,
+    LOADS,
+    WEIGHED,
+    SPEEDS,
+    STILL,
+    BOTH_WAYS,
+    LATER,
+    TURN,
+    LEVELLED,
+    KNOWN_WEIGHT,
+)
+
+
+def split_of(one: Shown, other: Shown) -> Split | None:
+    """The experiment that tells two effects apart; None where none of them does."""
+    return next((s for s in SPLITS if shown(one, s) != shown(other, s)), None)
+
+
+def shown(effect: Shown, split: Split) -> str:
+    """What an effect shows in an experiment."""
+    return dict(effect.shows).get(split, split.untouched)
+
+
+def experiments(effect: Shown, rivals: Iterable[Shown]) -> tuple[str, ...]:
+    """How to tell an effect from its rivals: a sentence for each experiment, the easiest first.
+
+    A rival that no experiment tells from it is not in any.
+    """
+    by_split: dict[Split, list[Shown]] = {}
+    for rival in rivals:
+        split = split_of(effect, rival)
+        if split is not None:
+            by_split.setdefault(split, []).append(rival)
+    return tuple(
+        f"{split.do}: " + ", ".join(f"the {e.title} {shown(e, split)}" for e in (effect, *others))
+        for split, others in sorted(by_split.items(), key=lambda pair: SPLITS.index(pair[0]))
+    )

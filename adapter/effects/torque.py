@@ -1,0 +1,143 @@
+"""Torque of a self model with its effects: what its sensors would read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from adapter.effects.active import Active, active_effects, lasting_effects
+from adapter.effects.base import (
+    ArmDynamics,
+    BodyEffect,
+    Flags,
+    Motion,
+    MotionEffect,
+    SensorEffect,
+    TorqueEffect,
+)
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+
+__all__ = [
+    "Active",
+    "ModelTorque",
+    "active_effects",
+    "added",
+    "bodies",
+    "lasting_effects",
+    "moved_links",
+    "sensed_torque",
+    "sensors",
+]
+
+
+def sensed_torque(motion: Motion, effects: Sequence[Active]) -> Array:
+    """tau (m, n) that the sensors would read, stage by stage (see `effects.base`)."""
+    motion = moved_links(motion, effects)
+    tau = bodies(motion, effects)
+    return sensors(motion, added(motion, tau, effects), effects)
+
+
+def moved_links(motion: Motion, effects: Sequence[Active]) -> Motion:
+    """Stage 1: motion of the links behind the measured one."""
+    guess = None
+    for active in effects:
+        if isinstance(active.effect, MotionEffect):
+            if guess is None:
+                guess = bodies(motion, effects)
+            moved = active.effect.link_side(motion, guess, active.joint, active.values)
+            motion = _where(active.on(motion.t), moved, motion)
+    return motion
+
+
+def _where(on: Flags | None, moved: Motion, motion: Motion) -> Motion:
+    if on is None:
+        return moved
+    tables = {
+        key: np.where(on[:, None], getattr(moved, key), getattr(motion, key))
+        for key in ("q", "dq", "ddq")
+    }
+    return replace(motion, **tables)
+
+
+def bodies(motion: Motion, effects: Sequence[Active]) -> Array:
+    """Stage 2: rigid torque (m, n) with the bodies and the gravity of every instant."""
+    own = [active for active in effects if isinstance(active.effect, BodyEffect)]
+    switches = sorted({t for active in own for t in active.interval_s if np.isfinite(t)})
+    tau = np.empty_like(motion.q)
+    edges = [-np.inf, *switches, np.inf]
+    for begin, end in pairwise(edges):
+        rows = (motion.t >= begin) & (motion.t < end)
+        if rows.any():
+            arm = _arm_with(motion.arm, [a for a in own if _covers(a, begin, end)])
+            tau[rows] = arm.torque(motion.q[rows], motion.dq[rows], motion.ddq[rows])
+    return tau
+
+
+def _covers(active: Active, begin: float, end: float) -> bool:
+    return active.interval_s[0] <= begin and end <= active.interval_s[1]
+
+
+def _arm_with(arm: ArmDynamics, own: Sequence[Active]) -> ArmDynamics:
+    theta, gravity = arm.theta, arm.gravity
+    for active in own:
+        assert isinstance(active.effect, BodyEffect)
+        theta, gravity = active.effect.body(theta, gravity, active.joint, active.values)
+    return arm.changed(theta, gravity)
+
+
+def added(motion: Motion, tau: Array, effects: Sequence[Active]) -> Array:
+    """Stage 3: rigid torque (m, n) with what acts at the joints."""
+    total = tau.copy()
+    for active in effects:
+        if isinstance(active.effect, TorqueEffect) and not active.effect.after_sensors:
+            own, begin = motion, active.interval_s[0]
+            if begin > -np.inf:  # what changes with time counts from the effect's own start
+                own = replace(motion, t=motion.t - begin)
+            extra = active.effect.torque(own, tau, active.joint, active.values)
+            on = active.on(motion.t)
+            total += extra if on is None else extra * on[:, None]
+    return total
+
+
+def sensors(motion: Motion, tau: Array, effects: Sequence[Active]) -> Array:
+    """Stage 4: what the torque sensors make of torques (m, n)."""
+    for active in effects:
+        if isinstance(active.effect, SensorEffect):
+            read = active.effect.measured(motion, tau, active.joint, active.values)
+            on = active.on(motion.t)
+            tau = read if on is None else np.where(on[:, None], read, tau)
+    for active in effects:  # a sensor's offset is added to whatever else it does
+        if isinstance(active.effect, TorqueEffect) and active.effect.after_sensors:
+            extra = active.effect.torque(motion, tau, active.joint, active.values)
+            on = active.on(motion.t)
+            tau = tau + (extra if on is None else extra * on[:, None])
+    return tau
+
+
+class ModelTorque:
+    """Inverse dynamics of a fixed-base self model with its tool and its effects.
+
+    Args:
+        model: whose λ, θ, tool, gravity and effects are used.
+    """
+
+    def __init__(self, model: SelfModel) -> None:
+        self._arm = RigidArm.of(model)
+        self._effects = active_effects(model.effects, model.tree.n)
+        self._lasting = lasting_effects(model.effects, model.tree.n)
+
+    def __call__(self, q: Array, dq: Array, ddq: Array, t: Array | None = None) -> Array:
+        """tau (m, n), N m, for q, dq, ddq (m, n) rad, rad/s, rad/s².
+
+        `t` (m,), s since the recording began, decides which effects act. Without it those act
+        that have no end, and rows are taken 1 ms apart where an effect needs rates.
+        """
+        if t is None:
+            stamps = 1e-3 * np.arange(len(q), dtype=np.float64)
+            return sensed_torque(Motion(stamps, q, dq, ddq, self._arm), self._lasting)
+        return sensed_torque(Motion(t, q, dq, ddq, self._arm), self._effects)

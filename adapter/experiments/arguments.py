@@ -1,0 +1,76 @@
+"""The command lines of `adapter experiment` and `adapter bench`; brings nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from adapter.errors import UsageError
+from adapter.experiments.split import LEAST_TRAJECTORIES, learned_samples
+from adapter.runs.terminal import check_writable
+
+EXPERIMENTS = ("atlas", "panda")
+LEAST_LEARNED = 50  # samples; far fewer show λ and θ of 30 joints only by chance
+
+
+def experiment(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `experiment`."""
+    parser.description = (
+        "Rerun section IV of the paper: `atlas`, a simulated humanoid in free fall "
+        "against three learners that know no physics, and `panda`, online learning at 1 kHz. "
+        "Prints the paper's figures beside ours and makes one HTML page."
+    )
+    add = parser.add_argument
+    add("names", nargs="+", choices=EXPERIMENTS, metavar="NAME", help="which: atlas, panda")
+    add("--full", action="store_true", help="the baselines in the paper's size")
+    add("--no-baselines", action="store_true", help="atlas: only the FOP networks")
+    add("--trajectories", type=int, default=63, metavar="N", help="atlas: default 63")
+    add("--seconds", type=float, default=10.0, metavar="S", help="atlas: of each; default 10")
+    add(
+        "--seeds",
+        type=int,
+        default=20,
+        metavar="N",
+        help="recordings whose tree is to be found, N and A unknown; default 20",
+    )
+    add("--seed", type=int, default=0, help="of every random choice")
+    add("--cache", type=Path, metavar="FOLDER", help="where simulated data are kept")
+    add("--out", type=Path, metavar="FOLDER", help="where results go")
+    add("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.set_defaults(check=_check_experiment)
+
+
+def _check_experiment(args: argparse.Namespace) -> None:
+    """Before minutes of work. Raises UsageError or OSError for what would end it."""
+    if args.seed < 0 or args.seeds < 0:
+        raise UsageError("--seed and --seeds must be 0 or more")
+    if "atlas" in args.names:
+        _check_falls(args.trajectories, args.seconds)
+    check_writable(args.json)
+
+
+def _check_falls(trajectories: int, seconds: float) -> None:
+    """Raises UsageError where there would be too little to learn from."""
+    if trajectories < LEAST_TRAJECTORIES:
+        raise UsageError(f"--trajectories must be at least {LEAST_TRAJECTORIES}")
+    if not 0.0 < seconds < math.inf:
+        raise UsageError(f"--seconds must be above 0 and finite, got {seconds}")
+    learned = learned_samples(trajectories, round(1000.0 * seconds))
+    if learned < LEAST_LEARNED:
+        raise UsageError(
+            f"{trajectories} falls of {seconds:g} s give {learned} samples to learn "
+            f"from (1 % of the training set), fewer than {LEAST_LEARNED}; raise --trajectories "
+            "or --seconds"
+        )
+
+
+def bench(parser: argparse.ArgumentParser) -> None:
+    """Declare the options of `bench`."""
+    parser.description = (
+        "Times one update of λ and θ of a Panda beside autograd through the torch "
+        "networks, Pinocchio's regressor with recursive least squares (if pin is installed) and "
+        "differentiable-robot-model (extra [peers], if installed)."
+    )
+    parser.add_argument("--repeats", type=int, default=2000, metavar="N", help="default 2000")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")

@@ -1,0 +1,354 @@
+"""Section IV.A of the paper: the body schema and the dynamics of a humanoid in free fall."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.experiments.baselines.compare import Errors, arm_tables, choices, compare
+from adapter.experiments.falls import Falls, gathered, sets_of
+from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
+from adapter.experiments.online import noisy, online_trial, without_velocity
+from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, Learned
+from adapter.experiments.split import Split, split
+from adapter.experiments.stated import PAPER_BASELINES, atlas_stated
+from adapter.experiments.topology import fall_logs, topology_trials
+from adapter.learning.batch.prediction_errors import (
+    KinematicErrors,
+    kinematic_errors,
+    predicted_torques,
+)
+from adapter.learning.batch.schema import schema_from_moments
+from adapter.learning.batch.theta import BatchThetaSettings, ThetaResult, learn_theta
+from adapter.learning.tree_data import TreeData
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.runs.terminal import console
+from sim.falls.data_set import Flight, data_set
+
+SOLVER_NAMES = {"consistent": "interior point (Clarabel)"}
+ONLINE_FALLS = 3  # that the online learner sees, 30 s in all
+ARM = tuple(range(23, 30))  # the right arm: joints 24 to 30 of the paper's Fig. 5e
+
+
+@dataclass(frozen=True)
+class Body:
+    """λ and θ of a tree as learned from 1 % of the training set.
+
+    Attributes:
+        name: "FOPnet", where λ is learned as the paper does; "FOPnet, moments" where it comes
+            from the second moments of the same samples.
+        lam: (n, 6) λ, with which θ was learned.
+        theta: with its sub-problems.
+        schema_s, theta_s: seconds for λ, and for θ.
+    """
+
+    name: str
+    lam: Array
+    theta: ThetaResult
+    schema_s: float
+    theta_s: float
+
+    @property
+    def learning_s(self) -> float:
+        """Both together."""
+        return self.schema_s + self.theta_s
+
+
+def learn_bodies(data: TreeData, seed: int) -> tuple[NetworkResult, Body, Body]:
+    """λ by networks and by moments, and with each θ over bodies that can exist.
+
+    Returns:
+        What the networks learned, the body with their λ, that with the moments'.
+    """
+    marks = [time.perf_counter()]
+
+    def lap() -> float:
+        marks.append(time.perf_counter())
+        return marks[-1] - marks[-2]
+
+    networks = schema_by_networks(data, seed)
+    networks_s = lap()
+    lam = schema_from_moments(data).lam
+    moments_s = lap()
+    bodies = []
+    for name, own, schema_s in (
+        ("FOPnet", networks.lam, networks_s),
+        ("FOPnet, moments", lam, moments_s),
+    ):
+        theta = learn_theta(data, own, seed)
+        bodies.append(Body(name, own, theta, schema_s, lap()))
+    return networks, bodies[0], bodies[1]
+
+
+@dataclass
+class Judged:
+    """What a learned body is worth on all samples.
+
+    Attributes:
+        body: which it is.
+        learned: torque errors of all joints, as a learner of the comparison.
+        arm: the same of the joints alone that the others learn.
+        kinematics: on the control set; training: on the samples learned from.
+    """
+
+    body: Body
+    learned: Learned
+    arm: Learned
+    kinematics: KinematicErrors
+    training: KinematicErrors
+
+
+class _Judge:
+    """Gathers errors of one body, trajectory by trajectory."""
+
+    def __init__(self, body: Body, joints: int, arm: Sequence[int]) -> None:
+        self._body, self._n, self._arm = body, joints, list(arm)
+        self._whole, self._part = Errors(joints), Errors(len(self._arm))
+        self._kinematics: list[KinematicErrors] = []
+
+    def add(self, data: TreeData, rows: dict[str, np.ndarray]) -> None:
+        """A trajectory, and its rows by set."""
+        estimate = predicted_torques(data, self._body.lam, self._body.theta.theta)[:, -self._n :]
+        for name, own in rows.items():
+            tau = data.tau[own][:, -self._n :]
+            self._whole.add(name, tau, estimate[own])
+            self._part.add(name, tau[:, self._arm], estimate[own][:, self._arm])
+        if "control" in rows:
+            self._kinematics.append(kinematic_errors(data, self._body.lam))
+
+    def verdict(self, learned_from: TreeData) -> Judged:
+        """All of it."""
+        body = self._body
+        how = "mini-batches" if body.name == "FOPnet" else "second moments"
+        title = f"First-order-principles networks, λ from {how}"
+        learned = Learned(body.name, title, train_s=body.learning_s)
+        learned.tuning = [
+            f"λ from {len(learned_from)} samples, 1 % of the training set, by {how} in "
+            f"{body.schema_s:.2f} s",
+            f"θ over bodies that can exist, {len(body.theta.stages)} sub-problems in "
+            f"{body.theta_s:.1f} s",
+        ]
+        arm = Learned(f"{body.name}, arm", title, train_s=body.learning_s)
+        training = kinematic_errors(learned_from, body.lam)
+        return Judged(
+            body,
+            self._whole.into(learned),
+            self._part.into(arm),
+            _worst(self._kinematics),
+            training,
+        )
+
+
+def judge(
+    bodies: Sequence[Body], learned_from: TreeData, source: Falls, parts: Split, arm: Sequence[int]
+) -> list[Judged]:
+    """Torques on every sample, of all joints and of an arm's; link motion on the control set."""
+    judges = [_Judge(body, learned_from.tree.n, arm) for body in bodies]
+    for data, rows in sets_of(source, parts):
+        for one in judges:
+            one.add(data, rows)
+    return [one.verdict(learned_from) for one in judges]
+
+
+def _worst(parts: list[KinematicErrors]) -> KinematicErrors:
+    """Errors of several sets of samples as one."""
+    first = parts[0]
+    return KinematicErrors(
+        {k: max(p.largest[k] for p in parts) for k in first.largest},
+        {k: np.sum([p.histogram[k] for p in parts], axis=0) for k in first.histogram},
+        first.edges,
+        {k: np.max([p.largest_by_link[k] for p in parts], axis=0) for k in first.largest},
+    )
+
+
+def noisy_trial(source: Falls, parts: Split, true_lam: Array, seed: int) -> dict[str, Any]:
+    """Learned λ and θ against weighted least squares with true λ, all from noisy sensors.
+
+    Both see the same filtered samples (1 % of the training set) and are judged on the control
+    set, joints in units of what the least squares leaves there.
+    """
+    data = gathered(source, parts, parts.learned, noisy=True)
+    n = data.tree.n
+    lam = schema_from_moments(data).lam
+    theta = learn_theta(data, lam, seed)
+    best = learn_theta(data, true_lam, seed, BatchThetaSettings(solver="least squares"))
+    square, count = np.zeros((2, n)), 0
+    for k in parts.control:
+        control = source.measured(k)
+        for row, (frames, bodies) in enumerate(((lam, theta.theta), (true_lam, best.theta))):
+            estimate = predicted_torques(control, frames, bodies)
+            square[row] += np.square((control.tau - estimate)[:, -n:]).sum(axis=0)
+        count += len(control)
+    ours, least = np.sqrt(square / count)
+    return {
+        "samples": len(data),
+        "control_torque_rmse_nm": ours,
+        "least_squares_control_torque_rmse_nm": least,
+        "ratio_by_joint": ours / least,
+        "ratio": float(np.sqrt(np.mean(np.square(ours / least)))),
+        "ratio_of_total": float(np.sqrt(np.sum(ours**2) / np.sum(least**2))),
+        "min_pseudo_inertia_eigenvalue": theta.min_eigenvalue,
+        "theta_converged": theta.converged,
+    }
+
+
+def run_atlas(args: argparse.Namespace) -> AtlasResults:
+    """The whole experiment; says what it is at."""
+
+    def say(line: str) -> None:
+        console.print(f"[dim]{line}[/]", soft_wrap=True)
+
+    began = time.perf_counter()
+    say(f"simulating {args.trajectories} falls of {args.seconds:g} s, where none are kept")
+    flight = Flight(args.seconds, seed=args.seed)
+    options = {"trajectories": args.trajectories, "flight": flight, "folder": args.cache}
+    source = Falls(data_set("atlas", **options), data_set("atlas", noise=True, **options))
+    truth, tree = source.truth, source.tree
+    count = len(source)  # trajectories, all of one length
+    parts = split(count * [len(source.exact(0))], args.seed)
+    data = gathered(source, parts, parts.learned, noisy=False)
+    simulated_s = time.perf_counter() - began
+    say(f"learning λ and θ from {len(data)} samples")
+    networks, *bodies = learn_bodies(data, args.seed)
+    say("judging all samples")
+    by_networks, by_moments = judge(bodies, data, source, parts, ARM)
+    say("learning from noisy sensors")
+    noisy_parts = split(count * [len(source.measured(0))], args.seed)
+    noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
+    learners = [by_networks.learned, by_moments.learned]
+    if not args.no_baselines:
+        joints = [tree.joint_names[j] for j in ARM]
+        carrier = tree.link_names[tree.parent[ARM[0]]]
+        tables = arm_tables(source, parts, joints, carrier)
+        chosen = choices(tree, truth.lam, joints, carrier, args.full, args.seed)
+        learners += compare(tables, chosen, args.seed, say)
+    say("learning online, sample by sample")
+    online = _online(source, parts.control)
+    say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
+    found = topology_trials(fall_logs(source.noisy, args.seeds), tree, args.seed)
+    numbers = {
+        "joints": tree.n,
+        "arm_joints": [j + 1 for j in ARM],
+        **_sizes(parts, len(data)),
+        **_learning(networks, by_networks, by_moments, tree),
+        **_comparison(learners, [by_networks.arm, by_moments.arm]),
+        "noise": noise,
+        "online": online,
+        "discover": found,
+        "trajectory_s": args.seconds,
+        "simulated_s": simulated_s,
+        "wall_s": time.perf_counter() - began,
+    }
+    return AtlasResults(
+        tree=tree,
+        true_lam=truth.lam,
+        arm=ARM,
+        snapshots=snapshots(networks.snapshots),
+        cost=networks.loss,
+        error_edges=np.log10(by_moments.training.edges),
+        error_counts=by_networks.training.histogram,
+        moments_error_counts=by_moments.training.histogram,
+        not_converged=tuple(numbers["schema_networks_not_converged"]),
+        full=args.full,
+        learners=learners,
+        stated=atlas_stated(numbers),
+        numbers=numbers,
+    )
+
+
+def _online(source: Falls, control: Sequence[int]) -> dict[str, Any]:
+    """The online learner on falls with noise, judged on one that it never sees."""
+    used = [k for k in range(len(source)) if k not in control][:ONLINE_FALLS]
+    motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
+    return online_trial(motions, source.exact(control[0]), source.truth.lam)[0]
+
+
+def snapshots(kept: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:
+    """λ by label, the last one called final."""
+    last = max(kept)
+    return [("final" if epoch == last else f"epoch {epoch}", kept[epoch]) for epoch in sorted(kept)]
+
+
+# --- every number of the experiment under a key of its own --------------------------------------
+
+
+def _sizes(parts: Split, learned: int) -> dict[str, Any]:
+    return {
+        "trajectories": len(parts.lengths) + len(parts.control),
+        "control_trajectories": len(parts.control),
+        "train_samples": len(parts.train),
+        "test_samples": len(parts.test),
+        "learned_samples": learned,
+    }
+
+
+def _learning(
+    networks: NetworkResult, by_networks: Judged, by_moments: Judged, tree: Tree
+) -> dict[str, Any]:
+    """Without a suffix: λ from the moments; `_networks`: from mini-batches, as the paper."""
+    ours, theta = by_moments.learned, by_moments.body.theta
+    settings = NetworkSettings()
+    return {
+        "minibatch": settings.minibatch,
+        "cycles": settings.cycles,
+        "theta_solver": SOLVER_NAMES[BatchThetaSettings().solver],
+        "kinematic_error_max": by_moments.kinematics.largest,
+        "kinematic_error_max_networks": by_networks.kinematics.largest,
+        "kinematic_error_max_training": by_moments.training.largest,
+        "torque_relative_error_median": ours.median,
+        "torque_relative_error_p99": ours.p99,
+        "torque_rmse_nm": ours.rmse,
+        "torque_relative_error_median_networks": by_networks.learned.median,
+        "torque_relative_error_p99_networks": by_networks.learned.p99,
+        "min_pseudo_inertia_eigenvalue": theta.min_eigenvalue,
+        "base_parameters": theta.rank,
+        "theta_converged": theta.converged,
+        "schema_networks_not_converged": [
+            tree.joint_names[j] for j in np.flatnonzero(~networks.converged)
+        ],
+        "sub_problems": [
+            {"name": stage.name, "bodies": len(stage.bodies), "rank": stage.rank,
+             "parameters": stage.parameters, "wall_s": stage.wall_s}
+            for stage in theta.stages
+        ],
+        "learning_s": by_networks.body.learning_s,
+        "learning_moments_s": by_moments.body.learning_s,
+        "schema_networks_s": by_networks.body.schema_s,
+        "schema_moments_s": by_moments.body.schema_s,
+        "theta_s": by_networks.body.theta_s,
+    }  # fmt: skip
+
+
+def _comparison(learners: Sequence[Learned], arms: Sequence[Learned]) -> dict[str, Any]:
+    """All learners, and the best and worst of the paper's three on the control set.
+
+    Args:
+        learners: of the page.
+        arms: the FOP networks on the arm's joints alone, those with the paper's λ first.
+    """
+    paper = [x for x in learners if x.name in PAPER_BASELINES]
+    best = min(paper, key=lambda x: x.median["control"], default=None)
+    worst = max(paper, key=lambda x: x.median["control"], default=None)
+    ours = max(arms[0].median["control"], 1e-300)
+    return {
+        "learners": {
+            x.name: {
+                "median": x.median, "p99": x.p99, "rmse_nm": x.rmse, "boxes": x.boxes,
+                "train_s": x.train_s, "sizes": x.sizes, "tuning": x.tuning,
+                "selection": x.selection,
+            }
+            for x in (*learners, *arms)
+        },
+        "box_percentiles": BOX_PERCENTILES,
+        "best_baseline": None if best is None else best.name,
+        "worst_baseline": None if worst is None else worst.name,
+        "control_error_ratio_to_best_baseline": (
+            None if best is None else best.median["control"] / ours
+        ),
+    }  # fmt: skip

@@ -1,0 +1,214 @@
+"""The learners that the FOP networks are compared with, on the right arm (Fig. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
+from adapter.experiments.baselines.learner import Baseline
+from adapter.experiments.baselines.presets import Choice, learners
+from adapter.experiments.falls import Falls, sets_of
+from adapter.experiments.results import BOX_PERCENTILES, Learned
+from adapter.experiments.split import SETS, Split
+from adapter.learning.batch.prediction_errors import relative_errors
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+
+Say = Callable[[str], None]
+Table = tuple[Array, Array]  # inputs X and torques Y
+JUDGED = 20_000  # random samples of each set; all of them would take a committee half an hour
+VALIDATION_SHARE = 0.2  # of the training part's trajectories, at least one
+TRIED = 20_000  # random samples that a trial learns from; half as many judge it
+
+
+@dataclass(frozen=True)
+class Tables:
+    """Samples of the arm.
+
+    Attributes:
+        sets: X and Y of each set; the training set in its shuffled order.
+        trajectory: (m,) number of the trajectory of each training sample.
+    """
+
+    sets: dict[str, Table]
+    trajectory: np.ndarray
+
+
+def arm_tables(source: Falls, parts: Split, joints: Sequence[str], carrier: str) -> Tables:
+    """Inputs and torques of the arm for every set."""
+    found: dict[str, list[Table]] = {name: [] for name in SETS}
+    for data, rows in sets_of(source, parts):
+        x, y = arm_problem(data, joints, carrier)
+        for name, own in rows.items():
+            found[name].append((x[own], y[own]))
+    sets = {}
+    for name, pairs in found.items():
+        xs, ys = zip(*pairs, strict=True)
+        sets[name] = np.concatenate(xs), np.concatenate(ys)
+    order = np.argsort(np.argsort(parts.train))
+    x, y = sets["train"]
+    sets["train"] = x[order], y[order]
+    ends = np.cumsum(parts.lengths)
+    return Tables(sets, np.searchsorted(ends, parts.train, side="right"))
+
+
+def choices(
+    tree: Tree, lam: Array, joints: Sequence[str], carrier: str, full: bool, seed: int
+) -> tuple[Choice, ...]:
+    """The learners; the body schema λ (n, 6) is for least squares alone."""
+    index = sub_chain(tree, joints, carrier)
+    return learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed)
+
+
+def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> list[Learned]:
+    """Choose every learner's settings, train it on the training set, judge it on all three sets.
+
+    Args:
+        tables: of `arm_tables`.
+        chosen: of `choices`.
+        seed: of the samples that are judged, and of what is held out to choose settings.
+        say: takes a sentence on progress.
+    """
+    judged = {name: _some(table, seed, JUDGED) for name, table in tables.sets.items()}
+    held_out = HeldOut.of(tables, seed)
+    found = []
+    for choice in chosen:
+        selection = select(choice, held_out, say)
+        say(f"training: {choice.title}")
+        learner = choice.make(**selection["chosen"])
+        learner.fit(*tables.sets["train"], progress=say)
+        errors = Errors(tables.sets["train"][1].shape[1])
+        for name, (x, y) in judged.items():
+            errors.add(name, y, learner.predict(x))
+        facts = learner.facts()
+        sizes = ", ".join(f"{value:,.6g} {what}" for what, value in facts.sizes.items())
+        learned = Learned(choice.key, choice.title, train_s=facts.train_s)
+        learned.sizes, learned.selection = dict(facts.sizes), selection
+        learned.tuning = [sizes, *facts.tuning, _told(choice, selection)]
+        found.append(errors.into(learned))
+    return found
+
+
+def _some(table: Table, seed: int, most: int) -> Table:
+    """Random samples of a table, all of a small one."""
+    rows = np.random.default_rng(seed).permutation(len(table[0]))[:most]
+    return table[0][rows], table[1][rows]
+
+
+# --- settings, chosen on trajectories of the training part that a trial does not learn from -----
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Training samples parted by trajectory: to learn from, and to judge settings by.
+
+    Attributes:
+        fit, judge: X and Y.
+        trajectories: numbers of those held out to judge.
+    """
+
+    fit: Table
+    judge: Table
+    trajectories: tuple[int, ...]
+
+    @classmethod
+    def of(cls, tables: Tables, seed: int) -> HeldOut:
+        """Whole trajectories held out; of the test and control sets nothing is looked at."""
+        x, y = tables.sets["train"]
+        every = np.unique(tables.trajectory)
+        count = max(1, round(VALIDATION_SHARE * len(every)))
+        out = np.random.default_rng([seed, 1]).permutation(every)[:count]
+        held = np.isin(tables.trajectory, out)
+        return cls(
+            _some((x[~held], y[~held]), seed, TRIED),
+            _some((x[held], y[held]), seed, TRIED // 2),
+            tuple(sorted(out.tolist())),
+        )
+
+
+def select(choice: Choice, held_out: HeldOut, say: Say) -> dict[str, Any]:
+    """The candidate with the smallest median error by eq. 20 on the trajectories held out.
+
+    Returns:
+        chosen (settings), candidates (settings and validation_median of each; none where there
+        is nothing to choose), validation_trajectories, trial (the sizes of the learners compared).
+    """
+    if len(choice.candidates) == 1:
+        return {"chosen": dict(choice.candidates[0]), "candidates": []}
+    say(f"choosing among {len(choice.candidates)} settings: {choice.title}")
+    rows = []
+    for candidate in choice.candidates:
+        learner = choice.make(**{**(choice.trial or {}), **candidate})
+        learner.fit(*held_out.fit)
+        rows.append({**candidate, "validation_median": validation_error(learner, held_out)})
+    errors = [row["validation_median"] for row in rows]
+    best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
+    return {
+        "chosen": dict(choice.candidates[best]),
+        "candidates": rows,
+        "validation_trajectories": held_out.trajectories,
+        "trial": {"samples": len(held_out.fit[0]), **(choice.trial or {})},
+    }
+
+
+def validation_error(learner: Baseline, held_out: HeldOut) -> float:
+    """Median relative error by eq. 20, of all joints."""
+    x, y = held_out.judge
+    return float(np.nanmedian(relative_errors(y, learner.predict(x))))
+
+
+def _told(choice: Choice, selection: dict[str, Any]) -> str:
+    """How the settings were chosen, a sentence."""
+    if not selection["candidates"]:
+        return choice.otherwise
+    own = ", ".join(f"{name} {value:g}" for name, value in selection["chosen"].items())
+    sizes = ", ".join(f"{value} {name}" for name, value in selection["trial"].items())
+    best = min(row["validation_median"] for row in selection["candidates"])
+    return (
+        f"Chosen among {len(selection['candidates'])} settings by the error on "
+        f"{len(selection['validation_trajectories'])} trajectories held out of the training part "
+        f"(neither test nor control set): {own}, {best:.1%} there; compared with {sizes}."
+    )
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+class Errors:
+    """Relative and absolute torque errors, gathered trajectory by trajectory."""
+
+    def __init__(self, joints: int) -> None:
+        self._joints = joints
+        self._relative: dict[str, list[Array]] = {name: [] for name in SETS}
+        self._square = {name: np.zeros(joints) for name in SETS}
+        self._count = dict.fromkeys(SETS, 0)
+
+    def add(self, name: str, tau: Array, estimate: Array) -> None:
+        """Joint torques (m, joints) of a set, and what a learner says of them."""
+        if len(tau):
+            self._relative[name].append(relative_errors(tau, estimate))
+            self._square[name] += np.square(tau - estimate).sum(axis=0)
+            self._count[name] += len(tau)
+
+    def into(self, learned: Learned) -> Learned:
+        """Fill in boxes, percentiles and root mean squares."""
+        for name in SETS:
+            if not self._relative[name]:
+                continue
+            table = np.concatenate(self._relative[name])
+            learned.boxes[name] = np.array([_percentiles(column) for column in table.T])
+            every = table[~np.isnan(table)]
+            learned.median[name], learned.p99[name] = map(float, np.percentile(every, (50, 99)))
+            learned.rmse[name] = np.sqrt(self._square[name] / max(self._count[name], 1))
+        return learned
+
+
+def _percentiles(column: Array) -> Array:
+    judged = column[~np.isnan(column)]
+    if not len(judged):
+        return np.full(len(BOX_PERCENTILES), np.nan)
+    return np.asarray(np.percentile(judged, BOX_PERCENTILES))

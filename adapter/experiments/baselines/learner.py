@@ -1,0 +1,140 @@
+"""What all baselines have in common: fit, predict, facts; scaled inputs and outputs."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.spatial import Array
+
+# Told a sentence now and then while a learner works.
+Progress = Callable[[str], None]
+# Sizes by name, and sentences on the tuning, of a learner that has learned.
+Told = tuple[Mapping[str, float], tuple[str, ...]]
+
+# A column whose deviation is below this share of its size holds a constant and rounding.
+CONSTANT_SHARE = 1e-12
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is to be said of a trained learner.
+
+    Attributes:
+        sizes: numbers of units, samples, members, ...
+        tuning: sentences: what was chosen, and how.
+        train_s: seconds that `fit` took.
+    """
+
+    sizes: dict[str, float]
+    tuning: tuple[str, ...]
+    train_s: float
+
+
+class Baseline(ABC):
+    """A learner of Y (m, n), N m, from X (m, width) in the layout of `features.Columns`.
+
+    Attributes:
+        at_once: samples that are predicted together.
+    """
+
+    at_once = 10_000
+    _facts: Facts | None = None
+
+    def fit(self, X: Array, Y: Array, progress: Progress | None = None) -> None:
+        """Learn from samples. Raises ModelError for tables that don't fit or aren't finite."""
+        begin = time.perf_counter()
+        X = checked(X, Y)
+        sizes, tuning = self._learn(X, Y, progress or _unheard)
+        self._width = X.shape[1]
+        named = {name: float(value) for name, value in sizes.items()}
+        self._facts = Facts(named, tuning, time.perf_counter() - begin)
+
+    def predict(self, X: Array) -> Array:
+        """Torques (m, n), N m. Raises ModelError before `fit` or for another width."""
+        self.facts()
+        x = checked(X, width=self._width)
+        starts = range(0, len(x), self.at_once)
+        return np.concatenate([self._answer(x[k : k + self.at_once]) for k in starts])
+
+    def facts(self) -> Facts:
+        """Sizes, tuning and training time. Raises ModelError before `fit`."""
+        if self._facts is None:
+            raise ModelError("this learner has not learned yet; call fit first")
+        return self._facts
+
+    @abstractmethod
+    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+        """Learn from checked samples. Returns sizes by name, and sentences on the tuning."""
+
+    @abstractmethod
+    def _answer(self, x: Array) -> Array:
+        """Torques (m, n), N m, of at most `at_once` checked samples."""
+
+
+def _unheard(said: str) -> None:
+    """Progress that nobody asked for."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Columns brought to zero mean and unit deviation; constant ones only to zero mean.
+
+    Attributes:
+        mean, deviation: (width,) of the table that it was made from.
+    """
+
+    mean: Array
+    deviation: Array
+
+    @classmethod
+    def of(cls, table: Array) -> Scale:
+        """Of a table (m, width)."""
+        mean, deviation = table.mean(axis=0), table.std(axis=0)
+        flat = deviation <= CONSTANT_SHARE * np.abs(table).max(axis=0)
+        return cls(mean, np.where(flat, 1.0, deviation))
+
+    def __call__(self, table: Array) -> Array:
+        """The table scaled."""
+        scaled: Array = (table - self.mean) / self.deviation
+        return scaled
+
+    def undo(self, scaled: Array) -> Array:
+        """A scaled table in its own units, in float64."""
+        table: Array = scaled * self.deviation + self.mean
+        return table
+
+
+def checked(X: Array, Y: Array | None = None, width: int | None = None) -> Array:
+    """X as float64 (m, width). Raises ModelError where X or Y won't do for learning."""
+    x = np.asarray(X, dtype=np.float64)
+    if x.ndim != 2 or not len(x) or (width is not None and x.shape[1] != width):
+        wanted = "columns" if width is None else f"{width} columns"
+        raise ModelError(f"X must be a table of samples by {wanted}, got shape {x.shape}")
+    if not np.isfinite(x).all():
+        raise ModelError("X holds values that are not finite; leave those samples out")
+    if Y is not None:
+        if np.ndim(Y) != 2 or len(Y) != len(x):
+            raise ModelError(f"Y must have {len(x)} rows, one by sample, got shape {np.shape(Y)}")
+        if not np.isfinite(Y).all():
+            raise ModelError("Y holds values that are not finite; leave those samples out")
+    return x
+
+
+def at_least(least: int, **counts: int) -> None:
+    """Raises ModelError naming the count that is too small."""
+    for name, value in counts.items():
+        if value < least:
+            raise ModelError(f"{name} must be at least {least}, got {value}")
+
+
+def positive(**numbers: float) -> None:
+    """Raises ModelError naming the number that is not positive and finite."""
+    for name, value in numbers.items():
+        if not 0.0 < value < np.inf:
+            raise ModelError(f"{name} must be positive and finite, got {value}")

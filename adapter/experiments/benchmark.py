@@ -1,0 +1,203 @@
+"""`adapter bench`: one learning update of ours beside what a user would pick instead."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.export import to_urdf
+from adapter.effects.torque import ModelTorque
+from adapter.learning.learner import Filtered, Learner, LearnerSettings
+from adapter.model.inertia import log_cholesky_from_theta
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.networks import (
+    inverse_dynamics,
+    link_motion,
+    theta_from_log_cholesky_torch,
+)
+from adapter.runs.pipeline import PipelineSettings, make_front_end
+from adapter.runs.terminal import console, write_json
+from adapter.signals.filters import JointFilter
+from drivers.interface import JointSample
+
+WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
+LEAST_REPEATS = 10
+MOST_SLOW_REPEATS = 100
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the command out; returns the exit code."""
+    rows = benchmark(max(args.repeats, LEAST_REPEATS))
+    table = Table("what", "p50 µs", "p99 µs", "note", box=None, pad_edge=False)
+    for row in rows:
+        p50, p99 = row["p50_us"], row["p99_us"]
+        shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
+        table.add_row(row["what"], *shown, row["note"])
+    console.print(table)
+    write_json(args.json, {"rows": rows})
+    return 0
+
+
+def motion(robot: SelfModel, samples: int) -> tuple[Array, Array, Array, Array]:
+    """A smooth motion (m, n) q, dq, ddq and its torque, for timing alone."""
+    n = robot.tree.n
+    t: Array = 1e-3 * np.arange(samples, dtype=np.float64)[:, None]
+    w: Array = 2.0 + 0.7 * np.arange(n, dtype=np.float64)
+    middle = 0.5 * (robot.limits.lower + robot.limits.upper)
+    q, dq = middle + 0.3 * np.sin(w * t), 0.3 * w * np.cos(w * t)
+    ddq = -0.3 * w**2 * np.sin(w * t)
+    return q, dq, ddq, ModelTorque(robot)(q, dq, ddq)
+
+
+def benchmark(repeats: int) -> list[dict[str, Any]]:
+    """One row per contender: what, p50_us, p99_us, note. Contenders not installed say so."""
+    torch.set_num_threads(1)
+    robot = documented("panda")
+    rows = _ours(robot, repeats)
+    rows.append(_autograd(robot, min(repeats, MOST_SLOW_REPEATS)))
+    rows.append(_pinocchio(robot, repeats))
+    rows.append(_peer(min(repeats, MOST_SLOW_REPEATS)))
+    return rows
+
+
+def _row(what: str, times_ns: list[int] | None, note: str) -> dict[str, Any]:
+    if times_ns is None:
+        return {"what": what, "p50_us": None, "p99_us": None, "note": note}
+    p50, p99 = np.percentile(1e-3 * np.array(times_ns), [50, 99])
+    return {"what": what, "p50_us": float(p50), "p99_us": float(p99), "note": note}
+
+
+def _timed(step: Callable[[int], object], repeats: int) -> list[int]:
+    times = []
+    for k in range(repeats):
+        before = time.perf_counter_ns()
+        step(k)
+        times.append(time.perf_counter_ns() - before)
+    return times
+
+
+def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
+    q, dq, _, tau = motion(robot, WARM_UP + repeats)
+    front_end = make_front_end(robot, PipelineSettings())
+    samples = [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(WARM_UP + repeats)]
+    states: list[Array] = []
+
+    def tick(k: int) -> None:
+        state = front_end.step(samples[k])
+        if state is not None:
+            states.append(state.copy())
+
+    ticks = _timed(tick, WARM_UP + repeats)[WARM_UP:]
+    rows = [_row("front end: checks, filter, twist synthesis", ticks, "per sample")]
+    gain = JointFilter(robot.tree.n).noise_gain
+    for effects, note in (((), "λ and θ"), (REAL_ARM_EFFECTS, "λ, θ and four effects per joint")):
+        settings = LearnerSettings(effects=effects)
+        learner = Learner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))
+        for state in states[: WARM_UP // 2]:
+            learner.step(state)
+        rest = states[WARM_UP // 2 :]
+        times = _timed(partial(_learn, learner, rest), len(rest))
+        if learner.theta_started_ns is None:
+            note += " (θ had not begun)"
+        rows.append(_row("our update from the moments of all samples", times[-repeats:], note))
+    return rows
+
+
+def _learn(learner: Learner, states: list[Array], k: int) -> None:
+    learner.step(states[k])
+
+
+def _autograd(robot: SelfModel, repeats: int) -> dict[str, Any]:
+    """The paper's way: one sample, autograd through the torch networks, torch ADAM."""
+    q, dq, ddq, tau = (torch.from_numpy(x) for x in motion(robot, repeats))
+    lam = torch.tensor(robot.lam, requires_grad=True)
+    x = torch.tensor(log_cholesky_from_theta(robot.theta), requires_grad=True)
+    gravity = torch.from_numpy(robot.gravity)
+    adam = torch.optim.Adam([lam, x], lr=1e-3)
+    with torch.no_grad():
+        true = link_motion(robot.tree, lam, (q, dq, ddq), gravity)
+
+    def step(k: int) -> None:
+        at = slice(k, k + 1)
+        joints = q[at], dq[at], ddq[at]
+        adam.zero_grad()
+        k_hat = link_motion(robot.tree, lam, joints, gravity)
+        pairs = ((k_hat.v, true.v), (k_hat.w, true.w), (k_hat.a, true.a))
+        cost = torch.stack([((ours - there[at]) ** 2).sum() for ours, there in pairs]).sum()
+        theta = theta_from_log_cholesky_torch(x)
+        hat = inverse_dynamics(robot.tree, lam.detach(), theta, joints, gravity)
+        (cost + ((hat - tau[at]) ** 2).sum()).backward()
+        adam.step()
+
+    return _row("autograd through the torch networks, ADAM", _timed(step, repeats), "one sample")
+
+
+def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
+    """Regressor by Pinocchio, recursive least squares in numpy; θ alone, λ as documented."""
+    what = "Pinocchio regressor + recursive least squares"
+    if importlib.util.find_spec("pinocchio") is None:
+        return _row(what, None, "pin is not installed")
+    import pinocchio
+
+    model = pinocchio.buildModelFromXML(to_urdf(robot))
+    data = model.createData()
+    q, dq, ddq, tau = motion(robot, repeats)
+    n = model.nv
+    P, theta = 1e3 * np.eye(10 * n), np.zeros(10 * n)
+
+    def step(k: int) -> None:
+        nonlocal P, theta
+        Y = pinocchio.computeJointTorqueRegressor(model, data, q[k], dq[k], ddq[k])
+        PY = P @ Y.T
+        gain = np.linalg.solve(Y @ PY + np.eye(n), PY.T).T
+        theta = theta + gain @ (tau[k] - Y @ theta)
+        P = P - gain @ PY.T
+
+    return _row(what, _timed(step, repeats), "θ alone, no λ, no physical consistency")
+
+
+def _peer(repeats: int) -> dict[str, Any]:
+    what = "differentiable-robot-model, ADAM"
+    if importlib.util.find_spec("differentiable_robot_model") is None:
+        return _row(what, None, "extra [peers] is not installed")
+    return _row(what, _time_peer(repeats), "one sample, link masses alone")
+
+
+def _time_peer(repeats: int) -> list[int]:
+    """Nanoseconds of each ADAM step on one sample, the link masses being learned."""
+    from differentiable_robot_model.rigid_body_params import UnconstrainedTensor
+    from differentiable_robot_model.robot_model import DifferentiableRobotModel
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "panda.urdf"
+        path.write_text(to_urdf(documented("panda")))
+        model = DifferentiableRobotModel(os.fspath(path), device="cpu")
+    for k in range(1, 8):
+        model.make_link_param_learnable(
+            f"panda_link{k}", "mass", UnconstrainedTensor(dim1=1, dim2=1)
+        )
+    adam = torch.optim.Adam(model.parameters(), lr=1e-3)
+    q, dq, ddq, tau = torch.rand(4, 1, 7)
+    times = []
+    for _ in range(repeats):
+        before = time.perf_counter_ns()
+        adam.zero_grad()
+        hat = model.compute_inverse_dynamics(q, dq, ddq, include_gravity=True)
+        ((hat - tau) ** 2).sum().backward()
+        adam.step()
+        times.append(time.perf_counter_ns() - before)
+    return times

@@ -1,0 +1,334 @@
+"""λ the paper's way (eq. 18): N independent networks, mini-batches, from random starts.
+
+Every joint's network takes its parent's measured motion, so all joints, and several starts of
+each, are one batch of tensors. A first-order descent crawls where a link's motion shows one
+direction of its frame far less than another, and ends wherever its rate has run out; with 6
+unknowns a joint, Gauss-Newton's curvature costs next to nothing, and its recursive form (the
+curvature a running mean over mini-batches, the step as much of Newton's as the newest batch is of
+the mean) goes down alike in all directions.
+
+Turned into the parent's axes, eqs. 8a, 8b and 8c of joint j read `R0 y = z + W p`: y is link j's
+measured motion turned by Rz(q_j), z and W are its parent's, and only R0 and p vary. So residuals
+`R0 y - z - W p` and their derivatives, `-[R0 y]x` to a turn in the parent's axes and `-W` to a
+shift, take a few products of tensors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from adapter.errors import ModelError
+from adapter.learning.tree_data import BodyMotion, TreeData, check_motion
+from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
+from adapter.model.tree import BASE
+from adapter.physics.networks import turn_z
+
+# Called after every iteration with its number and the mean cost of the batch.
+Callback = Callable[[int, float], None]
+
+# A cost below this share of the signal's is rounding: motion right to 1e-8 of its size.
+ROUNDING = 1e-16
+# A frame is at its minimum where Newton's step would take off less than this share of the cost;
+# the last digits of a descent by mini-batches take off 1e-3 or less.
+STATIONARY = 0.05
+# ... and the minimum is the frame's where it leaves less than this share of the signal: noise
+# leaves far less, a wrong frame (a saddle) the better part.
+UNEXPLAINED = 0.05
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """How eq. 18 is descended.
+
+    Attributes:
+        minibatch: samples an iteration; cycles: passes over all samples (the paper: 10 and 10).
+        starts: random starts of each joint, the best of which is kept: a rotation can start
+            close to a saddle.
+        gain: weight of the newest batch in slope and curvature, above 0 and at most 1.
+        constant: share of the iterations (0 to 1) in which it stays; then it falls so that all
+            later batches count alike, which averages noise out.
+        longest_step: of an iteration, rad and m.
+        position_span: starting positions are uniform within ± this, m; angles within ±π.
+        accelerations: whether accelerations are compared beside the twist. None: only where
+            twists can't show every frame (no measured v, or a base at rest).
+        snapshots: iterations ("epochs") at which λ is kept, beside the last.
+    """
+
+    minibatch: int = 10
+    cycles: int = 10
+    starts: int = 6
+    gain: float = 0.3
+    constant: float = 0.5
+    longest_step: float = 0.05
+    position_span: float = 0.5
+    accelerations: bool | None = None
+    snapshots: tuple[int, ...] = (0, 50, 100)
+
+    def __post_init__(self) -> None:
+        for name in ("minibatch", "cycles", "starts"):
+            if getattr(self, name) < 1:
+                raise ModelError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not 0.0 < self.gain <= 1.0:
+            raise ModelError(f"gain must be above 0 and at most 1, got {self.gain}")
+        if not 0.0 <= self.constant <= 1.0:
+            raise ModelError(f"constant must be a share, 0 to 1, got {self.constant}")
+        for name in ("longest_step", "position_span"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ModelError(f"{name} must be above 0 and finite, got {getattr(self, name)}")
+        if any(epoch < 0 for epoch in self.snapshots):
+            raise ModelError(f"snapshots are iterations from 0 on, got {self.snapshots}")
+
+
+@dataclass
+class NetworkResult:
+    """What the networks learned.
+
+    Attributes:
+        lam: (n, 6) λ at the end, of the best start of each joint; angles are canonical.
+        snapshots: λ (n, 6) of those starts by epoch, the last one included.
+        loss: (epochs,) mean cost of the batch over joints, of those starts.
+        final_loss: (n, starts) mean cost over all samples of every start at the end.
+        converged: (n,) bool, whether the joint's cost is rounding, or at a minimum that leaves
+            what noise may leave; λ of other joints is the best found and may be far off.
+    """
+
+    lam: Array
+    snapshots: dict[int, Array]
+    loss: Array
+    final_loss: Array
+    converged: np.ndarray
+
+
+def schema_by_networks(
+    data: TreeData,
+    seed: int = 0,
+    settings: NetworkSettings | None = None,
+    callback: Callback | None = None,
+) -> NetworkResult:
+    """λ by stochastic descent of eq. 18, all joints at once.
+
+    Args:
+        data: with measured motion of the links.
+        seed: of the starts and of the order of the samples.
+        settings: see `NetworkSettings`.
+        callback: told of every iteration.
+
+    Raises:
+        ModelError: no link motion, fewer samples than a mini-batch, numbers that are not finite.
+    """
+    settings = settings or NetworkSettings()
+    if data.links is None:
+        raise ModelError("the body schema is learned from the links' motion, and none is given")
+    if len(data) < settings.minibatch:
+        raise ModelError(
+            f"{len(data)} samples don't fill a mini-batch of {settings.minibatch}; give more"
+        )
+    check_motion(data)
+    signals = network_signals(data, _channels(data, settings))
+    rng = np.random.default_rng(seed)
+    frames = _random_starts(data.tree.n, settings, rng)
+    total = settings.cycles * (len(data) // settings.minibatch)
+    kept, losses = {}, np.empty((total, data.tree.n, settings.starts))
+    curvature, gain = torch.zeros(()), 1.0
+    for epoch, rows in enumerate(_batches(len(data), settings, rng)):
+        if epoch in settings.snapshots:
+            kept[epoch] = _lam(frames)
+        cost, slope, own = slope_and_curvature(frames, signals.take(rows))
+        gain = _gain(settings, gain, epoch / total)
+        curvature = (1.0 - gain) * curvature + gain * own
+        frames = frames.moved(_shortened(gain * newton_step(slope, curvature), settings))
+        losses[epoch] = cost.numpy()
+        if callback is not None:
+            callback(epoch, float(losses[epoch].min(axis=1).mean()))
+    kept[total] = _lam(frames)
+    final = costs(frames, signals).numpy()
+    joints, best = np.arange(data.tree.n), final.argmin(axis=1)
+    chosen = {epoch: x[joints, best] for epoch, x in kept.items()}
+    found = Frames(frames.r0[joints, best][:, None], frames.p[joints, best][:, None])
+    loss = losses[:, joints, best].mean(axis=1)
+    return NetworkResult(chosen[total], chosen, loss, final, _converged(found, signals))
+
+
+def _channels(data: TreeData, settings: NetworkSettings) -> list[str]:
+    """What is compared of w, v and a."""
+    assert data.links is not None
+    with_speed = data.links.v is not None and data.base.v is not None
+    accelerations = settings.accelerations
+    if accelerations is None:
+        accelerations = not (with_speed and data.tree.floating)
+    return ["w", *(["v"] if with_speed else []), *(["a"] if accelerations else [])]
+
+
+def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> Frames:
+    """Uniform angles, positions within ± the span."""
+    angles = rng.uniform(-np.pi, np.pi, (n, settings.starts, 3))
+    p = rng.uniform(-settings.position_span, settings.position_span, angles.shape)
+    return Frames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
+
+
+def _batches(
+    count: int, settings: NetworkSettings, rng: np.random.Generator
+) -> Iterator[np.ndarray]:
+    """Rows of every mini-batch of every cycle, shuffled anew each cycle; a rest is left out."""
+    whole = count // settings.minibatch
+    for _ in range(settings.cycles):
+        order = rng.permutation(count)[: whole * settings.minibatch]
+        yield from order.reshape(whole, settings.minibatch)
+
+
+def _gain(settings: NetworkSettings, last: float, done: float) -> float:
+    """Weight of the newest batch: 1, 1/2, 1/3, ... to `gain`, and on so where it is to fall."""
+    least = settings.gain if done < settings.constant else 0.0
+    return max(least, last / (1.0 + last)) if done > 0.0 else 1.0
+
+
+def _shortened(step: torch.Tensor, settings: NetworkSettings) -> torch.Tensor:
+    """Turn and shift (..., 6) no longer than the longest step each."""
+    both = step.unflatten(-1, (2, 3))
+    length = both.norm(dim=-1, keepdim=True)
+    share = (settings.longest_step / length.clamp_min(1e-300)).clamp_max(1.0)
+    return (both * share).flatten(-2)
+
+
+def _converged(frames: Frames, signals: NetworkSignals) -> np.ndarray:
+    """By joint (n,) of frames with one start each; see `NetworkResult`."""
+    cost, slope, curvature = slope_and_curvature(frames, signals)
+    gain = -0.5 * (slope * newton_step(slope, curvature)).sum(dim=-1)
+    power = signals.power()[:, None]
+    at_minimum = (gain <= STATIONARY * cost) & (cost <= UNEXPLAINED * power)
+    return ((cost <= ROUNDING * power) | at_minimum)[:, 0].numpy()
+
+
+def _lam(frames: Frames) -> Array:
+    """λ (n, starts, 6) with canonical angles."""
+    return np.concatenate([zxz_from_matrix(frames.r0.numpy()), frames.p.numpy()], axis=-1)
+
+
+# --- the networks of all joints and starts as one batch of tensors ------------------------------
+
+# Added to a curvature whose diagonal is 1: where samples show nothing, nothing moves.
+LEVENBERG = 1e-10
+# [x]× as a linear map of x: row a of the table (3, 9) is that of unit vector a.
+_CROSS = torch.zeros(3, 3, 3, dtype=torch.float64)
+for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _CROSS[_a, _c, _b], _CROSS[_a, _b, _c] = 1.0, -1.0
+_CROSS = _CROSS.reshape(3, 9)
+
+
+def cross_matrix(x: Tensor) -> Tensor:
+    """[x]× (..., 3, 3) of vectors (..., 3)."""
+    return (x @ _CROSS).unflatten(-1, (3, 3))
+
+
+@dataclass
+class NetworkSignals:
+    """What the networks of n joints compare, over m samples and c channels.
+
+    Attributes:
+        y: (m, n, c, 3) of the link, turned by Rz(q).
+        z: (m, n, c, 3) of its parent; w: (m, n, c, 3, 3) what carries p.
+    """
+
+    y: Tensor
+    z: Tensor
+    w: Tensor
+
+    def take(self, rows: Array) -> NetworkSignals:
+        """Some of the samples."""
+        index = torch.from_numpy(rows)
+        return NetworkSignals(self.y[index], self.z[index], self.w[index])
+
+    def power(self) -> Tensor:
+        """Half the mean square (n,) of y."""
+        return 0.5 * (self.y**2).sum(dim=(2, 3)).mean(dim=0)
+
+
+@dataclass
+class Frames:
+    """Frames of n joints, several starts of each: r0 (n, starts, 3, 3), p (n, starts, 3)."""
+
+    r0: Tensor
+    p: Tensor
+
+    def moved(self, step: Tensor) -> Frames:
+        """The frames after (turn, shift) (n, starts, 6) in the parent's axes."""
+        angle = step[..., :3].norm(dim=-1)[..., None, None]
+        k = cross_matrix(step[..., :3])
+        half = torch.sinc(angle / (2.0 * torch.pi))
+        turn = torch.eye(3, dtype=k.dtype) + torch.sinc(angle / torch.pi) * k
+        turn = turn + 0.5 * half**2 * (k @ k)
+        return Frames(turn @ self.r0, self.p + step[..., 3:])
+
+
+def network_signals(data: TreeData, channels: Sequence[str]) -> NetworkSignals:
+    """NetworkSignals of all joints; the joint's own speed is taken off as eq. 8b has it.
+
+    Args:
+        data: with measured motion of the links.
+        channels: of "w", "v" and "a" (eqs. 8b, 8a, 8c).
+    """
+    assert data.links is not None
+    q = torch.from_numpy(np.ascontiguousarray(data.q))
+    up = {
+        name: _of_parents(data.tree.parent, data.base, data.links, name)
+        for name in {"w", "dw", *channels}
+    }
+    spin = cross_matrix(up["w"])
+    carried = {"w": torch.zeros_like(spin), "v": spin, "a": cross_matrix(up["dw"]) + spin @ spin}
+    y = []
+    for name in channels:
+        own = torch.from_numpy(np.array(getattr(data.links, name)))
+        if name == "w":
+            own[:, :, 2] -= torch.from_numpy(data.dq)
+        y.append(turn_z(q, own))
+    z, w = [up[name] for name in channels], [carried[name] for name in channels]
+    return NetworkSignals(*(torch.stack(parts, dim=2) for parts in (y, z, w)))
+
+
+def _of_parents(parent: tuple[int, ...], base: BodyMotion, links: BodyMotion, name: str) -> Tensor:
+    """A signal (m, n, 3) of the parent of every joint."""
+    every = np.concatenate([getattr(base, name)[:, None], getattr(links, name)], axis=1)
+    return torch.from_numpy(np.ascontiguousarray(every[:, [i - BASE for i in parent]]))
+
+
+def residuals(frames: Frames, s: NetworkSignals) -> tuple[Tensor, Tensor]:
+    """R0 y - z - W p and R0 y, (n, starts, m c, 3) each."""
+    n, starts = frames.p.shape[:2]
+    y, z = (x.transpose(0, 1).reshape(n, 1, -1, 3) for x in (s.y, s.z))
+    turned = y @ frames.r0.transpose(-1, -2)
+    lever = s.w.transpose(0, 1).reshape(n, -1, 3) @ frames.p.transpose(1, 2)
+    lever = lever.reshape(n, -1, 3, starts).movedim(-1, 1)
+    return turned - z - lever, turned
+
+
+def costs(frames: Frames, s: NetworkSignals) -> Tensor:
+    """Half the mean squared error (n, starts) over samples (eq. 18)."""
+    return 0.5 * (residuals(frames, s)[0] ** 2).sum(dim=(2, 3)) / len(s.y)
+
+
+def slope_and_curvature(frames: Frames, s: NetworkSignals) -> tuple[Tensor, Tensor, Tensor]:
+    """`costs`, their gradient (n, starts, 6) and Gauss-Newton's curvature (n, starts, 6, 6)."""
+    left, turned = residuals(frames, s)
+    n, starts = frames.p.shape[:2]
+    by_turn = -cross_matrix(turned).flatten(2, 3)
+    by_shift = -s.w.transpose(0, 1).reshape(n, 1, -1, 3).expand(n, starts, -1, 3)
+    jacobian = torch.cat([by_turn, by_shift], dim=-1)
+    across = jacobian.transpose(-1, -2) / len(s.y)
+    flat = left.flatten(2)
+    gradient = (across @ flat[..., None])[..., 0]
+    return 0.5 * (flat**2).sum(dim=-1) / len(s.y), gradient, across @ jacobian
+
+
+def newton_step(gradient: Tensor, curvature: Tensor) -> Tensor:
+    """-curvature⁻¹ gradient (..., 6), still where the curvature is nothing."""
+    size = torch.diagonal(curvature, dim1=-2, dim2=-1)
+    floor = LEVENBERG * size.amax(dim=-1, keepdim=True).clamp_min(1e-300)
+    scale = size.clamp_min(floor).rsqrt()
+    scaled = curvature * scale[..., :, None] * scale[..., None, :]
+    scaled = scaled + LEVENBERG * torch.eye(6, dtype=scaled.dtype)
+    return -scale * torch.linalg.solve(scaled, scale * gradient)

@@ -1,0 +1,162 @@
+"""What the paper leaves for later: trees found from signals alone, and ATLAS learned online."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from adapter.experiments.page.figure4 import KINDS
+from adapter.experiments.page.words import grouped, listed, scientific, with_unit
+from adapter.experiments.results import AtlasResults, PandaResults
+from adapter.model.spatial import Array
+from adapter.report.style import (
+    ACCENT,
+    GOAL,
+    MUTED,
+    SIZES,
+    Drawing,
+    Panel,
+    level,
+    log_axis,
+    time_axis,
+)
+from adapter.report.tables import Table
+from adapter.report.words import NOTHING
+from adapter.runs.score import TORQUE_GOAL
+
+DECADE = 10.0  # largest over smallest value from which a plot is logarithmic
+SECONDS = "seconds of motion learned from"
+Line = tuple[str, Array, str]  # name, values, colour
+
+
+def beyond(atlas: AtlasResults | None, panda: PandaResults | None) -> dict[str, Any] | None:
+    """Tables and panels of the section; None where neither was run."""
+    robots = [
+        (name, results.numbers["discover"])
+        for name, results in (("ATLAS", atlas), ("Panda", panda))
+        if results is not None and results.numbers.get("discover", {}).get("trials")
+    ]
+    online = {} if atlas is None else atlas.numbers.get("online", {})
+    if not robots and not online:
+        return None
+    return {
+        "trees": tree_table(robots),
+        "online": online_table(online),
+        "panels": online_panels(online.get("history", [])),
+    }
+
+
+def tree_table(robots: Sequence[tuple[str, Mapping[str, Any]]]) -> Table | None:
+    """Of each robot how many trees were found, and how sure of them discovery was."""
+    if not robots:
+        return None
+    trials = [found for _, found in robots]
+    rows: list[tuple[str, list[str]]] = [
+        ("trees found, every edge right", [f"{x['right']} of {x['trials']}" for x in trials]),
+        ("least confidence in a right edge", [_share(x["least_confidence_right"]) for x in trials]),
+        ("most confidence in a wrong edge", [_wrong(x["most_confidence_wrong"]) for x in trials]),
+        ("longest recording", [with_unit(x["motion_s"], "s", 3) for x in trials]),
+        ("measured on every link", [_channels(x["measured"]) for x in trials]),
+    ]
+    return Table(["", *(name for name, _ in robots)], [[what, *cells] for what, cells in rows])
+
+
+def _share(confidence: float) -> str:
+    """Never rounded up to certainty."""
+    return f"{math.floor(1e4 * confidence) / 1e4:.4f}"
+
+
+def _wrong(confidence: float) -> str:
+    return _share(confidence) if confidence > 0.0 else "none was reported"
+
+
+def _channels(measured: str) -> str:
+    """Channels by name: "w, a" is angular velocity and acceleration."""
+    return listed([KINDS.get(x, (x, ""))[0] for x in measured.split(", ")])
+
+
+def online_table(online: Mapping[str, Any]) -> Table | None:
+    """How fast the online learner is on the whole tree, and what it shows; None without any."""
+    if not online:
+        return None
+    settled = online.get("lambda_settled_s")
+    steps = [_time(online.get(key)) for key in ("step_p50_us", "step_p99_us")]
+    rows = [
+        ["samples a second, on one core", with_unit(online.get("samples_per_second"), "1/s", 3)],
+        ["time of a sample, median", steps[0]],
+        ["time of a sample, 99th percentile", steps[1]],
+        [
+            "λ settled, θ begins after",
+            "not reached" if settled is None else with_unit(settled, "s", 3),
+        ],
+        ["directions of λ shown", _ranks(online.get("lambda_rank"), online.get("joints"))],
+    ]
+    return Table(["", "ATLAS"], rows)
+
+
+def _time(us: float | None) -> str:
+    """A time in µs, or in ms where it is longer than one."""
+    if us is not None and us >= 1000.0:
+        return with_unit(1e-3 * us, "ms", 3)
+    return with_unit(us, "µs", 3)
+
+
+def _ranks(rank: int | None, joints: int | None) -> str:
+    if rank is None or joints is None:
+        return NOTHING
+    return f"{grouped(rank)} of {grouped(6 * joints)}"
+
+
+def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:
+    """Torque error over least squares', and λ's error, against seconds learned from."""
+    if not history:
+        return []
+    t = _column(history, "seconds")
+    ratios: list[Line] = [
+        ("all joints", _column(history, "over_least_squares"), ACCENT),
+        ("worst joint", _column(history, "worst_joint_over_least_squares"), MUTED),
+    ]
+    errors: list[Line] = [
+        ("turn, rad", _column(history, "turn_rad"), ACCENT),
+        ("shift, m", _column(history, "shift_m"), GOAL),
+    ]
+    note = "on a motion never learned from; 1 is least squares on all samples seen so far"
+    return [
+        _plot(t, ratios, TORQUE_GOAL).panel(
+            "ATLAS online: torque error", "times batch least squares", note
+        ),
+        _plot(t, errors, None).panel(
+            "ATLAS online: error of λ", "rad, m", "of the joint whose frame is farthest off"
+        ),
+    ]
+
+
+def _column(history: Sequence[Mapping[str, float]], key: str) -> Array:
+    return np.array([row.get(key, math.nan) for row in history], dtype=float)
+
+
+def _plot(t: Array, lines: Sequence[Line], goal: float | None) -> Drawing:
+    """Lines with a dot at each look, from zero on."""
+    drawing = Drawing("half")
+    ax = drawing.axes[0]
+    shown = np.concatenate([values for _, values, _ in lines])
+    shown = shown[np.isfinite(shown) & (shown > 0.0)]
+    for name, values, color in lines:
+        ax.plot(t, values, color=color, linewidth=1.2, marker="o", markersize=2.8, label=name)
+    if len(shown):
+        low, high = float(shown.min()), max(float(shown.max()), goal or 0.0)
+        if goal is None or high > DECADE * low:
+            log_axis(ax, 0.5 * min(low, goal or low), 4.0 * high)
+        else:
+            ax.set_ylim(0.0, 1.35 * high)
+    ax.set_xlim(0.0, 1.04 * float(t[-1]))
+    if goal is not None:
+        level(ax, goal, f"goal {scientific(goal)}", left=True)
+    ax.legend(
+        frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="upper right", ncols=2
+    )
+    time_axis(drawing, SECONDS)
+    return drawing

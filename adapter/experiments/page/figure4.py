@@ -1,0 +1,326 @@
+"""Fig. 4: where λ puts the joints while it is learned (a-e), and how far off it is in the end (f).
+
+A tree is drawn as a skeleton, coloured limb by limb.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+from adapter.experiments.page.words import grouped, with_unit
+from adapter.experiments.results import AtlasResults
+from adapter.model.spatial import Array, matrix_from_zxz
+from adapter.model.tree import BASE, Tree
+from adapter.report.skeleton import Skeleton
+from adapter.report.style import (
+    ACCENT,
+    GOAL,
+    INK,
+    JOINT_COLORS,
+    MUTED,
+    SIZES,
+    Drawing,
+    Panel,
+    joint_color,
+    log_axis,
+    mark,
+    power_of_ten,
+    thin,
+    time_axis,
+)
+from adapter.runs.outcome import frame_errors
+
+TURN, LIFT = np.radians(-28.0), np.radians(14.0)  # seen from the front, its right, and above
+STRETCH = 1.3  # a skeleton's height, of the usual
+# The paper's letters, by label: a run too short for an epoch must not move the others' letters.
+EPOCH_LETTERS = {"epoch 0": "a", "epoch 50": "b", "epoch 100": "c", "final": "d"}
+MARGIN = 1.12  # times what is shown
+SCALES_M = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+SCALE_SHARE = 0.25  # of a picture's height that a scale may take
+SIDES = {"l": "left", "r": "right"}
+SMALLEST = 1e-16  # of an error in double precision; an exact zero is drawn here
+PERCENT = 100.0
+KINEMATIC_GOAL = 1e-6  # of |k - k_hat| in SI units; ours, the paper states none
+KINDS = {
+    "v": ("velocity", "m/s"),
+    "w": ("angular velocity", "rad/s"),
+    "a": ("acceleration", "m/s²"),
+    "dw": ("angular acceleration", "rad/s²"),
+}
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A chain of joints between branchings of the tree: its name and its colour's number."""
+
+    name: str
+    joints: tuple[int, ...]
+    color: int
+
+
+def limbs(tree: Tree) -> list[Limb]:
+    """The chains that the tree's branchings make; a single joint belongs to what it hangs on."""
+    chains: list[list[int]] = []
+    at: dict[int, int] = {}
+    for j, i in enumerate(tree.parent):
+        if i == BASE or len(tree.children[i]) > 1:
+            chains.append([])
+            at[j] = len(chains) - 1
+        else:
+            at[j] = at[i]
+        chains[at[j]].append(j)
+    names = [_name([tree.joint_names[j] for j in chain]) for chain in chains]
+    for k, chain in enumerate(chains):
+        parent = tree.parent[chain[0]]
+        if len(chain) == 1 and parent != BASE:
+            chains[at[parent]].append(chain[0])
+            names[at[parent]] += f" and {names[k]}"
+            at[chain[0]], chains[k] = at[parent], []
+    kept = [(name, chain) for name, chain in zip(names, chains, strict=True) if chain]
+    return [Limb(name, tuple(chain), k) for k, (name, chain) in enumerate(kept)]
+
+
+def _name(joints: Sequence[str]) -> str:
+    """What the joints' names begin with in common: "right arm" of r_arm_shz to r_arm_wry2."""
+    parts = [name.split("_")[:-1] for name in joints]
+    common = []
+    for words in zip(*parts, strict=False):
+        if len(set(words)) > 1:
+            break
+        common.append(SIDES.get(words[0], words[0]))
+    if common:
+        return " ".join(common)
+    return joints[0] if len(joints) == 1 else f"{joints[0]} to {joints[-1]}"
+
+
+def limb_key(tree: Tree) -> list[tuple[int, str]]:
+    """Colour (1 to 8, as the page names it) and name of each limb."""
+    return [(limb.color % JOINT_COLORS + 1, limb.name) for limb in limbs(tree)]
+
+
+def skeleton(tree: Tree, lam: Array) -> Skeleton:
+    """Joint origins and axes in the base's frame, all joint angles zero, of λ (n, 6).
+
+    Raises:
+        ValueError: λ of another shape, or not finite.
+    """
+    lam = np.asarray(lam, dtype=float)
+    if lam.shape != (tree.n, 6) or not np.isfinite(lam).all():
+        raise ValueError(f"a skeleton needs finite λ ({tree.n}, 6), got shape {lam.shape}")
+    turns = matrix_from_zxz(lam[:, :3])
+    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
+    for j, i in enumerate(tree.parent):
+        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
+        R[j], p[j] = R_i @ turns[j], p_i + R_i @ lam[j, 3:]
+    return Skeleton(p, R[:, :, 2], {})
+
+
+def epoch_panels(atlas: AtlasResults) -> list[Panel]:
+    """λ of each epoch kept, then the actual one (Fig. 4a-e)."""
+    tree, actual = atlas.tree, skeleton(atlas.tree, atlas.true_lam)
+    panels = []
+    for label, lam in atlas.snapshots:
+        shown = skeleton(tree, lam)
+        off = float(np.linalg.norm(shown.p - actual.p, axis=1).max())
+        drawing = Drawing("third", bare=True, stretch=STRETCH)
+        draw_bones(drawing.axes[0], tree, actual, behind=True)
+        draw_bones(drawing.axes[0], tree, shown)
+        fit_to(drawing, [shown, actual])
+        note = f"joint origins off by up to {with_unit(off, 'm')}; grey: the actual ones"
+        which = EPOCH_LETTERS.get(label)
+        title = f"{label[:1].upper()}{label[1:]}"
+        panels.append(drawing.panel(f"({which}) {title}" if which else title, "", note))
+    drawing = Drawing("third", bare=True, stretch=STRETCH)
+    draw_bones(drawing.axes[0], tree, actual)
+    fit_to(drawing, [actual])
+    return [*panels, drawing.panel(f"(e) Actual {tree.n}-joint robot", "", "true λ")]
+
+
+def draw_bones(
+    ax: Axes,
+    tree: Tree,
+    shown: Skeleton,
+    behind: bool = False,
+    only: Sequence[int] | None = None,
+) -> None:
+    """Lines from each parent's origin to the joint's, and a dot there."""
+    color = {j: joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}
+    for j, line in enumerate(shown.bones(tree)):
+        ends = _projected(line).T
+        if behind:
+            ax.plot(*ends, color=MUTED, linewidth=6.0, alpha=0.25, solid_capstyle="round")
+            continue
+        marked = only is None or j in only
+        stroke = color[j] if only is None else ACCENT if marked else MUTED
+        wide = 2.2 if only is None else 3.4 if marked else 1.6
+        faint = 1.0 if marked else 0.55
+        ax.plot(*ends, color=stroke, linewidth=wide, alpha=faint, solid_capstyle="round")
+        dot = ends[:, 1:]
+        ax.plot(*dot, color=stroke, marker="o", markersize=3.4, alpha=faint, linestyle="none")
+    if not behind:
+        ax.plot(*_projected(np.zeros((1, 3))).T, color=INK, marker="s", markersize=4.4)
+
+
+def _projected(points: Array) -> Array:
+    """Points (..., 3) in the drawing plane (..., 2), by parallel projection."""
+    right = np.array([-np.sin(TURN), np.cos(TURN), 0.0])
+    towards = np.array([np.cos(TURN), np.sin(TURN), 0.0])
+    up = np.array([0.0, 0.0, np.cos(LIFT)]) - np.sin(LIFT) * towards
+    return np.stack([points @ right, points @ up], axis=-1)
+
+
+def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
+    """Limits that hold everything at equal scales, and how long a metre is."""
+    ax = drawing.axes[0]
+    flat = _projected(np.vstack([np.zeros((1, 3)), *(x.p for x in shown)]))
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    width, height, text = SIZES[drawing.size]
+    ratio = width / (height * STRETCH)
+    half = 0.5 * MARGIN * max(float((high - low)[1]), float((high - low)[0]) / ratio, 1e-6)
+    x, y = 0.5 * (low + high)
+    ax.set_xlim(x - ratio * half, x + ratio * half)
+    ax.set_ylim(y - half, y + half)
+    fits = [s for s in SCALES_M if s <= SCALE_SHARE * 2.0 * half]
+    scale = fits[-1] if fits else SCALES_M[0]
+    left, foot = x - 0.97 * ratio * half, y - 0.95 * half
+    ax.plot([left, left + scale], [foot, foot], color=MUTED, linewidth=1.4)
+    ax.text(
+        left + scale + 0.03 * half, foot, f"{scale:g} m", color=MUTED, va="center", fontsize=text
+    )
+
+
+def histogram_panels(atlas: AtlasResults) -> tuple[Panel | None, Panel | None]:
+    """Kinematic errors of the networks' λ (Fig. 4f) and of the moments'; None without any.
+
+    Raises:
+        ValueError: counts that do not fit the edges.
+    """
+    error = "errors |k − k̂|"
+    samples = atlas.numbers.get("learned_samples")
+    on = "the samples" if samples is None else f"the {grouped(samples)} samples"
+    return (
+        _histogram(
+            atlas.error_edges,
+            atlas.error_counts,
+            f"(f) Kinematic {error}",
+            f"λ of (d), from mini-batches, on {on} it learned from",
+        ),
+        _histogram(
+            atlas.error_edges,
+            atlas.moments_error_counts,
+            f"λ from moments: {error}",
+            "on the same samples; “FOPnet, moments” takes this λ",
+        ),
+    )
+
+
+def _histogram(
+    log_edges: Array, by_kind: Mapping[str, Array], title: str, note: str
+) -> Panel | None:
+    """How large the kinematic errors are, by kind."""
+    edges = np.asarray(log_edges, dtype=float)
+    counts = {kind: np.asarray(c, dtype=float) for kind, c in by_kind.items()}
+    for kind, values in counts.items():
+        if len(values) != len(edges) - 1:
+            raise ValueError(f"{len(edges)} edges need {len(edges) - 1} counts of '{kind}'")
+    counts = {kind: values for kind, values in counts.items() if values.sum() > 0.0}
+    if not counts:
+        return None
+    drawing = Drawing("third", stretch=STRETCH)
+    ax = drawing.axes[0]
+    for k, (kind, values) in enumerate(counts.items()):
+        name, unit = KINDS.get(kind, (kind, ""))
+        share = PERCENT * values / values.sum()
+        label, color = f"{name} {kind}, {unit}".rstrip(", "), joint_color(k)
+        ax.stairs(share, 10.0**edges, color=color, fill=True, alpha=0.18)
+        ax.stairs(share, 10.0**edges, color=color, linewidth=1.2, label=label)
+    _magnitudes(ax, edges, sum(counts.values(), np.zeros(len(edges) - 1)))
+    ax.set_ylim(0.0, 1.5 * ax.dataLim.y1)  # room for the legend, which the goal must not cross
+    low, high = np.log10(ax.get_xlim())
+    missed = np.log10(KINEMATIC_GOAL) < 0.5 * (low + high)
+    ax.legend(
+        frameon=False,
+        labelcolor=MUTED,
+        fontsize=SIZES["third"][2],
+        loc="upper right" if missed else "upper left",
+        ncols=1,
+        handlelength=1.2,
+        borderaxespad=0.1,
+    )
+    mark(ax, KINEMATIC_GOAL, "goal", top=0.6)
+    time_axis(drawing, "size of the error, in the unit of its kind")
+    most = int(max(values.sum() for values in counts.values()))
+    return drawing.panel(title, "% of their kind", f"{note}; {grouped(most)} numbers of a kind")
+
+
+def _magnitudes(ax: Axes, edges: Array, counts: Array) -> None:
+    """A logarithmic x axis around what is counted, with the goal in it."""
+    used = np.flatnonzero(counts)
+    low, high = edges[used[0]], edges[used[-1] + 1]
+    ax.set_xscale("log")
+    first, last = 10.0 ** (low - 0.5), 10.0 ** (high + 0.5)
+    ax.set_xlim(min(first, 0.25 * KINEMATIC_GOAL), max(last, 4.0 * KINEMATIC_GOAL))
+    ax.xaxis.set_major_locator(LogLocator(10, numticks=7))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: power_of_ten(value)))
+
+
+def schema_panels(atlas: AtlasResults) -> list[Panel]:
+    """λ's cost while it is learned, and its error at the epochs of the pictures."""
+    panels = []
+    cost = np.asarray(atlas.cost, dtype=float)
+    good = np.isfinite(cost) & (cost > 0.0)
+    if good.sum() > 1:
+        drawing = Drawing("third", stretch=STRETCH)
+        ax = drawing.axes[0]
+        ax.plot(*thin(np.flatnonzero(good).astype(float), cost[good]), color=ACCENT, linewidth=1.2)
+        log_axis(ax, 0.3 * cost[good].min(), 3.0 * cost[good].max())
+        ax.set_xlim(0.0, 1.04 * len(cost))
+        time_axis(drawing, "step of the optimiser")
+        panels.append(drawing.panel("Cost of λ, eq. 18", "m²/s² + rad²/s²", "mean over the joints"))
+    if atlas.snapshots:
+        panels.append(_epoch_errors(atlas))
+    return panels
+
+
+def _epoch_errors(atlas: AtlasResults) -> Panel:
+    """One dot per joint: how far its frame is from the actual one in its parent's."""
+    n = atlas.tree.n
+    lam = np.stack([lam for _, lam in atlas.snapshots])
+    every = np.tile(np.eye(6), (n, 1, 1))
+    kinds = zip(("turn, rad", "shift, m"), frame_errors(lam, atlas.true_lam, every), strict=True)
+    drawing = Drawing("third", stretch=STRETCH)
+    ax = drawing.axes[0]
+    at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)
+    shown = []
+    for k, (name, errors) in enumerate(kinds):
+        errors = np.maximum(errors, SMALLEST)
+        shown.append(errors)
+        side, color = -0.18 + 0.36 * k, (ACCENT, GOAL)[k]
+        ax.plot(
+            (at + side).ravel(),
+            errors.ravel(),
+            linestyle="none",
+            marker="o",
+            markersize=2.6,
+            color=color,
+            alpha=0.75,
+            label=name,
+        )
+    low, high = np.min(shown), np.max(shown)
+    log_axis(ax, 0.3 * low, 5.0 * high)
+    categories(ax, [label for label, _ in atlas.snapshots])
+    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["third"][2], loc="best")
+    return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
+
+
+def categories(ax: Axes, names: Sequence[str]) -> None:
+    """Names along x, at 0, 1, 2, ..."""
+    ax.set_xlim(-0.5, len(names) - 0.5)
+    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
+    ax.grid(False, axis="x")

@@ -1,0 +1,268 @@
+"""The paper's section IV on one self-contained page: its figures, and its numbers beside ours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.experiments.page import figure4, figure5, figure6
+from adapter.experiments.page.beyond import beyond
+from adapter.experiments.page.words import (
+    ATLAS_LEFT_OUT,
+    OURS,
+    PANDA_LEFT_OUT,
+    SETS,
+    advantage,
+    baselines,
+    best_baseline,
+    fopnet,
+    grouped,
+    headline,
+    last_ratio,
+    letter,
+    listed,
+    measured,
+    ours_text,
+    percent,
+    scientific,
+    sentences,
+    with_unit,
+)
+from adapter.experiments.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.learning.batch.prediction_errors import LEAST_TORQUE
+from adapter.report.html import fill, write_whole
+from adapter.report.page import Tile
+from adapter.report.style import JOINT_COLORS
+from adapter.report.tables import Table
+from adapter.report.words import JOIN, NARROW, NOTHING
+
+TEMPLATE = "experiment.html"
+NOT_STATED = "not stated"
+PAPER_LEARNERS = (
+    ("a", "the feed-forward network"),
+    ("b", "the committee of extreme learning machines"),
+    ("c", "the Gaussian process"),
+    ("d", OURS),
+)
+
+
+def render_experiment(atlas: AtlasResults | None, panda: PandaResults | None, written: str) -> str:
+    """The page as HTML text; what was not run is left out, with a reason.
+
+    Args:
+        atlas: results of section IV.A.
+        panda: results of section IV.B.
+        written: who wrote this, when and where, for the foot of the page.
+
+    Raises:
+        ValueError: results whose shapes do not fit their tree.
+    """
+    return fill(TEMPLATE, context(atlas, panda, written), "adapter.experiments")
+
+
+def write_experiment(
+    path: str | Path, atlas: AtlasResults | None, panda: PandaResults | None, written: str
+) -> Path:
+    """Write the page, whole or not at all. Returns the path. See `render_experiment`.
+
+    Raises:
+        RunFolderError: the file cannot be written.
+        ValueError: results whose shapes do not fit their tree.
+    """
+    return write_whole(path, render_experiment(atlas, panda, written))
+
+
+def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str) -> dict[str, Any]:
+    """What the template shows."""
+    shown = [*(atlas_tiles(atlas) if atlas else []), *(panda_tiles(panda) if panda else [])]
+    reasons = [ATLAS_LEFT_OUT] if atlas is None else _atlas_reasons(atlas)
+    reasons += [PANDA_LEFT_OUT] if panda is None else _panda_reasons(panda)
+    return {
+        "headline": headline(atlas, panda),
+        "tiles": shown,
+        "columns": max(len(shown), 1),
+        "left_out": reasons,
+        "atlas": None if atlas is None else _atlas(atlas),
+        "panda": None if panda is None else _panda(panda),
+        "beyond": beyond(atlas, panda),
+        "sets": list(figure5.SET_NAMES.items()),
+        "written": written,
+    }
+
+
+def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
+    """Key figures of section IV.A, those that there are."""
+    found = []
+    ours, best, times = fopnet(atlas), best_baseline(atlas), advantage(atlas)
+    if ours is not None and "control" in ours.median:
+        value = percent(ours.median["control"])
+        found.append(Tile(f"{OURS}, control set", value, "median relative error, eq. 20"))
+    if best is not None:
+        value = percent(best.median["control"])
+        found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
+    if times is not None:
+        found.append(
+            Tile(
+                "Advantage",
+                scientific(times),
+                f"times smaller on the arm, joints {arm_joints(atlas)}",
+            )
+        )
+    return found
+
+
+def panda_tiles(panda: PandaResults) -> list[Tile]:
+    """Key figures of section IV.B, those that there are."""
+    after, ratio = measured(panda.stated, "lambda_converged_s"), last_ratio(panda)
+    value = "not reached" if after is None else with_unit(after, "s", 3)
+    found = [Tile("λ of the simulated Panda converged", value, "after the first motion")]
+    if ratio is not None:
+        found.append(
+            Tile("Its torque error at the end", scientific(ratio, 3), "times batch least squares")
+        )
+    return found
+
+
+def _atlas(atlas: AtlasResults) -> dict[str, Any]:
+    histogram, moments = figure4.histogram_panels(atlas)
+    paper, others = figure5.arm_panels(atlas)
+    summary = figure5.side_by_side(atlas)
+    return {
+        "n": atlas.tree.n,
+        "limbs": figure4.limb_key(atlas.tree),
+        "schema": [*figure4.epoch_panels(atlas), *([histogram] if histogram else [])],
+        "schema_more": [*([moments] if moments else []), *figure4.schema_panels(atlas)],
+        "not_converged": _not_converged(atlas),
+        "paper": paper,
+        "whole": figure5.whole_panels(atlas),
+        "others": others,
+        "last": [figure5.arm_panel(atlas), *([summary] if summary else [])],
+        "arm": arm_joints(atlas),
+        "not_judged": _not_judged(atlas),
+        "compared": bool(baselines(atlas)),
+        "full": atlas.full,
+        "stated": stated_table(atlas.stated),
+        "learners": learner_table(atlas),
+        "tuning": tuning_rows(atlas),
+    }
+
+
+def arm_joints(atlas: AtlasResults) -> str:
+    """The joints that the baselines learn, numbered from 1."""
+    return f"{atlas.arm[0] + 1} to {atlas.arm[-1] + 1}"
+
+
+def _not_converged(atlas: AtlasResults) -> str:
+    """Which networks of Fig. 4 did not find their joint's frame; empty where all did."""
+    names, samples = atlas.not_converged, atlas.numbers.get("learned_samples")
+    if not names:
+        return ""
+    few = "too few samples" if samples is None else f"too few samples ({grouped(samples)})"
+    if len(names) == atlas.tree.n:
+        return f"None of the {atlas.tree.n} joints had converged; {few}."
+    whose = f"{len(names)} joint{'' if len(names) == 1 else 's'} had not converged"
+    return f"{whose}: {', '.join(names)}; {few}."
+
+
+def _not_judged(atlas: AtlasResults) -> str:
+    """Why some joints have no box in Fig. 5; empty where all have one."""
+    joints = figure5.not_judged(atlas)
+    if not joints:
+        return ""
+    names = listed([f"{j + 1} ({atlas.tree.joint_names[j]})" for j in joints])
+    which = f"Joint {names} has" if len(joints) == 1 else f"Joints {names} have"
+    least = f"{LEAST_TORQUE:g} N m".replace(" ", NARROW)
+    return (
+        f"{which} no box: eq. 20 is judged only where |τ| > {least} (our choice, since relative "
+        "errors of less say nothing), which is never exceeded there."
+    )
+
+
+def _panda(panda: PandaResults) -> dict[str, Any]:
+    torque = figure6.torque_panel(panda)
+    return {
+        "joints": [(j % JOINT_COLORS + 1, name) for j, name in enumerate(panda.tree.joint_names)],
+        "lambda": figure6.lambda_panels(panda),
+        "theta": [*figure6.theta_panels(panda), *([torque] if torque else [])],
+        "logarithmic": figure6.logarithmic(panda),
+        "stated": stated_table(panda.stated),
+    }
+
+
+def _atlas_reasons(atlas: AtlasResults) -> list[str]:
+    """What of Figs. 4 and 5 is missing, and why."""
+    reasons = []
+    kept = {label for label, _ in atlas.snapshots}
+    if not atlas.snapshots:
+        reasons.append("Fig. 4a-d: no epochs of λ's training were kept.")
+    for label, which in figure4.EPOCH_LETTERS.items():
+        if kept and label not in kept:
+            reasons.append(f"Fig. 4{which}: λ's training has no {label}, it ended before.")
+    if not any(sum(counts) for counts in atlas.error_counts.values()):
+        reasons.append("Fig. 4f: no kinematic errors were counted.")
+    have = {letter(learner) for learner in atlas.learners if learner.boxes}
+    for which, name in PAPER_LEARNERS:
+        if which not in have:
+            reasons.append(f"Fig. 5{which}: {name} was not run.")
+    return reasons
+
+
+def _panda_reasons(panda: PandaResults) -> list[str]:
+    """What of Fig. 6 is missing, and why."""
+    if math.isfinite(panda.theta_start_s):
+        return []
+    return ["Fig. 6b: θ was not learned, it waits until λ has converged."]
+
+
+def stated_table(items: Sequence[Stated]) -> Table | None:
+    """What the paper states, what we measured, what differs; None without any."""
+    rows = [[item.what, item.paper or NOT_STATED, ours_text(item), item.note] for item in items]
+    return Table(["", "Paper states", "We measured", "Remark"], rows) if rows else None
+
+
+def learner_table(atlas: AtlasResults) -> Table | None:
+    """A row per learner and set: errors, and how long it trained; None without any."""
+    if not atlas.learners:
+        return None
+    heads = ["Learner", "Joints", "Training", "Set", "Median", "99th percentile", "RMSE"]
+    units = ["", "", "", "", "eq. 20", "eq. 20", "by joint, N m"]
+    rows = []
+    for learner in atlas.learners:
+        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [NOTHING]
+        for name in known:
+            first = name == known[0]
+            row = [learner.name, _joints(learner), with_unit(learner.train_s, "s", 3)]
+            rows.append(
+                [
+                    *(row if first else [""] * len(row)),
+                    name,
+                    percent(learner.median.get(name)),
+                    percent(learner.p99.get(name)),
+                    _spread(learner.rmse.get(name)),
+                ]
+            )
+    return Table(heads, rows, units)
+
+
+def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
+    """Name, title and how it was tuned, of each learner."""
+    return [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners]
+
+
+def _joints(learner: Learned) -> str:
+    known = {len(x) for x in (*learner.rmse.values(), *learner.boxes.values())}
+    return str(max(known)) if known else NOTHING
+
+
+def _spread(values: np.ndarray | None) -> str:
+    """Smallest to largest over the joints."""
+    finite = np.asarray([] if values is None else values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
+        return NOTHING
+    low, high = scientific(float(finite.min())), scientific(float(finite.max()))
+    return low if low == high else f"{low}{NARROW}–{JOIN}{NARROW}{high}"

@@ -1,0 +1,205 @@
+"""Numbers and the two opening sentences of the experiments' page."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from adapter.experiments.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.report.style import SUPERSCRIPTS
+from adapter.report.words import NARROW, NOTHING, count, number
+
+OURS = "FOPnet"
+# The paper's Fig. 5 by the first word of a learner's name, without regard to capitals.
+LETTERS = {"ffnn": "a", "elm": "b", "gpr": "c", "fopnet": "d"}
+SETS = ("train", "test", "control")
+PLAIN_FROM, PLAIN_TO = 1e-3, 1e4  # between them a number needs no power of ten
+ATLAS_LEFT_OUT = "Section IV.A was not run: “adapter experiment atlas” makes Figs. 4 and 5."
+PANDA_LEFT_OUT = "Section IV.B was not run: “adapter experiment panda” makes Fig. 6."
+
+
+def scientific(value: float | int | None, digits: int = 2) -> str:
+    """A number for people over any range; a dash where there is none.
+
+    >>> scientific(2.13e-9).split(), scientific(0.5), scientific(None), scientific(0.0)
+    (['2.1', '×', '10⁻⁹'], '0.50', '–', '0')
+    """
+    if value is None or not math.isfinite(value):
+        return NOTHING
+    if value == 0.0 or PLAIN_FROM <= abs(value) < PLAIN_TO:
+        return number(value, digits)
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    shown = f"{mantissa} × 10{str(int(power)).translate(SUPERSCRIPTS)}"
+    return shown.replace("-", "−").replace(" ", NARROW)
+
+
+def with_unit(value: float | int | None, unit: str, digits: int = 2) -> str:
+    """A number and its unit, on one line."""
+    return f"{scientific(value, digits)} {unit}".replace(" ", NARROW).rstrip(NARROW)
+
+
+def percent(fraction: float | None, digits: int = 2) -> str:
+    """A relative error (eq. 20) in per cent."""
+    return with_unit(None if fraction is None else 100.0 * fraction, "%", digits)
+
+
+def grouped(value: int) -> str:
+    """A whole number, in groups of three from five digits on.
+
+    >>> grouped(1500), grouped(375_000).split()
+    ('1500', ['375', '000'])
+    """
+    return str(value) if abs(value) < PLAIN_TO else count(value)
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a sentence lists them.
+
+    >>> listed(["a"]), listed(["a", "b", "c"])
+    ('a', 'a, b and c')
+    """
+    return " and ".join([part for part in (", ".join(words[:-1]), *words[-1:]) if part])
+
+
+def sentences(pieces: Sequence[str]) -> str:
+    """Pieces of text as sentences, their numbers in readable form.
+
+    >>> sentences(["1,500 tuned_on, 30 inputs", "up to 3e+02.", "θ is next"])
+    'Tuned on 1500, 30 inputs. Up to 300. θ is next.'
+    """
+    return " ".join(_sentence(piece) for piece in pieces if piece.strip())
+
+
+def _sentence(piece: str) -> str:
+    said = piece.strip().rstrip(".")
+    said = re.sub(r"([\d,]*\d) (tuned_on|rank)\b", r"\2 \1", said).replace("_", " ")
+    said = re.sub(r"\b\d{1,3}(?:,\d{3})+\b", lambda x: grouped(int(x[0].replace(",", ""))), said)
+    said = re.sub(r"\b\d{5,}\b", lambda x: grouped(int(x[0])), said)
+    said = re.sub(r"(\d)%", rf"\1{NARROW}%", said)
+    said = re.sub(r"\b\d+(?:\.(\d+))?e[+-]\d+\b", _plain, said)
+    said = re.sub(r"(?<![\w.])-(?=\d)", "−", said)
+    first = said[:1]
+    return f"{first.upper() if first.isascii() else first}{said[1:]}."  # θ stays small
+
+
+def _plain(power: re.Match[str]) -> str:
+    """A number with an exponent, as `scientific` writes it, with as many digits."""
+    return scientific(float(power[0]), 1 + len(power[1] or ""))
+
+
+def ours_text(item: Stated) -> str:
+    """What we measured, with its unit; words where it was not run."""
+    value = item.ours
+    if value is None:
+        return "not run"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int) or (value.is_integer() and abs(value) < PLAIN_TO):
+        return f"{grouped(int(value))} {item.unit}".replace(" ", NARROW).rstrip(NARROW)
+    return with_unit(value, item.unit, 3)
+
+
+def letter(learner: Learned) -> str:
+    """Which part of the paper's Fig. 5 shows this learner; empty where none does."""
+    first = learner.name.replace("-", " ").split()[:1]
+    return LETTERS.get(first[0].lower(), "") if first else ""
+
+
+def fopnet(atlas: AtlasResults) -> Learned | None:
+    """The learner of the paper."""
+    return next((x for x in atlas.learners if letter(x) == LETTERS["fopnet"]), None)
+
+
+def baselines(atlas: AtlasResults) -> list[Learned]:
+    """The paper's three."""
+    return [x for x in atlas.learners if letter(x) in ("a", "b", "c")]
+
+
+def best_baseline(atlas: AtlasResults) -> Learned | None:
+    """Of the paper's three the one with the smallest median error on the control set."""
+    name = atlas.numbers.get("best_baseline")
+    return next((x for x in baselines(atlas) if x.name == name), None)
+
+
+def advantage(atlas: AtlasResults) -> float | None:
+    """How many times smaller FOPnet's median control error is than the best baseline's, both of
+    the joints that the baselines learn."""
+    ratio = atlas.numbers.get("control_error_ratio_to_best_baseline")
+    return ratio if ratio is not None and math.isfinite(ratio) and ratio > 0.0 else None
+
+
+def of(items: Sequence[Stated], key: str) -> Stated | None:
+    """The figure with that key, if there is one."""
+    return next((item for item in items if item.key == key), None)
+
+
+def measured(items: Sequence[Stated], key: str) -> float | None:
+    """Our value of the figure with that key, if it is a finite number."""
+    item = of(items, key)
+    value = None if item is None else item.ours
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def last_ratio(panda: PandaResults) -> float | None:
+    """The last torque error over that of batch least squares."""
+    finite = panda.torque_error[np.isfinite(panda.torque_error)]
+    return float(finite[-1]) if len(finite) else None
+
+
+def headline(atlas: AtlasResults | None, panda: PandaResults | None) -> str:
+    """The outcome: a sentence for each experiment."""
+    return f"{atlas_sentence(atlas)} {panda_sentence(panda)}"
+
+
+def atlas_sentence(atlas: AtlasResults | None) -> str:
+    """How FOPnet does on ATLAS, beside the best of the paper's baselines."""
+    if atlas is None:
+        return "ATLAS was not run."
+    ours = fopnet(atlas)
+    if ours is None or "control" not in ours.median:
+        return f"ATLAS ({atlas.tree.n} joints) was run without {OURS} on the control set."
+    said = (
+        f"On control trajectories {OURS} predicts the joint torques of ATLAS "
+        f"({atlas.tree.n} joints) with a median relative error of "
+        f"{percent(ours.median['control'])}"
+    )
+    best, times = best_baseline(atlas), advantage(atlas)
+    if best is None:
+        return f"{said}; the baselines were not run."
+    theirs = f"{best.name}, {percent(best.median['control'])}"
+    if times is None:
+        return f"{said}; the best of the paper's baselines has {theirs}."
+    held = f"{scientific(max(times, 1.0 / times))} times {'smaller' if times >= 1.0 else 'larger'}"
+    where = f"on the arm ({len(atlas.arm)} joints)"
+    return f"{said}; {where} it is {held} than that of the paper's best baseline ({theirs})."
+
+
+def panda_sentence(panda: PandaResults | None) -> str:
+    """How fast and how well the Panda learns itself."""
+    if panda is None:
+        return "The Panda was not run."
+    at = of(panda.stated, "lambda_converged_s")
+    after = measured(panda.stated, "lambda_converged_s")
+    if after is None:
+        said = "The simulated Panda's λ did not converge"
+    else:
+        theirs = (
+            f" (the paper's real arm: {at.paper.replace(' ', NARROW)})"
+            if at is not None and at.paper
+            else ""
+        )
+        after_s = with_unit(after, "s")
+        said = f"The simulated Panda's λ converges {after_s} after the first motion{theirs}"
+    ratio = last_ratio(panda)
+    if ratio is None or not math.isfinite(panda.theta_start_s):
+        return f"{said}; its θ was not learned."
+    joined = ", and" if after is not None else "; in the end"
+    error = f"its torque error is {scientific(ratio, 3)}"
+    return f"{said}{joined} {error} times that of batch least squares."

@@ -1,0 +1,176 @@
+"""Beyond the paper: whether discovery finds the tree of recordings whose order and names are lost.
+
+Every recording is shuffled and renamed first, so that nothing but the signals can tell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.control.controller import ExcitationController
+from adapter.control.excitation import ExcitationSettings
+from adapter.control.limits import MotionLimits
+from adapter.discovery import UNSEEN_BASE, Discovery, discover
+from adapter.model.robots import documented
+from adapter.model.tree import BASE, Tree
+from adapter.realtime.session import run_lockstep
+from adapter.runs.pipeline import PipelineSettings, make_front_end
+from drivers.files.mcap import Log
+from drivers.interface import JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.falls.data_set import FallData
+from sim.falls.fall import RATE_HZ
+from sim.scenarios import build
+
+MOTION_S = 10.0  # of each recording, from its start (the project's goal: at most that)
+Edges = frozenset[tuple[str, str, str]]  # (joint, the link it moves, its parent)
+
+
+@dataclass(frozen=True)
+class Shuffled:
+    """A shuffled recording, and the tree that discovery is to find in it."""
+
+    log: Log
+    edges: Edges
+    root: str
+
+
+def shuffled(log: Log, tree: Tree, rng: np.random.Generator) -> Shuffled:
+    """Joints and links in random order, under names that tell nothing.
+
+    Args:
+        log: its joints and links are named as the tree's; the base may be among its links.
+        tree: the truth.
+        rng: draws the order.
+    """
+    joints = [str(name) for name in rng.permutation(log.joint_names)]
+    links = [str(name) for name in rng.permutation(log.link_names)]
+    joint = {name: f"joint {k}" for k, name in enumerate(joints)}
+    link = {name: f"link {k}" for k, name in enumerate(links)}
+    root = link.get(tree.base_name, UNSEEN_BASE)
+    parents = [root if i == BASE else link[tree.link_names[i]] for i in tree.parent]
+    edges = frozenset(
+        (joint[name], link[moved], parent)
+        for name, moved, parent in zip(tree.joint_names, tree.link_names, parents, strict=True)
+    )
+    mixed = replace(
+        log.select(joints, links),
+        joint_names=tuple(joint.values()),
+        link_names=tuple(link.values()),
+        metadata={},
+    )
+    return Shuffled(mixed, edges, root)
+
+
+def judged(asked: Shuffled, found: Discovery) -> dict[str, Any]:
+    """What discovery made of it: right or not, and the confidences that matter."""
+    named = {(e.joint, e.link, e.parent): e.confidence for e in found.edges if e.joint}
+    right = [c for edge, c in named.items() if edge in asked.edges]
+    wrong = [c for edge, c in named.items() if edge not in asked.edges]
+    return {
+        "right": len(right) == len(asked.edges) and not wrong and found.root == asked.root,
+        "least_confidence_right": min(right, default=0.0),
+        "most_confidence_wrong": max(wrong, default=0.0),
+        "motion_s": found.log.duration_s,
+    }
+
+
+def topology_trials(logs: Iterable[Log], tree: Tree, seed: int) -> dict[str, Any]:
+    """Shuffle, discover and judge recordings of one tree.
+
+    Returns:
+        trials, right (trees wholly right), least_confidence_right and most_confidence_wrong (of
+        an edge, over all trials), motion_s (the longest recording), channels that were measured.
+    """
+    rows, measured = [], ""
+    for k, log in enumerate(logs):
+        asked = shuffled(log, tree, np.random.default_rng([seed, k]))
+        found = discover(asked.log)
+        measured = ", ".join(found.log.measured)
+        rows.append(judged(asked, found))
+    return {
+        "trials": len(rows),
+        "right": sum(row["right"] for row in rows),
+        "least_confidence_right": min((r["least_confidence_right"] for r in rows), default=0.0),
+        "most_confidence_wrong": max((r["most_confidence_wrong"] for r in rows), default=0.0),
+        "motion_s": max((row["motion_s"] for row in rows), default=0.0),
+        "measured": measured,
+    }
+
+
+def fall_logs(noisy: FallData, count: int) -> Iterator[Log]:
+    """What joints, gyroscopes and accelerometers of falling robots say, one log per fall.
+
+    Neither velocities nor angular accelerations are in them: no such sensor is.
+    """
+    truth = noisy.truth
+    for k in range(min(count, len(noisy))):
+        measured = noisy[k]
+        q = measured["q"]
+        turning, pull = (
+            np.concatenate([measured[f"base_{x}"][:, None], measured[f"link_{x}"]], axis=1)
+            for x in ("w", "a")
+        )
+        nothing = np.full_like(turning, np.nan)
+        log = Log(
+            Path(f"fall {k}"),
+            tuple(truth.joint_names),
+            np.arange(len(q)) * round(1e9 / RATE_HZ),
+            q,
+            measured["dq"],
+            measured["tau"],
+            (truth.base_name, *truth.link_names),
+            np.concatenate([nothing, turning], axis=2),
+            np.concatenate([pull, nothing], axis=2),
+        )
+        yield _first(log)
+
+
+def panda_logs(count: int, seed: int) -> Iterator[Log]:
+    """What simulated Pandas with bent links say, each moving by itself; one log per seed."""
+    robot = documented("panda")
+    limits = MotionLimits.of(robot)
+    for k in range(seed, seed + count):
+        arm = PyBulletArm(build("bent_link", k).plant())
+        controller = ExcitationController(limits, ExcitationSettings(seed=k))
+        samples: list[JointSample] = []
+
+        def keep(sample: JointSample, command: object, into: list[JointSample] = samples) -> None:
+            into.append(sample)
+
+        front_end = make_front_end(robot, PipelineSettings())
+        try:
+            run_lockstep(arm, front_end, controller=controller, duration_s=MOTION_S, each=keep)
+        finally:
+            arm.close()
+        yield _first(_log_of(arm, samples))
+
+
+def _log_of(arm: PyBulletArm, samples: Sequence[JointSample]) -> Log:
+    links = [sample.links for sample in samples if sample.links is not None]
+    return Log(
+        Path("simulated Panda"),
+        arm.joint_names,
+        np.array([sample.stamp_ns for sample in samples]),
+        np.array([sample.q for sample in samples]),
+        np.array([sample.dq for sample in samples]),
+        np.array([sample.tau for sample in samples]),
+        arm.link_names,
+        np.array([motion.twist for motion in links]),
+        np.array([motion.accel for motion in links]),
+    )
+
+
+def _first(log: Log) -> Log:
+    """The first seconds of a recording."""
+    stop = int(np.searchsorted(log.stamp_ns, log.stamp_ns[0] + round(1e9 * MOTION_S)))
+    assert log.twists is not None and log.accels is not None
+    return Log(
+        log.path, log.joint_names, log.stamp_ns[:stop], log.q[:stop], log.dq[:stop],
+        log.tau[:stop], log.link_names, log.twists[:stop], log.accels[:stop],
+    )  # fmt: skip

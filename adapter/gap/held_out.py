@@ -1,0 +1,335 @@
+"""How far the gap shrinks: torque and forward simulation on data that the fit never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from adapter.effects.torque import ModelTorque
+from adapter.errors import ModelError
+from adapter.gap.evidence import Carried
+from adapter.gap.findings import entries, noise_floor
+from adapter.gap.fit import Fit, Model, refitted
+from adapter.gap.result import Curves, RolloutCurves, Shortfall
+from adapter.gap.rivals import FOLD_S, FOLDS, block_s, fold_of, fold_rows
+from adapter.gap.search import Found
+from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
+from adapter.model.inertia import is_consistent
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
+from adapter.signals.validation import smooth
+
+SEGMENT_S = 0.5
+NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
+THINNED = 10  # rollout rows kept for a plot: one in so many
+WORST = 100.0  # rad, rad/s: a simulation that runs away
+
+
+class DrivenMotion(NamedTuple):
+    """How an arm moved and what drove it.
+
+    Attributes:
+        t: (m,) s, uniform.
+        q, dq: (m, n) measured, smoothed, rad and rad/s.
+        u: (m, n) driving torque, N m.
+    """
+
+    t: Array
+    q: Array
+    dq: Array
+    u: Array
+
+
+# (model, motion, segments, drive) -> simulated q, dq (m, n), NaN outside the segments and all
+# over where the model cannot be simulated
+Simulate = Callable[[SelfModel, DrivenMotion, Sequence[tuple[int, int]], str], tuple[Array, Array]]
+
+
+def model_of(model: SelfModel, fit: Fit) -> SelfModel:
+    """The self model with the corrections and the named effects of a fit.
+
+    A correction that would make a body impossible is taken back as far as it must be.
+    """
+    theta = model.theta.copy()
+    first = len(theta) - len(fit.dtheta)  # a floating base comes before the links
+    for k, change in enumerate(fit.dtheta, start=first):
+        share = 1.0
+        while not is_consistent(theta[k] + share * change) and is_consistent(theta[k]):
+            share *= 0.7
+            if share < 1e-3:
+                share = 0.0
+                break
+        theta[k] += share * change
+    return replace(model, theta=theta, effects=(*model.effects, *entries(fit)))
+
+
+def held_out_coefficients(fit: Fit, carried: Carried) -> list[Array]:
+    """Coefficients of a fit, one set per fold, each without that fold's blocks of time.
+
+    Names, dates and the noise are those that all data gave; what is fitted is refitted.
+    """
+    fold = fold_rows(fit)
+    seen = [fold != f for f in range(FOLDS)]
+    return [Carried(carried.N[:, s], carried.prior_std, carried.data[s]).x for s in seen]
+
+
+def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfModel]:
+    """One model per fold: the named effects refitted without that fold's blocks of time."""
+    models = []
+    for x in held_out_coefficients(fit, carried):
+        try:
+            models.append(model_of(model, fit.at(x)))
+        except ModelError:  # a coefficient at its bound without these data
+            models.append(model_of(model, fit))
+    return models
+
+
+@dataclass(frozen=True, eq=False)
+class TorqueErrors:
+    """Errors by the recipe of `adapter.signals.validation`, (m, n) N m, at t (m,) s."""
+
+    t: Array
+    before: Array
+    after: Array
+
+
+def torque_errors(
+    recording: Recorded, before: SelfModel, after: Sequence[SelfModel], block: float = FOLD_S
+) -> TorqueErrors:
+    """Measured less predicted torque; `after` has one model per fold of `block` s, or one."""
+    q, dq, ddq, tau = smooth(recording.t, recording.q, recording.dq, recording.tau)
+    t = recording.t[0] + 1e-3 * np.arange(len(q))
+    old = tau - ModelTorque(before)(q, dq, ddq, t)
+    fold = fold_of(t, block) % len(after)
+    new = np.empty_like(old)
+    for f, model in enumerate(after):
+        rows = fold == f
+        if rows.any():
+            new[rows] = (tau - ModelTorque(model)(q, dq, ddq, t))[rows]
+    edge = round(RECIPE_EDGE_S / 1e-3)
+    return TorqueErrors(t[edge:-edge], old[edge:-edge], new[edge:-edge])
+
+
+def rms(errors: Sequence[Array]) -> Array:
+    """(n,) root of the mean square over all rows of all tables; NaN where there is no row."""
+    table = np.concatenate(list(errors))
+    if not len(table):
+        return np.full(table.shape[1], np.nan)
+    return np.sqrt(np.mean(np.square(table), axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class RolloutErrors:
+    """Simulated less measured by row and joint, (k, n) rad and rad/s, and curves for a plot.
+
+    Rows are those that both models could be simulated along; none where one could not at all.
+    """
+
+    before_q: Array
+    before_dq: Array
+    after_q: Array
+    after_dq: Array
+    curves: RolloutCurves
+
+
+def rollout_errors(
+    recording: Recorded,
+    before: SelfModel,
+    after: Sequence[SelfModel],
+    simulate: Simulate,
+    block: float = FOLD_S,
+) -> RolloutErrors:
+    """Forward simulation restarted from the data every 0.5 s.
+
+    Each segment goes by the model of the fold that it starts in (blocks of `block` s).
+    """
+    t = recording.grid()
+    q, dq, _ = recording.smoothed().at(t)
+    u, drive = recording.drive(t)
+    segments = [s for s in _segments(len(t)) if recording.is_whole(t[s[0]], t[s[1] - 1])]
+    motion = DrivenMotion(t, q, dq, u)
+    old = _along(segments, [before], simulate, motion, drive, block)
+    new = _along(segments, after, simulate, motion, drive, block)
+    told = np.zeros(len(t), dtype=bool)
+    for begin, end in segments:  # a simulation that was refused lacks even its start
+        told[begin:end] = np.isfinite(old[0][begin]).all() and np.isfinite(new[0][begin]).all()
+    thin = slice(None, None, THINNED)
+    curves = RolloutCurves(t[thin], q[thin], old[0][thin], new[0][thin])
+    return RolloutErrors(
+        _off(old[0], q)[told],
+        _off(old[1], dq)[told],
+        _off(new[0], q)[told],
+        _off(new[1], dq)[told],
+        curves,
+    )
+
+
+def _segments(rows: int) -> list[tuple[int, int]]:
+    """[start, stop) of 0.5 s each; the row at stop is the next start."""
+    length = round(SEGMENT_S / ROLLOUT_STEP_S)
+    return [(k, k + length) for k in range(0, rows - length, length)]
+
+
+def _along(
+    segments: Sequence[tuple[int, int]],
+    models: Sequence[SelfModel],
+    simulate: Simulate,
+    motion: DrivenMotion,
+    drive: str,
+    block: float,
+) -> tuple[Array, Array]:
+    """Simulated q, dq (m, n), NaN outside the segments; `models` has one per fold, or one."""
+    out = np.full_like(motion.q, np.nan), np.full_like(motion.q, np.nan)
+    for f, model in enumerate(models):
+        t, count = motion.t, len(models)
+        own = [s for s in segments if fold_of(t[s[0] : s[0] + 1], block)[0] % count == f]
+        if own:
+            found = simulate(model, motion, own, drive)
+            for begin, end in own:
+                for mine, part in zip(out, found, strict=True):
+                    mine[begin:end] = part[begin:end]
+    return out
+
+
+def _off(simulated: Array, measured: Array) -> Array:
+    """Error of a simulation; of one that ran away the worst that counts."""
+    off = np.abs(simulated - measured)
+    return np.minimum(np.where(np.isfinite(off), off, WORST), WORST)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What there is to work with.
+
+    Attributes:
+        model: the nominal one.
+        fitted, scored: recordings to fit and to score on; the same ones where blocks are held out.
+        moving: joints (from 0) that move, per fitted recording.
+        period_s: the longest sample period.
+        one_clock: what is scored belongs to the recording that is fitted.
+        notes: what is known of the logs.
+    """
+
+    model: SelfModel
+    fitted: tuple[Recorded, ...]
+    scored: tuple[Recorded, ...]
+    moving: tuple[tuple[int, ...], ...]
+    period_s: float
+    one_clock: bool
+    notes: tuple[str, ...]
+
+    @property
+    def folds(self) -> bool:
+        """The fit's own recordings are scored, each block by a fit without it."""
+        return self.fitted == self.scored
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """The gap before and after, on data that the fit never saw.
+
+    Attributes:
+        found: what was searched for, without the corrections of the inertias where these do
+            not pay.
+        before, after: errors of the nominal model and of the new one.
+        curves: one per fitted recording; rollouts: one per recording that was simulated.
+    """
+
+    found: Found
+    before: Shortfall
+    after: Shortfall
+    curves: tuple[Curves, ...]
+    rollouts: tuple[RolloutCurves, ...]
+
+
+def measure(
+    task: Task, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
+) -> HeldOut:
+    """Score the nominal model and the new one where the new one was not fitted."""
+    found = _corrected_where_it_pays(task, found)
+    block = block_s(found.fit)
+    if task.folds:
+        after = held_out_models(task.model, found.fit, found.carried)
+    else:
+        model = model_of(task.model, found.fit)
+        after = [model if task.one_clock else lasting(model)]
+    errors = [torque_errors(r, task.model, after, block) for r in task.scored]
+    old, new = Shortfall(rms([e.before for e in errors])), Shortfall(rms([e.after for e in errors]))
+    rollouts: tuple[RolloutCurves, ...] = ()
+    if simulate is not None:
+        progress("simulating forward")
+        runs = [rollout_errors(r, task.model, after, simulate, block) for r in task.scored]
+        old = replace(
+            old,
+            rollout_rmse_rad=rms([x.before_q for x in runs]),
+            rollout_rmse_rad_s=rms([x.before_dq for x in runs]),
+        )
+        new = replace(
+            new,
+            rollout_rmse_rad=rms([x.after_q for x in runs]),
+            rollout_rmse_rad_s=rms([x.after_dq for x in runs]),
+        )
+        rollouts = tuple(x.curves for x in runs)
+    curves = tuple(_curves(r.name, found, i) for i, r in enumerate(task.fitted))
+    return HeldOut(found, old, new, curves, rollouts)
+
+
+def lasting(model: SelfModel) -> SelfModel:
+    """The model in another recording: its effects that had not ended, at all times."""
+    kept = []
+    for entry in model.effects:
+        begin, end = entry.get("interval_s") or (None, None)
+        if end is None:
+            kept.append(dict(entry, interval_s=None) if begin is not None else entry)
+    return replace(model, effects=tuple(kept))
+
+
+def _corrected_where_it_pays(task: Task, found: Found) -> Found:
+    """Without the corrections of the inertias where they do not pay on held-out data."""
+    bare = uncorrected(found)
+    level = noise_floor(found.fit)
+    costs = []
+    for own in (found, bare):
+        folds = held_out_models(task.model, own.fit, own.carried)
+        errors = [torque_errors(r, task.model, folds, block_s(own.fit)) for r in task.fitted]
+        costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
+    return found if costs[0] <= costs[1] else bare
+
+
+def uncorrected(found: Found) -> Found:
+    """The same effects fitted with the nominal inertias.
+
+    What is known of the coefficients stays what is known with the inertias free within their
+    prior: that they are left alone does not make them any surer.
+    """
+    fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
+    model = replace(fit.model, dtheta=np.zeros_like(fit.dtheta))
+    kept = replace(fit, model=model, prior=found.fit.prior)
+    return replace(found, fit=kept, carried=carried, known=kept.carried())
+
+
+def _curves(name: str, found: Found, i: int) -> Curves:
+    """What is shown of the i-th fitted recording, called `name`."""
+    own, model = found.fit.recordings[i], found.fit.model
+    nominal = Model((own,), np.zeros_like(found.fit.dtheta), known=model.known)
+    after = np.empty_like(own.tau)
+    for f, x in enumerate(held_out_coefficients(found.fit, found.carried)):
+        rows = fold_of(own.t, block_s(found.fit)) == f
+        after[rows] = found.fit.at(x).without_patterns().model.residual(i)[rows]
+    rows = np.searchsorted(own.motion.t, own.t - 1e-9)
+    motion = own.motion
+    return Curves(
+        recording=name,
+        t=own.t,
+        q=motion.q[rows],
+        dq=motion.dq[rows],
+        ddq=motion.ddq[rows],
+        tau=own.tau,
+        before=nominal.residual(0),
+        after=after,
+        held_out=np.zeros(len(own.t), dtype=bool),
+    )

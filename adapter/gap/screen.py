@@ -1,0 +1,315 @@
+"""What stops the search for the gap: recordings that would only yield false names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.effects.torque import ModelTorque
+from adapter.gap.timing import Timing, check_timing, uniform
+from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.matching import matching
+from adapter.signals.validation import GRID_S, smooth
+from drivers.files.mcap import Log
+from drivers.interface import DriverError
+
+MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
+MOTION_S = 2.0  # of motion faster than half MOVES_DQ; less tells nothing
+WANTED_RAD, WANTED_DQ = 0.3, 0.3  # what to ask for
+DEGREES = 180.0 / np.pi
+TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
+BEYOND_RAD, BEYOND_SHARE = 0.2, 0.05  # over the limit, and in which share of the samples
+TILT_RAD = np.deg2rad(20.0)  # of gravity; less is a base that stands askew
+FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias stays below 100
+NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
+EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
+EDGE = 300  # ms at either end, where the filter has no neighbours
+
+
+class Fault(StrEnum):
+    """What is wrong with a recording, as in the JSON file."""
+
+    ROBOT = "robot"
+    DATA = "data"
+    VELOCITY = "velocity"
+    DEGREES = "degrees"
+    MOTION = "motion"
+    TORQUE = "torque"
+    SIGN = "sign"
+    SCALE = "scale"
+    GRAVITY = "gravity"
+    MOUNTING = "mounting"
+    ORDER = "order"
+
+    @property
+    def is_an_answer(self) -> bool:
+        """Whether nothing is wrong with the recording, it only holds too little."""
+        return self is Fault.MOTION
+
+
+class Refusal(ValueError):
+    """A recording that the search for the gap must not use; one sentence says why.
+
+    Attributes:
+        kind: of what is wrong.
+    """
+
+    def __init__(self, kind: Fault, sentence: str) -> None:
+        super().__init__(sentence)
+        self.kind = kind
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A recording that can be used.
+
+    Attributes:
+        log: joints in the model's order; strictly increasing stamps, finite, without repeats.
+        timing: of the recording as it was.
+        moving: joints (from 0) that move enough to tell anything of them.
+        notes: what to report beside the findings, a sentence each.
+    """
+
+    log: Log
+    timing: Timing
+    moving: tuple[int, ...]
+    notes: list[str]
+
+
+def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
+    """Let a recording pass or say in one sentence why not.
+
+    Args:
+        log: as read; model: whose joints it should have; arm: the model's rigid body.
+
+    Raises:
+        Refusal: another robot; no second of data; units or sign of velocities or positions;
+            too little motion; units, sign, order or meaning of the torques.
+    """
+    recorded = log.joint_names
+    log = _of_this_robot(log, model)
+    names = model.tree.joint_names
+    signals = (log.q, log.dq, log.tau)
+    timing = check_timing(log.stamp_ns, *signals)
+    keep = uniform(log.stamp_ns, *signals)
+    log = rows_of(log, keep)
+    if timing.span_s < MOTION_S or len(log) < 100:
+        raise Refusal(
+            Fault.DATA,
+            f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
+            f"{timing.samples}; record at least {MOTION_S:g} s, better 20 s, of motion.",
+        )
+    renamed = not set(names) <= set(recorded)
+    _check_motion_units(log, model, timing)
+    outside = _outside_limits(log, model, recorded, renamed)
+    stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    q, dq, ddq, tau = smooth(stamps_s, log.q, log.dq, log.tau)
+    moving = moving_joints(q, dq)
+    _check_motion(log, names, q, dq, moving)
+    silent = _silent(log, names)
+    judge_torque(log, model, arm, (q, dq, ddq, tau), renamed, recorded)
+    notes = [*timing.words(), *outside, *_standing(names, moving, q, dq), *silent]
+    return Screened(log, timing, moving, notes)
+
+
+def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
+    """The recording with only these samples."""
+    return replace(
+        log,
+        stamp_ns=log.stamp_ns[rows],
+        q=log.q[rows],
+        dq=log.dq[rows],
+        tau=log.tau[rows],
+        twists=None if log.twists is None else log.twists[rows],
+        accels=None if log.accels is None else log.accels[rows],
+    )
+
+
+def _of_this_robot(log: Log, model: SelfModel) -> Log:
+    try:
+        return matching(log, model)
+    except DriverError:
+        missing = [name for name in model.tree.joint_names if name not in log.joint_names]
+        raise _another_robot(
+            log, model, log.joint_names, f"it lacks {', '.join(missing)}"
+        ) from None
+
+
+def _another_robot(log: Log, model: SelfModel, recorded: Sequence[str], why: str) -> Refusal:
+    return Refusal(
+        Fault.ROBOT,
+        f"{log.path} is a recording of another robot than {model.name}: {why}; its "
+        f"{len(recorded)} joints are {', '.join(recorded)}, those of the model "
+        f"({model.tree.n}) are {', '.join(model.tree.joint_names)}; give the model of the arm "
+        "that was recorded.",
+    )
+
+
+def _check_motion_units(log: Log, model: SelfModel, timing: Timing) -> None:
+    names = model.tree.joint_names
+    gain = timing.velocity_gain
+    seen = np.flatnonzero(np.isfinite(gain))
+    share = (np.abs(log.q) > TURNS_RAD).mean(axis=0)
+    upper = np.nan_to_num(np.fmax(np.abs(model.limits.lower), np.abs(model.limits.upper)))
+    beyond = np.flatnonzero((share > BEYOND_SHARE) & (upper < TURNS_RAD) & (upper > 0))
+    middle = float(np.median(gain[seen])) if seen.size else 1.0
+    if 1 / 1.2 < middle / DEGREES < 1.2:
+        raise Refusal(
+            Fault.DEGREES,
+            f"{log.path}: dq is {middle:.3g} times the rate of q, so dq is in degrees per second "
+            "while q is in radians; convert dq to rad/s (`adapter import` does).",
+        )
+    if beyond.size or 1 / 1.2 < middle * DEGREES < 1.2:
+        k = int(np.argmax(np.abs(log.q).max(axis=0)))
+        raise Refusal(
+            Fault.DEGREES,
+            f"{log.path}: {names[k]} reaches {np.abs(log.q[:, k]).max():.3g}, where its limit is "
+            f"{upper[k]:.3g} rad, and dq is {middle:.3g} times the rate of q: positions look like "
+            "degrees; convert them to radians (`adapter import` does).",
+        )
+    wrong = [j for j in seen if not 0.5 < gain[j] < 2.0]
+    if wrong:
+        told = ", ".join(f"{names[j]} {gain[j]:.3g}" for j in wrong)
+        raise Refusal(
+            Fault.VELOCITY,
+            f"{log.path}: dq is not the rate of q, their ratio is {told} instead of 1; check "
+            "sign, unit and order of the velocities, or leave them out of the recording.",
+        )
+
+
+def _outside_limits(
+    log: Log, model: SelfModel, recorded: Sequence[str], renamed: bool
+) -> list[str]:
+    """A note on a joint beyond its limits; Refusal where joints were matched by number alone."""
+    low, high = model.limits.lower, model.limits.upper
+    over = np.maximum(log.q - high, low - log.q) > BEYOND_RAD
+    beyond = np.flatnonzero((over.mean(axis=0) > BEYOND_SHARE) & (high > low))
+    if not beyond.size:
+        return []
+    k = int(beyond[0])
+    name = recorded[k] if renamed else model.tree.joint_names[k]
+    why = (
+        f"{name} goes from {log.q[:, k].min():.3g} to {log.q[:, k].max():.3g} rad where the "
+        f"model's {model.tree.joint_names[k]} may go from {low[k]:.3g} to {high[k]:.3g}"
+    )
+    if renamed:
+        raise _another_robot(log, model, recorded, why)
+    return [f"{why}: is this the arm of the model, with its zero positions?"]
+
+
+def _extent(q: Array, dq: Array) -> tuple[Array, Array]:
+    """Range rad and speed rad/s (n,) of each joint, without the most extreme samples."""
+    return np.ptp(np.percentile(q, (1, 99), axis=0), axis=0), np.percentile(np.abs(dq), 95, axis=0)
+
+
+def moving_joints(q: Array, dq: Array, period_s: float = GRID_S) -> tuple[int, ...]:
+    """Joints (from 0) that move enough; q, dq (m, n) rad, rad/s, smoothed, period_s apart."""
+    wide, fast = _extent(q, dq)
+    long = (np.abs(dq) > 0.5 * MOVES_DQ).sum(axis=0) * period_s
+    moves = (wide >= MOVES_RAD) & (fast >= MOVES_DQ) & (long >= MOTION_S)
+    return tuple(np.flatnonzero(moves).tolist())
+
+
+def _check_motion(
+    log: Log, names: Sequence[str], q: Array, dq: Array, moving: Sequence[int]
+) -> None:
+    if moving:
+        return
+    wide, fast = _extent(q, dq)
+    k = int(np.argmax(wide))
+    long = float((np.abs(dq).max(axis=1) > 0.5 * MOVES_DQ).sum() * GRID_S)
+    raise Refusal(
+        Fault.MOTION,
+        f"{log.path}: too little motion to tell anything: {names[k]} moves most, by "
+        f"{wide[k]:.2g} rad at {fast[k]:.2g} rad/s, and the arm is in motion for {long:.2g} s; "
+        f"move {', '.join(names)} by at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s, "
+        "all of them at once, for some 20 s.",
+    )
+
+
+def _standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:
+    still = [name for j, name in enumerate(names) if j not in moving]
+    wide, fast = _extent(q, dq)
+    little = [names[j] for j in moving if wide[j] < WANTED_RAD or fast[j] < WANTED_DQ]
+    notes = []
+    if still:
+        notes.append(
+            f"{', '.join(still)} stand still: nothing can be told of their friction, inertia, "
+            f"elasticity or encoders; move them by at least {WANTED_RAD} rad with at least "
+            f"{WANTED_DQ} rad/s."
+        )
+    if little:
+        notes.append(
+            f"{', '.join(little)} move little: what is told of them is uncertain; move them by "
+            f"at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s."
+        )
+    return notes
+
+
+def _silent(log: Log, names: Sequence[str]) -> list[str]:
+    """A note on joints whose torque never changes. Raises Refusal where no torque does."""
+    dead = [name for name, span in zip(names, np.ptp(log.tau, axis=0), strict=True) if span == 0]
+    if len(dead) == len(names):
+        raise Refusal(
+            Fault.TORQUE,
+            f"{log.path}: the torques never change ({', '.join(f'{x:.3g}' for x in log.tau[0])} "
+            "N m throughout) though the arm moves; record measured joint torques.",
+        )
+    if not dead:
+        return []
+    return [f"The torque of {', '.join(dead)} never changes: is it measured?"]
+
+
+def judge_torque(
+    log: Log,
+    model: SelfModel,
+    arm: RigidArm,
+    smoothed: tuple[Array, Array, Array, Array],
+    renamed: bool = False,
+    recorded: Sequence[str] = (),
+) -> None:
+    """Refuse torques in another unit, sign, order or without gravity.
+
+    Args:
+        smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
+        renamed: joints were matched by number, so it may be another arm altogether.
+        recorded: joint names of the recording.
+
+    Raises:
+        Refusal: see there.
+    """
+    every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
+    t = np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
+    q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
+    comparison = TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, GRID_S * t))
+
+    def gravity(along: Array) -> Array:
+        return arm.changed(gravity=along).torque(q, 0.0 * q, 0.0 * q)
+
+    as_is, *others = readings(comparison, tau, gravity(arm.gravity), gravity)
+    best = others[0]
+    if renamed and min(as_is.cost, best.cost) > FOREIGN_COST:
+        why = "the joints are named otherwise and its torques are not those of such an arm"
+        raise _another_robot(log, model, recorded, why)
+    if not convincing(comparison, best, as_is):
+        return
+    if best.kind == "mounting" and _angle(best.detail, arm.gravity) < TILT_RAD:
+        return
+    cheap = [r for r in others if r.cost < best.cost + NAMED_UNIT_COST]
+    if best.kind == "scale":
+        best = next((r for r in cheap if unit(r)), best)
+    raise Refusal(
+        Fault(best.kind), f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}"
+    )
+
+
+def _angle(a: Array, b: Array) -> float:
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(np.arccos(np.clip(a @ b / size, -1.0, 1.0))) if size else 0.0

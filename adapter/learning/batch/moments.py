@@ -1,0 +1,140 @@
+"""One pass over the samples: the second moments that hold all they say of every joint frame.
+
+Eqs. 8a-8d turned by Rz(q_j) read `y = R0^T z(p)` with y known from link j and z linear in known
+signals of its parent, so the cost of any number of samples lives in the moments of [y, s]
+(`schema_kernels` has the algebra of w, v and a; angular acceleration has that of w).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.learning.schema_kernels import WIDTH, accumulate, signals
+from adapter.learning.tree_data import TreeData, check_motion
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.kernels import JointMotion, jit
+
+# What a link measures, in the order of the moments, and the kernel that knows its algebra.
+CHANNELS = ("w", "v", "a", "dw")
+KERNELS = (0, 1, 2, 0)
+# Which of the parent's signals stand in s, three numbers each; products of w_i come last in a's.
+_PARENT_SIGNALS = (("w",), ("v", "w"), ("a", "dw"), ("dw",))
+
+
+@dataclass(frozen=True)
+class LinkNoise:
+    """Standard deviation of one sample of a link's motion, as it stands in the data.
+
+    Attributes:
+        w: rad/s; v: m/s; a: m/s²; dw: rad/s².
+    """
+
+    w: float
+    v: float
+    a: float
+    dw: float
+
+    def __post_init__(self) -> None:
+        for name in CHANNELS:
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ModelError(f"noise of {name} must be 0 or more, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class SchemaMoments:
+    """Sums over samples of [y, s] [y, s]^T, by joint and channel.
+
+    Attributes:
+        tree: N and A.
+        sums: (n, 4, 15, 15), channels in the order of `CHANNELS`.
+        count: number of samples.
+        with_speed: whether velocities v were measured (else their channel is zero).
+    """
+
+    tree: Tree
+    sums: Array
+    count: int
+    with_speed: bool
+
+    def __add__(self, other: SchemaMoments) -> SchemaMoments:
+        """The moments of both sets of samples; v only where both have it."""
+        if other.tree != self.tree:
+            raise ModelError("moments of two different trees can't be added")
+        with_speed = self.with_speed and other.with_speed
+        sums = self.sums + other.sums
+        if not with_speed:
+            sums[:, 1] = 0.0
+        return SchemaMoments(self.tree, sums, self.count + other.count, with_speed)
+
+    def power(self) -> Array:
+        """Sum of |y|² (n, 4)."""
+        return np.asarray(np.trace(self.sums[:, :, :3, :3], axis1=2, axis2=3))
+
+    def without_noise(self, variance: Array) -> Array:
+        """`sums` with the noise power of the parents' signals taken out.
+
+        Noise in what a fit takes as input passes for excitation and shrinks what is found
+        (errors in variables); its expected power is known once its variance is.
+
+        Args:
+            variance: (n, 4) of the parent's w, v, a, dw by joint.
+        """
+        out = self.sums.copy()
+        for channel, names in enumerate(_PARENT_SIGNALS):
+            if channel == CHANNELS.index("v") and not self.with_speed:
+                continue
+            for block, name in enumerate(names):
+                place = 3 + 3 * block + np.arange(3)
+                out[:, channel, place, place] -= (
+                    self.count * variance[:, CHANNELS.index(name)][:, None]
+                )
+        return out
+
+
+def schema_moments(data: TreeData) -> SchemaMoments:
+    """The moments of every joint.
+
+    Raises:
+        ModelError: no samples, no measured motion of the links, or a number that is not finite.
+    """
+    if data.links is None:
+        raise ModelError("the body schema is learned from the links' motion, and none is given")
+    if len(data) == 0:
+        raise ModelError("the body schema can't be learned from no samples")
+    with_speed = data.links.v is not None and data.base.v is not None
+    check_motion(data)
+    base, links = data.base.rows(), data.links.rows()
+    sums = np.zeros((data.tree.n, len(CHANNELS), WIDTH, WIDTH))
+    parent = np.array(data.tree.parent, dtype=np.int64)
+    _accumulate(parent, JointMotion(data.q, data.dq, data.ddq), base, links, sums)
+    if not with_speed:
+        sums[:, CHANNELS.index("v")] = 0.0
+    return SchemaMoments(data.tree, sums, len(data), with_speed)
+
+
+@jit
+def _accumulate(parent, joints, base, links, sums):
+    """Add every sample: `JointMotion`, base (m, 12), links (m, n, 12) to sums (n, 4, 15, 15)."""
+    q, dq, ddq = joints
+    s = np.zeros((3, 15))
+    turn = np.zeros(6)
+    for m in range(q.shape[0]):
+        for j in range(parent.shape[0]):
+            up = base[m] if parent[j] < 0 else links[m, parent[j]]
+            signals(q[m, j], dq[m, j], up, links[m, j], s)
+            accumulate(s, 1.0, sums[j])
+            # 8d as R0^T dw_i = Rz(q)(dw_j - ddq z - w_j x z dq)
+            x = links[m, j, 9] - links[m, j, 4] * dq[m, j]
+            y = links[m, j, 10] + links[m, j, 3] * dq[m, j]
+            c, sn = np.cos(q[m, j]), np.sin(q[m, j])
+            turn[0], turn[1] = c * x - sn * y, sn * x + c * y
+            turn[2] = links[m, j, 11] - ddq[m, j]
+            for k in range(3):
+                turn[3 + k] = up[9 + k]
+            for a in range(6):
+                for b in range(6):
+                    sums[j, 3, a, b] += turn[a] * turn[b]

@@ -1,0 +1,272 @@
+"""Solvers of R θ = b: least squares in base parameters, and two over bodies that can exist.
+
+A body can exist where its pseudo-inertia (4, 4), linear in θ, is positive definite (Wensing, Kim
+and Slotine 2018). Least squares over such bodies is a semidefinite program (Clarabel solves it):
+convex, so there is one answer and no start to choose. Where the data can be explained to the last
+bit, one of the explanations is a robot: it is looked for among the explanations alone, as the one
+furthest from impossible, so that no digit is lost.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import clarabel
+import numpy as np
+import scipy.linalg
+import torch
+from scipy import sparse
+
+from adapter.errors import ModelError
+from adapter.model.inertia import min_eigenvalue, pseudo_inertia
+from adapter.model.spatial import Array
+from adapter.physics.identifiability import RANK_TOLERANCE
+from adapter.physics.networks import (
+    PER_BODY,
+    theta_from_log_cholesky,
+    theta_from_log_cholesky_torch,
+)
+
+# Random bodies to start from: masses (kg), distance of the centre and radii of gyration (m).
+START_MASS, START_REACH, START_RADIUS, START_SPREAD = (0.5, 10.0), 0.1, 0.1, 0.3
+GAP, NEGLIGIBLE = 1e-7, 1e-14
+RATE, LAST_RATE, BETAS = 1e-2, 1e-4, (0.97, 0.99)  # of ADAM
+
+LENGTH = 0.1  # m, in units of which the entries of a link's pseudo-inertia (kg) are of like size
+EDGE = 1e-6  # kg, least eigenvalue in those units of a body that noise pushes to the edge
+ROOM = 1e-2  # kg, such an eigenvalue from which on more room is worth nothing
+LIGHT = 1e-6  # kg of room that 1 kg of mass (and of its size) is worth: what is unseen stays light
+HELD = 1e-9  # weight of a body of 1 kg and radius `LENGTH`, to the mean weight of the data
+PRECISION = 1e-10  # of the solver, relative and absolute
+SOLVED = ("Solved", "AlmostSolved")
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What a solver found.
+
+    Attributes:
+        theta: (bodies, 10).
+        cost: half the weighted sum of squares that is left.
+        steps: taken.
+        rank: directions of θ that the rows show; None where the solver does not ask.
+        converged: whether the cost is the least that such bodies allow, but for `GAP` of it or
+            `NEGLIGIBLE` of the signal.
+    """
+
+    theta: Array
+    cost: float
+    steps: int
+    rank: int | None = None
+    converged: bool = True
+
+
+def least_squares_theta(r: Array, b: Array, prior: Array) -> Solution:
+    """The θ of least squares that is nearest to the prior in what the rows don't show.
+
+    Args:
+        r: (k, 10 bodies); b: (k,) from `theta_factors.system`.
+        prior: (bodies, 10).
+    """
+    scale, u, values, vt = _decomposed(r)
+    left = b - r @ prior.ravel()
+    change = (vt[: len(values)].T @ ((u.T @ left) / values)) / scale
+    theta = prior + change.reshape(prior.shape)
+    return Solution(theta, _cost(r, b, theta), 1, len(values))
+
+
+def consistent_theta(r: Array, b: Array) -> Solution:
+    """Least squares over possible bodies.
+
+    Raises:
+        ModelError: the solver gave up without an answer.
+    """
+    scale, u, values, vt = _decomposed(r)
+    shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
+    hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
+    found = possible_theta(r, b, shown, hidden)
+    cost = _cost(r, b, found.theta)
+    return Solution(found.theta, cost, found.steps, len(values), found.solved)
+
+
+def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
+    """Column scale s (inf for a column of zeros) and the singular values of R / s that count.
+
+    Returns:
+        s (10 bodies,), U (k, rank), values (rank,), Vᵀ (10 bodies, 10 bodies): rows beyond the
+        rank are directions of θ s that R does not show.
+    """
+    scale = np.linalg.norm(r, axis=0)
+    scale = np.where(scale > RANK_TOLERANCE * scale.max(initial=1e-300), scale, np.inf)
+    u, values, vt = _svd(r / scale)
+    rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
+    return scale, u[:, :rank], values[:rank], vt
+
+
+def _svd(matrix: Array) -> tuple[Array, Array, Array]:
+    """Full SVD; by the slower algorithm where the fast one does not converge."""
+    try:
+        u, values, vt = np.linalg.svd(matrix, full_matrices=True)
+    except np.linalg.LinAlgError:
+        u, values, vt = scipy.linalg.svd(matrix, full_matrices=True, lapack_driver="gesvd")
+    return u, values, vt
+
+
+_UPPER = [(row, column) for column in range(4) for row in range(column + 1)]
+
+
+def _entries(matrix: Array) -> Array:
+    """(..., 10) of symmetric matrices (..., 4, 4): as Clarabel wants a triangle."""
+    twice = np.sqrt(2.0)
+    parts = [matrix[..., i, j] * (1.0 if i == j else twice) for i, j in _UPPER]
+    return np.stack(parts, axis=-1)
+
+
+_UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
+_FROM_THETA = _entries(_UNITS @ pseudo_inertia(np.eye(PER_BODY)) @ _UNITS).T  # entries of one body
+_TO_THETA = np.linalg.inv(_FROM_THETA)
+_ONE = _entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
+
+
+@dataclass(frozen=True)
+class Possible:
+    """What was found.
+
+    Attributes:
+        theta: (bodies, 10), every body possible.
+        steps: of the solver.
+        solved: whether nothing better is possible; else it is the best found.
+    """
+
+    theta: Array
+    steps: int
+    solved: bool
+
+
+def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> Possible:
+    """The possible bodies that leave least of R θ = b, and what does not show near a small body.
+
+    Args:
+        r: (k, 10 bodies); b: (k,).
+        shown: (10 bodies,) a least-squares solution.
+        hidden: (10 bodies, h) directions of θ that R does not show.
+
+    Raises:
+        ModelError: the solver gave up without an answer.
+    """
+    exact = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    if exact.solved:
+        return exact
+    found = _closest(r, b)
+    return replace(found, steps=exact.steps + found.steps)
+
+
+def _roomiest(shown: Array, hidden: Array) -> Possible:
+    """Among all least-squares solutions the one whose bodies are furthest from impossible.
+
+    Maximised is the least eigenvalue t of all bodies, up to `ROOM`; solved if it is above zero.
+    """
+    bodies, count = len(shown), hidden.shape[1]
+    fixed = (shown @ _FROM_THETA.T).ravel()
+    moved = np.einsum("ek,bkh->beh", _FROM_THETA, hidden.reshape(bodies, PER_BODY, count))
+    free = np.linalg.qr(moved.reshape(PER_BODY * bodies, count))[0]
+    one = np.tile(_ONE, bodies)
+    size = max(float(np.abs(fixed).max()), 1e-300)
+    goal = np.append(LIGHT * (free.T @ one), -1.0)
+    in_cone = np.column_stack([-free, one])
+    in_room = np.append(np.zeros(count), 1.0)
+    cones = [*_cones(bodies), clarabel.NonnegativeConeT(1)]
+    x, steps, _ = _solve(
+        np.zeros((count + 1, count + 1)),
+        goal,
+        np.vstack([in_cone, in_room]),
+        np.append(fixed, ROOM) / size,
+        cones,
+    )
+    if not np.isfinite(x).all():
+        return Possible(shown, steps, False)
+    theta = (fixed + size * (free @ x[:count])).reshape(bodies, PER_BODY) @ _TO_THETA.T
+    return Possible(theta, steps, bool(min_eigenvalue(theta).min() > 0.0))
+
+
+def _closest(r: Array, b: Array) -> Possible:
+    """Least squares with every eigenvalue at least `EDGE`."""
+    bodies = r.shape[1] // PER_BODY
+    table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, PER_BODY), _TO_THETA)
+    table = table.reshape(len(r), -1)
+    power = float(b @ b) or 1.0
+    quadratic, goal = table.T @ table / power, -(table.T @ b) / power
+    hold = HELD * float(np.trace(quadratic)) / len(quadratic)
+    one = np.tile(_ONE, bodies)
+    x, steps, solved = _solve(
+        quadratic + hold * np.eye(len(quadratic)),
+        goal - hold * one,
+        -np.eye(len(quadratic)),
+        -EDGE * one,
+        _cones(bodies),
+    )
+    if not np.isfinite(x).all():
+        raise ModelError("no possible bodies were found near what the data say; are they sound?")
+    theta = x.reshape(bodies, PER_BODY) @ _TO_THETA.T
+    least = np.linalg.eigvalsh(_UNITS @ pseudo_inertia(theta) @ _UNITS).min(axis=-1)
+    # where the solver stopped short of the edge's right side
+    lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
+    return Possible(theta + lifted, steps, solved)
+
+
+def _cones(bodies: int) -> list[clarabel.PSDTriangleConeT]:
+    return [clarabel.PSDTriangleConeT(4)] * bodies
+
+
+def _solve(
+    quadratic: Array, linear: Array, left: Array, right: Array, cones: list[object]
+) -> tuple[Array, int, bool]:
+    """Minimise x·Q x / 2 + linear·x where right - left x lies in the cones: x, steps, solved."""
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = PRECISION
+    # Its scaling of rows would turn the cones; the units above scale better.
+    settings.equilibrate_enable = False
+    upper = sparse.triu(sparse.csc_matrix(quadratic), format="csc")
+    solver = clarabel.DefaultSolver(upper, linear, sparse.csc_matrix(left), right, cones, settings)
+    answer = solver.solve()
+    return np.array(answer.x), int(answer.iterations), str(answer.status) in SOLVED
+
+
+def adam_theta(r: Array, b: Array, start: Array, steps: int = 5000) -> Solution:
+    """ADAM on the moments R^T R over possible bodies, as the online learner descends them.
+
+    Any log-Cholesky vector is a possible body, so no constraint is needed.
+
+    Args:
+        start: (bodies, 10) log-Cholesky vectors.
+    """
+    x = torch.from_numpy(start.copy()).requires_grad_()
+    power = float(b @ b) or 1.0
+    factor, right = (torch.from_numpy(np.ascontiguousarray(a / np.sqrt(power))) for a in (r, b))
+    moments, cross = factor.T @ factor, factor.T @ right
+    optimiser = torch.optim.Adam([x], lr=RATE, betas=BETAS, eps=1e-14)
+    for step in range(steps):
+        optimiser.param_groups[0]["lr"] = RATE * (LAST_RATE / RATE) ** (step / steps)
+        optimiser.zero_grad()
+        theta = theta_from_log_cholesky_torch(x).ravel()
+        (0.5 * theta @ (moments @ theta) - cross @ theta).backward()
+        optimiser.step()
+    found = theta_from_log_cholesky(x.detach().numpy())
+    cost, least = _cost(r, b, found), consistent_theta(r, b).cost
+    close = cost - least <= max(GAP * least, NEGLIGIBLE * 0.5 * power)
+    return Solution(found, cost, steps, converged=close)
+
+
+def random_bodies(count: int, rng: np.random.Generator) -> Array:
+    """Log-Cholesky vectors (count, 10) of random possible bodies."""
+    mass = np.exp(rng.uniform(np.log(START_MASS[0]), np.log(START_MASS[1]), count))
+    radii = np.log(START_RADIUS) + START_SPREAD * rng.normal(size=(count, 3))
+    sides = START_RADIUS * START_SPREAD * rng.normal(size=(count, 3))
+    centre = START_REACH * rng.normal(size=(count, 3))
+    return np.concatenate([0.5 * np.log(mass)[:, None], radii, sides, centre], axis=1)
+
+
+def _cost(r: Array, b: Array, theta: Array) -> float:
+    left = r @ theta.ravel() - b
+    return 0.5 * float(left @ left)

@@ -1,0 +1,142 @@
+"""Noticing that the arm's load has changed: the torque error leaves its own running level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import SettingsError
+from adapter.model.spatial import Array
+from adapter.physics.kernels import jit
+
+BURST_BLOCK = 500  # samples
+
+
+@dataclass(frozen=True)
+class ChangeSettings:
+    """When a torque error means that something changed.
+
+    Attributes:
+        enabled: whether changes are looked for.
+        fast, slow: samples that the error and its level are averaged over.
+        all_factor: alarm when the rms over all joints, each in units of its level, exceeds this.
+        one_factor: alarm when a single joint's does.
+        burst_factor: neither alarms below this multiple of the largest burst seen before; real
+            arms show bursts where friction reverses.
+        burst_memory: samples over which such a burst is forgotten.
+        arm_after: samples of θ learning before the first alarm can be.
+        rearm_after: samples after a change before the next can be.
+        wait: samples after an alarm while the filters fill with the new state; the error must
+            still be there behind them, or the alarm was a burst.
+    """
+
+    enabled: bool = True
+    fast: int = 50
+    slow: int = 2000
+    all_factor: float = 2.6
+    one_factor: float = 5.0
+    burst_factor: float = 1.5
+    burst_memory: int = 20_000
+    arm_after: int = 5000
+    rearm_after: int = 3000
+    wait: int = 130
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.fast < self.slow:
+            raise SettingsError("change.fast must be at least 1 and below change.slow")
+
+
+@jit
+def compare(error, fast, slow, samples, recent, level):
+    """Update the recent power and its level (n,); root of the largest and of the mean ratio.
+
+    A level follows its power at most fourfold, so that the start of a change does not hide it.
+    """
+    m, n = error.shape
+    most, total = 0.0, 0.0
+    for j in range(n):
+        power = 0.0
+        for k in range(m):
+            power += error[k, j] * error[k, j] / m
+        recent[j] += min(1.0, m / fast) * (power - recent[j])
+        ratio = recent[j] / max(level[j], 1e-12)
+        most = max(most, ratio)
+        total += ratio
+        if samples > slow:
+            power = min(power, 4.0 * level[j])
+        level[j] += (power - level[j]) * min(1.0, max(m / slow, m / max(samples, m)))
+    return np.sqrt(most), np.sqrt(total / n)
+
+
+class ChangeDetector:
+    """Compares each joint's recent squared torque error with its running level.
+
+    Args:
+        n: joints.
+
+    Attributes:
+        waiting: an alarm is waiting for its confirmation; nothing should be learned meanwhile.
+    """
+
+    def __init__(self, n: int, settings: ChangeSettings | None = None) -> None:
+        self.settings = settings or ChangeSettings()
+        self.recent, self.level = np.zeros(n), np.zeros(n)
+        self.samples = 0
+        self._peaks, self._block, self._block_samples = np.zeros(2), np.zeros(2), 0
+        self._armed_at = self.settings.arm_after
+        self._wait = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether an alarm waits for its confirmation."""
+        return self._wait > 0
+
+    def look(self, error: Array) -> bool:
+        """Take torque errors (m, n); True when they say, for good, that something changed."""
+        s = self.settings
+        if self.waiting:
+            return self._confirm(error)
+        self.samples += len(error)
+        most, mean = compare(error, s.fast, s.slow, self.samples, self.recent, self.level)
+        if s.enabled and self.samples >= self._armed_at and self._alarming(most, mean):
+            self._wait = s.wait
+        else:
+            self._remember_burst(len(error), most, mean)
+        return False
+
+    def _remember_burst(self, samples: int, most: float, mean: float) -> None:
+        """Largest ratios, block by block: a block counts once it is over, so that what is just
+        rising does not raise its own bar."""
+        if self.samples < self._armed_at - self.settings.slow:
+            return
+        block, peaks = self._block, self._peaks
+        block[0], block[1] = max(block[0], most), max(block[1], mean)
+        self._block_samples += samples
+        if self._block_samples >= BURST_BLOCK:
+            fade = 1.0 - self._block_samples / self.settings.burst_memory
+            peaks[:] = np.maximum(fade * peaks, block)
+            block[:], self._block_samples = 0.0, 0
+
+    def _alarming(self, most: float, mean: float) -> bool:
+        s = self.settings
+        return bool(
+            most > max(s.one_factor, s.burst_factor * self._peaks[0])
+            or mean > max(s.all_factor, s.burst_factor * self._peaks[1])
+        )
+
+    def _confirm(self, error: Array) -> bool:
+        """Look on without touching the level; at the end of the wait the alarm must still hold."""
+        level = self.level.copy()
+        most, mean = compare(
+            error, self.settings.fast, self.settings.slow, self.samples, self.recent, level
+        )
+        self._wait -= len(error)
+        if self._wait > 0:
+            return False
+        if not self._alarming(most, mean):
+            self._block = np.maximum(self._block, (most, mean))
+            return False
+        self._armed_at = self.samples + self.settings.rearm_after
+        self.recent[:] = 0.0
+        return True

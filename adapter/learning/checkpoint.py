@@ -1,0 +1,135 @@
+"""A learner's whole state in a file, so that a run can go on where another ended."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import SettingsError
+from adapter.learning.learner import Change, Learner
+from adapter.learning.schema_kernels import MotionMoments
+from adapter.learning.theta_kernels import Moments
+from adapter.signals.records import LinkMotionKind
+
+VERSION = 2
+
+# What each part would not be the same learner without. Everything else follows from the settings.
+_STATE = {
+    "": (
+        *("learned", "refused", "stamp_ns", "theta_started_ns", "theta_converged", "rebuilds"),
+        *("_held_from", "_held_to", "_R0", "_p", "_alarm_ns", "_shadow_at", "_since_update"),
+        "_judged",
+    ),
+    "schema": (
+        *("R0", "p", "start_lam", "kind", "updates", "information", "identifiable", "_inverse"),
+        *("_distance", "rank", "_calm", "converged", "_rough", "_then"),
+    ),
+    "schema.moments": MotionMoments._fields,
+    "theta": (
+        *("x", "mean", "th", "count", "prior", "prior_rhs", "_ranges", "floor", "floor_count"),
+        *("spare_in_use", "updates", "effect_spread", "model_variance"),
+    ),
+    "theta.rows": ("place", "base_place"),
+    "theta.moments": Moments._fields,
+    "theta.newest": ("A", "C"),
+    "_shadow": ("A", "C"),
+    "adam": ("first", "second", "rate"),
+    "known": ("clock", "memory"),
+    "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),
+    "schema_trace": ("_rows", "_used", "_offers", "stride"),
+    "theta_trace": ("_rows", "_used", "_offers", "stride"),
+    "score_trace": ("_rows", "_used", "_offers", "stride"),
+}
+
+
+def save_checkpoint(learner: Learner, path: str | Path, *, sync: bool = True) -> None:
+    """Write a learner's state; an existing file is replaced in one go, or not at all.
+
+    With `sync` it is on the disk afterwards, safe from a power cut and not only from a kill.
+    """
+    path = Path(path)
+    arrays: dict[str, Any] = {"version": VERSION, "about": _about(learner)}
+    for part, names in _STATE.items():
+        owner = attrgetter(part)(learner) if part else learner
+        for name in names if owner is not None else ():
+            value = getattr(owner, name)
+            if value is not None:
+                arrays[f"{part}.{name}"] = value
+    size = len(learner._held)
+    rows = np.arange(learner._held_from, learner._held_to) % size
+    arrays[".held"] = learner._held[rows]
+    arrays[".changes"] = np.array([change.stamp_ns for change in learner.changes], dtype=np.int64)
+    arrays["adam.steps"] = learner.adam.steps
+    part_file = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with part_file.open("wb") as file:
+        np.savez(file, **arrays)
+        file.flush()
+        if sync:
+            os.fsync(file.fileno())
+    part_file.replace(path)
+
+
+def load_checkpoint(learner: Learner, path: str | Path) -> None:
+    """Put a fresh learner into the state of a file.
+
+    Raises:
+        SettingsError: not a checkpoint, or one of another tree or other settings.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise SettingsError(f"{path}: cannot be read as a checkpoint: {error}") from error
+    if int(arrays.get("version", -1)) != VERSION:
+        raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")
+    if str(arrays["about"]) != _about(learner):
+        raise SettingsError(
+            f"{path}: is of another robot or other learner settings: {arrays['about']}; "
+            f"here: {_about(learner)}"
+        )
+    learner._shadow = learner.theta.empty_moments() if "_shadow.A" in arrays else None
+    for part, names in _STATE.items():
+        owner = attrgetter(part)(learner) if part else learner
+        for name in names if owner is not None else ():
+            _put(owner, name, arrays.get(f"{part}.{name}"))
+    learner.schema.kind = LinkMotionKind(learner.schema.kind)
+    size = len(learner._held)
+    learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
+    learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
+    learner.adam.steps = int(arrays["adam.steps"])
+
+
+def _put(owner: object, name: str, value: np.ndarray | None) -> None:
+    """Set an attribute; arrays in place, since ADAM and the parts share their memory."""
+    if value is None:
+        setattr(owner, name, None)
+    elif value.ndim and isinstance(getattr(owner, name), np.ndarray):
+        getattr(owner, name)[...] = value
+    else:
+        setattr(owner, name, value if value.ndim else value.item())
+
+
+def _about(learner: Learner) -> str:
+    tree = learner.tree
+    about: dict[str, Any] = {
+        "parent": tree.parent,
+        "settings": dataclasses.asdict(learner.settings),
+    }
+    if learner.given:
+        about["effects"] = [
+            [a.effect.name, a.joint + 1, _plain(a.values), _plain(a.std)] for a in learner.given
+        ]
+    return json.dumps(about, sort_keys=True)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters as JSON holds them."""
+    return {key: np.asarray(value, dtype=float).tolist() for key, value in values.items()}

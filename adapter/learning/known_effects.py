@@ -1,0 +1,173 @@
+"""Filtered states freed of the effects that a model brings along and nobody learns.
+
+Signals leave the joint filter as if everything before it had gone through the same low-pass, so
+what is linear in them (offsets, gains, twists of gears, delays) is undone after it; what jumps
+(friction) is as smooth as the learner's own columns. Rates of torque come from the state before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
+from adapter.effects.catalogue import LEARNED, effects_by_name
+from adapter.effects.link_angles import Gears, JointTorques, to_links
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.kernels import JointMotion, jit
+from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns, stamps_of
+
+LONGEST_STEP_NS = 20_000_000  # between two states that a rate is taken from
+# On a Panda's noise and 4000 N m/rad, the error that twist leaves on the worst joint's torque:
+# 0.10 N m without smoothing, 0.01 with.
+TWIST_SMOOTHING_S = 0.03
+SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
+
+
+class SensorErrors(NamedTuple):
+    """What gears' play and torque sensors do to readings, each (n,); see `ByJoint`."""
+
+    half_play: Array
+    gain: Array
+    delay_s: Array
+
+
+@jit
+def to_joints(stamps, table, sensors, gears, clock, memory):
+    """Undo what sensors and gears do to states (m, size), in place, one after the other.
+
+    Args:
+        stamps: (m,) int64 ns; table: (m, size) of `StateLayout`.
+        sensors: `SensorErrors`; gears: `Gears`.
+        clock: (2,) int64 stamp of the state before, and states since a hole, at most 2.
+        memory: (4, n) torque of the state before, its rate, link angle behind the play, second
+            rate of torque.
+    """
+    half, gain, delay = sensors
+    n = half.shape[0]
+    at = columns(n, False)
+    lag, rate, jerk = np.empty(n), np.empty(n), np.empty(n)
+    for m in range(table.shape[0]):
+        q, dq = table[m, at.q : at.dq], table[m, at.dq : at.ddq]
+        ddq, tau = table[m, at.ddq : at.tau], table[m, at.tau : at.base]
+        step = stamps[m] - clock[0]
+        if step <= 0 or step > LONGEST_STEP_NS:
+            clock[1] = 0
+        dt = 1e-9 * step
+        for j in range(n):
+            rate[j] = (tau[j] - memory[0, j]) / dt if clock[1] >= 1 else 0.0
+            # the second rate of torque is small against its noise: followed slowly
+            newest = (rate[j] - memory[1, j]) / dt if clock[1] >= 2 else 0.0
+            old = memory[3, j] if clock[1] >= 2 else 0.0
+            memory[3, j] = old + (newest - old) * dt / (dt + TWIST_SMOOTHING_S)
+            jerk[j] = memory[3, j]
+            memory[0, j], memory[1, j] = tau[j], rate[j]
+            if clock[1] == 0:  # before it is known better, the motor pushes the way it moves
+                memory[2, j] = q[j] - half[j] * np.sign(dq[j])
+            memory[2, j] = min(max(memory[2, j], q[j] - half[j]), q[j] + half[j])
+            lag[j] = q[j] - memory[2, j]
+            scale = 1.0 / (1.0 + gain[j])
+            tau[j] = (tau[j] + delay[j] * rate[j]) * scale
+            rate[j], jerk[j] = rate[j] * scale, jerk[j] * scale
+        to_links(JointMotion(q, dq, ddq), JointTorques(tau, rate, jerk), gears)
+        q -= lag
+        clock[0] = stamps[m]
+        clock[1] = min(clock[1] + 1, 2)
+
+
+def learnable(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
+    """Effects to learn: these, and after them what the model has that can be learned further."""
+    told = {a.effect.name for a in lasting_effects(model.effects, model.tree.n)}
+    return (*names, *(name for name in LEARNED if name in told and name not in names))
+
+
+def not_taken_off(model: SelfModel) -> tuple[str, ...]:
+    """Names of the model's lasting effects that the learner neither learns nor takes off."""
+    whole = with_bodies(model)
+    return by_joint(lasting_effects(whole.effects, whole.tree.n), whole.tree.n).left_out
+
+
+def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Array, Array] | None:
+    """(e, n) values and standard deviations that a model gives of learned effects, else None.
+
+    NaN where it has no such effect on a joint. Without a standard deviation in the model it is
+    the effect's own prior one.
+    """
+    effects = effects_by_name(names)
+    total, variance = np.zeros((len(effects), n)), np.full((len(effects), n), np.nan)
+    for active in known:
+        if active.effect.name not in names:
+            continue
+        effect = LEARNED[active.effect.name]
+        at = names.index(effect.name), active.joint
+        std = active.std.get(effect.key)
+        widest = effect.prior_std
+        spread = widest if std is None or not np.isfinite(std) else max(std, SMALLEST_STD * widest)
+        total[at] += float(active.values[effect.key])
+        variance[at] = np.nan_to_num(variance[at]) + spread**2
+    told = np.isfinite(variance)
+    return (np.where(told, total, np.nan), np.sqrt(variance)) if told.any() else None
+
+
+class KnownEffects:
+    """Takes off states what known effects put on; keeps the little that needs a state before.
+
+    Args:
+        effects: lasting ones, none of bodies (`with_bodies`), none being learned.
+        arm: the rigid arm; its frames carry a wrench to the joints.
+        smoothing_s: how long the filter takes a step of torque.
+
+    Attributes:
+        clock, memory: see `to_joints`.
+        left_out: names of effects that are not undone.
+    """
+
+    def __init__(self, effects: Sequence[Active], arm: RigidArm, smoothing_s: float) -> None:
+        n = arm.n
+        self._layout, self._arm, self._smoothing_s = StateLayout(n), arm, smoothing_s
+        self._own = own = by_joint(effects, n)
+        self._sensors = SensorErrors(own.half_play, own.gain, own.delay_s)
+        self._gears = Gears.of(own)
+        turned = own.offset.any() or own.ripple.any()
+        self._encoders = self._gears._replace(compliance=np.zeros(n)) if turned else None
+        self._sensed = own.moves or bool(own.gain.any() or own.delay_s.any())
+        self._by_load = own.by_load
+        self.clock, self.memory = np.zeros(2, dtype=np.int64), np.zeros((4, n))
+        self.left_out = own.left_out
+        self.take_off(self._layout.new(1))  # compiled now, not at the first state
+        self.clock[:], self.memory[:] = 0, 0.0
+
+    def take_off(self, table: Array) -> Array:
+        """A copy of filtered states (m, size), in order, as an arm without the effects gives them.
+
+        Where link motion was measured, the encoders' errors leave the angles it goes with too;
+        motion that was synthesized from the encoders' angles stays with them.
+        """
+        at, own = self._layout, self._own
+        table = table.copy()
+        if self._sensed:
+            stamps = stamps_of(table)
+            to_joints(stamps, table, self._sensors, self._gears, self.clock, self.memory)
+        q, dq, ddq, tau = table[:, at.q], table[:, at.dq], table[:, at.ddq], table[:, at.tau]
+        if own.pushed:
+            tau += self._arm.wrench_torque(q, own.wrench)
+        rigid = tau
+        if self._by_load:
+            rigid = tau - own.torque(q, dq, ddq, tau, self._smoothing_s)
+        if own.laws:
+            tau -= own.torque(q, dq, ddq, rigid, self._smoothing_s)
+        if self._encoders is not None:
+            self._turn_back(table, self._encoders)
+        return table
+
+    def _turn_back(self, table: Array, encoders: Gears) -> None:
+        """Take the encoders' errors off the angles that measured link motion goes with."""
+        at, still, unused = self._layout, np.zeros(self._layout.n), np.zeros(self._layout.n)
+        untwisted = JointTorques(still, still, still)
+        for m in np.flatnonzero(table[:, KIND] == LinkMotionKind.MEASURED):
+            q, dq = table[m, at.motion_q], table[m, at.motion_dq]
+            to_links(JointMotion(q, dq, unused), untwisted, encoders)

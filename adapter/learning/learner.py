@@ -1,0 +1,495 @@
+"""λ first, then θ: one ADAM update per filtered state, from the moments of all states so far.
+
+One learner for every tree: the Panda on the bench, whose base rests, and ATLAS in free fall,
+whose base's motion comes with each state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from adapter.effects.active import Active
+from adapter.effects.catalogue import effects_by_name
+from adapter.errors import ModelError, SettingsError
+from adapter.learning.adam import FlatAdam
+from adapter.learning.change import ChangeDetector, ChangeSettings
+from adapter.learning.known_effects import KnownEffects, believed
+from adapter.learning.schema import RestingBase, Schema, SchemaSettings
+from adapter.learning.theta import Theta, ThetaKnowledge, ThetaSettings
+from adapter.learning.theta_kernels import Moments
+from adapter.learning.trace import Trace
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.kernels import base_at_rest, jit
+from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.records import StateLayout, stamp_of
+
+JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
+CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
+REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
+# No joint of a robot shows more; a state beyond is refused as a NaN is.
+MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
+MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
+
+
+class Mode(StrEnum):
+    """What an update descends: the cost over all samples, or (the paper) that of the newest."""
+
+    MOMENTS = "moments"
+    SAMPLE = "sample"
+
+
+MODES = tuple(Mode)
+
+
+@dataclass(frozen=True)
+class LearnerSettings:
+    """How the self is learned.
+
+    Attributes:
+        mode: see `Mode`.
+        effects: names from the catalogue, learned beside θ.
+        seed: of the random start of λ.
+        update_every: states for each ADAM step; every state joins the moments.
+        wait_for_schema: whether θ waits until λ has converged.
+        held_samples: newest states kept to rebuild θ's moments from when λ has moved.
+        rebuild_rows: how many of them each state redoes.
+        rebuild_stds: by how many of its standard deviations λ may leave θ's moments.
+        schema, theta, change: of the parts.
+    """
+
+    mode: str = Mode.MOMENTS
+    effects: tuple[str, ...] = ()
+    seed: int = 0
+    update_every: int = 1
+    wait_for_schema: bool = True
+    held_samples: int = 60_000
+    rebuild_rows: int = 10
+    rebuild_stds: float = 1.0
+    schema: SchemaSettings = field(default_factory=SchemaSettings)
+    theta: ThetaSettings = field(default_factory=ThetaSettings)
+    change: ChangeSettings = field(default_factory=ChangeSettings)
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise SettingsError(f"no learner mode '{self.mode}'; have: {', '.join(MODES)}")
+        if self.held_samples < 1000:
+            raise SettingsError(f"held_samples must be at least 1000, got {self.held_samples}")
+        if self.update_every < 1:
+            raise SettingsError(f"update_every must be at least 1, got {self.update_every}")
+        if self.rebuild_rows < 2:
+            raise SettingsError(f"rebuild_rows must be at least 2, got {self.rebuild_rows}")
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What the filter before the learner does to signals.
+
+    Attributes:
+        noise_gain: correlated samples that one independent sample is worth
+            (`JointFilter.noise_gain`).
+        delay_s: of the filter (`JointFilter.delay_s`).
+    """
+
+    noise_gain: float = 1.0
+    delay_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """What is known of the robot beside its topology.
+
+    Attributes:
+        hand: the link whose load may change; None for the last one.
+        tool_theta: (10,) of a known tool on the hand, kept out of θ.
+        effects: lasting ones that a model brings, none of bodies (`with_bodies`). Those that are
+            learned start from the model's values; the others are taken off the states.
+        arm: the model's rigid arm, needed where there are such effects. Its gravity is what
+            torques and measured link motion show; where the base is tilted it is not that of
+            the documentation, which synthesized link motion is made with.
+    """
+
+    hand: int | None = None
+    tool_theta: Array | None = None
+    effects: Sequence[Active] = ()
+    arm: RigidArm | None = None
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change at the hand: when it was seen (stamp of the filtered state, ns)."""
+
+    stamp_ns: int
+
+
+class Watch(Protocol):
+    """What looks over the learner's shoulder; see `adapter.gap.monitor`."""
+
+    @property
+    def reports(self) -> list[dict[str, Any]]:
+        """What it has to tell."""
+
+    def __call__(self, learner: Learner, table: Array) -> None:
+        """Take states (m, size), known effects taken off, that were just learned from."""
+
+
+class Learner:
+    """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
+
+    Args:
+        tree: N and A; the networks are built from them alone.
+        gravity: (3,) acceleration of gravity in base axes, m/s²; not needed where the base
+            floats, since its measured acceleration tells.
+        settings: of the learner.
+        filtered: what the filter did to the states.
+        known: what is known of the robot.
+
+    Attributes:
+        schema, theta: λ and θ, with what is known of them.
+        base: (12,) motion of a base that rests, as sensors feel it; empty where it floats.
+        learned, refused: states taken, and states refused for numbers that are not finite or
+            that no robot shows.
+        theta_started_ns: stamp at which θ began; None before.
+        rebuilds: times that θ's moments were rebuilt for a better λ.
+        changes: at the hand, in order.
+
+    Raises:
+        SettingsError: no gravity for a base that rests, or effects without the model's arm.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        gravity: Array | None = None,
+        settings: LearnerSettings | None = None,
+        filtered: Filtered | None = None,
+        known: KnownArm | None = None,
+    ) -> None:
+        self.settings = s = settings or LearnerSettings()
+        filtered, known = filtered or Filtered(), known or KnownArm()
+        self.tree, self.layout = tree, StateLayout(tree.n, tree.floating)
+        each_sample = s.mode == Mode.SAMPLE
+        rest = _resting_base(tree, gravity, known.arm)
+        self.base = np.empty(0) if rest is None else rest.measured
+        self.schema = Schema(tree, rest, s.schema, each_sample, filtered.noise_gain, s.seed)
+        told = believed(known.effects, s.effects, tree.n)
+        before = ThetaKnowledge(
+            None if rest is None else rest.measured,
+            filtered.noise_gain,
+            filtered.delay_s,
+            known.hand,
+            known.tool_theta,
+            told,
+        )
+        self.theta = Theta(tree, before, effects_by_name(s.effects), s.theta, each_sample)
+        self.given = tuple(known.effects)
+        self.known = _taken_off(known, s.effects, self.theta.smoothing_s)
+        self.change = ChangeDetector(tree.n, s.change)
+        rate = s.theta.sample_rate if each_sample else s.theta.rate
+        # one flat parameter, so that one step serves λ and θ
+        self.adam = FlatAdam(6 * tree.n + self.theta.P, rate, s.theta.betas)
+        self._bind(self.adam.parameters, self.adam.gradient)
+        self._cap = _caps(self.layout)
+        self.learned = self.refused = self.rebuilds = 0
+        self.stamp_ns = 0
+        self.theta_started_ns: int | None = None
+        self.theta_converged = False
+        self.changes: list[Change] = []
+        self.watch: Watch | None = None
+        self._since_update, self._states_per_update = 0, float(s.update_every)
+        self._held = np.zeros((s.held_samples, self.layout.before_links.stop))
+        self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
+        self._R0, self._p = self.schema.R0.copy(), self.schema.p.copy()
+        self._alarm_ns = 0
+        self._judged = -1
+        self._shadow: Moments | None = None
+        self._shadow_at = 0
+        self.schema_trace = Trace(1 + 6 * tree.n)
+        self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
+        self.score_trace = Trace(1 + 3 * tree.n + 2 * tree.rows, capacity=12_000)
+
+    def _bind(self, parameters: Array, gradient: Array) -> None:
+        """Let λ's tangent, θ's parameters and their gradients be views of the flat arrays."""
+        n = self.tree.n
+        parameters[6 * n :] = self.theta.x
+        self.schema.tangent = parameters[: 6 * n].reshape(n, 6)
+        self.schema.gradient = gradient[: 6 * n].reshape(n, 6)
+        self.theta.x, self.theta.gradient = parameters[6 * n :], gradient[6 * n :]
+
+    def step(self, state: Array) -> bool:
+        """Learn from one filtered state (a record of `StateLayout`): one update of λ and θ.
+
+        Returns:
+            False where it was refused, and nothing is changed.
+
+        Raises:
+            ModelError: a record of another size.
+        """
+        return self.step_table(state[None]) == 1
+
+    def step_table(self, table: Array) -> int:
+        """Add a table (m, size) of filtered states, then make one update of λ and θ.
+
+        Returns:
+            How many of them were learned from; the others are counted in `refused`.
+
+        Raises:
+            ModelError: records of another size.
+        """
+        table = self.without_known(self._sound(table))
+        if not len(table):
+            return 0
+        self.stamp_ns = stamp_of(table[-1])
+        self.schema.absorb(table)
+        self._since_update += len(table)
+        updating = self._since_update >= self.settings.update_every
+        if updating:
+            self._since_update = 0
+            self.schema.compute_gradient()
+        theta_too = self._theta_is_due(table) and self._take_torque(table)
+        if updating:
+            self._update(theta_too)
+        self.learned += len(table)
+        if self.schema_trace.wants(len(table)):
+            self.schema_trace.keep(self.stamp_ns, self.schema.lam)
+        if self.watch is not None:
+            self.watch(self, table)
+        return len(table)
+
+    def _sound(self, table: Array) -> Array:
+        """The states of a table that can be learned from."""
+        if table.shape[1] != self.layout.size:
+            raise ModelError(
+                f"a state of this tree has {self.layout.size} numbers (StateLayout), "
+                f"got {table.shape[1]}"
+            )
+        if not count_beyond(table, self._cap):
+            return table
+        sound = (np.abs(table[:, 1:]) < self._cap[1:]).all(axis=1)  # false for NaN
+        self.refused += int(len(table) - sound.sum())
+        return table[sound]
+
+    @property
+    def frames(self) -> tuple[Array, Array]:
+        """(R0, p) that θ is learned with: λ as it was when θ's moments were last rebuilt."""
+        return self._R0, self._p
+
+    def predict(self, table: Array) -> Array:
+        """Torque (m, rows) of states with the λ, θ, effects and tool in use; nothing is learned.
+
+        Args:
+            table: (m, size) states of `StateLayout`; their torque is not looked at.
+        """
+        blank = table.copy()
+        blank[:, self.layout.tau] = 0.0
+        return -self.theta.errors(self.frames, blank)
+
+    def without_known(self, table: Array) -> Array:
+        """Filtered states (m, size), which follow those before, without known effects."""
+        return table if self.known is None or not len(table) else self.known.take_off(table)
+
+    def learn_schema(self, table: Array, updates: int = 1) -> None:
+        """λ's half of `step_table` on states that `without_known` has seen, if any."""
+        if len(table):
+            self.schema.absorb(table)
+        for _ in range(updates):
+            self.schema.compute_gradient()
+            self._adam_step(theta_too=False)
+        self.learned += len(table)
+        if updates and self.schema_trace.wants(len(table)):
+            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+
+    def learn_theta(self, table: Array, updates: int = 1) -> None:
+        """θ's half of `step_table`, λ standing still; on states as in `learn_schema`."""
+        ready = not self.change.waiting
+        if len(table):
+            ready = self._take_torque(table)
+        if not ready or not updates:
+            return
+        self.schema.gradient[:] = 0.0
+        self.adam.forget(slice(0, 6 * self.tree.n))  # λ's momentum would move it on
+        self._states_per_update = max(len(table) / updates, 1.0)
+        for _ in range(updates):
+            if self.theta.compute_gradient():
+                self.adam.step()
+                self.theta.after_step(self.theta_converged, self._states_per_update)
+
+    def set_rate(self, rate: float) -> None:
+        """Let ADAM go on at this rate per update."""
+        self.adam.rate = rate
+
+    def follow_convergence(self) -> None:
+        """Let ADAM go on at the rate that the settings have before or after θ has converged."""
+        if self.settings.mode == Mode.MOMENTS:
+            s = self.settings.theta
+            self.adam.rate = s.settled_rate if self.theta_converged else s.rate
+
+    def _update(self, theta_too: bool) -> None:
+        """One ADAM step on λ and, if it is being learned, on θ."""
+        ready = theta_too and self.theta.compute_gradient()
+        self.follow_convergence()
+        self._adam_step(ready)
+
+    def _adam_step(self, theta_too: bool) -> None:
+        """One ADAM step on the gradients as they stand; θ's counts only if asked for."""
+        if not theta_too:
+            self.theta.gradient[:] = 0.0
+        self.adam.step()
+        self.schema.apply_step(self.adam.rate)
+        if theta_too:
+            self.theta.after_step(self.theta_converged, self._states_per_update)
+
+    def _theta_is_due(self, table: Array) -> bool:
+        """Whether θ is being learned; sees to it that its moments follow λ."""
+        if self.theta_started_ns is None:
+            if self.settings.wait_for_schema and not self.schema.converged:
+                self._hold(table)
+                return False
+            self.start_theta(stamp_of(table[0]))
+        elif self.schema.updates % self.settings.schema.judge_every == 0:
+            self._follow_schema()
+        return True
+
+    def start_theta(self, stamp_ns: int) -> None:
+        """Begin to learn θ, with the frames as they are now; states held so far count too."""
+        self.theta_started_ns = stamp_ns
+        if self._held_to > self._held_from:
+            self._begin_rebuild()
+        else:
+            self._R0[:], self._p[:] = self.schema.R0, self.schema.p
+
+    def _take_torque(self, table: Array) -> bool:
+        """Add states to θ's moments; whether θ may be stepped on."""
+        if self.change.waiting:
+            self._look_on(table, self.theta.errors(self.frames, table))
+            return False
+        error = self.theta.absorb(self.frames, table)
+        self._hold(table)
+        if self._shadow is not None:
+            self._rebuild_some(len(table))
+        self._look_on(table, error)
+        if self.theta.restart_due(len(table)):
+            self.theta.restart_spare()
+            self._forget_momentum()
+        self._judge_theta()
+        return True
+
+    def _judge_theta(self) -> None:
+        """θ has converged when it predicts the last seconds as well as it fits all samples."""
+        now = self.theta.updates // JUDGE_THETA_EVERY
+        if now == self._judged:
+            return
+        self._judged = now
+        if now % (ADAPT_EVERY // JUDGE_THETA_EVERY) == 0 and self.theta.count >= ADAPT_EVERY:
+            self.theta.adapt_effects()
+        excess = float(np.mean(self.change.level / self.theta.variance()))
+        limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
+        self.theta_converged = self.change.samples >= self.change.settings.slow and excess < limit
+
+    def _look_on(self, table: Array, error: Array) -> None:
+        """Keep the scores, and notice a change."""
+        state, at = table[-1], self.layout
+        if self.score_trace.wants(len(table)):
+            self.score_trace.keep(stamp_of(state), state[at.signals], error[-1])
+        if self.theta_trace.wants(len(table)):
+            self.theta_trace.keep(stamp_of(state), self.theta.th)
+        alarmed_before = self.change.waiting
+        if self.change.look(error[:, self.tree.rows - self.tree.n :]):
+            self._start_change(self._alarm_ns)
+        elif self.change.waiting and not alarmed_before:
+            self._alarm_ns = stamp_of(state)
+
+    def _start_change(self, stamp_ns: int) -> None:
+        self.changes.append(Change(stamp_ns))
+        self.theta.start_change()
+        self._held_from = self._held_to
+        self._shadow = None
+        self.theta_converged = False
+        self._forget_momentum()
+
+    def _forget_momentum(self) -> None:
+        """ADAM's averages of θ's gradient are of no use after a jump."""
+        self.adam.forget(slice(6 * self.tree.n, None))
+
+    def _hold(self, table: Array) -> None:
+        rows = table[:, self.layout.before_links]
+        size, first, count = len(self._held), self._held_to % len(self._held), len(rows)
+        if first + count <= size:
+            self._held[first : first + count] = rows
+        else:
+            self._held[np.arange(first, first + count) % size] = rows
+        self._held_to += count
+        self._held_from = max(self._held_from, self._held_to - size)
+
+    def _follow_schema(self) -> None:
+        """Rebuild θ's moments when λ has left them by more than it is sure of."""
+        std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
+        allowed = np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
+        if (np.abs(self.schema.moved_from(self._R0, self._p)) > allowed).any():
+            self._begin_rebuild()
+
+    def _begin_rebuild(self) -> None:
+        self._R0[:], self._p[:] = self.schema.R0, self.schema.p
+        self._shadow = self.theta.empty_moments()
+        self._shadow_at = self._held_from
+
+    def _rebuild_some(self, states: int) -> None:
+        """Redo some of the states still held with the present λ; swap when all are done."""
+        assert self._shadow is not None
+        start = max(self._shadow_at, self._held_from)
+        stop = min(start + self.settings.rebuild_rows * states, self._held_to)
+        rows = self._held[np.arange(start, stop) % len(self._held)]
+        self.theta.absorb_again(self.frames, rows, self._shadow)
+        self._shadow_at = stop
+        if stop == self._held_to:
+            self.theta.replace_moments(self._shadow, float(stop - self._held_from))
+            self._shadow = None
+            self.rebuilds += 1
+
+
+def _resting_base(tree: Tree, gravity: Array | None, arm: RigidArm | None) -> RestingBase | None:
+    """Motion of a base that rests; None where it floats."""
+    if tree.floating:
+        return None
+    if gravity is None:
+        raise SettingsError("a robot whose base rests needs the gravity it stands in")
+    documented = base_at_rest(gravity)
+    return RestingBase(documented, documented if arm is None else base_at_rest(arm.gravity))
+
+
+def _taken_off(known: KnownArm, learned: Sequence[str], smoothing_s: float) -> KnownEffects | None:
+    """What takes the known effects off that nobody learns; None where there are none."""
+    fixed = [active for active in known.effects if active.effect.name not in learned]
+    if not fixed:
+        return None
+    if known.arm is None:
+        raise SettingsError("effects of a model need the model's arm beside them")
+    return KnownEffects(fixed, known.arm, smoothing_s)
+
+
+def _caps(at: StateLayout) -> Array:
+    """(size,) most that each number of a state may be; the stamp may be anything."""
+    cap = np.full(at.size, np.inf)
+    joint = (at.q, MOST_Q), (at.dq, MOST_DQ), (at.ddq, MOST_DDQ), (at.tau, MOST_TAU)
+    for part, most in (*joint, (at.motion_q, MOST_Q), (at.motion_dq, MOST_DQ)):
+        cap[part] = most
+    cap[at.motion] = np.tile(MOST_MOTION, at.n)
+    if at.floating:
+        cap[at.base] = MOST_MOTION
+    return cap
+
+
+@jit
+def count_beyond(table, cap):
+    """How many numbers of a table of states, stamps apart, are not finite or not below `cap`."""
+    count = 0
+    for m in range(table.shape[0]):
+        for k in range(1, table.shape[1]):
+            if not abs(table[m, k]) < cap[k]:  # so that a NaN counts too
+                count += 1
+    return count

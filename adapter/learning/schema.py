@@ -1,0 +1,337 @@
+"""λ, the body schema: ADAM's gradient from the moments of eqs. 8a-8c (eq. 18), joint by joint.
+
+Each joint frame moves in its own tangent (turn phi about its axes, shift d), so no angle triple
+has a singular place to start from or pass through; λ is read off the frame. Four cares beside
+plain ADAM, each a consequence of the moments being there:
+
+- each channel's noise level is profiled (weight = 1 / its own residual variance);
+- when it is judged what the data show, the noise of measured parent motion is taken out of the
+  moments, where it would pass for excitation;
+- a step is kept out of directions the data do not show: those stay where they started;
+- a step is at most as long as a share of the distance to the optimum, which the curvature
+  tells: full speed at first, no spikes later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import SettingsError
+from adapter.learning.schema_kernels import (
+    Count,
+    MotionMoments,
+    absorb,
+    carry_spin,
+    descend,
+    distances,
+    profiled,
+    residual_variance,
+    retract,
+    steepest,
+    without_noise,
+)
+from adapter.model.spatial import (
+    Array,
+    exp_rotation,
+    log_rotation,
+    matrix_from_zxz,
+    zxz_from_matrix,
+)
+from adapter.model.tree import Tree
+from adapter.signals.filters import THIRD_DIFFERENCE_GAIN
+from adapter.signals.records import KIND, LinkMotionKind, StateLayout
+
+PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
+FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
+LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
+# Where dw is carried by λ: samples between two looks at λ, and the turn (rad) in between that
+# spoils them.
+CARRIED_SAMPLES, CARRIED_TURN = 400, 2e-3
+
+
+@dataclass(frozen=True)
+class SchemaSettings:
+    """How λ is learned.
+
+    Attributes:
+        rate: ADAM's longest step per sample, rad and m.
+        share: longest step as a share of the distance to the optimum.
+        sample_rate: ADAM's rate in mode `sample`.
+        start_rms: spread of the random starting λ, rad and m.
+        forget_s: time constant of the forgotten window in moving samples x 1 ms; None keeps all.
+        judge_every: updates between two looks at curvature and identifiability.
+        rotation_goal, position_goal: std and remaining distance below which λ has converged.
+        stable_updates: for how many updates in a row that must hold.
+        spin_measured: whether measured link motion has angular accelerations dw. Where not, the
+            base's is carried along the tree by eq. 8d with the present λ, and moments made
+            while λ still turned are dropped.
+    """
+
+    rate: float = 1.5e-2
+    share: float = 0.15
+    sample_rate: float = 1e-3
+    start_rms: float = 0.01
+    forget_s: float | None = None
+    judge_every: int = 10
+    rotation_goal: float = 0.005
+    position_goal: float = 0.0025
+    stable_updates: int = 200
+    spin_measured: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "share", "sample_rate", "start_rms", "judge_every"):
+            if not getattr(self, name) > 0:
+                raise SettingsError(f"schema.{name} must be above zero, got {getattr(self, name)}")
+        if self.forget_s is not None and self.forget_s < 0.05:
+            raise SettingsError(f"schema.forget_s must be at least 0.05 s, got {self.forget_s}")
+
+
+@dataclass(frozen=True)
+class RestingBase:
+    """Motion rows (12,) of a base that does not move, nothing but a = -gravity.
+
+    Attributes:
+        documented: that synthesized link motion is made with; measured: what sensors feel.
+    """
+
+    documented: Array
+    measured: Array
+
+
+class Schema:
+    """λ of every joint of a tree, its uncertainty and what of it the data show.
+
+    Args:
+        tree: N and A; nothing else of the robot is known.
+        base: motion of a base that rests; of a floating one the states tell.
+        settings: how it is learned.
+        each_sample: learn from the newest sample alone, as the paper does.
+        noise_gain: correlated samples that one independent sample is worth, for synthesized
+            (filtered) motion; measured motion is white.
+        seed: of the random start.
+
+    Attributes:
+        R0 (n, 3, 3), p (n, 3): the frames; `lam` reads λ off them.
+        tangent, gradient: (n, 6) what ADAM steps on (zero between steps), and its gradient.
+        moments: of all samples so far.
+        information: (n, 6, 6) of (phi, d).
+        identifiable: (n, 6, 6) projector on the directions the data show.
+        rank: their number over all joints.
+        converged: whether λ has settled (see SchemaSettings).
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        base: RestingBase | None,
+        settings: SchemaSettings,
+        each_sample: bool = False,
+        noise_gain: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        n = tree.n
+        self.settings, self.each_sample = settings, each_sample
+        self.layout = StateLayout(n, tree.floating)
+        self._parent = np.array(tree.parent, dtype=np.int64)
+        self._base, self._noise_gain = base, noise_gain
+        rng = np.random.default_rng(seed)
+        start = settings.start_rms * rng.normal(size=(n, 6))
+        self.R0 = np.ascontiguousarray(exp_rotation(start[:, :3]))
+        self.p = np.ascontiguousarray(start[:, 3:])
+        # plain tuples: numba takes 3 µs longer for a named one
+        self._frames = self._parent, self.R0, self.p
+        self.start_lam = self.lam
+        self.kind = LinkMotionKind.NONE  # taken from the first state that has link motion
+        newest = n if each_sample or settings.forget_s is not None else 0
+        self.moments = MotionMoments(
+            np.zeros((n, 3, 15, 15)),
+            np.zeros((newest, 3, 15, 15)),
+            np.zeros((n + 1, 4)),
+            np.zeros((3, n + 1, 12)),
+            np.array([LONG_AGO_NS, 2**62]),
+            np.zeros(len(Count)),
+        )
+        self._moments = tuple(self.moments)
+        self._clean = np.zeros_like(self.moments.M)
+        self.updates = 0
+        self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
+        self._H, self._distance = np.zeros((n, 6, 6)), np.zeros(n)
+        self._everything = np.tile(np.eye(6), (n, 1, 1))
+        self.information = np.zeros((n, 6, 6))
+        self.identifiable = np.zeros((n, 6, 6))
+        self._inverse = np.zeros((n, 6, 6))
+        self.rank = 0
+        self._calm = 0
+        self.converged = False
+        self._rough, self._then = not settings.spin_measured, self.R0.copy()
+
+    @property
+    def lam(self) -> Array:
+        """λ (n, 6): [α β γ p]."""
+        return np.concatenate([zxz_from_matrix(self.R0), self.p], axis=1)
+
+    def set_lam(self, lam: Array) -> None:
+        """Start from a given λ (n, 6), e.g. a checkpoint's."""
+        self.R0[:] = matrix_from_zxz(lam[:, :3])
+        self.p[:] = lam[:, 3:]
+
+    @property
+    def count(self) -> float:
+        """Samples in the moments (fewer where some were forgotten)."""
+        return float(self.moments.counts[Count.SAMPLES])
+
+    def absorb(self, table: Array) -> None:
+        """Add a table (m, size) of filtered states to the moments."""
+        if self.kind != LinkMotionKind.MEASURED:
+            newest = LinkMotionKind(
+                int(table[0, KIND] if len(table) == 1 else table[:, KIND].max())
+            )
+            if newest == LinkMotionKind.MEASURED:
+                self._forget_all()
+            self.kind = newest or self.kind
+        base = self._base_motion()
+        if not self.settings.spin_measured and self.kind == LinkMotionKind.MEASURED:
+            table = table.copy()
+            carry_spin(self._frames, base, table)
+        keep = self._keep() if self.settings.forget_s is not None else 1.0
+        absorb(self._parent, base, table, self._moments, float(self.kind), keep)
+
+    def _base_motion(self) -> Array:
+        """(12,) motion of a base at rest; empty where the states tell of the base."""
+        if self._base is None:
+            return np.empty(0)
+        measured = self.kind == LinkMotionKind.MEASURED
+        return self._base.measured if measured else self._base.documented
+
+    def _forget_all(self) -> None:
+        """Drop all samples; λ goes on from where it is."""
+        for part in (self.moments.M, self.moments.noise_power, self.moments.counts):
+            part[:] = 0.0
+        self._calm, self.converged = 0, False
+
+    def _keep(self) -> float:
+        """Forgetting factor per sample; one while the window would lose what it shows."""
+        window = self.settings.forget_s * 1e3 if self.settings.forget_s else np.inf
+        return 1.0 - 1.0 / window if self.count >= 0.9 * window and self._excited() else 1.0
+
+    def _excited(self) -> bool:
+        """Whether the newest sample moves every joint that the moments know about."""
+        fresh = np.abs(self.moments.newest[:, 0, 3:6, 3:6]).max(axis=(1, 2))
+        held = np.abs(self.moments.M[:, 0, 3:6, 3:6]).max(axis=(1, 2)) / max(self.count, 1.0)
+        return bool((fresh >= 1e-2 * held).all())
+
+    def noise_variance(self) -> Array:
+        """(n + 1, 4) noise variance of measured v, w, a, dw of the base and of each link.
+
+        Zero where motion is synthesized. From third differences, which jerky motion can exceed; so
+        of v, w and a at most half of what the fit leaves, the other half being the child's own
+        noise.
+        """
+        moments, differences = self.moments, self.moments.counts[Count.DIFFERENCES]
+        if self.kind != LinkMotionKind.MEASURED or differences < FEWEST_DIFFERENCES:
+            return np.zeros_like(moments.noise_power)
+        found = moments.noise_power / (THIRD_DIFFERENCE_GAIN * differences)
+        left = np.empty((len(self.p), 3))
+        residual_variance(self._frames, moments.M, self.count, left)
+        for j, i in enumerate(self._parent):
+            # channels are w, v, a
+            found[i + 1, :3] = np.minimum(found[i + 1, :3], 0.5 * left[j, [1, 0, 2]])
+        return found
+
+    def compute_gradient(self) -> None:
+        """Fill `gradient` for one ADAM step; looks at the curvature now and then."""
+        looking = self.updates % self.settings.judge_every == 0
+        self.updates += 1
+        frames, moments = self._frames, self.moments
+        if looking:
+            self._profile()
+            self._judge()
+        if self.each_sample:
+            steepest(frames, moments.newest, self.gradient)
+        elif looking:
+            distances(self._inverse, self.count, self.gradient, self._distance)
+        else:
+            outputs = self.gradient, self._distance
+            descend(frames, moments.M, self.count, self._inverse, *outputs)
+        if self._rough and self.count >= CARRIED_SAMPLES:
+            self._check_carried()
+
+    def _check_carried(self) -> None:
+        """Begin anew where the frames that carried dw were not yet those of now."""
+        turned = log_rotation(np.swapaxes(self._then, 1, 2) @ self.R0)
+        shown = np.einsum("jaa->j", self.identifiable)
+        self._rough = bool(np.abs(turned).max() > CARRIED_TURN or shown.min() < 1.0)
+        if self._rough:
+            self._forget_all()
+            self._then = self.R0.copy()
+
+    def apply_step(self, rate: float) -> None:
+        """Move the frames by ADAM's step in `tangent`, taken at `rate`, and zero it."""
+        s = self.settings
+        if self.each_sample:
+            unlimited = np.full(len(self.p), np.inf)
+            pace = s.sample_rate, 1.0, rate
+            retract(self._frames, self.tangent, self._everything, unlimited, pace)
+        else:
+            pace = s.rate, s.share, rate
+            retract(self._frames, self.tangent, self.identifiable, self._distance, pace)
+
+    def _profile(self) -> None:
+        """Fill the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
+        size), and the curvature from what of them is motion."""
+        M, counts = self.moments.M, self.moments.counts
+        clean = M
+        if self.kind == LinkMotionKind.MEASURED:
+            clean = self._clean
+            without_noise(self._parent, M, counts, self.noise_variance(), clean)
+        profiled(self._frames, M, self.count, clean, self.gradient, self._H)
+
+    def _judge(self) -> None:
+        """Which directions the data show, how far the optimum is, whether λ has settled."""
+        gain = self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
+        self.information[:] = self._H / gain
+        values, vectors = np.linalg.eigh(self._H)
+        # noise alone makes eigenvalues of the size sqrt(count); 400 is a std of 0.05 rad or m
+        shown = values > max(400.0, 10.0 * np.sqrt(self.count))
+        kept = vectors * shown[:, None, :]
+        self.identifiable[:] = kept @ kept.transpose(0, 2, 1)
+        safe = np.where(shown, values, 1.0)
+        self._inverse[:] = (kept / safe[:, None, :]) @ kept.transpose(0, 2, 1)
+        rank = int(shown.sum())
+        distance = np.abs(np.einsum("jab,jb->ja", self._inverse, self.gradient))
+        std = np.sqrt(np.einsum("jaa->ja", self._inverse) * gain)
+        goal = np.repeat([self.settings.rotation_goal, self.settings.position_goal], 3)
+        calm = rank > 0 and rank == self.rank and bool((np.maximum(distance, std) < goal).all())
+        self._calm = self._calm + self.settings.judge_every if calm else 0
+        self.rank = rank
+        self._hold_unshown()
+        self.converged = self._calm >= self.settings.stable_updates and not self._rough
+
+    def _hold_unshown(self) -> None:
+        """Put shifts that the data do not show back to where they started.
+
+        Steps keep out of such directions, but while noise still tilts the picture of what is
+        shown, a little leaks into them.
+        """
+        for j in range(len(self.p)):
+            unshown = np.eye(6) - self.identifiable[j]
+            if np.abs(unshown[:3, 3:]).max() < PURE_SHIFT:
+                self.p[j] -= unshown[3:, 3:] @ (self.p[j] - self.start_lam[j, 3:])
+
+    def covariance(self) -> Array:
+        """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""
+        gain = self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
+        return gain * self._inverse
+
+    def moved_from(self, R0: Array, p: Array) -> Array:
+        """(n, 6) small turns and shifts (phi, d) from other frames to these, rad and m.
+
+        Sines of the turns, which is all that is asked for a hundred times a second; inf for more
+        than a quarter turn.
+        """
+        turn = np.swapaxes(R0, 1, 2) @ self.R0
+        sine = 0.5 * (turn[:, (2, 0, 1), (1, 2, 0)] - turn[:, (1, 2, 0), (2, 0, 1)])
+        sine[np.einsum("jaa->j", turn) < 1.0] = np.inf
+        return np.concatenate([sine, self.p - p], axis=1)

@@ -1,0 +1,422 @@
+"""Second moments of the body-schema signals, and the cost, gradient and curvature they hold.
+
+For joint j with parent i, eqs. 8a, 8b and 8c multiplied by Rz(q_j) read `y = R0^T z`, with
+`y` known from link j and `z = T(p) s` linear in known signals `s` of link i:
+
+    channel 0 (angular velocity)      y = Rz(q)(w_j - dq z)   s = w_i
+    channel 1 (linear velocity)       y = Rz(q) v_j           s = [v_i, w_i]
+    channel 2 (linear acceleration)   y = Rz(q) a_j           s = [a_i, dw_i, products of w_i]
+
+so `sum |y - R0^T z|^2` over any number of samples depends on the data only through the second
+moments of [y, s], 15 x 15 numbers at most per channel (reading notes). Small changes of a frame
+are written (phi, d): R0 <- R0 exp(phi), p <- p + d.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.model.spatial import Array
+from adapter.physics.kernels import Frames, jit, link_spin
+from adapter.signals.records import KIND, columns
+
+N_SIGNALS = (3, 6, 12)  # length of s by channel
+WIDTH = 15  # y and the longest s
+# Products of w in s of channel 2, which axes they multiply.
+PRODUCTS = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
+NOISE_FLOOR = 1e-4  # m/s, rad/s, m/s²: below any sensor; keeps noise-free data from infinite weight
+MISFIT_FLOOR = 1e-6  # share of a signal's power that no weight looks below while the fit is rough
+
+
+class Count(IntEnum):
+    """Places in `MotionMoments.counts`."""
+
+    SAMPLES = 0  # in the moments (fewer where some were forgotten)
+    DIFFERENCES = 1  # third differences taken
+    UNBROKEN = 2  # motions since the last hole in time
+    VELOCITIES = 3  # samples that showed a linear velocity of any body
+
+
+class MotionMoments(NamedTuple):
+    """All that λ is learned from, filled by `absorb`.
+
+    Attributes:
+        M: (n, 3, 15, 15) second moments of [y, s] by joint and channel.
+        newest: the same of the last sample alone; (0, 3, 15, 15) where nobody asks for it.
+        noise_power: (n + 1, 4) sums of squared third differences of v, w, a, dw of the base and
+            of each link.
+        last_motion: (3, n + 1, 12) the three motions before.
+        last_stamps: (2,) int64 stamp of the last one, and the shortest step so far, ns.
+        counts: (4,), see `Count`.
+    """
+
+    M: Array
+    newest: Array
+    noise_power: Array
+    last_motion: Array
+    last_stamps: NDArray[np.int64]
+    counts: Array
+
+
+def _placement_derivatives() -> NDArray[np.float64]:
+    """D[c, i] (3, 3): T(p)[:, i] = T(0)[:, i] + D[c, i] p."""
+    D = np.zeros((3, 12, 3, 3))
+    cross = np.zeros((3, 3, 3))  # column i of w x p, by component of w
+    for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
+        cross[i, b, a] = 1.0  # w_i p_a shows in row b with +, w_i p_b in row a with -
+        cross[i, a, b] = -1.0
+    D[1, 3:6] = cross
+    D[2, 3:6] = cross
+    # w (w.p) - |w|^2 p for the products xx xy xz yy yz zz
+    for i, (a, b) in enumerate(PRODUCTS):
+        D[2, 6 + i, a, b] += 1.0
+        if a == b:
+            D[2, 6 + i] -= np.eye(3)
+        else:
+            D[2, 6 + i, b, a] += 1.0
+    return D
+
+
+DERIVATIVES = _placement_derivatives()
+
+
+@jit
+def signals(q, dq, parent_motion, motion, s):
+    """Fill s (3, 15) with [y, s] of each channel for one joint at one instant.
+
+    Args:
+        q, dq: position and velocity of the joint, rad, rad/s.
+        parent_motion, motion: (12,) [v, w, a, dw] of link i and link j in their own frames.
+    """
+    c, sn = math.cos(q), math.sin(q)
+    wz = motion[5] - dq
+    s[0, 0] = c * motion[3] - sn * motion[4]
+    s[0, 1] = sn * motion[3] + c * motion[4]
+    s[0, 2] = wz
+    for ch, o in ((1, 0), (2, 6)):
+        s[ch, 0] = c * motion[o] - sn * motion[o + 1]
+        s[ch, 1] = sn * motion[o] + c * motion[o + 1]
+        s[ch, 2] = motion[o + 2]
+    wx, wy, wz = parent_motion[3], parent_motion[4], parent_motion[5]
+    for k in range(3):
+        s[0, 3 + k] = parent_motion[3 + k]
+        s[1, 3 + k] = parent_motion[k]
+        s[1, 6 + k] = parent_motion[3 + k]
+        s[2, 3 + k] = parent_motion[6 + k]
+        s[2, 6 + k] = parent_motion[9 + k]
+    s[2, 9], s[2, 10], s[2, 11] = wx * wx, wx * wy, wx * wz
+    s[2, 12], s[2, 13], s[2, 14] = wy * wy, wy * wz, wz * wz
+
+
+@jit
+def accumulate(s, keep, M):
+    """M (3, 15, 15) <- keep M + s s^T by channel; keep < 1 forgets exponentially."""
+    for ch in range(3):
+        k = 6 if ch == 0 else (9 if ch == 1 else 15)
+        for a in range(k):
+            x = s[ch, a]
+            for b in range(k):
+                M[ch, a, b] = keep * M[ch, a, b] + x * s[ch, b]
+
+
+@jit
+def channel_cost(M, ch, R, p, g, H):
+    """Sum of |y - R^T z|^2 of one channel; adds its gradient to g (6,), its curvature to H (6, 6).
+
+    The gradient is that of half the sum, in (phi, d); the curvature is Gauss-Newton's, and left
+    out where H is empty (0, 6).
+    """
+    D = DERIVATIVES
+    k = 3 if ch == 0 else (6 if ch == 1 else 12)
+    T = np.zeros((3, k))
+    for i in range(k):
+        for r in range(3):
+            T[r, i] = 1.0 if i == r else 0.0
+            for a in range(3):
+                T[r, i] += D[ch, i, r, a] * p[a]
+    TM = np.zeros((3, k))  # sum z s^T
+    Tsy = np.zeros((3, 3))  # sum z y^T
+    for r in range(3):
+        for i in range(k):
+            t = T[r, i]
+            if t != 0.0:
+                for j in range(k):
+                    TM[r, j] += t * M[ch, 3 + i, 3 + j]
+                for j in range(3):
+                    Tsy[r, j] += t * M[ch, 3 + i, j]
+    Suy = R.T @ Tsy  # sum u y^T with u = R^T z
+    cost = 0.0
+    for r in range(3):
+        cost += M[ch, r, r] - 2.0 * Suy[r, r]
+        for i in range(k):
+            cost += TM[r, i] * T[r, i]
+    g[0] += Suy[1, 2] - Suy[2, 1]
+    g[1] += Suy[2, 0] - Suy[0, 2]
+    g[2] += Suy[0, 1] - Suy[1, 0]
+    for i in range(3, k):
+        for r in range(3):
+            e = -TM[r, i]  # sum s_i (R y - z)_r
+            for a in range(3):
+                e += R[r, a] * M[ch, 3 + i, a]
+            for a in range(3):
+                g[3 + a] -= D[ch, i, r, a] * e
+    if H.shape[0]:
+        _add_curvature(M[ch], DERIVATIVES[ch], R, T, TM, H)
+    return cost
+
+
+@jit
+def _add_curvature(M, D, R, T, TM, H):
+    """Gauss-Newton's curvature (6, 6) of one channel in (phi, d), added to H."""
+    k = T.shape[1]
+    U = R.T @ TM  # sum u s^T
+    Suu = U @ T.T @ R
+    trace = Suu[0, 0] + Suu[1, 1] + Suu[2, 2]
+    for a in range(3):
+        for b in range(3):
+            H[a, b] -= Suu[a, b]
+        H[a, a] += trace
+    for i in range(3, k):
+        for a in range(3):  # H_phi,d += [U_i]x^T (R^T D_i)
+            x, y, z = U[0, i], U[1, i], U[2, i]
+            v0, v1, v2 = 0.0, 0.0, 0.0
+            for r in range(3):
+                d = D[i, r, a]
+                v0 += R[r, 0] * d
+                v1 += R[r, 1] * d
+                v2 += R[r, 2] * d
+            H[0, 3 + a] += z * v1 - y * v2
+            H[1, 3 + a] += x * v2 - z * v0
+            H[2, 3 + a] += y * v0 - x * v1
+        for j in range(3, k):
+            m = M[3 + i, 3 + j]
+            for a in range(3):
+                for b in range(3):
+                    x = D[i, 0, a] * D[j, 0, b] + D[i, 1, a] * D[j, 1, b]
+                    H[3 + a, 3 + b] += m * (x + D[i, 2, a] * D[j, 2, b])
+    for a in range(3):
+        for b in range(3):
+            H[3 + b, a] = H[a, 3 + b]
+
+
+@jit
+def absorb(parent, base, table, moments, kind, keep):
+    """Add a table of filtered states to the moments.
+
+    Args:
+        parent: (n,) int64, -1 for the base.
+        base: (12,) motion of a base at rest; empty where the states hold the base's motion.
+        table: (m, size) states, see `records.columns`; only those whose link motion is of this
+            `kind` are taken.
+        moments: `MotionMoments` as a plain tuple.
+        keep: forgetting factor of a sample, 1 for none.
+    """
+    into = MotionMoments(*moments)
+    n, counts = parent.shape[0], into.counts
+    at = columns(n, base.shape[0] == 0)
+    s, motion = np.zeros((3, 15)), np.zeros((n + 1, 12))
+    motion[0, : base.shape[0]] = base
+    for m in range(table.shape[0]):
+        if table[m, KIND] != kind:
+            continue
+        if base.shape[0] == 0:
+            motion[0] = table[m, at.base : at.motion_q]
+        motion[1:] = table[m, at.motion : at.size].reshape((n, 12))
+        if counts[Count.VELOCITIES] == 0.0 and motion[:, :3].any():
+            counts[Count.VELOCITIES] = 1.0
+        for j in range(n):
+            q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
+            signals(q, dq, motion[parent[j] + 1], motion[j + 1], s)
+            accumulate(s, keep, into.M[j])
+            if counts[Count.VELOCITIES] == 0.0:
+                # w alone would say that no frame has a place (v = w x p = 0)
+                into.M[j, 1, 6:9, 6:9] = 0.0
+            if into.newest.shape[0]:
+                accumulate(s, 0.0, into.newest[j])
+        counts[Count.SAMPLES] = keep * counts[Count.SAMPLES] + 1.0
+        _look_for_noise(table[m, :1].view(np.int64)[0], motion, into)
+
+
+@jit
+def _look_for_noise(stamp, motion, into):
+    """Take third differences of motion (n + 1, 12), which hold noise rather than motion."""
+    counts, last, stamps = into.counts, into.last_motion, into.last_stamps
+    step = stamp - stamps[0]
+    stamps[0] = stamp
+    stamps[1] = min(stamps[1], max(step, 1))
+    if 2 * step > 5 * stamps[1]:
+        counts[Count.UNBROKEN] = 0.0  # across a hole, motion would pass for noise
+    if counts[Count.UNBROKEN] >= 3.0:
+        counts[Count.DIFFERENCES] += 1.0
+        for i in range(motion.shape[0]):
+            for k in range(12):
+                d = motion[i, k] - last[0, i, k] - 3.0 * (last[2, i, k] - last[1, i, k])
+                into.noise_power[i, k // 3] += d * d / 3.0
+    counts[Count.UNBROKEN] += 1.0
+    for k in range(2):
+        last[k] = last[k + 1]
+    last[2] = motion
+
+
+@jit
+def carry_spin(frames, base, table):
+    """Fill the links' angular accelerations by eq. 8d from the base's, w being as measured.
+
+    Args:
+        frames: `Frames` as a plain tuple; base, table: as for `absorb`.
+    """
+    tree = Frames(*frames)
+    n = tree.parent.shape[0]
+    at = columns(n, base.shape[0] == 0)
+    for m in range(table.shape[0]):
+        motion = table[m, at.motion : at.size].reshape((n, 12))
+        for j in range(n):
+            i, o = tree.parent[j], motion[j]
+            if i >= 0:
+                up = motion[i]
+            elif base.shape[0]:
+                up = base
+            else:
+                up = table[m, at.base : at.motion_q]
+            q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
+            cs = math.cos(q), math.sin(q)
+            rates = dq, table[m, at.ddq + j]
+            spin = (up[9], up[10], up[11])
+            o[9], o[10], o[11] = link_spin(tree.R0[j], cs[0], cs[1], spin, (o[3], o[4]), rates)
+
+
+@jit
+def without_noise(parent, M, counts, variance, out):
+    """out = M with the parents' noise variance (n + 1, 4; order v, w, a, dw) taken out.
+
+    Where velocities are measured, angular accelerations and products of angular velocities leave
+    altogether: what they show of a frame's place, the velocities show as well, and their noise
+    cannot be told from jerky motion. Where none is (gyroscopes and accelerometers measure none),
+    a frame's place shows in accelerations alone, and the noise in both is taken out.
+    """
+    count = counts[Count.SAMPLES]
+    for j in range(parent.shape[0]):
+        out[j] = M[j]
+        noise = variance[parent[j] + 1]
+        v, w, a, dw = noise[0], noise[1], noise[2], noise[3]
+        for k in range(3):
+            out[j, 0, 3 + k, 3 + k] -= count * w
+            out[j, 1, 3 + k, 3 + k] -= count * v
+            out[j, 1, 6 + k, 6 + k] -= count * w
+            out[j, 2, 3 + k, 3 + k] -= count * a
+        if counts[Count.VELOCITIES]:
+            out[j, 2, 6:, :] = 0.0
+            out[j, 2, :, 6:] = 0.0
+            continue
+        out[j, 1] = 0.0
+        for k in range(3):
+            out[j, 2, 6 + k, 6 + k] -= count * dw
+        for k in range(6):
+            x, y = PRODUCTS[k]
+            square = M[j, 0, 3 + x, 3 + x] + M[j, 0, 3 + y, 3 + y]
+            out[j, 2, 9 + k, 9 + k] -= w * (2.0 * square if x == y else square)
+
+
+@jit
+def profiled(frames, M, count, clean, g, H):
+    """Gradient g (n, 6), every channel weighted by its own residual, and curvature H (n, 6, 6).
+
+    Args:
+        frames: `Frames` as a plain tuple; M: (n, 3, 15, 15) moments of `count` samples.
+        clean: moments that the curvature is of, with the same weights; (0, 3, 15, 15): none asked.
+    """
+    tree = Frames(*frames)
+    gc, Hc, unused = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    for j in range(M.shape[0]):
+        R, p = tree.R0[j], tree.p[j]
+        g[j] = 0.0
+        if clean.shape[0]:
+            H[j] = 0.0
+        for ch in range(3):
+            gc[:], Hc[:] = 0.0, 0.0
+            cost = max(channel_cost(M[j], ch, R, p, gc, Hc[:0]), 0.0)
+            power = M[j, ch, 0, 0] + M[j, ch, 1, 1] + M[j, ch, 2, 2]
+            least = 3.0 * count * NOISE_FLOOR * NOISE_FLOOR + MISFIT_FLOOR * power
+            weight = 3.0 * count / (cost + least + 1e-300)
+            for a in range(6):
+                g[j, a] += weight * gc[a]
+            if clean.shape[0]:
+                channel_cost(clean[j], ch, R, p, unused, Hc)
+                H[j] += weight * Hc
+
+
+@jit
+def residual_variance(frames, M, count, out):
+    """out (n, 3): mean square of what each channel's fit leaves, per component."""
+    tree = Frames(*frames)
+    g, H = np.zeros(6), np.zeros((0, 6))
+    for j in range(M.shape[0]):
+        for ch in range(3):
+            cost = channel_cost(M[j], ch, tree.R0[j], tree.p[j], g, H)
+            out[j, ch] = max(cost, 0.0) / (3.0 * max(count, 1.0))
+
+
+@jit
+def steepest(frames, M, g):
+    """Gradient g (n, 6) of the plain squared error (eq. 18)."""
+    tree = Frames(*frames)
+    none = np.zeros((0, 6))
+    for j in range(M.shape[0]):
+        g[j] = 0.0
+        for ch in range(3):
+            channel_cost(M[j], ch, tree.R0[j], tree.p[j], g[j], none)
+
+
+@jit
+def distances(inverse, count, g, out):
+    """out (n,): longest entry of each joint's Newton step, rad or m; then g is put per sample."""
+    for j in range(g.shape[0]):
+        out[j] = np.abs(inverse[j] @ g[j]).max()
+    g /= max(count, 1.0)
+
+
+@jit
+def descend(frames, M, count, inverse, g, out):
+    """`profiled` without curvature, then `distances`, in one call for the 1 kHz step."""
+    profiled(frames, M, count, M[:0], g, inverse)  # no curvature: nothing is written there
+    distances(inverse, count, g, out)
+
+
+@jit
+def retract(frames, step, project, distance, pace):
+    """Move every frame by its projected step (n, 6): R0 exp(phi), p + d; then zero the step.
+
+    Args:
+        frames: `Frames` as a plain tuple, moved.
+        project: (n, 6, 6) onto the directions that may move.
+        distance: (n,) of each joint to its optimum.
+        pace: (longest, share, rate): a step taken at `rate` is scaled to `longest`, or to a share
+            of the joint's distance.
+    """
+    tree = Frames(*frames)
+    longest, share, rate = pace
+    turn = np.empty((3, 3))
+    for j in range(step.shape[0]):
+        scale = min(longest, share * distance[j]) / rate
+        x = scale * (project[j] @ step[j])
+        a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+        s = np.sin(a) / a if a > 1e-8 else 1.0
+        h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
+        for r in range(3):
+            for c in range(3):
+                turn[r, c] = h * x[r] * x[c]
+            turn[r, r] += 1.0 - h * a * a
+        turn[0, 1] -= s * x[2]
+        turn[0, 2] += s * x[1]
+        turn[1, 0] += s * x[2]
+        turn[1, 2] -= s * x[0]
+        turn[2, 0] -= s * x[1]
+        turn[2, 1] += s * x[0]
+        tree.R0[j] = tree.R0[j] @ turn
+        tree.p[j] += x[3:]
+    step[:] = 0.0

@@ -1,0 +1,550 @@
+"""θ and the effects beside it: ADAM's gradient from the moments of eq. 19, physically consistent.
+
+Bodies live in log-Cholesky coordinates, so every step of ADAM is a possible body. What the data
+do not show is held by a broad prior around a neutral body. The noise level of each joint is
+profiled from its own residual. The value in use is a short running mean of ADAM's iterates.
+
+A change at the hand (a payload) gets a body of its own, in the hand's place: what was known of the
+other links stays known, and the payload is the difference to the hand before.
+
+A floating base follows from its wrench, given the links (and moves what torques leave open of the
+links that hang on it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.effects.base import LinearEffect
+from adapter.errors import SettingsError
+from adapter.learning.theta_kernels import (
+    Given,
+    Indices,
+    Moments,
+    Prior,
+    Rows,
+    Weighing,
+    absorb,
+    follow,
+    gradient,
+    joint_costs,
+    values,
+)
+from adapter.model.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
+from adapter.model.spatial import Array
+from adapter.model.tree import BASE, Tree
+from adapter.signals.records import StateLayout
+
+# Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
+NEUTRAL_MASS = 1.0  # kg
+NEUTRAL_INERTIA = 0.02  # kg m², about every axis
+PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
+
+REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.025, 0.001  # N m
+# An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
+# has fallen to this share of what it may be is not there.
+REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
+
+# A step of friction that has gone through the filter looks like tanh over this share of its delay
+# (fitted on simulated reversals; 1 for a tanh as wide as the delay).
+STEP_SMOOTHING = 0.6
+
+# What the base's wrench has to say on the links that hang on it: enough to decide what torques
+# leave open, little enough that the noise of the base's own motion bends nothing that they show.
+HANGING_SHARE = 0.03
+BASE_LEVEL_SAMPLES = 2000  # that the running mean of the base's squared errors spans
+
+SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
+LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
+
+
+@dataclass(frozen=True)
+class ThetaSettings:
+    """How θ is learned.
+
+    Attributes:
+        rate: ADAM's rate per sample on the log-Cholesky parameters.
+        settled_rate: the same once θ has converged: smaller steps, no spikes.
+        betas: ADAM's averaging constants.
+        average: samples that the reported running mean spans.
+        settled_average: the same once θ has converged.
+        restarts: samples after a change at which the spare body is put to the point mass that
+            fits best so far; ADAM refines it from there.
+        warm_up: samples in the moments before the first step.
+        forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
+        model_error: torque that the model is not trusted to explain, N m; no weight looks below
+            it. None: 0.025 where friction or another effect is found (a real arm, whose friction
+            no such model explains better), 0.001 else.
+        sample_rate: ADAM's rate in mode `sample`.
+    """
+
+    rate: float = 3e-3
+    settled_rate: float = 1e-3
+    betas: tuple[float, float] = (0.97, 0.99)
+    average: int = 100
+    settled_average: int = 30
+    restarts: tuple[int, ...] = (50, 100, 200, 400)
+    warm_up: int = 50
+    forget_s: float | None = None
+    model_error: float | None = None
+    sample_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "settled_rate", "average", "settled_average", "sample_rate"):
+            if not getattr(self, name) > 0:
+                raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
+        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
+            raise SettingsError(f"theta.betas must be two numbers in [0, 1), got {self.betas}")
+        if self.forget_s is not None and self.forget_s < 0.5:
+            raise SettingsError(f"theta.forget_s must be at least 0.5 s, got {self.forget_s}")
+
+
+def neutral_body() -> Array:
+    """(10,) what is believed of a link before any data."""
+    return theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
+
+
+@dataclass(frozen=True)
+class ThetaKnowledge:
+    """What is known before any torque.
+
+    Attributes:
+        base: (12,) motion of a base at rest; None where it floats and the states tell.
+        noise_gain: correlated samples that one independent sample is worth.
+        delay_s: of the filter that torque and motion went through.
+        hand: the link whose load may change, and that carries a tool; None for the last one.
+        tool_theta: (10,) of a known tool, kept out of θ.
+        believed: (e, n) values of the effects' parameters and their standard deviations, from a
+            model; NaN where it says nothing, which is held for absent until data show it.
+    """
+
+    base: Array | None = None
+    noise_gain: float = 1.0
+    delay_s: float = 0.0
+    hand: int | None = None
+    tool_theta: Array | None = None
+    believed: tuple[Array, Array] | None = None
+
+
+class Theta:
+    """θ and the effects' parameters of a tree, their uncertainty, and a spare body for a change.
+
+    Args:
+        tree: N and A.
+        known: see `ThetaKnowledge`.
+        effects: learned beside θ.
+        settings: how.
+        each_sample: learn from the newest sample alone, as the paper does.
+
+    Attributes:
+        x: (P,) what ADAM steps on: log-Cholesky of the bodies (the base first if it floats, the
+            links, the spare one), then the effects; `gradient`.
+        mean: (P,) the running mean of x that is in use; `th` its values (θ, effects).
+        moments: since the last change; `count` samples in them.
+        prior, prior_rhs: information (P, P) and (P,) from before: the prior and, after a change,
+            all that was known then.
+        hand, spare: (slices of P) the hand's body, and the one that stands in for it after a
+            change, when `spare_in_use`.
+        effect_spread: (e,) of each effect's prior over the joints, see `adapt_effects`.
+        smoothing_s: how long the filter takes a step of torque.
+    """
+
+    def __init__(
+        self,
+        tree: Tree,
+        known: ThetaKnowledge,
+        effects: Sequence[LinearEffect] = (),
+        settings: ThetaSettings | None = None,
+        each_sample: bool = False,
+    ) -> None:
+        self.tree, self.effects, self.each_sample = tree, tuple(effects), each_sample
+        self.settings = settings or ThetaSettings()
+        self.layout = StateLayout(tree.n, tree.floating)
+        self.noise_gain = known.noise_gain
+        self.smoothing_s = STEP_SMOOTHING * known.delay_s
+        n, e = tree.n, len(self.effects)
+        self.bodies = tree.bodies + 1
+        self.P = 10 * self.bodies + n * e
+        hand = n - 1 if known.hand is None else known.hand
+        self.hand = self._body(int(tree.floating) + hand)
+        self.spare = self._body(self.bodies - 1)
+        self._parent = np.array(tree.parent, dtype=np.int64)
+        self.rows = rows_of(tree, e)
+        self._rows = tuple(self.rows)  # numba takes 3 µs longer for a named tuple
+        self._places = self.rows.place.copy(), self.rows.base_place.copy()
+        self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
+        self.moments, self.newest = self.empty_moments(), self.empty_moments()
+        self.count = 0.0
+        self.effect_spread = np.array([effect.prior_std for effect in self.effects])
+        nothing: Array = np.full((e, n), np.nan)
+        self._believed, self._belief_std = known.believed or (nothing, nothing)
+        self.prior, self.prior_rhs = self._neutral_prior()
+        self._ranges = ranges_of(self.prior)
+        self.x, self.gradient = self._neutral(), np.zeros(self.P)
+        self.mean, self.th = self.x.copy(), np.zeros(self.P)
+        values(self.mean, self.bodies, self.th)
+        if known.base is None and not tree.floating:
+            raise SettingsError("a tree whose base does not float needs its base's motion")
+        base = np.empty(0) if known.base is None or tree.floating else known.base
+        tool = np.zeros(10) if known.tool_theta is None else np.array(known.tool_theta)
+        self._given = tuple(Given(base, tool, np.array([hand]), self.th))
+        self._work = np.zeros(self.P), np.zeros(self.P)
+        self.updates = 0
+        error = self.settings.model_error
+        if error is None:
+            error = REAL_MODEL_ERROR if self.effects else IDEAL_MODEL_ERROR
+        self.model_variance = error**2
+        self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
+        self.spare_in_use = False
+
+    @staticmethod
+    def _body(k: int) -> slice:
+        return slice(10 * k, 10 * k + 10)
+
+    @property
+    def _effects_from(self) -> int:
+        return 10 * self.bodies
+
+    def _neutral(self) -> Array:
+        x = np.zeros(self.P)
+        x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
+        x[self._effects_from :] = np.nan_to_num(self._believed).ravel()
+        return x
+
+    def _neutral_prior(self) -> tuple[Array, Array]:
+        """Information of the prior: bodies and effects; the spare body waits without one."""
+        std = np.full(self.P, np.inf)
+        std[: self.spare.start] = np.tile(PRIOR_STD, self.bodies - 1)
+        told = np.isfinite(self._believed)
+        spread = np.where(told, self._belief_std, self.effect_spread[:, None])
+        std[self._effects_from :] = spread.ravel()
+        mean = np.zeros(self.P)
+        mean[: self.spare.start] = np.tile(neutral_body(), self.bodies - 1)
+        mean[self._effects_from :] = np.nan_to_num(self._believed).ravel()
+        information = 1.0 / std**2
+        return np.diag(information), information * mean
+
+    def effect_columns(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """(m, e, n) columns of the effects for tables (m, n)."""
+        out = np.empty((len(q), len(self.effects), self.tree.n))
+        for k, effect in enumerate(self.effects):
+            out[:, k] = effect.column(q, dq, ddq, self.smoothing_s)
+        return out
+
+    def empty_moments(self) -> Moments:
+        """Moments of no samples, to be filled by `absorb` and put in place by `replace_moments`."""
+        widths = self.rows.sizes + 1
+        A = np.zeros(int((widths * (widths + 1) // 2).sum()))
+        floating = int(self.tree.floating)
+        C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
+        return Moments(A, C, np.zeros(6 * floating), np.array([0.0, BASE_LEVEL_SAMPLES]))
+
+    def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
+        """Add samples to the moments.
+
+        Args:
+            frames: R0 (n, 3, 3) and p (n, 3) to build the regressor with.
+            table: (m, size) states, or their columns `before_links`.
+
+        Returns:
+            (m, rows) errors of the parameters in use, before: measured minus predicted torque,
+            the base's wrench first if it floats.
+        """
+        error = self._absorb(frames, table, self.moments)
+        if self.each_sample:
+            newest = self.newest
+            newest.A[:], newest.C[:] = 0.0, 0.0
+            self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL))
+        self.count += len(table)
+        return error
+
+    def absorb_again(self, frames: tuple[Array, Array], table: Array, into: Moments) -> None:
+        """Add samples seen before to other moments, see `replace_moments`."""
+        self._absorb(frames, table, Moments(into.A, into.C, *_NO_LEVEL))
+
+    def errors(self, frames: tuple[Array, Array], table: Array) -> Array:
+        """Torque errors (m, rows) of the parameters in use; nothing is learned."""
+        return self._absorb(frames, table, Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL))
+
+    def _absorb(self, frames: tuple[Array, Array], table: Array, into: Moments) -> Array:
+        at, forget = self.layout, self.settings.forget_s
+        columns = self.effect_columns(table[:, at.q], table[:, at.dq], table[:, at.ddq])
+        rate = 0.0 if forget is None else 1e-3 / forget
+        placed = self._parent, *frames
+        return absorb(placed, self._rows, self._given, table, columns, (tuple(into), rate))
+
+    def replace_moments(self, moments: Moments, count: float) -> None:
+        """Put moments rebuilt with a better λ in place of the old ones.
+
+        What was folded into the prior at a change cannot be rebuilt; it counts half from here on.
+        """
+        self.moments.A[:], self.moments.C[:], self.count = moments.A, moments.C, count
+        if self.spare_in_use:
+            neutral, neutral_rhs = self._neutral_prior()
+            self._set_prior(0.5 * (self.prior + neutral), 0.5 * (self.prior_rhs + neutral_rhs))
+
+    def _set_prior(self, H: Array, rhs: Array) -> None:
+        self.prior, self.prior_rhs, self._ranges = H, rhs, ranges_of(H)
+
+    def compute_gradient(self) -> bool:
+        """Fill the gradient of one ADAM step; False while there is too little to step on."""
+        if self.count < self.settings.warm_up and not self.spare_in_use:
+            self.gradient[:] = 0.0
+            return False
+        data, count = self.moments[:2], self.count
+        floor, floor_count, least = self.floor, self.floor_count, self.model_variance
+        prior = Prior(self.prior, self.prior_rhs, self._ranges, 1.0)
+        if self.each_sample:  # plain squared error of the newest sample, priors next to none
+            data, count = self.newest[:2], 1.0
+            floor, floor_count = np.ones_like(floor), 1e9
+            prior = Prior(1e-6 * self.prior, 1e-6 * self.prior_rhs, self._ranges, 1e-6)
+        base = self.base_weights()
+        weighing = Weighing(count, self.noise_gain, floor, floor_count, least, base, self.share)
+        out = *self._work, self.gradient
+        gradient(self.x, self._rows, data, tuple(prior), tuple(weighing), out)
+        return True
+
+    def base_weights(self) -> Array:
+        """(2,) weight of the base's force and moment rows: 1 / their running squared error."""
+        if not self.tree.floating:
+            return _NOTHING
+        square = self.moments.base_level.reshape(2, 3).mean(axis=1)
+        return 1.0 / (self.noise_gain * (square + self.model_variance))
+
+    def restart_due(self, added: int) -> bool:
+        """Whether the newest samples reached a restart of the spare body."""
+        before = self.count - added
+        return self.spare_in_use and any(before < k <= self.count for k in self.settings.restarts)
+
+    def restart_spare(self) -> None:
+        """Put the spare body to the hand plus the point mass that fits the data best.
+
+        Nothing happens where that is no possible body (a load was taken away, say).
+        """
+        spare, link = self.spare, self.th[self.hand]
+        H, rhs = self.information()
+        th = self.th.copy()
+        th[spare] = link
+        at = np.arange(spare.start, spare.start + 4)
+        mass, *moment = np.linalg.solve(H[np.ix_(at, at)], rhs[at] - H[at] @ th)
+        if mass < SMALLEST_LOAD:
+            return
+        centre = np.array(moment) / mass
+        load = theta_from_body(mass, centre, mass * LOAD_RADIUS**2 * np.eye(3))
+        if min_eigenvalue(link + load) <= 0.0:
+            return
+        self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
+        values(self.mean, self.bodies, self.th)
+        self.updates = 0
+
+    def after_step(self, settled: bool, samples: float = 1.0) -> None:
+        """Carry the running mean along after ADAM has moved x, once for so many samples."""
+        self.updates += 1
+        s = self.settings
+        span = max((s.settled_average if settled else s.average) / samples, 1.0)
+        follow(self.x, float(min(self.updates, span)), self.bodies, self.mean, self.th)
+
+    def variance(self, th: Array | None = None) -> Array:
+        """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)².
+
+        The residual is that of the parameters in use, or of others, th (P,).
+        """
+        cost = joint_costs(self._rows, self.th if th is None else th, self.moments.A)
+        own = (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
+        return np.asarray(own + self.model_variance)
+
+    def joint_moments(self, j: int) -> Array:
+        """(S + 1, S + 1) moments of joint j's row [y, tau]; `rows.place[j, :S]` are its columns."""
+        width = int(self.rows.sizes[j]) + 1
+        out, start = np.zeros((width, width)), self.rows.starts[j]
+        upper = np.triu_indices(width)
+        out[upper] = self.moments.A[start : start + len(upper[0])]
+        return out + np.triu(out, 1).T
+
+    def information(self) -> tuple[Array, Array]:
+        """All that is known of (θ, effects): information matrix (P, P) and right side (P,).
+
+        That of a floating base is what its wrench tells when the links are what they are now.
+        """
+        H, rhs = self.prior.copy(), self.prior_rhs.copy()
+        for j, weight in enumerate(1.0 / (self.noise_gain * self.variance())):
+            at = self.rows.place[j, : self.rows.sizes[j]]
+            moments = self.joint_moments(j)
+            H[np.ix_(at, at)] += weight * moments[:-1, :-1]
+            rhs[at] += weight * moments[:-1, -1]
+        if self.tree.floating:
+            wrench = self._base_information()
+            H[:10, :10] += wrench[:, :10]
+            rhs[:10] += wrench[:, -1] - wrench[:, 10:-1] @ self.th[self.rows.base_place[10:]]
+        return H, rhs
+
+    def _base_information(self) -> Array:
+        """(10, 10 (n + 1) + 1) information of the base's wrench: base by [base, links, wrench]."""
+        return np.einsum("h,hab->ab", self.base_weights(), self.moments.C[:, :10])
+
+    def adapt_effects(self) -> None:
+        """Let the data say how large each effect is: the spread of its prior follows.
+
+        One step of empirical Bayes a call: the square of the spread becomes the mean over the
+        joints of estimate² + variance. An effect that is not there fades away, instead of taking
+        a share of the data for itself; and where none is left, the model is trusted as that of
+        an ideal arm. What a model told of keeps the spread that the model gave it.
+        """
+        if not self.effects:
+            return
+        n = self.tree.n
+        variance = self.covariance().diagonal()[self._effects_from :].reshape(-1, n)
+        widest = np.array([effect.prior_std for effect in self.effects])
+        square = self.effect_values**2 + variance
+        free = np.isnan(self._believed)
+        found = [
+            np.sqrt(np.mean(s[f])) if f.any() else 0.0 for s, f in zip(square, free, strict=True)
+        ]
+        spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
+        at = np.arange(self._effects_from, self.P)
+        change = np.repeat(1.0 / spread**2 - 1.0 / self.effect_spread**2, n)
+        self.prior[at, at] += np.where(free.ravel(), change, 0.0)
+        self.effect_spread[:] = spread
+        if self.settings.model_error is None:
+            size = np.sqrt(np.mean(square, axis=1))
+            real = bool((np.where(free.all(axis=1), spread, size) > REAL_EFFECT).any())
+            self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
+
+    def known(self) -> NDArray[np.intp]:
+        """Indices of the parameters that have any information (the idle spare body has none)."""
+        idle = np.zeros(self.P, dtype=bool)
+        idle[self.spare] = not self.spare_in_use
+        return np.flatnonzero(~idle)
+
+    def least_squares(self) -> Array:
+        """(P,) the batch solution on all samples so far, with the same prior, unconstrained."""
+        H, rhs = self.information()
+        at = self.known()
+        out = self.th.copy()
+        out[at] = np.linalg.solve(H[np.ix_(at, at)], rhs[at])
+        if self.tree.floating:  # the base again, for these links
+            links = self.rows.base_place[10:]
+            other = rhs[:10] - self._base_information()[:, 10:-1] @ (out - self.th)[links]
+            out[:10] = np.linalg.solve(H[:10, :10], other)
+        return out
+
+    def covariance(self) -> Array:
+        """(P, P) covariance of (θ, effects); zero for the idle spare body."""
+        H, _ = self.information()
+        at = self.known()
+        out = np.zeros((self.P, self.P))
+        out[np.ix_(at, at)] = np.linalg.inv(H[np.ix_(at, at)])
+        if self.tree.floating:  # the base takes the opposite of what the links are off
+            links = self.rows.base_place[10:]
+            follows = np.zeros((10, self.P))
+            follows[:, links] = -np.linalg.solve(H[:10, :10], self._base_information()[:, 10:-1])
+            across = follows @ out
+            out[:10, :10] += across @ follows.T
+            out[:10, 10:] = across[:, 10:]
+            out[10:, :10] = across[:, 10:].T
+        return out
+
+    @property
+    def in_use(self) -> NDArray[np.intp]:
+        """(bodies,) numbers of the bodies in use: the spare one in the hand's place if it is."""
+        out = np.arange(self.bodies - 1)
+        if self.spare_in_use:
+            out[self.hand.start // 10] = self.bodies - 1
+        return out
+
+    @property
+    def theta(self) -> Array:
+        """(bodies, 10) inertial parameters in use, the base first if it floats; the hand's with
+        whatever it carries."""
+        return self.th[: self._effects_from].reshape(-1, 10)[self.in_use]
+
+    @property
+    def payload(self) -> tuple[Array, Array] | None:
+        """What the hand carries more than before the change: θ (10,), covariance (10, 10)."""
+        if not self.spare_in_use:
+            return None
+        cov, hand, spare = self.covariance(), self.hand, self.spare
+        across = cov[hand, spare]
+        own = cov[hand, hand] + cov[spare, spare] - across - across.T
+        return self.th[spare] - self.th[hand], own
+
+    @property
+    def effect_values(self) -> Array:
+        """(e, n) parameters of the effects."""
+        return self.th[self._effects_from :].reshape(len(self.effects), self.tree.n)
+
+    def start_change(self) -> None:
+        """Something at the hand changed: keep what is known, open the spare body for the rest."""
+        hand, spare = self.hand, self.spare
+        H, rhs = self.information()
+        if self.spare_in_use:
+            H, rhs = _marginalise(H, rhs, spare)
+        link = np.diag(1.0 / PRIOR_STD**2)
+        H[hand, hand] += link
+        H[spare, spare] += link
+        H[hand, spare] -= link
+        H[spare, hand] -= link
+        self.floor, self.floor_count = self.variance() - self.model_variance, 500.0
+        self._set_prior(H, rhs)
+        self.moments.A[:], self.moments.C[:], self.count = 0.0, 0.0, 0.0
+        self.x[spare] = self.mean[spare] = self.mean[hand]
+        values(self.mean, self.bodies, self.th)
+        # columns of the hand are the spare body's from here on
+        for place, before in zip(
+            (self.rows.place, self.rows.base_place), self._places, strict=True
+        ):
+            moved = (before >= hand.start) & (before < hand.stop)
+            place[:] = np.where(moved, before + spare.start - hand.start, before)
+        self.spare_in_use = True
+        self.updates = 0
+
+
+_NOTHING = np.empty(0)
+_NO_LEVEL = _NOTHING, _NOTHING
+
+
+def rows_of(tree: Tree, effects: int) -> Rows:
+    """Which parameters each torque row of a tree touches, so many effects a joint beside θ."""
+    n, first = tree.n, int(tree.floating)
+    bodies = tree.bodies + 1
+    beyond = [[k for k in range(n) if j in tree.path_to(k)] for j in range(n)]
+    sizes = np.array([10 * len(links) + effects for links in beyond], dtype=np.int64)
+    place = np.zeros((n, int(sizes.max())), dtype=np.int64)
+    slot = np.full((n, n), -1, dtype=np.int64)
+    for j, links in enumerate(beyond):
+        for number, k in enumerate(links):
+            slot[j, k] = 10 * number
+            place[j, 10 * number : 10 * (number + 1)] = 10 * (k + first) + np.arange(10)
+        place[j, 10 * len(links) : sizes[j]] = 10 * bodies + n * np.arange(effects) + j
+    triangles = (sizes + 1) * (sizes + 2) // 2
+    starts = np.concatenate([[0], np.cumsum(triangles)[:-1]]).astype(np.int64)
+    near: list[int] = []
+    if tree.floating:
+        hanging = [k + 1 for k, i in enumerate(tree.parent) if i == BASE]
+        near = [10 * body + i for body in (0, *hanging) for i in range(10)]
+    every = np.arange(10 * (n + 1) if tree.floating else 0)
+    return Rows(
+        slot, sizes, starts, place, every, np.array(near, dtype=np.int64), np.array([bodies])
+    )
+
+
+def ranges_of(H: Array) -> Indices:
+    """(P, 2) first and one behind the last column that is not zero, of each row of H."""
+    full = H != 0.0
+    some = full.any(axis=1)
+    first, last = full.argmax(axis=1), len(H) - full[:, ::-1].argmax(axis=1)
+    return np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=1)
+
+
+def _marginalise(H: Array, rhs: Array, block: slice) -> tuple[Array, Array]:
+    """Information about the rest when `block` is integrated out; zero rows in its place."""
+    rest = np.setdiff1d(np.arange(len(H)), np.arange(block.start, block.stop))
+    gain = np.linalg.solve(H[block, block], np.c_[H[block, rest], rhs[block]]).T
+    out, out_rhs = np.zeros_like(H), np.zeros_like(rhs)
+    out[np.ix_(rest, rest)] = H[np.ix_(rest, rest)] - H[rest, block] @ gain[:-1].T
+    out_rhs[rest] = rhs[rest] - H[rest, block] @ gain[-1]
+    return out, out_rhs

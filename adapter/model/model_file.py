@@ -1,0 +1,257 @@
+"""The model file: one readable, versioned JSON text; round trips are exact to the last bit.
+
+Numbers are written so that they read back unchanged; what is unknown (NaN) is null, infinity is
+the text "inf".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.self_model import LIMITS, FixedFrame, Limits, SelfModel, Tool
+from adapter.model.tree import Tree
+
+FORMAT = "panda-adapter/self-model"
+VERSION = 1
+_REQUIRED = ("name", "tree", "lambda", "theta")
+
+
+def save_model(model: SelfModel, path: str | Path) -> Path:
+    """Write `model` to `path`, whole or not at all (written beside, then renamed)."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(dumps(model), encoding="utf-8")
+    os.replace(beside, path)
+    return path
+
+
+def load_model(path: str | Path) -> SelfModel:
+    """Read a model file.
+
+    Raises:
+        ModelError: no such file, not JSON, another format or version, missing or wrong parts.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
+    try:
+        return loads(text)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from None
+
+
+def dumps(model: SelfModel) -> str:
+    """The text of the model file."""
+    return _text(_to_json(model), 0) + "\n"
+
+
+def loads(text: str) -> SelfModel:
+    """The model in a model file's text. Raises ModelError."""
+    try:
+        data = json.loads(text, parse_constant=_refuse_constant)
+    except ValueError as error:
+        raise ModelError(f"not a JSON model file ({error})") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else None
+        raise ModelError(f"format is {found!r}, expected '{FORMAT}'")
+    if data.get("version") != VERSION:
+        raise ModelError(f"version {data.get('version')!r} of the format; have: {VERSION}")
+    missing = [key for key in _REQUIRED if key not in data]
+    if missing:
+        raise ModelError(f"'{missing[0]}' is missing; needed are {', '.join(_REQUIRED)}")
+    return _from_json(data)
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"'{name}' is not a number; what is unknown is null")
+
+
+def _to_json(model: SelfModel) -> dict[str, Any]:
+    tree, tool = model.tree, model.tool
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": model.name,
+        "lambda_source": model.lambda_source,
+        "provenance": _plain(model.provenance),
+        "tree": {
+            "parent": list(tree.parent),
+            "floating": tree.floating,
+            "joint_names": list(tree.joint_names),
+            "link_names": list(tree.link_names),
+            "base_name": tree.base_name,
+        },
+        "lambda": _numbers(model.lam),
+        "lambda_std": _numbers(model.lam_std),
+        "lambda_identifiable": _flags(model.lam_identifiable),
+        "theta": _numbers(model.theta),
+        "theta_std": _numbers(model.theta_std),
+        "theta_identifiable": _flags(model.theta_identifiable),
+        "base_theta": _numbers(model.base_theta),
+        "effects": _plain(model.effects),
+        "gravity": _numbers(model.gravity),
+        "tool": None
+        if tool is None
+        else {
+            "mass": float(tool.mass),
+            "com": _numbers(tool.com),
+            "inertia": _numbers(tool.inertia),
+            "link": tool.link,
+        },
+        "limits": {key: _numbers(getattr(model.limits, key)) for key in LIMITS},
+        "axis": _numbers(model.axis),
+        "frames": [
+            {
+                "name": f.name,
+                "joint": f.joint,
+                "parent": f.parent,
+                "rotation": _numbers(f.rotation),
+                "position": _numbers(f.position),
+            }
+            for f in model.frames
+        ],
+    }
+
+
+def _from_json(data: Mapping[str, Any]) -> SelfModel:
+    tree = _tree(_part(data, "tree", dict))
+    n, bodies = tree.n, tree.bodies
+    optional: dict[str, Any] = {
+        "axis": _array(data, "axis", (n, 3)),
+        "lam_std": _array(data, "lambda_std", (n, 6)),
+        "theta_std": _array(data, "theta_std", (bodies, 10)),
+        "base_theta": _array(data, "base_theta", (10,)),
+        "gravity": _array(data, "gravity", (3,)),
+        "lam_identifiable": _bools(data, "lambda_identifiable", (n, 6)),
+        "theta_identifiable": _bools(data, "theta_identifiable", (bodies, 10)),
+    }
+    lam, theta = _array(data, "lambda", (n, 6)), _array(data, "theta", (bodies, 10))
+    if lam is None or theta is None:
+        raise ModelError("'lambda' and 'theta' must hold numbers, not null")
+    return SelfModel(
+        name=_part(data, "name", str),
+        tree=tree,
+        lam=lam,
+        theta=theta,
+        limits=_limits(_part(data, "limits", dict), n) if data.get("limits") else Limits.unknown(n),
+        frames=tuple(_frame(item) for item in _part(data, "frames", list, [])),
+        tool=_tool(_part(data, "tool", dict)) if data.get("tool") else None,
+        effects=tuple(_part(data, "effects", list, [])),
+        lambda_source=_part(data, "lambda_source", str, "documentation"),
+        provenance=_part(data, "provenance", dict, {}),
+        **{key: value for key, value in optional.items() if value is not None},
+    )
+
+
+def _part(data: Mapping[str, Any], key: str, kind: type, default: Any = None) -> Any:
+    value = data.get(key, default)
+    if not isinstance(value, kind):
+        raise ModelError(f"'{key}' must be a {kind.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _tree(data: Mapping[str, Any]) -> Tree:
+    parent, floating = _part(data, "parent", list), _part(data, "floating", bool, False)
+    if not all(isinstance(i, int) for i in parent):
+        raise ModelError("'parent' must be a list of integers")
+    joints, links = _part(data, "joint_names", list, []), _part(data, "link_names", list, [])
+    base = _part(data, "base_name", str, "base")
+    return Tree(tuple(parent), floating, tuple(map(str, joints)), tuple(map(str, links)), base)
+
+
+def _limits(data: Mapping[str, Any], n: int) -> Limits:
+    arrays = {key: _array(data, key, (n,)) for key in LIMITS}
+    return Limits(**{k: np.full(n, np.nan) if v is None else v for k, v in arrays.items()})
+
+
+def _frame(data: Any) -> FixedFrame:
+    if not isinstance(data, dict):
+        raise ModelError(f"an entry of 'frames' must be a dict, got {type(data).__name__}")
+    name, joint, parent = (_part(data, key, str) for key in ("name", "joint", "parent"))
+    rotation = _needed(data, "rotation", (3, 3), "frames")
+    return FixedFrame(name, joint, parent, rotation, _needed(data, "position", (3,), "frames"))
+
+
+def _tool(data: Mapping[str, Any]) -> Tool:
+    mass = float(_needed(data, "mass", (), "tool"))
+    com, inertia = _needed(data, "com", (3,), "tool"), _needed(data, "inertia", (3, 3), "tool")
+    return Tool(mass, com, inertia, data.get("link"))
+
+
+def _needed(data: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Any:
+    value = _array(data, key, shape)
+    if value is None or not np.all(np.isfinite(value)):
+        raise ModelError(f"'{key}' in '{where}' must hold finite numbers")
+    return value
+
+
+def _array(data: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Any:
+    """Numbers of a given shape, null read as NaN; None where the key is absent or null."""
+    if data.get(key) is None:
+        return None
+    try:
+        value = np.array(data[key], dtype=object).astype(np.float64)
+    except (TypeError, ValueError):
+        raise ModelError(f"'{key}' must hold numbers (or null) in shape {shape}") from None
+    if value.shape != shape:
+        raise ModelError(f"'{key}' must have shape {shape}, got {value.shape}")
+    return value
+
+
+def _bools(data: Mapping[str, Any], key: str, shape: tuple[int, ...]) -> Any:
+    if data.get(key) is None:
+        return None
+    value = np.array(data[key])
+    if value.shape != shape or value.dtype != bool:
+        raise ModelError(f"'{key}' must hold true and false in shape {shape}")
+    return value
+
+
+def _numbers(array: Any) -> Any:
+    """Nested lists of floats, NaN as None, infinity as the text "inf" (JSON has neither)."""
+    if np.ndim(array) > 0:
+        return [_numbers(row) for row in array]
+    value = float(array)
+    if math.isnan(value):
+        return None
+    return str(value) if math.isinf(value) else value
+
+
+def _plain(value: Any) -> Any:
+    """Effects and provenance as JSON holds them: numpy's types made Python's, NaN as None."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    return _numbers(value) if isinstance(value, float) else value
+
+
+def _flags(array: np.ndarray | None) -> Any:
+    return None if array is None else array.tolist()
+
+
+def _text(value: Any, indent: int) -> str:
+    """JSON with one line for each list of plain values, so that λ and θ read as tables."""
+    pad = " " * (indent + 1)
+    if isinstance(value, Mapping) and value:
+        items = [f"{pad}{json.dumps(str(k))}: {_text(v, indent + 1)}" for k, v in value.items()]
+        return "{\n" + ",\n".join(items) + "\n" + " " * indent + "}"
+    if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | dict) for v in value):
+        rows = [f"{pad}{_text(v, indent + 1)}" for v in value]
+        return "[\n" + ",\n".join(rows) + "\n" + " " * indent + "]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)

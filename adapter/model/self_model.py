@@ -1,0 +1,239 @@
+"""The self model S = {N, A, λ, θ} (paper, eq. 1), with what is known of how well it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.inertia import move_theta, theta_from_body
+from adapter.model.spatial import Array, matrix_from_zxz
+from adapter.model.tree import Tree
+
+STANDARD_GRAVITY = 9.81  # m/s², the value simulators and Pinocchio use
+LAMBDA_DOCUMENTATION = "documentation"
+LAMBDA_REPRODUCED = "reproduces the documentation"
+LAMBDA_MEASURED = "measured"
+LAMBDA_SOURCES = (LAMBDA_DOCUMENTATION, LAMBDA_REPRODUCED, LAMBDA_MEASURED)
+LIMITS = ("lower", "upper", "velocity", "effort")
+
+
+def gravity_down() -> Array:
+    """Gravity [0 0 -9.81] m/s² of a base that stands upright."""
+    return np.array([0.0, 0.0, -STANDARD_GRAVITY])
+
+
+@dataclass(frozen=True)
+class FixedFrame:
+    """A frame that rides on a link: a flange, a sensor, a link that was merged into another.
+
+    Attributes:
+        name: of the frame (the URDF link).
+        joint: name of the fixed (or locked) joint that carried it.
+        parent: name of the moving link, or of the base, that it rides on.
+        rotation: (3, 3) its orientation in the frame of `parent` (of this model).
+        position: (3,) its origin there, m.
+    """
+
+    name: str
+    joint: str
+    parent: str
+    rotation: Array
+    position: Array
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A known load on a link; kept apart from θ, which describes the arm alone.
+
+    Attributes:
+        mass: kg, above zero.
+        com: (3,) centre of mass in the frame of `link`, m.
+        inertia: (3, 3) about the centre of mass, axes of `link`, kg m².
+        link: the link that carries it; the last one where None.
+    """
+
+    mass: float
+    com: Array
+    inertia: Array
+    link: str | None = None
+
+    def theta(self) -> Array:
+        """Its ten inertial parameters (10,) about the origin of its link's frame."""
+        return theta_from_body(self.mass, self.com, self.inertia)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Joint limits, (n,) each, NaN where unknown: rad, rad, rad/s, N m."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    effort: Array
+
+    @classmethod
+    def unknown(cls, n: int) -> Limits:
+        """Limits of n joints of which nothing is known."""
+        return cls(*(np.full(n, np.nan) for _ in LIMITS))
+
+
+@dataclass(frozen=True)
+class SelfModel:
+    """What an arm knows about its own body.
+
+    Link frames turn about their z (paper, eq. 9). A URDF joint turning about another axis has
+    its frame turned by the smallest rotation from z to that axis (`spatial.z_to_axis`); `axis`
+    keeps the original one, and `urdf_text` undoes the turn.
+
+    Attributes:
+        name: of the robot.
+        tree: N, A and the names.
+        lam: (n, 6) λ, rows [α β γ px py pz], rad and m (eq. 3b).
+        theta: (bodies, 10) θ in the link frames; the base first with a floating base.
+        limits: of the joints.
+        axis: (n, 3) unit axes of the joints in the URDF's link frames.
+        frames: what rides on the links.
+        gravity: (3,) acceleration of gravity in base axes, m/s².
+        base_theta: (10,) inertia of the base link, for a fixed base only (no torque shows it).
+        tool: a known load, not part of `theta`.
+        lam_std: (n, 6) standard deviations of each frame's turn (rotation vector, rad) and
+            shift (m), both in the axes of the parent link; NaN where unknown.
+        theta_std: (bodies, 10) standard deviations; NaN where unknown or without meaning alone.
+        lam_identifiable: (n, 6) bool, the same directions as `lam_std`; None where not judged.
+        theta_identifiable: (bodies, 10) bool, the parameter alone; None where not judged.
+        effects: one mapping each {effect, joints, parameters} with what goes along ({interval_s,
+            std, units, evidence, ...}), JSON values only; what they mean, and whether they are
+            right, `effects.active` knows.
+        lambda_source: one of `LAMBDA_SOURCES`; λ from synthesized twists is never "measured".
+        provenance: where the model came from, JSON values only.
+
+    Raises:
+        ModelError: shapes that don't fit the tree, non-finite λ, θ or gravity, unknown source.
+    """
+
+    name: str
+    tree: Tree
+    lam: Array
+    theta: Array
+    limits: Limits = None  # type: ignore[assignment]  # filled from the tree
+    axis: Array = None  # type: ignore[assignment]
+    frames: tuple[FixedFrame, ...] = ()
+    gravity: Array = field(default_factory=gravity_down)
+    base_theta: Array = field(default_factory=lambda: np.zeros(10))
+    tool: Tool | None = None
+    lam_std: Array = None  # type: ignore[assignment]
+    theta_std: Array = None  # type: ignore[assignment]
+    lam_identifiable: np.ndarray | None = None
+    theta_identifiable: np.ndarray | None = None
+    effects: tuple[Mapping[str, Any], ...] = ()
+    lambda_source: str = LAMBDA_DOCUMENTATION
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, bodies = self.tree.n, self.tree.bodies
+        defaults = {
+            "limits": lambda: Limits.unknown(n),
+            "axis": lambda: np.tile([0.0, 0.0, 1.0], (n, 1)),
+            "lam_std": lambda: np.full((n, 6), np.nan),
+            "theta_std": lambda: np.full((bodies, 10), np.nan),
+        }
+        for key, default in defaults.items():
+            if getattr(self, key) is None:
+                object.__setattr__(self, key, default())
+        object.__setattr__(self, "effects", tuple(self.effects))
+        self._check_arrays(n, bodies)
+        if self.lambda_source not in LAMBDA_SOURCES:
+            choices = ", ".join(f"'{s}'" for s in LAMBDA_SOURCES)
+            raise ModelError(f"no lambda_source '{self.lambda_source}'; have: {choices}")
+        self._check_names()
+
+    def __repr__(self) -> str:
+        return f"SelfModel({self.name}: {self.tree.n} joints, λ {self.lambda_source})"
+
+    def _check_arrays(self, n: int, bodies: int) -> None:
+        known = {
+            "lam": (n, 6),
+            "theta": (bodies, 10),
+            "axis": (n, 3),
+            "gravity": (3,),
+            "base_theta": (10,),
+        }
+        maybe = {"lam_std": (n, 6), "theta_std": (bodies, 10)}
+        for key, shape in {**known, **maybe}.items():
+            value = np.array(getattr(self, key), dtype=np.float64)
+            object.__setattr__(self, key, value)
+            if value.shape != shape:
+                raise ModelError(f"{key} must have shape {shape}, got {value.shape}")
+            if key in known and not np.all(np.isfinite(value)):
+                raise ModelError(f"{key} holds a value that is not finite")
+        for key, shape in {"lam_identifiable": (n, 6), "theta_identifiable": (bodies, 10)}.items():
+            flags = getattr(self, key)
+            if flags is not None:
+                object.__setattr__(self, key, np.array(flags, dtype=bool))
+                if getattr(self, key).shape != shape:
+                    raise ModelError(f"{key} must have shape {shape}, got {np.shape(flags)}")
+        for key in LIMITS:
+            if np.shape(getattr(self.limits, key)) != (n,):
+                raise ModelError(f"limits.{key} must hold {n} values, one for each joint")
+
+    def _check_names(self) -> None:
+        links = (self.tree.base_name, *self.tree.link_names)
+        riding = [(f"frame '{f.name}'", f.parent) for f in self.frames]
+        if self.tool is not None and self.tool.link is not None:
+            riding.append(("the tool", self.tool.link))
+        for what, link in riding:
+            if link not in links:
+                raise ModelError(f"{what} rides on '{link}'; have: {', '.join(links)}")
+        if self.tool is not None and not self.tool.mass > 0:
+            raise ModelError(f"a tool's mass must be above zero, got {self.tool.mass}")
+
+    @property
+    def tool_link(self) -> str:
+        """Name of the link that carries the tool."""
+        named = self.tool.link if self.tool is not None else None
+        return named if named is not None else self.tree.link_names[-1]
+
+    def theta_with_tool(self) -> Array:
+        """θ (bodies, 10) of the arm and its tool: what predicts the torques of the loaded arm."""
+        theta = self.theta.copy()
+        if self.tool is not None and self.tool_link in self.tree.body_names:
+            theta[self.tree.body_names.index(self.tool_link)] += self.tool.theta()
+        return theta
+
+    def with_base(self, floating: bool) -> SelfModel:
+        """The same robot on a free (True) or a fixed base; the base's inertia is not lost."""
+        if floating == self.tree.floating:
+            return self
+        tree = replace(self.tree, floating=floating)
+        unknown = np.full((1, 10), np.nan)
+        if floating:
+            theta = np.vstack([self.base_theta, self.theta])
+            std, base = np.vstack([unknown, self.theta_std]), np.zeros(10)
+        else:
+            theta, std, base = self.theta[1:], self.theta_std[1:], self.theta[0]
+        return replace(
+            self, tree=tree, theta=theta, theta_std=std, base_theta=base, theta_identifiable=None
+        )
+
+    def joint_rotation(self) -> Array:
+        """Orientation (n, 3, 3) of each link frame in its parent's at q = 0."""
+        return matrix_from_zxz(self.lam[:, :3])
+
+
+def base_inertia(model: SelfModel) -> Array:
+    """Ten parameters (10,) of the base link, in its frame, whether it floats or not."""
+    return model.theta[0] if model.tree.floating else model.base_theta
+
+
+def link_theta(model: SelfModel) -> Array:
+    """Rows (n, 10) of θ of the moving links."""
+    return model.theta[1:] if model.tree.floating else model.theta
+
+
+def turned_theta(theta: Array, rotation: Array) -> Array:
+    """Ten parameters (10,) in axes turned about the same origin: R takes old axes to new."""
+    return move_theta(theta, rotation, np.zeros(3))

@@ -1,0 +1,228 @@
+"""A self model as URDF text, with the joint axes that its source had.
+
+What effects add to the arm comes in a record that knows nothing of them; `effects.export` fills it.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.inertia import (
+    CONSISTENCY_TOLERANCE,
+    body_from_theta,
+    is_consistent,
+    min_eigenvalue,
+    six_from_tensor,
+)
+from adapter.model.self_model import (
+    SelfModel,
+    base_inertia,
+    gravity_down,
+    link_theta,
+    turned_theta,
+)
+from adapter.model.spatial import Array, rot_z, rpy_from_matrix, z_to_axis
+from adapter.model.tree import BASE
+
+# What a joint of a file may have beside its limits; a format has some of them.
+DAMPING, FRICTION, ARMATURE, STIFFNESS = "damping", "friction", "armature", "stiffness"
+URDF_PLACES = (DAMPING, FRICTION)
+NO_PLACE = ""
+
+
+@dataclass(eq=False)
+class Additions:
+    """What a file of an arm holds beside the rigid arm itself.
+
+    Attributes:
+        n: joints; floating: whether the base is free.
+        places: what a joint may have in this format.
+        joint: (n,) by place: N m s/rad, N m, kg m², N m/rad.
+        pull: (n,) N m, a spring's torque at q = 0.
+        offset: (n,) of the encoders, rad.
+        dtheta: (n, 10) what links weigh more than the model's θ, in their frames.
+        loads: (10,) each, bodies that the last link carries, in its frame.
+        tilt: (3, 3) how the base stands, None where upright.
+        left_out: what has no place, in words; names: of the effects in it, sorted.
+    """
+
+    n: int
+    floating: bool
+    places: tuple[str, ...]
+    left_out: list[str] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    loads: list[Array] = field(default_factory=list)
+    tilt: Array | None = None
+
+    def __post_init__(self) -> None:
+        self.joint: dict[str, Array] = {place: np.zeros(self.n) for place in self.places}
+        self.pull, self.offset = np.zeros((2, self.n))
+        self.dtheta = np.zeros((self.n, 10))
+
+    def at_joint(self, place: str, joint: int, value: float, part: str | None = None) -> str | None:
+        """Add to what a joint has in a place.
+
+        Returns:
+            `part`, which says what of the effect that is, None for all of it; `NO_PLACE` where
+            the format has no such place.
+        """
+        if place not in self.joint:
+            return NO_PLACE
+        self.joint[place][joint] += value
+        return part
+
+    def carry(self, theta: Array) -> bool:
+        """A body (10,) on the last link; within that link (False) where it could not be one."""
+        alone = is_consistent(theta, -CONSISTENCY_TOLERANCE * float(np.max(np.abs(theta))))
+        if alone:
+            self.loads.append(theta)
+        else:
+            self.dtheta[-1] += theta
+        return bool(alone)
+
+    def turn_base(self, turn: Array) -> None:
+        """Turn the base by a rotation (3, 3), in its own axes."""
+        self.tilt = turn if self.tilt is None else self.tilt @ turn
+
+    def without_negative(self, joint_names: tuple[str, ...]) -> None:
+        """Take out what no format takes, negative losses, and say so."""
+        for what, table in self.joint.items():
+            for j in np.flatnonzero(table < 0.0) if what != STIFFNESS else ():
+                name = joint_names[j]
+                self.left_out.append(f"{what} of {name}, which is negative: {table[j]:g}")
+                table[j] = 0.0
+
+
+def urdf_text(model: SelfModel, more: Additions) -> str:
+    """URDF text of a model; the inverse of `urdf.read_urdf` up to rounding.
+
+    Each link frame is turned back to its original axis, frames that ride on links come out as
+    massless links on fixed joints, a tool and loads as links of their own. A fixed base may be
+    massless. A comment lists what has no place.
+
+    Args:
+        model: the arm; more: what it has beside, `places` being `URDF_PLACES`.
+
+    Raises:
+        ModelError: where a body is physically impossible; names the link and the eigenvalue.
+    """
+    tree, robot = model.tree, ET.Element("robot", name=model.name)
+    missing = [*_gravity(model), *more.left_out]
+    if missing:
+        robot.append(ET.Comment(_comment(missing)))
+    turns = {tree.base_name: np.eye(3)}
+    turns.update({name: z_to_axis(model.axis[k]) for k, name in enumerate(tree.link_names)})
+    base = base_inertia(model)
+    massless_base = not tree.floating and not np.any(base)
+    _add_link(robot, tree.base_name, None if massless_base else base)
+    for k, name in enumerate(tree.link_names):
+        _add_link(robot, name, turned_theta(link_theta(model)[k] + more.dtheta[k], turns[name]))
+        _add_joint(robot, model, k, turns, more)
+    for frame in model.frames:
+        _add_link(robot, frame.name, None)
+        turn = turns[frame.parent]
+        joint = _joint(robot, frame.joint, "fixed", frame.parent, frame.name)
+        _add_origin(joint, turn @ frame.rotation, turn @ frame.position)
+    if model.tool is not None:
+        link = model.tool_link
+        _add_load(robot, link, "tool", turned_theta(model.tool.theta(), turns[link]))
+    last = tree.link_names[-1]
+    for k, load in enumerate(more.loads):
+        what = "payload" if k == 0 else f"payload_{k + 1}"
+        _add_load(robot, last, what, turned_theta(load, turns[last]))
+    if more.tilt is not None:
+        upright = f"{tree.base_name}_upright"
+        _add_link(robot, upright, None)
+        _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, tree.base_name), more.tilt)
+    ET.indent(robot)
+    return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _gravity(model: SelfModel) -> list[str]:
+    """A simulator's gravity is upright; say so where the model's is not."""
+    upright = np.array_equal(model.gravity, gravity_down())
+    return [] if upright else [f"gravity {model.gravity.tolist()} m/s2 in base axes"]
+
+
+def _comment(left_out: list[str]) -> str:
+    """Text of the comment; XML forbids two hyphens in a row in one."""
+    text = " This file has no place for: " + "; ".join(left_out) + " "
+    return text.replace("--", "- -")
+
+
+def _text(values: Array) -> str:
+    """Numbers that read back unchanged; a negative zero loses its sign."""
+    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
+
+
+def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:
+    xyz = _text(np.zeros(3) if position is None else position)
+    ET.SubElement(element, "origin", xyz=xyz, rpy=_text(rpy_from_matrix(rotation)))
+
+
+def _add_link(robot: ET.Element, name: str, theta: Array | None) -> None:
+    """A link with its inertia (10,) in its URDF frame; without any where None."""
+    link = ET.SubElement(robot, "link", name=name)
+    if theta is None:
+        return
+    smallest = float(min_eigenvalue(theta))
+    if not smallest > CONSISTENCY_TOLERANCE * float(np.max(np.abs(theta))):
+        raise ModelError(
+            f"link '{name}' is physically impossible: its pseudo-inertia has an eigenvalue of "
+            f"{smallest:.3g}, all must be positive; learn or set its inertia before exporting"
+        )
+    mass, com, tensor = body_from_theta(theta)
+    inertial = ET.SubElement(link, "inertial")
+    _add_origin(inertial, np.eye(3), com)
+    ET.SubElement(inertial, "mass", value=_text(mass))
+    keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+    six = {key: _text(value) for key, value in zip(keys, six_from_tensor(tensor), strict=True)}
+    ET.SubElement(inertial, "inertia", six)
+
+
+def _add_load(robot: ET.Element, link: str, what: str, theta: Array) -> None:
+    """A body that a link carries, as a link of its own on a fixed joint."""
+    name = f"{link}_{what}"
+    _add_link(robot, name, theta)
+    _add_origin(_joint(robot, f"{name}_joint", "fixed", link, name), np.eye(3))
+
+
+def _joint(robot: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    joint = ET.SubElement(robot, "joint", name=name, type=kind)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    return joint
+
+
+def _add_joint(
+    robot: ET.Element, model: SelfModel, k: int, turns: dict[str, Array], more: Additions
+) -> None:
+    """Joint k, its frame turned back at both ends: R_urdf = Q_i R_ij Q_jᵀ, p_urdf = Q_i p."""
+    tree, limits = model.tree, model.limits
+    i = tree.parent[k]
+    parent = tree.base_name if i == BASE else tree.link_names[i]
+    child = tree.link_names[k]
+    bounded = bool(np.isfinite(limits.lower[k]) and np.isfinite(limits.upper[k]))
+    kind = "revolute" if bounded else "continuous"
+    joint = _joint(robot, tree.joint_names[k], kind, parent, child)
+    zero = model.joint_rotation()[k] @ rot_z(-more.offset[k])  # q = q_measured - offset
+    rotation = turns[parent] @ zero @ turns[child].T
+    _add_origin(joint, rotation, turns[parent] @ model.lam[k, 3:])
+    ET.SubElement(joint, "axis", xyz=_text(model.axis[k]))
+    losses = {place: _text(more.joint[place][k]) for place in more.places if more.joint[place][k]}
+    if losses:
+        ET.SubElement(joint, "dynamics", losses)
+    values = {
+        "lower": limits.lower[k],
+        "upper": limits.upper[k],
+        "velocity": limits.velocity[k],
+        "effort": limits.effort[k],
+    }
+    known = {key: _text(value) for key, value in values.items() if math.isfinite(value)}
+    if known:
+        ET.SubElement(joint, "limit", known)

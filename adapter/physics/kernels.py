@@ -1,0 +1,375 @@
+"""The paper's formulas compiled (numba): one sample at a time for the 1 kHz step, and tables.
+
+`networks` has the same formulas in torch and defines them; tests hold the two together at 1e-9.
+
+A motion row is [v w a dw] (12,) of one body in its own frame, `a` with gravity (what an
+accelerometer reads). Wrenches are [f; m] (6,). The networks carry wrenches from link to link; here
+each goes to the base at once: about the base's origin the wrenches of a sub-tree add up, and the
+torque of joint j is their product with the line of its axis. Eqs. 14c and 16 say the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numba
+import numpy as np
+
+from adapter.model.spatial import Array, matrix_from_zxz
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def jit(function: F) -> F:
+    """Compile with numba: cached on disk, IEEE arithmetic as written, so that runs repeat."""
+    return cast(F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+class Frames(NamedTuple):
+    """Where the joints of a tree are, as compiled code takes it.
+
+    Attributes:
+        parent: (n,) int64, index of the link that each joint hangs on, -1 for the base.
+        R0, p: (n, 3, 3) and (n, 3) m, frame j in frame i at q = 0.
+    """
+
+    parent: np.ndarray
+    R0: Array
+    p: Array
+
+
+class JointMotion(NamedTuple):
+    """Joint angles (rad), velocities (rad/s), accelerations (rad/s²): (n,), or (m, n) in tables."""
+
+    q: Array
+    dq: Array
+    ddq: Array
+
+
+def frames_of(parent: Sequence[int], lam: Array) -> Frames:
+    """The frames that λ (n, 6) describes, of a tree given by its joints' parents (n,)."""
+    lam = np.asarray(lam, dtype=np.float64)
+    R0 = np.ascontiguousarray(matrix_from_zxz(lam[:, :3]))
+    return Frames(np.array(parent, dtype=np.int64), R0, np.ascontiguousarray(lam[:, 3:]))
+
+
+def base_at_rest(gravity: Array) -> Array:
+    """Motion row (12,) of a base at rest: nothing but a = -gravity (base axes, m/s²)."""
+    base = np.zeros(12)
+    base[6:9] = -np.asarray(gravity)
+    return base
+
+
+# Motion of links: eqs. 8 to 10
+
+
+@jit
+def into_link(R, c, s, x, y, z):
+    """R_ijᵀ [x y z]: a vector of frame i in axes of frame j; R = R0_j, c and s of q_j (eq. 9)."""
+    u = R[0, 0] * x + R[1, 0] * y + R[2, 0] * z
+    v = R[0, 1] * x + R[1, 1] * y + R[2, 1] * z
+    return c * u + s * v, -s * u + c * v, R[0, 2] * x + R[1, 2] * y + R[2, 2] * z
+
+
+@jit
+def link_motion(frames, joints, base, out):
+    """Motion of every moving link, eqs. 8a to 8d (8c as in the reading notes).
+
+    Args:
+        frames: `Frames`.
+        joints: `JointMotion` (n,).
+        base: (12,) motion row of the base.
+        out: (n, 12) motion rows, filled.
+    """
+    parent, R0, p = frames
+    q, dq, ddq = joints
+    for j in range(q.shape[0]):
+        m = base if parent[j] < 0 else out[parent[j]]
+        R, P, o = R0[j], p[j], out[j]
+        wx, wy, wz = m[3], m[4], m[5]
+        ex, ey, ez = m[9], m[10], m[11]
+        c, s = math.cos(q[j]), math.sin(q[j])
+        # 8a
+        ux = m[0] + wy * P[2] - wz * P[1]
+        uy = m[1] + wz * P[0] - wx * P[2]
+        uz = m[2] + wx * P[1] - wy * P[0]
+        o[0], o[1], o[2] = into_link(R, c, s, ux, uy, uz)
+        # 8b, the parent's part first: 8d wants it
+        o[3], o[4], o[5] = into_link(R, c, s, wx, wy, wz)
+        # 8c, w x (w x p) written as w (w.p) - p |w|²
+        wp = wx * P[0] + wy * P[1] + wz * P[2]
+        ww = wx * wx + wy * wy + wz * wz
+        ux = m[6] + ey * P[2] - ez * P[1] + wx * wp - ww * P[0]
+        uy = m[7] + ez * P[0] - ex * P[2] + wy * wp - ww * P[1]
+        uz = m[8] + ex * P[1] - ey * P[0] + wz * wp - ww * P[2]
+        o[6], o[7], o[8] = into_link(R, c, s, ux, uy, uz)
+        o[9], o[10], o[11] = link_spin(R, c, s, (ex, ey, ez), (o[3], o[4]), (dq[j], ddq[j]))
+        o[5] += dq[j]
+
+
+@jit
+def link_spin(R, c, s, dw, w, rates):
+    """Angular acceleration of link j from its parent's (eq. 8d), rad/s².
+
+    Args:
+        R, c, s: as for `into_link`.
+        dw: the three numbers of the parent, in its frame.
+        w: x and y of link j's own angular velocity, in its frame.
+        rates: dq and ddq of the joint.
+    """
+    x, y, z = into_link(R, c, s, dw[0], dw[1], dw[2])
+    return x + w[1] * rates[0], y - w[0] * rates[0], z + rates[1]
+
+
+@jit
+def place_frames(frames, q, R, o):
+    """Orientation R (n, 3, 3) and origin o (n, 3) of every link frame in the base, filled."""
+    parent, R0, p = frames
+    for j in range(q.shape[0]):
+        c, s = math.cos(q[j]), math.sin(q[j])
+        i = parent[j]
+        for r in range(3):
+            if i < 0:
+                x, y, z, origin = R0[j, r, 0], R0[j, r, 1], R0[j, r, 2], p[j, r]
+            else:
+                x, y, z, origin = 0.0, 0.0, 0.0, o[i, r]
+                for k in range(3):
+                    t = R[i, r, k]
+                    x += t * R0[j, k, 0]
+                    y += t * R0[j, k, 1]
+                    z += t * R0[j, k, 2]
+                    origin += t * p[j, k]
+            R[j, r, 0], R[j, r, 1], R[j, r, 2] = c * x + s * y, c * y - s * x, z
+            o[j, r] = origin
+
+
+# Wrenches of bodies: eqs. 11 to 14
+
+
+@jit
+def body_wrench(m, theta, out):
+    """Wrench out (6,) of one body at its frame's origin (eqs. 11, 12).
+
+    Args:
+        m: (12,) motion row; theta: (10,) parameters of the body.
+    """
+    wx, wy, wz = m[3], m[4], m[5]
+    ax, ay, az = m[6], m[7], m[8]
+    ex, ey, ez = m[9], m[10], m[11]
+    mass, hx, hy, hz = theta[0], theta[1], theta[2], theta[3]
+    XX, XY, XZ, YY, YZ, ZZ = theta[4], theta[5], theta[6], theta[7], theta[8], theta[9]
+    # I w; and w x (w x h) written as w (w.h) - h |w|²
+    lx = XX * wx + XY * wy + XZ * wz
+    ly = XY * wx + YY * wy + YZ * wz
+    lz = XZ * wx + YZ * wy + ZZ * wz
+    wh = wx * hx + wy * hy + wz * hz
+    ww = wx * wx + wy * wy + wz * wz
+    out[0] = mass * ax + ey * hz - ez * hy + wx * wh - ww * hx
+    out[1] = mass * ay + ez * hx - ex * hz + wy * wh - ww * hy
+    out[2] = mass * az + ex * hy - ey * hx + wz * wh - ww * hz
+    out[3] = XX * ex + XY * ey + XZ * ez + wy * lz - wz * ly + hy * az - hz * ay
+    out[4] = XY * ex + YY * ey + YZ * ez + wz * lx - wx * lz + hz * ax - hx * az
+    out[5] = XZ * ex + YZ * ey + ZZ * ez + wx * ly - wy * lx + hx * ay - hy * ax
+
+
+@jit
+def body_wrench_regressor(m, W):
+    """W (6, 10) of eq. 12, filled: `body_wrench` = W theta for a motion row m (12,)."""
+    wx, wy, wz = m[3], m[4], m[5]
+    ax, ay, az = m[6], m[7], m[8]
+    ex, ey, ez = m[9], m[10], m[11]
+    W[:] = 0.0
+    W[0, 0], W[1, 0], W[2, 0] = ax, ay, az
+    # [dw x] + [w x][w x] for the first moments
+    W[0, 1] = -wy * wy - wz * wz
+    W[0, 2] = -ez + wx * wy
+    W[0, 3] = ey + wx * wz
+    W[1, 1] = ez + wx * wy
+    W[1, 2] = -wx * wx - wz * wz
+    W[1, 3] = -ex + wy * wz
+    W[2, 1] = -ey + wx * wz
+    W[2, 2] = ex + wy * wz
+    W[2, 3] = -wx * wx - wy * wy
+    W[3, 2], W[3, 3] = az, -ay
+    W[4, 1], W[4, 3] = -az, ax
+    W[5, 1], W[5, 2] = ay, -ax
+    # [• dw] + [w x][• w] for XX XY XZ YY YZ ZZ
+    W[3, 4], W[3, 5], W[3, 6] = ex, ey - wx * wz, ez + wx * wy
+    W[3, 7], W[3, 8], W[3, 9] = -wy * wz, wy * wy - wz * wz, wy * wz
+    W[4, 4], W[4, 5], W[4, 6] = wx * wz, ex + wy * wz, wz * wz - wx * wx
+    W[4, 7], W[4, 8], W[4, 9] = ey, ez - wx * wy, -wx * wz
+    W[5, 4], W[5, 5], W[5, 6] = -wx * wy, wx * wx - wy * wy, ex - wy * wz
+    W[5, 7], W[5, 8], W[5, 9] = wx * wy, ey + wx * wz, ez
+
+
+@jit
+def transfer_one(R, o, w, out):
+    """`transfer_wrench` of one wrench w (6,) into out (6,)."""
+    fx = R[0, 0] * w[0] + R[0, 1] * w[1] + R[0, 2] * w[2]
+    fy = R[1, 0] * w[0] + R[1, 1] * w[1] + R[1, 2] * w[2]
+    fz = R[2, 0] * w[0] + R[2, 1] * w[1] + R[2, 2] * w[2]
+    mx = R[0, 0] * w[3] + R[0, 1] * w[4] + R[0, 2] * w[5]
+    my = R[1, 0] * w[3] + R[1, 1] * w[4] + R[1, 2] * w[5]
+    mz = R[2, 0] * w[3] + R[2, 1] * w[4] + R[2, 2] * w[5]
+    out[0], out[1], out[2] = fx, fy, fz
+    out[3] = mx + o[1] * fz - o[2] * fy
+    out[4] = my + o[2] * fx - o[0] * fz
+    out[5] = mz + o[0] * fy - o[1] * fx
+
+
+@jit
+def transfer_wrench(R, o, W, out):
+    """Wrenches of a frame as wrenches about another frame's origin, in its axes (eq. 14a).
+
+    Args:
+        R, o: (3, 3) and (3,), the frame in the other one (R_ij, p_ij; or in the base).
+        W: (6, k), one wrench a column, in the frame's axes.
+        out: (6, k), filled.
+    """
+    for i in range(W.shape[1]):
+        transfer_one(R, o, W[:, i], out[:, i])
+
+
+@jit
+def axis_line(R, o):
+    """[o x z, z], six numbers: the axis z of a joint whose frame is at R (3, 3), o (3,)."""
+    x, y, z = R[0, 2], R[1, 2], R[2, 2]
+    return o[1] * z - o[2] * y, o[2] * x - o[0] * z, o[0] * y - o[1] * x, x, y, z
+
+
+@jit
+def moment_about(line, w):
+    """Moment of a wrench w (6,) on the base about an axis (`axis_line`, eq. 16)."""
+    force = line[0] * w[0] + line[1] * w[1] + line[2] * w[2]
+    return force + line[3] * w[3] + line[4] * w[4] + line[5] * w[5]
+
+
+@jit
+def axis_moment(R, o, B, out):
+    """Moments out (k,) about a joint's axis of wrenches on the base B (6, k), one a column.
+
+    Args:
+        R, o: (3, 3) and (3,), the joint's frame in the base.
+    """
+    line = axis_line(R, o)
+    for i in range(B.shape[1]):
+        out[i] = moment_about(line, B[:, i])
+
+
+# Torques of one sample: eqs. 14 to 16. With a floating base the base comes first: its wrench
+# [f; m] in its own frame among the torques, its ten parameters in theta.
+
+
+@jit
+def inverse_dynamics(frames, theta, q, motion, base, tau):
+    """Torques that a motion takes, N m.
+
+    Args:
+        frames: `Frames`; theta: (bodies, 10).
+        q: (n,) rad; motion: (n, 12) from `link_motion`; base: (12,) motion row of the base.
+        tau: (n,), or (6 + n,) where theta has a base; filled.
+    """
+    n = q.shape[0]
+    first = theta.shape[0] - n
+    R, o = np.empty((n, 3, 3)), np.empty((n, 3))
+    own, total = np.empty(6), np.zeros((n + 1, 6))
+    place_frames(frames, q, R, o)
+    if first:
+        body_wrench(base, theta[0], total[0])
+    for j in range(n):
+        body_wrench(motion[j], theta[first + j], own)
+        transfer_one(R[j], o[j], own, total[j + 1])
+    for j in range(n - 1, -1, -1):
+        tau[6 * first + j] = moment_about(axis_line(R[j], o[j]), total[j + 1])
+        below = total[frames.parent[j] + 1]
+        for r in range(6):
+            below[r] += total[j + 1, r]
+    for r in range(6 * first):
+        tau[r] = total[0, r]
+
+
+@jit
+def regressor(frames, q, motion, base, Y):
+    """Regressor of one sample: `inverse_dynamics` = Y theta, theta's rows one after the other.
+
+    Args:
+        frames, q, motion, base: as for `inverse_dynamics`.
+        Y: (n, 10 n), or (6 + n, 10 (n + 1)) with the base; filled.
+    """
+    n = q.shape[0]
+    first = Y.shape[1] // 10 - n
+    R, o = np.empty((n, 3, 3)), np.empty((n, 3))
+    W, B = np.empty((6, 10)), np.empty((6, 10))
+    place_frames(frames, q, R, o)
+    Y[:] = 0.0
+    if first:
+        body_wrench_regressor(base, W)
+        Y[:6, :10] = W
+    for k in range(n):
+        body_wrench_regressor(motion[k], W)
+        transfer_wrench(R[k], o[k], W, B)
+        columns = slice(10 * (first + k), 10 * (first + k + 1))
+        if first:
+            Y[:6, columns] = B
+        j = k
+        while j >= 0:
+            axis_moment(R[j], o[j], B, Y[6 * first + j, columns])
+            j = frames.parent[j]
+
+
+# Tables of m samples. `base` is (m, 12), or (1, 12) where it is the same for all.
+
+
+@jit
+def link_motions(frames, joints, base, out):
+    """`link_motion` of every sample: out (m, n, 12), filled."""
+    q, dq, ddq = joints
+    for m in range(q.shape[0]):
+        k = base[min(m, base.shape[0] - 1)]
+        link_motion(frames, JointMotion(q[m], dq[m], ddq[m]), k, out[m])
+
+
+@jit
+def torques(frames, theta, joints, base, tau):
+    """`inverse_dynamics` of every sample: tau (m, rows), filled."""
+    q, dq, ddq = joints
+    motion = np.empty((q.shape[1], 12))
+    for m in range(q.shape[0]):
+        k = base[min(m, base.shape[0] - 1)]
+        link_motion(frames, JointMotion(q[m], dq[m], ddq[m]), k, motion)
+        inverse_dynamics(frames, theta, q[m], motion, k, tau[m])
+
+
+@jit
+def regressors(frames, joints, base, Y):
+    """`regressor` of every sample: Y (m, rows, 10 bodies), filled."""
+    q, dq, ddq = joints
+    motion = np.empty((q.shape[1], 12))
+    for m in range(q.shape[0]):
+        k = base[min(m, base.shape[0] - 1)]
+        link_motion(frames, JointMotion(q[m], dq[m], ddq[m]), k, motion)
+        regressor(frames, q[m], motion, k, Y[m])
+
+
+@jit
+def wrench_torques(frames, q, wrenches, out):
+    """Joint torques that wrenches on the last link make, Jᵀ [f; m].
+
+    Args:
+        frames: `Frames`; q: (m, n) rad.
+        wrenches: (6, k) at the last link's origin, in axes of the base, one a column.
+        out: (m, n, k), filled; zero for joints that do not carry the last link.
+    """
+    n = frames.parent.shape[0]
+    R, o = np.empty((n, 3, 3)), np.empty((n, 3))
+    axes, on_base = np.eye(3), np.empty(wrenches.shape)
+    out[:] = 0.0
+    for m in range(q.shape[0]):
+        place_frames(frames, q[m], R, o)
+        transfer_wrench(axes, o[n - 1], wrenches, on_base)
+        j = n - 1
+        while j >= 0:
+            axis_moment(R[j], o[j], on_base, out[m, j])
+            j = frames.parent[j]

@@ -1,0 +1,272 @@
+"""Rings, the estimate's board and the workers of one live run, from start to end."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adapter.model.spatial import Array
+from adapter.realtime.jobs import (
+    DisplayTask,
+    Jobs,
+    LearnerJob,
+    LearnerTask,
+    RawLayout,
+    RecorderTask,
+    RecordingJob,
+)
+from adapter.realtime.real_time import split_cores
+from adapter.realtime.ring import Ring, affordable_rows
+from adapter.realtime.shared import SharedMemoryError
+from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWriter
+from adapter.realtime.worker import (
+    RESTARTS,
+    RestartableWorker,
+    RestartPolicy,
+    Worker,
+    WorkerStarter,
+)
+from drivers.interface import Driver, JointSample
+
+SHORTEST_RING_S = 1.0
+RECORDER_NICE, DISPLAY_NICE = 5, 10
+DISPLAY_STALL_S = 3.0
+
+
+@dataclass(frozen=True)
+class SharedMemoryOptions:
+    """Sizes and names.
+
+    Attributes:
+        ring_s: how much the rings hold; less where shared memory is short (it is said).
+        snapshot_name: under which other processes find the estimate, if it is free; None for any.
+    """
+
+    ring_s: float = 60.0
+    snapshot_name: str | None = DEFAULT_NAME
+
+
+class Supervisor:
+    """Workers and what connects them with the loop. A worker that dies never stops the loop.
+
+    A learner that dies is followed by one that goes on from its last kept state with what the
+    ring holds since; a recorder that dies by one that writes a further file. Three times each.
+
+    Args:
+        driver: for the names of joints and links and the period.
+        state_size: of a filtered state's record.
+        jobs: what to do.
+        options: sizes and names.
+        say: takes a line for people.
+
+    Attributes:
+        passed_on: states handed to the learner; unlearned: those that found no room or nobody.
+        skipped: of those passed on, not learned because the ring had lost them when the learner
+            died, known at the end.
+        kept: samples that were to be recorded; recorded: of these, in files, known at the end.
+        troubles: one sentence for each worker that died.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        state_size: int,
+        jobs: Jobs,
+        options: SharedMemoryOptions,
+        say: Callable[[str], None],
+    ) -> None:
+        self._say, self._jobs = say, jobs
+        self._names = tuple(driver.joint_names), tuple(driver.link_names)
+        self.raw = RawLayout(len(self._names[0]), len(self._names[1]))
+        self._record = self.raw.new()
+        self._state_size, self._period_ns, self._options = state_size, driver.period_ns, options
+        self._cores = split_cores()[1]
+        self._starter: WorkerStarter | None = None
+        self._folder: Path | None = None
+        self.states: Ring | None = None
+        self.samples: Ring | None = None
+        self.board: SnapshotWriter | None = None
+        self.learner: RestartableWorker | None = None
+        self.recorder: RestartableWorker | None = None
+        self.display: Worker | None = None
+        self.passed_on = self.unlearned = self.kept = self.skipped = 0
+        self.recorded: int | None = None
+        self.troubles: list[str] = []
+
+    def start(self, cancelled: Callable[[], bool] = lambda: False) -> None:
+        """Create memory and processes and wait until all are ready, or it is cancelled.
+
+        Raises:
+            DriverError: the recording cannot be written.
+            SharedMemoryError, SnapshotError, WorkerError: as they say.
+        """
+        jobs, rows = self._jobs, self._rows()
+        self._starter = WorkerStarter(self._cores)
+        if jobs.learner is not None:
+            self.states = Ring.create(self._state_size, rows)
+            self.board = self._new_board(jobs.learner)
+            self.learner = self._start_learner(jobs.learner, self.states, self.board.name)
+        board = None if self.board is None else self.board.name
+        if jobs.recording is not None:
+            self.samples = Ring.create(self.raw.size, rows)
+            self.recorder = self._start_recorder(jobs.recording, self.samples, board)
+        shown = self.states or self.samples
+        if jobs.display is not None and shown is not None:
+            show = DisplayTask(jobs.display, shown.name, board)
+            self.display = Worker("display process", show, self._cores, DISPLAY_NICE)
+        first = [part.worker for part in (self.recorder, self.learner) if part is not None]
+        for worker in (*first, self.display):
+            if worker is not None:
+                worker.wait_ready(cancelled=cancelled)
+
+    def _start_learner(self, job: LearnerJob, ring: Ring, board: str) -> RestartableWorker:
+        lasting = job.keep is not None and job.restore is not None
+        if lasting:
+            self._folder = Path(tempfile.mkdtemp(prefix="adapter-learner-"))
+        task = LearnerTask(job, ring.name, board, self._folder)
+        name = "learner process"
+        policy = self._policy("nothing more is learned", RESTARTS if lasting else 0)
+        return RestartableWorker(name, lambda k: Worker(name, task, self._cores), policy)
+
+    def _start_recorder(
+        self, job: RecordingJob, ring: Ring, board: str | None
+    ) -> RestartableWorker:
+        name = "recorder process"
+
+        def build(k: int) -> Worker:
+            task = RecorderTask(job.part(k), ring.name, board, *self._names)
+            return Worker(name, task, self._cores, RECORDER_NICE)
+
+        return RestartableWorker(name, build, self._policy("nothing more is recorded", RESTARTS))
+
+    def _policy(self, lost: str, most: int) -> RestartPolicy:
+        assert self._starter is not None
+        return RestartPolicy(self._starter, most, self._tell, f"the arm goes on, {lost}")
+
+    @property
+    def restarts(self) -> int:
+        """Learners and recorders that followed one that died."""
+        return sum(part.restarts for part in (self.learner, self.recorder) if part is not None)
+
+    @property
+    def unrecorded(self) -> int:
+        """Samples that are in no file, known at the end."""
+        return 0 if self.recorded is None else self.kept - self.recorded
+
+    def _new_board(self, learner: LearnerJob) -> SnapshotWriter:
+        """Where the estimate is published; under another name where another run has the usual."""
+        parts = self._names[0], learner.effect_names, learner.bodies
+        try:
+            return SnapshotWriter.create(*parts, self._options.snapshot_name)
+        except SnapshotError as error:
+            if self._options.snapshot_name is None:
+                raise
+            board = SnapshotWriter.create(*parts, None)
+            self._say(f"{error}; this run publishes its estimate as '{board.name}'")
+            return board
+
+    def _rows(self) -> int:
+        """Records that each ring can hold. Raises SharedMemoryError where these are too few."""
+        wanted, fewest = (
+            max(round(1e9 * seconds / self._period_ns), 1)
+            for seconds in (self._options.ring_s, SHORTEST_RING_S)
+        )
+        jobs = self._jobs
+        rings = (self._state_size, jobs.learner), (self.raw.size, jobs.recording)
+        rows = affordable_rows(tuple(size for size, job in rings if job is not None), wanted)
+        if rows < fewest:
+            raise SharedMemoryError(
+                f"shared memory is too small for rings of {SHORTEST_RING_S} s; give it more "
+                "(docker run --shm-size=256m)"
+            )
+        if rows < wanted:
+            self._say(
+                f"shared memory is short: rings hold {rows} samples instead of "
+                f"{wanted} (docker run --shm-size=256m gives more)"
+            )
+        return rows
+
+    def pass_on(self, record: Array) -> None:
+        """Hand a filtered state to the learner; never waits."""
+        if self.learner is None or self.states is None:
+            return
+        if self.learner.held and self.states.push(record):
+            self.passed_on += 1
+        else:
+            self.unlearned += 1
+
+    def keep(self, sample: JointSample, command: Array | None) -> None:
+        """Hand a sample to the recorder; never waits."""
+        if self.recorder is None or self.samples is None:
+            return
+        self.kept += 1
+        if self.recorder.held:
+            self.raw.fill(self._record, sample, command)
+            self.samples.push(self._record)
+
+    def look_after(self) -> None:
+        """Notice workers that died, tell it once and have them followed; never waits."""
+        for worker, ring in ((self.learner, self.states), (self.recorder, self.samples)):
+            if worker is not None and ring is not None and worker.held:
+                worker.look_after()
+                if not worker.held:
+                    self._abandon(ring)
+
+    def _tell(self, line: str) -> None:
+        self.troubles.append(line)
+        self._say(line)
+
+    def _abandon(self, ring: Ring) -> None:
+        """Empty the ring that nobody reads any more, which a display may be waiting for."""
+        if ring is self.samples:
+            self.recorded = ring.released
+        ring.release(ring.unread)
+
+    def finish(self, hurry: Callable[[], bool]) -> Any:
+        """Let the workers drain their rings and end; returns what the learner collected.
+
+        Args:
+            hurry: true when somebody no longer wants to wait for the learner.
+        """
+        for ring in (self.states, self.samples):
+            if ring is not None:
+                ring.finish()
+        learner = self._end(self.learner, self.states, hurry)
+        recorder = self._end(self.recorder, self.samples, lambda: False)
+        if recorder is not None and self.samples is not None:
+            self.recorded = self.samples.released
+        if self.states is not None:
+            self.skipped = self.states.skipped
+        if self.display is not None:
+            self.display.finish(lambda: 0, stall_s=DISPLAY_STALL_S)
+        return None if learner is None else learner.result
+
+    def _end(
+        self, worker: RestartableWorker | None, ring: Ring | None, hurry: Callable[[], bool]
+    ) -> Worker | None:
+        """The worker that drained its ring and came to its end; None where none did."""
+        if worker is None or ring is None or not worker.held:
+            return None
+        last = worker.finish(lambda: ring.taken, hurry)
+        if last is None:
+            self._abandon(ring)
+        return last
+
+    def close(self) -> None:
+        """End what still runs and free all memory; may be called more than once."""
+        if self._starter is not None:
+            self._starter.close()
+        for worker in (self.learner, self.recorder, self.display):
+            if worker is not None:
+                worker.kill()
+        for part in (self.states, self.samples, self.board):
+            if part is not None:
+                part.close()
+                part.unlink()
+        self.states = self.samples = self.board = None
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)

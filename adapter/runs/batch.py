@@ -1,0 +1,102 @@
+"""Learning from a whole table of filtered states at once: the same moments, fewer ADAM steps.
+
+λ takes all states first, then θ takes them all with the λ they led to; live, θ has to do
+without the states before λ had converged. Moments need no steps to be complete, so as many steps
+as live are taken until λ and θ have converged, and few from there on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from adapter.learning.learner import Learner
+from adapter.model.spatial import Array
+from adapter.signals.records import stamp_of
+
+SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
+SCHEMA_POLISH = 300  # more of them, to the optimum
+SETTLED_EVERY = 5  # batches for each step of λ, once it has converged
+# θ takes as many steps as states at first, at a higher rate, then while that gains more than this
+# share of the joints' error variances, as a look at every so many batches tells; else a few.
+FIRST_STEPS, FIRST_RATE = 2000, 1.75
+GAIN, LOOK_EVERY, FEW_STEPS = 0.001, 4, 2
+# (steps, share of the usual rate) at the end, to the optimum
+THETA_POLISH = ((250, 1.0), (250, 0.3))
+
+
+def learn_batch(
+    learner: Learner, tables: Iterable[Array], every: int, progress: Callable[[int], None]
+) -> None:
+    """Learn from states, `every` of them at a time.
+
+    Args:
+        tables: states (m, size), one table after the other.
+        progress: called with the number of states done.
+    """
+    torque, waiting = _learn_schema(learner, tables, every)
+    if learner.settings.wait_for_schema and not learner.schema.converged:
+        return
+    learner.learn_schema(_NO_STATES, SCHEMA_POLISH)
+    if not len(torque):
+        return
+    learner.start_theta(stamp_of(torque[0]))
+    _learn_theta(learner, torque, every, waiting, progress)
+    for steps, share in THETA_POLISH:
+        learner.set_rate(share * learner.settings.theta.rate)
+        learner.learn_theta(_NO_STATES, steps)
+        learner.theta.adapt_effects()
+    learner.follow_convergence()
+
+
+def _learn_schema(learner: Learner, tables: Iterable[Array], every: int) -> tuple[Array, int]:
+    """Let λ take all states.
+
+    Returns:
+        What θ needs of them (m, columns `before_links`), and how many came before λ had converged.
+    """
+    kept, waiting, done, number = [], 0, 0, 0
+    for table in tables:
+        states = learner.without_known(table)
+        kept.append(states[:, learner.layout.before_links].copy())
+        for start in range(0, len(states), every):
+            batch = states[start : start + every]
+            steps = int(number % SETTLED_EVERY == 0) if learner.schema.converged else every
+            done, number = done + len(batch), number + 1
+            if not learner.schema.converged:
+                waiting = done
+            learner.learn_schema(batch, steps)
+    for _ in range(SCHEMA_STEPS):
+        if learner.schema.converged:
+            break
+        learner.learn_schema(_NO_STATES)
+    return np.concatenate(kept) if kept else _NO_STATES, waiting
+
+
+def _learn_theta(
+    learner: Learner, torque: Array, every: int, waiting: int, progress: Callable[[int], None]
+) -> None:
+    """Let θ take all states; it begins to step behind the first `waiting` of them, as live."""
+    theta, usual = learner.theta, learner.settings.theta.rate
+    moving = True
+    for number, start in enumerate(range(0, len(torque), every)):
+        batch = torque[start : start + every]
+        progress(start)
+        if start < waiting:
+            learner.learn_theta(batch, 0)
+            continue
+        learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
+        before = theta.th.copy()
+        learner.learn_theta(batch, every if moving else FEW_STEPS)
+        if number % LOOK_EVERY == 0:
+            moving = theta.updates < FIRST_STEPS or _gain(learner, before) > GAIN
+
+
+def _gain(learner: Learner, before: Array) -> float:
+    """Mean share of the joints' error variances that went, on all samples, from `before` (P,)."""
+    theta = learner.theta
+    return float(np.mean(1.0 - theta.variance() / theta.variance(before)))
+
+
+_NO_STATES = np.empty((0, 0))

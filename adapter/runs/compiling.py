@@ -1,0 +1,78 @@
+"""Kernels are compiled on a machine's first run: said once, and done before anything is timed.
+
+Numba keeps what it compiled beside the sources, or in the user's cache folder where those cannot
+be written (NUMBA_CACHE_DIR names another place).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numba.core import event
+
+from adapter.model.self_model import SelfModel
+from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.pipeline import PipelineSettings, make_front_end
+from adapter.runs.replay import ReplayOptions, replay
+from drivers.files.mcap import Log
+from drivers.interface import JointSample
+
+COMPILE = "numba:compile"  # numba's event; none where a kernel comes from the cache
+SENTENCE = "compiling for this machine, once; this takes about half a minute"
+TRIED_S, SWING_RAD = 3.0, 0.2  # of the motion that every kernel is tried on
+
+Say = Callable[[str], None]
+
+
+class _Announcer(event.Listener):
+    """Says that something is compiled when the first kernel is."""
+
+    def __init__(self, say: Say) -> None:
+        self._say, self.compiled = say, 0
+
+    def on_start(self, event: object) -> None:
+        if not self.compiled:
+            self._say(SENTENCE)
+        self.compiled += 1
+
+    def on_end(self, event: object) -> None:
+        """Nothing to say."""
+
+
+def announce_compiling(say: Say) -> _Announcer:
+    """From now on, say once when a kernel has to be compiled."""
+    announcer = _Announcer(say)
+    event.register(COMPILE, announcer)
+    return announcer
+
+
+def compile_first(documented: SelfModel, settings: PipelineSettings, every: int, say: Say) -> None:
+    """Compile what learning takes, where this machine has not yet, by learning a made-up motion.
+
+    Args:
+        documented: an arm on a fixed base.
+        settings, every: of the learning to come.
+        say: hears, once, that compiling takes place.
+    """
+    announcer = announce_compiling(say)
+    log = _motion(documented, settings.filter.period_s)
+    make_front_end(documented, settings).step(
+        JointSample(int(log.stamp_ns[0]), log.q[0], log.dq[0], log.tau[0])
+    )
+    if announcer.compiled:
+        replay(log, documented, settings, ReplayOptions(every))
+
+
+def _motion(documented: SelfModel, period_s: float) -> Log:
+    """Every joint swings about the middle of its range, each at a pace of its own."""
+    n, limits = documented.tree.n, documented.limits
+    t = period_s * np.arange(round(TRIED_S / period_s), dtype=np.float64)[:, None]
+    middle = np.nan_to_num(0.5 * (limits.lower + limits.upper))
+    pace = 3.0 + 0.7 * np.arange(n, dtype=np.float64)
+    q = middle + SWING_RAD * np.sin(pace * t)
+    dq = SWING_RAD * pace * np.cos(pace * t)
+    tau = RigidArm.of(documented).torque(q, dq, -(pace**2) * (q - middle))
+    stamps = np.round(1e9 * t[:, 0]).astype(np.int64)
+    return Log(Path("made up"), documented.tree.joint_names, stamps, q, dq, tau)

@@ -1,0 +1,132 @@
+"""Settings from TOML, with every key checked, and back into a recording."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from adapter.control.excitation import ExcitationSettings
+from adapter.errors import SettingsError
+from adapter.model.self_model import SelfModel, Tool
+from adapter.runs.pipeline import PipelineSettings
+
+
+@dataclass(frozen=True)
+class ToolSettings:
+    """A known tool: mass in kg, centre (m) and inertia about it (kg m²) in the last link's frame.
+
+    `inertia` is XX XY XZ YY YZ ZZ.
+    """
+
+    mass: float
+    com: tuple[float, ...] = (0.0, 0.0, 0.0)
+    inertia: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not self.mass > 0.0 or len(self.com) != 3 or len(self.inertia) != 6:
+            raise SettingsError("tool needs mass > 0, com of 3 and inertia of 6 numbers")
+
+    def tool(self) -> Tool:
+        """As part of a model."""
+        xx, xy, xz, yy, yz, zz = self.inertia
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return Tool(self.mass, np.array(self.com), tensor)
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that can be set.
+
+    Attributes:
+        gravity: (3,) acceleration of gravity in base axes, m/s²; a wall- or ceiling-mounted arm
+            differs from the default [0, 0, -9.81]. None: that of the robot's model.
+        tool: a known tool, kept out of θ.
+        pipeline: filter, front end, learner.
+        excitation: of the controller in `run`.
+    """
+
+    gravity: tuple[float, ...] | None = None
+    tool: ToolSettings | None = None
+    pipeline: PipelineSettings = field(default_factory=PipelineSettings)
+    excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
+
+    def __post_init__(self) -> None:
+        if self.gravity is not None and len(self.gravity) != 3:
+            raise SettingsError(f"gravity needs 3 numbers, got {len(self.gravity)}")
+
+    def apply(self, documented: SelfModel) -> SelfModel:
+        """The documented model with this gravity and tool."""
+        changes: dict[str, Any] = {}
+        if self.gravity is not None:
+            changes["gravity"] = np.array(self.gravity, dtype=float)
+        if self.tool is not None:
+            changes["tool"] = self.tool.tool()
+        return dataclasses.replace(documented, **changes)
+
+
+def read_config(path: str | Path | None) -> Config:
+    """Settings from a TOML file; the defaults without one. Raises SettingsError."""
+    if path is None:
+        return Config()
+    try:
+        table = tomllib.loads(Path(path).read_text())
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read: {error.strerror}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{path}: not TOML: {error}") from error
+    return config_from(table, str(path))
+
+
+def config_from(table: dict[str, Any], where: str = "configuration") -> Config:
+    """Settings from nested tables. Raises SettingsError naming the key and the choices."""
+    return _build(Config, table, where)
+
+
+def config_table(config: Config) -> dict[str, Any]:
+    """The settings as nested tables (JSON and TOML values; unset ones left out)."""
+    return _drop_none(dataclasses.asdict(config))
+
+
+def _drop_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _drop_none(part) for key, part in value.items() if part is not None}
+    return [_drop_none(part) for part in value] if isinstance(value, tuple) else value
+
+
+def _build(kind: Any, table: Any, where: str) -> Any:
+    if not isinstance(table, dict):
+        raise SettingsError(f"{where}: needs a table, got {table!r}")
+    hints = get_type_hints(kind)
+    choices = [f.name for f in dataclasses.fields(kind)]
+    for key in table:
+        if key not in choices:
+            raise SettingsError(f"{where}: no setting '{key}'; have: {', '.join(choices)}")
+    values = {key: _value(hints[key], part, f"{where}: {key}") for key, part in table.items()}
+    try:
+        return kind(**values)
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+    except TypeError as error:
+        raise SettingsError(f"{where}: {str(error).partition(') ')[2] or error}") from error
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    if get_origin(hint) in (Union, types.UnionType):
+        hint = next(part for part in get_args(hint) if part is not type(None))
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, where)
+    if get_origin(hint) is tuple:
+        if not isinstance(value, list):
+            raise SettingsError(f"{where} needs a list, got {value!r}")
+        return tuple(_value(get_args(hint)[0], part, where) for part in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
+        raise SettingsError(f"{where} needs {hint.__name__}, got {value!r}")
+    return value

@@ -1,0 +1,151 @@
+"""What the learner process and the recorder process are asked to do in a live run."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.gap.monitor import Monitor
+from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
+from adapter.learning.learner import Learner
+from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
+from adapter.realtime.jobs import LearnerJob
+from adapter.realtime.snapshot import Snapshot
+from adapter.runs.outcome import collect
+from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.signals.records import LinkMotionKind
+
+KEPT_LEARNER, KEPT_MONITOR = "learner.npz", "monitor.pickle"
+STD_EVERY = 50  # publications; the covariance behind the standard deviations takes a millisecond
+
+
+def single_thread_learner(
+    documented: SelfModel, settings: PipelineSettings, resume: Path | None, aloud: bool = False
+) -> Learner:
+    """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit.
+
+    A monitor looks over its shoulder; `aloud`, it tells at once what it finds.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    learner = make_learner(documented, settings)
+    delay_s = make_front_end(documented, settings).delay_s
+    tool = None if documented.tool is None else documented.tool.theta()
+    learner.watch = Monitor(documented.tree.n, tool, delay_s, tell if aloud else keep_quiet)
+    if resume is not None:
+        load_checkpoint(learner, resume)
+    return learner
+
+
+def learner_job(
+    documented: SelfModel,
+    settings: PipelineSettings,
+    checkpoint: Path | None = None,
+    resume: Path | None = None,
+    aloud: bool = False,
+) -> LearnerJob:
+    """The learner process of a live run; everything in it can be pickled.
+
+    Args:
+        checkpoint: where the learner's state is kept; resume: one to go on from.
+        aloud: whether new disagreements are told on standard error when they are found.
+    """
+    return LearnerJob(
+        make=partial(single_thread_learner, documented, settings, resume, aloud),
+        collect=collect,
+        publish=Publisher(),
+        save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
+        keep=keep_learner,
+        restore=restore_learner,
+        effect_names=settings.learner.effects,
+    )
+
+
+def tell(line: str) -> None:
+    """A line to standard error, over the display's own line in a terminal (it comes back)."""
+    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    with suppress(OSError):  # the terminal may be gone; the learner goes on
+        sys.stderr.write(f"{clear}new disagreement: {line}\n")
+        sys.stderr.flush()
+
+
+def keep_quiet(line: str) -> None:
+    """Where nobody wants to hear at once; a function with a name can travel in a file."""
+
+
+def keep_learner(learner: Learner, folder: Path) -> None:
+    """Leave a learner and its monitor to a successor in an empty folder. Raises OSError."""
+    save_checkpoint(learner, folder / KEPT_LEARNER, sync=False)
+    (folder / KEPT_MONITOR).write_bytes(pickle.dumps(learner.watch))
+
+
+def restore_learner(learner: Learner, folder: Path) -> None:
+    """Put a fresh learner into the state that its predecessor left in this private folder."""
+    load_checkpoint(learner, folder / KEPT_LEARNER)
+    learner.watch = pickle.loads((folder / KEPT_MONITOR).read_bytes())
+
+
+class Publisher:
+    """Makes the snapshot that other processes read; standard deviations now and then."""
+
+    def __init__(self) -> None:
+        self._calls = 0
+        self._std: tuple[Any, Any, Any] | None = None
+
+    def __call__(self, learner: Learner) -> Snapshot:
+        """The estimate as it stands."""
+        if self._std is None or self._calls % STD_EVERY == 0:
+            self._std = self._deviations(learner)
+        self._calls += 1
+        measured = learner.schema.kind == LinkMotionKind.MEASURED
+        return Snapshot(
+            lam=learner.schema.lam,
+            lam_std=self._std[0],
+            theta=learner.theta.theta,
+            theta_std=self._std[1],
+            effects=learner.theta.effect_values,
+            effects_std=self._std[2],
+            lam_converged=learner.schema.converged,
+            theta_converged=learner.theta_converged,
+            stamp_ns=learner.stamp_ns,
+            learned=learner.learned,
+            lambda_source=LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED,
+        )
+
+    @staticmethod
+    def _deviations(learner: Learner) -> tuple[Any, Any, Any]:
+        n, schema, theta = learner.tree.n, learner.schema, learner.theta
+        covariance = schema.covariance()
+        turned = schema.R0 @ covariance[:, :3, :3] @ np.swapaxes(schema.R0, 1, 2)
+        variance = np.concatenate(
+            [np.einsum("jaa->ja", turned), np.einsum("jaa->ja", covariance[:, 3:, 3:])], axis=1
+        )
+        std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
+        bodies = std[: 10 * (n + 1)].reshape(-1, 10)
+        rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)
+        return (
+            np.sqrt(np.maximum(variance, 0.0)),
+            bodies[rows],
+            std[10 * (n + 1) :].reshape(-1, n),
+        )
+
+
+def describe_estimate(snapshot: Snapshot) -> dict[str, Any]:
+    """What of an estimate goes into the recording."""
+    return {
+        "stamp_ns": snapshot.stamp_ns,
+        "learned": snapshot.learned,
+        "lambda_source": snapshot.lambda_source,
+        "lambda_converged": snapshot.lam_converged,
+        "theta_converged": snapshot.theta_converged,
+        "lambda": snapshot.lam.tolist(),
+        "theta": snapshot.theta.tolist(),
+        "effects": snapshot.effects.tolist(),
+    }

@@ -1,0 +1,197 @@
+"""What a learner has to say at the end of a run, apart from the learner itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.active import active_effects, with_bodies
+from adapter.effects.catalogue import effects_by_name
+from adapter.learning.learner import Learner, LearnerSettings
+from adapter.model.inertia import body_from_theta, min_eigenvalue
+from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
+from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
+from adapter.physics.identifiability import base_parameters
+from adapter.signals.records import LinkMotionKind
+
+SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything a report, a model file or a score needs; plain arrays, so that it can travel.
+
+    Attributes:
+        learned, updates: states learned from; ADAM updates.
+        start_lam, lam: (n, 6) λ at first and at last.
+        lam_covariance, lam_identifiable: (n, 6, 6) of (turn, shift) in the parents' axes.
+        lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
+        theta: (n, 10); effects: (e, n); variance: (n,) of the residual torque, (N m)².
+        theta_started_ns: stamp of the first state θ learned from, None before.
+        covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
+        payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
+        schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
+        score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
+        frames: (R0, p) that θ's moments were taken with.
+        smoothing_s: how long the filter takes a step of torque.
+        min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
+        disagreements: what `adapter.gap.monitor` reported; None where nothing watched.
+    """
+
+    learned: int
+    updates: int
+    start_lam: Array
+    lam: Array
+    lam_covariance: Array
+    lam_identifiable: Array
+    lam_rank: int
+    lam_converged: bool
+    lam_measured: bool
+    theta: Array
+    effects: Array
+    variance: Array
+    theta_started_ns: int | None
+    covariance: Array
+    least_squares: Array
+    spare_in_use: bool
+    payload: tuple[Array, Array] | None
+    changes_ns: tuple[int, ...]
+    rebuilds: int
+    schema_trace: Array
+    theta_trace: Array
+    score_trace: Array
+    min_eigenvalue: float
+    settings: LearnerSettings
+    smoothing_s: float
+    disagreements: tuple[dict[str, Any], ...] | None = None
+
+
+def collect(learner: Learner) -> Outcome:
+    """Read off a learner what there is to tell."""
+    schema, theta = learner.schema, learner.theta
+    to_parent = np.zeros((learner.tree.n, 6, 6))  # (phi, d) -> (turn in the parent's axes, d)
+    to_parent[:, :3, :3], to_parent[:, 3:, 3:] = schema.R0, np.eye(3)
+    back = to_parent.transpose(0, 2, 1)
+    n = learner.tree.n
+    traced = learner.theta_trace.rows[:, 1 : 1 + 10 * n].reshape(-1, 10)
+    eigenvalues = min_eigenvalue(np.concatenate([traced, theta.theta]))
+    return Outcome(
+        learned=learner.learned,
+        updates=schema.updates,
+        start_lam=schema.start_lam,
+        lam=schema.lam,
+        lam_covariance=to_parent @ schema.covariance() @ back,
+        lam_identifiable=to_parent @ schema.identifiable @ back,
+        lam_rank=schema.rank,
+        lam_converged=schema.converged,
+        lam_measured=schema.kind == LinkMotionKind.MEASURED,
+        theta=theta.theta,
+        effects=theta.effect_values.copy(),
+        variance=theta.variance(),
+        theta_started_ns=learner.theta_started_ns,
+        covariance=theta.covariance(),
+        least_squares=theta.least_squares(),
+        spare_in_use=theta.spare_in_use,
+        payload=theta.payload,
+        changes_ns=tuple(change.stamp_ns for change in learner.changes),
+        rebuilds=learner.rebuilds,
+        schema_trace=learner.schema_trace.rows.copy(),
+        theta_trace=learner.theta_trace.rows.copy(),
+        score_trace=learner.score_trace.rows.copy(),
+        min_eigenvalue=float(np.min(eigenvalues)),
+        settings=learner.settings,
+        smoothing_s=theta.smoothing_s,
+        disagreements=None if learner.watch is None else tuple(learner.watch.reports),
+    )
+
+
+def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
+    """The self model a run ends with: what was learned in, what was not shown held and said so.
+
+    Effects of the documented model that were not learned stay in it as they are; those that
+    ended with the recording they were found in are left out.
+    """
+    documented, n = with_bodies(documented), documented.tree.n
+    variance = np.einsum("jaa->ja", outcome.lam_covariance)
+    shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
+    base = base_parameters(documented.tree, outcome.lam, documented.gravity)
+    share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
+    known = outcome.theta_started_ns is not None
+    body = outcome.covariance.diagonal()[: 10 * (n + 1)].reshape(-1, 10)
+    body = body[np.r_[: n - 1, n]] if outcome.spare_in_use else body[:n]
+    return replace(
+        documented,
+        name=f"{documented.name} (learned)",
+        lam=outcome.lam,
+        theta=outcome.theta,
+        base_theta=documented.base_theta,
+        lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
+        lam_identifiable=shown,
+        theta_std=np.sqrt(body) if known else np.full((n, 10), np.nan),
+        theta_identifiable=(share > SHOWN_SHARE) & known,
+        effects=(*_effects(outcome, n), *_kept(documented, outcome.settings.effects)),
+        lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
+        provenance={
+            **provenance,
+            "theta_source": "learned" if known else "neutral prior: λ had not converged",
+            "changes": changes(outcome),
+        },
+    )
+
+
+def _effects(outcome: Outcome, n: int) -> list[dict[str, Any]]:
+    """Entries of the model file, one per effect and joint."""
+    entries = []
+    std = np.sqrt(outcome.covariance.diagonal()[10 * (n + 1) :]).reshape(-1, n)
+    for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
+        for j in range(n):
+            entries.append(
+                {
+                    "effect": effect.name,
+                    "joints": [j + 1],
+                    "parameters": {effect.key: float(outcome.effects[k, j])},
+                    "std": {effect.key: float(std[k, j])},
+                    "units": {effect.key: effect.unit},
+                }
+            )
+    return entries
+
+
+def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, Any]]:
+    """Entries of the documented model that hold on, without the start that they had once."""
+    found: list[Mapping[str, Any]] = []
+    for entry in documented.effects:
+        active = active_effects([entry], documented.tree.n)
+        if entry["effect"] not in learned and active[0].lasting:
+            found.append({**entry, "interval_s": None} if "interval_s" in entry else entry)
+    return found
+
+
+def changes(outcome: Outcome) -> list[dict[str, Any]]:
+    """Changes at the hand, with what the last one brought (payload in the last link's frame)."""
+    found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in outcome.changes_ns]
+    if found and outcome.payload is not None:
+        theta, covariance = outcome.payload
+        found[-1]["payload"] = {
+            "m": float(theta[0]),
+            "m_std": float(np.sqrt(covariance[0, 0])),
+        }
+        if theta[0] > 0.0:
+            _, centre, _ = body_from_theta(theta)
+            found[-1]["payload"].update(zip(("cx", "cy", "cz"), map(float, centre), strict=True))
+    return found
+
+
+def frame_errors(lam: Array, reference: Array, projectors: Array) -> tuple[Array, Array]:
+    """Rotation (…, n) rad and position (…, n) m errors in the observable directions.
+
+    Args:
+        lam: (..., n, 6); reference: (n, 6); projectors: (n, 6, 6) in the parents' axes.
+    """
+    turn = matrix_from_zxz(lam[..., :3]) @ np.swapaxes(matrix_from_zxz(reference[:, :3]), 1, 2)
+    error = np.concatenate([log_rotation(turn), lam[..., 3:] - reference[:, 3:]], axis=-1)
+    seen = np.einsum("jab,...jb->...ja", projectors, error)
+    return np.linalg.norm(seen[..., :3], axis=-1), np.linalg.norm(seen[..., 3:], axis=-1)

@@ -1,0 +1,72 @@
+"""Front end and learner in one thread: what the live process does, without its clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from adapter.effects.active import lasting_effects, with_bodies
+from adapter.learning.learner import Filtered, KnownArm, Learner, LearnerSettings
+from adapter.model.self_model import SelfModel
+from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.filters import FilterSettings
+from adapter.signals.front_end import FrontEnd, FrontEndSettings
+from drivers.interface import JointSample
+
+
+@dataclass(frozen=True)
+class PipelineSettings:
+    """Settings of the parts."""
+
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
+
+
+class Pipeline:
+    """The two pure steps, composed.
+
+    Args:
+        documented: the arm as documented; the learner gets its topology, gravity, tool and
+            effects only.
+        settings: of the parts.
+
+    Attributes:
+        front_end, learner: the parts; estimates are read from the learner.
+    """
+
+    def __init__(self, documented: SelfModel, settings: PipelineSettings | None = None) -> None:
+        self.settings = settings or PipelineSettings()
+        self.front_end = make_front_end(documented, self.settings)
+        self.learner = make_learner(documented, self.settings)
+
+    def step(self, sample: JointSample) -> bool:
+        """Take one sample; whether it was learned from."""
+        state = self.front_end.step(sample)
+        if state is None:
+            return False
+        self.learner.step(state)
+        return True
+
+
+def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:
+    """The front end of a pipeline with these settings."""
+    return FrontEnd(documented, settings.filter, settings.front_end)
+
+
+def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
+    """The learner of a pipeline with these settings; it takes over the effects of the model."""
+    front_end = make_front_end(documented, settings)
+    whole = with_bodies(documented)
+    known = lasting_effects(whole.effects, whole.tree.n)
+    tool = documented.tool
+    return Learner(
+        documented.tree,
+        documented.gravity,
+        settings.learner,
+        Filtered(front_end.filter.noise_gain, front_end.delay_s),
+        KnownArm(
+            tool_theta=None if tool is None else tool.theta(),
+            effects=known,
+            arm=None if whole is documented and not known else RigidArm.of(whole),
+        ),
+    )

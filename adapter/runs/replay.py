@@ -1,0 +1,186 @@
+"""Learning from a recording: sample by sample as live, or in batches with the same moments."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.errors import SettingsError
+from adapter.gap.monitor import Monitor
+from adapter.learning.checkpoint import load_checkpoint
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.runs.batch import learn_batch
+from adapter.runs.outcome import Outcome, collect
+from adapter.runs.pipeline import Pipeline, PipelineSettings
+from adapter.signals.filters import FilterSettings, noise_from_samples
+from drivers.files.mcap import Log
+from drivers.interface import DriverError, JointSample, LinkMotion
+
+FEWEST_FOR_NOISE = 50  # samples
+AT_ONCE = 2000  # samples that pass the front end in one table: as much as a processor's cache holds
+MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
+
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Replay:
+    """What a replay found.
+
+    Attributes:
+        outcome: of the learner.
+        pipeline: its front end has the counts of refused samples.
+        samples: read from the recording.
+        tick_ns: compute time of the front end by sample (exact mode only).
+        wall_s: time spent on learning, without reading the file.
+        span_s: time that the samples span in the recording.
+    """
+
+    outcome: Outcome
+    pipeline: Pipeline
+    samples: int
+    tick_ns: NDArray[np.int64]
+    wall_s: float
+    span_s: float
+
+
+class ReplayOptions(NamedTuple):
+    """How a recording is learned from.
+
+    Attributes:
+        every: samples per update; 1 is the exact mode, which equals the live estimates and is
+            watched for disagreements as the live process is.
+        until_s: learn only from samples before this time after the first stamp.
+        progress: called with the number of samples taken so far.
+        resume: a checkpoint to go on from.
+        say: takes a sentence on each new disagreement when it is found.
+    """
+
+    every: int = 1
+    until_s: float | None = None
+    progress: Progress | None = None
+    resume: Path | None = None
+    say: Callable[[str], None] | None = None
+
+
+def replay(
+    log: Log,
+    documented: SelfModel,
+    settings: PipelineSettings,
+    options: ReplayOptions | None = None,
+) -> Replay:
+    """Learn from a recording (as `matching.matching` returns it).
+
+    Raises:
+        SettingsError: `every` out of range, or a checkpoint that does not fit.
+        DriverError: no samples.
+    """
+    every, until_s, progress, resume, say = options or ReplayOptions()
+    if not 1 <= every <= MOST_PER_UPDATE:
+        raise SettingsError(f"--every takes 1 to {MOST_PER_UPDATE} samples, got {every}")
+    stop = len(log)
+    if until_s is not None and stop:
+        stop = int(np.sum(log.stamp_ns < log.stamp_ns[0] + round(1e9 * until_s)))
+    if stop == 0:
+        raise DriverError(f"{log.path}: no samples to learn from")
+    pipeline = Pipeline(documented, settings)
+    if every == 1:  # a batch learns of everything before it could tell what is new
+        tool = None if documented.tool is None else documented.tool.theta()
+        delay_s = pipeline.front_end.delay_s
+        pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
+    if resume is not None:
+        load_checkpoint(pipeline.learner, resume)
+    started = time.perf_counter()
+    run = _exact if every == 1 else _batch
+    tick_ns = run(log, stop, pipeline, every, progress or (lambda done: None))
+    wall_s = time.perf_counter() - started
+    span_s = 1e-9 * float(log.stamp_ns[stop - 1] - log.stamp_ns[0])
+    return Replay(collect(pipeline.learner), pipeline, stop, tick_ns, wall_s, span_s)
+
+
+def _exact(
+    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
+) -> NDArray[np.int64]:
+    tick_ns = np.zeros(stop, dtype=np.int64)
+    front_end, learner = pipeline.front_end, pipeline.learner
+    heard = _heard(log)
+    for i in range(stop):
+        links = None
+        if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
+            links = LinkMotion(log.twists[i], log.accels[i])
+        sample = JointSample(int(log.stamp_ns[i]), log.q[i], log.dq[i], log.tau[i], links)
+        before = time.perf_counter_ns()
+        state = front_end.step(sample)
+        tick_ns[i] = time.perf_counter_ns() - before
+        if state is not None:
+            learner.step(state)
+        if i % 500 == 0:
+            progress(i)
+    return tick_ns
+
+
+def _heard(log: Log) -> NDArray[np.bool_] | None:
+    if log.twists is None or log.accels is None:
+        return None
+    silent = np.isnan(log.twists).all(axis=(1, 2)) & np.isnan(log.accels).all(axis=(1, 2))
+    return np.asarray(~silent)
+
+
+def _batch(
+    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
+) -> NDArray[np.int64]:
+    def states(start: int) -> Array:
+        part = slice(start, min(start + AT_ONCE, stop))
+        twists = None if log.twists is None else log.twists[part]
+        accels = None if log.accels is None else log.accels[part]
+        joints = log.stamp_ns[part], log.q[part], log.dq[part], log.tau[part]
+        return pipeline.front_end.step_table(*joints, twists, accels)
+
+    tables = (states(start) for start in range(0, stop, AT_ONCE))
+    learn_batch(pipeline.learner, tables, every, progress)
+    return np.zeros(0, dtype=np.int64)
+
+
+def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
+    """Filter settings for the rate of a recording and, where they leave it open, its noise.
+
+    Returns:
+        The settings, and a sentence where the recording's rate is not the nominal one.
+    """
+    steps = np.diff(log.stamp_ns)
+    steps = steps[steps > 0]
+    changes: dict[str, float] = {}
+    warnings = []
+    if len(steps):
+        period_s = 1e-9 * float(np.median(steps))
+        if not 0.8 < period_s / settings.period_s < 1.25:
+            changes["period_s"] = period_s
+            warnings.append(
+                f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter follows"
+            )
+    open_noise = settings.dq_noise is None and settings.dq_drive is not None
+    if open_noise and len(log) >= FEWEST_FOR_NOISE:
+        changes["dq_noise"] = float(np.median(noise_levels(log)["dq"]))
+    return replace(settings, **changes), warnings
+
+
+def noise_levels(log: Log) -> dict[str, Array]:
+    """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies."""
+    new = np.ones(len(log), dtype=bool)
+    new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
+    return {
+        name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))
+        for name in ("q", "dq", "tau")
+    }
+
+
+def seconds(log: Log) -> Array:
+    """(m,) seconds since the first stamp."""
+    return 1e-9 * (log.stamp_ns - log.stamp_ns[0])

@@ -1,0 +1,233 @@
+"""The figures of a run: the JSON of `run` and `replay`, and the numbers in the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adapter.effects.active import with_bodies
+from adapter.effects.catalogue import effects_by_name
+from adapter.errors import ModelError
+from adapter.model.model_file import load_model
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.outcome import Outcome, changes, frame_errors
+
+ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
+TORQUE_GOAL = 1.1  # times the final batch least squares
+TORQUE_WINDOW_S = 2.0
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What λ is compared with.
+
+    Attributes:
+        lam: (n, 6); theta: (n, 10), None where not known.
+        source: "documentation", or the file it was read from.
+    """
+
+    lam: Array
+    theta: Array | None
+    source: str
+
+
+def reference_from(path: str | Path | None, documented: SelfModel) -> Reference:
+    """The truth of a scenario or a model file; the documentation where no path is given.
+
+    Raises:
+        ModelError: the file cannot be read, or describes another number of joints.
+    """
+    n = documented.tree.n
+    if path is None:
+        return Reference(documented.lam, documented.theta[-n:], "documentation")
+    try:
+        content = json.loads(Path(path).read_text())
+    except (OSError, ValueError) as error:
+        raise ModelError(f"{path}: cannot be read as a truth or model file: {error}") from error
+    if not isinstance(content, dict) or "lambda" not in content:
+        raise ModelError(f"{path}: has no 'lambda'; give a scenario's truth or a model file")
+    if content.get("format") == "panda-adapter/self-model":
+        model = load_model(path)
+        lam, theta = model.lam, model.theta[-n:]
+    else:
+        lam = np.array(content["lambda"], dtype=float)
+        theta = np.array(content.get("theta", []), dtype=float)
+    if lam.shape != (n, 6):
+        raise ModelError(f"{path}: describes {len(lam)} joints, the robot has {n}")
+    return Reference(lam, theta if theta.shape == (n, 10) else None, str(path))
+
+
+def stamps_s(rows: Array) -> Array:
+    """Stamps (k,) in s of trace rows, whose first column is the stamp in ns."""
+    return 1e-9 * rows[:, 0]
+
+
+def settled_at(times: Array, good: Any) -> float | None:
+    """The time after which `good` always holds; None where it does not hold at the end."""
+    if not len(times) or not good[-1]:
+        return None
+    bad = np.flatnonzero(~good)
+    return float(times[bad[-1] + 1] if len(bad) else times[0])
+
+
+def schema_score(
+    outcome: Outcome, documented: SelfModel, reference: Reference, start_s: float | None
+) -> dict[str, Any]:
+    """The `lambda` part of the figures; errors per joint in the observable directions."""
+    seen = frame_observability(documented.tree, reference.lam, documented.gravity)
+    lam = outcome.schema_trace[:, 1:].reshape(-1, documented.tree.n, 6)
+    turn, shift = frame_errors(lam, reference.lam, seen.projectors)
+    inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
+    at = settled_at(stamps_s(outcome.schema_trace), inside)
+    last_turn, last_shift = frame_errors(outcome.lam, reference.lam, seen.projectors)
+    spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
+    return {
+        "converged_s": None if at is None or start_s is None else at - start_s,
+        "rotation_error_rad": last_turn.tolist(),
+        "position_error_m": last_shift.tolist(),
+        "identifiable_rank": outcome.lam_rank,
+        "observable_rank": seen.rank,
+        "std": {
+            "rotation_rad": np.linalg.norm(spread[:, :3], axis=1).tolist(),
+            "position_m": np.linalg.norm(spread[:, 3:], axis=1).tolist(),
+        },
+        "settled": outcome.lam_converged,
+        "source": "measured" if outcome.lam_measured else "reproduces the documentation",
+        "reference": reference.source,
+        "values": outcome.lam.tolist(),
+    }
+
+
+class ScoreRows:
+    """The states kept for scoring, with the torque any parameters predict for them."""
+
+    def __init__(self, outcome: Outcome, documented: SelfModel) -> None:
+        n = self.n = documented.tree.n
+        rows = outcome.score_trace
+        self.time_s = stamps_s(rows)
+        self.q, self.dq, self.ddq, self.tau, self.error = (
+            np.ascontiguousarray(rows[:, 1 + k * n : 1 + (k + 1) * n]) for k in range(5)
+        )
+        self._outcome, self._documented = outcome, with_bodies(documented)
+        first = outcome.changes_ns[0] if outcome.changes_ns else np.inf
+        self.before_change = rows[:, 0] < first
+        last = outcome.changes_ns[-1] if outcome.changes_ns else -np.inf
+        self.after_changes = rows[:, 0] >= last
+
+    def torque(self, theta: Array, effects: Array) -> Array:
+        """(k, n) torque of θ (n, 10) and effect parameters (e, n), with the learned frames."""
+        learned = replace(self._documented, lam=self._outcome.lam, theta=theta)
+        tau = RigidArm.of(learned).torque(self.q, self.dq, self.ddq)
+        for gain, effect in zip(
+            effects, effects_by_name(self._outcome.settings.effects), strict=True
+        ):
+            tau += gain * effect.column(self.q, self.dq, self.ddq, self._outcome.smoothing_s)
+        return tau
+
+
+def trailing_rms(time_s: Array, error: Array, window_s: float) -> Array:
+    """(k,) root of the mean of |error (k, n)|² over the window that ends at each row."""
+    total = np.concatenate([[0.0], np.cumsum((error**2).sum(axis=1))])
+    first = np.searchsorted(time_s, time_s - window_s, side="left")
+    k = np.arange(len(time_s))
+    return np.sqrt((total[k + 1] - total[first]) / (k + 1 - first))
+
+
+def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) -> dict[str, Any]:
+    """The `theta` part of the figures.
+
+    Convergence is judged up to the first change at the hand: prequential torque error against
+    the batch solution's on the same samples, joints in units of their noise.
+    """
+    n = documented.tree.n
+    base = base_parameters(documented.tree, outcome.lam, documented.gravity)
+    score: dict[str, Any] = {
+        "converged_s": None,
+        "base_parameters": base.rank,
+        "torque_rmse_nm": [],
+        "validation_torque_rmse_nm": None,
+        "min_pseudo_inertia_eigenvalue": outcome.min_eigenvalue,
+        "effects": {
+            effect.name: outcome.effects[k].tolist()
+            for k, effect in enumerate(effects_by_name(outcome.settings.effects))
+        },
+        "changes": changes(outcome),
+        "rebuilds": outcome.rebuilds,
+        "started_s": None,
+        "values": outcome.theta.tolist(),
+    }
+    if outcome.theta_started_ns is None or not len(outcome.score_trace):
+        return score
+    if start_s is not None:
+        score["started_s"] = 1e-9 * outcome.theta_started_ns - start_s
+    rows = ScoreRows(outcome, documented)
+    late = rows.after_changes
+    final = rows.tau - rows.torque(outcome.theta, outcome.effects)
+    score["torque_rmse_nm"] = np.sqrt(np.mean(final[late] ** 2, axis=0)).tolist()
+    best = outcome.least_squares
+    bodies = best[: 10 * (n + 1)].reshape(-1, 10)
+    batch = rows.tau - rows.torque(bodies[:n], best[10 * (n + 1) :].reshape(-1, n))
+    noise = np.sqrt(outcome.variance)
+    early = rows.before_change
+    ours = trailing_rms(rows.time_s[early], rows.error[early] / noise, TORQUE_WINDOW_S)
+    theirs = trailing_rms(rows.time_s[early], batch[early] / noise, TORQUE_WINDOW_S)
+    at = settled_at(rows.time_s[early], ours <= TORQUE_GOAL * theirs)
+    if at is not None and start_s is not None:
+        score["converged_s"] = max(at - start_s, 0.0)
+    return score
+
+
+class Course(NamedTuple):
+    """How a run or a replay went.
+
+    Attributes:
+        samples: taken by the front end.
+        refused: counts by reason.
+        first_moving_ns: stamp of the first moving sample, None where nothing moved.
+        delay_s: from a filtered stamp to the sample that completed it.
+        tick_us: percentiles of the tick, by name; None where there was no tick.
+        missed_deadlines: ticks that came too late.
+    """
+
+    samples: int
+    refused: Mapping[str, int]
+    first_moving_ns: int | None
+    delay_s: float
+    tick_us: Mapping[str, float | None] = MappingProxyType({})
+    missed_deadlines: int = 0
+
+
+def figures(
+    outcome: Outcome,
+    documented: SelfModel,
+    reference: Reference,
+    course: Course,
+    **more: Any,
+) -> dict[str, Any]:
+    """The figures of `run` and `replay`; times of convergence count from the first moving sample.
+
+    Filtered stamps lie `delay_s` before the sample that completed them; an estimate is there
+    when its sample is, so the delay is added to every time of convergence.
+    """
+    first_ns = course.first_moving_ns
+    start_s = None if first_ns is None else 1e-9 * first_ns - course.delay_s
+    return {
+        "samples": course.samples,
+        "learned": outcome.learned,
+        "refused": {reason: int(count) for reason, count in course.refused.items() if count},
+        "missed_deadlines": course.missed_deadlines,
+        "tick_us": dict(course.tick_us),
+        "lambda": schema_score(outcome, documented, reference, start_s),
+        "theta": theta_score(outcome, documented, start_s),
+        "disagreements": None if outcome.disagreements is None else list(outcome.disagreements),
+        **more,
+    }

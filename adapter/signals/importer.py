@@ -1,0 +1,515 @@
+"""Tables of joint signals from other tools, turned into a recording.
+
+A specification says which file, column and unit holds which signal; tables are number files as
+other tools write them (CSV, whitespace, one value a line, npz); the recording holds what they say,
+and the report what looks doubtful in it.
+"""
+
+from __future__ import annotations
+
+import csv
+import fnmatch
+import importlib.metadata
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.files.mcap import McapWriter, derive_velocity, looks_like_degrees
+from drivers.interface import Array, DriverError
+
+SIGNALS = ("time", "q", "dq", "tau")
+UNITS: dict[str, dict[str, float]] = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "q": {"rad": 1.0, "deg": np.pi / 180},
+    "dq": {"rad": 1.0, "deg": np.pi / 180},
+    "tau": {"Nm": 1.0, "mNm": 1e-3},
+}
+ALL = ""  # the source of every signal that has none of its own
+_USUAL = {  # what signals are called where the user doesn't say
+    "time": ("time", "times", "t", "stamp", "timestamp"),
+    "q": ("q", "positions", "position", "q[0-9]*", "q_*", "position*"),
+    "dq": ("dq", "velocities", "velocity", "dq[0-9]*", "dq_*", "velocity*"),
+    "tau": ("tau", "torques", "efforts", "effort", "tau[0-9]*", "tau_*", "torque*", "effort*"),
+}
+_STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
+_MOVING = 1e-2  # rad/s, a median slope below it says nothing
+_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
+_INDEX = re.compile(r"\d+")
+_RANGE = re.compile(r"(\d*):(\d*)")
+
+
+@dataclass(frozen=True)
+class ImportSpec:
+    """Where each signal is, and in which unit.
+
+    Attributes:
+        sources: a file for each signal (time, q, dq, tau), "" for those without their own. Text
+            tables or .npz.
+        columns: selectors of each signal in its file (`Table.columns`), or the key
+            in an .npz. Where absent: the usual names, or the whole of a signal's own file.
+        units: time s, ms, us, ns; q rad, deg; dq rad, deg (per second; that of q where absent);
+            tau Nm, mNm.
+        joint_names: in the order of the columns; joint1, joint2, ... where empty.
+        flat: files have one value a line, sample after sample (found out where time is a file).
+        period_s: of the samples, where there is no time.
+        overwrite: replace an existing recording.
+    """
+
+    sources: Mapping[str, Path]
+    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    joint_names: tuple[str, ...] = ()
+    flat: bool = False
+    period_s: float | None = None
+    overwrite: bool = False
+
+    @classmethod
+    def from_options(
+        cls, sources: Sequence[str], columns: str = "", units: str = "", **other: Any
+    ) -> ImportSpec:
+        """From a command line.
+
+        Args:
+            sources: `FILE`, or `SIGNAL=FILE` for each signal.
+            columns: `time=0,q=1:8,dq=8:15,tau=tau1,tau2,...`.
+            units: `q=deg,tau=mNm,time=ms`.
+            other: the other attributes.
+
+        Raises:
+            DriverError: a signal or unit that doesn't exist; names the choices.
+        """
+        files: dict[str, Path] = {}
+        for source in sources:
+            match = re.fullmatch(rf"({'|'.join((*SIGNALS, 't'))})=(.+)", source)
+            files[_signal(match[1]) if match else ALL] = Path(match[2] if match else source)
+        chosen = {signal: words[0] for signal, words in _assignments(units, "unit").items()}
+        return cls(files, _assignments(columns, "column"), chosen, **other)
+
+
+def _signal(name: str) -> str:
+    return "time" if name == "t" else name
+
+
+def _assignments(text: str, what: str) -> dict[str, tuple[str, ...]]:
+    """`a=1,2,b=x` as {a: (1, 2), b: (x,)}."""
+    found: dict[str, list[str]] = {}
+    current: list[str] | None = None
+    for word in filter(None, (w.strip() for w in text.split(","))):
+        name, equals, value = word.partition("=")
+        if equals:
+            if _signal(name) not in SIGNALS:
+                raise DriverError(f"no signal '{name}' for a {what}; have: {', '.join(SIGNALS)}")
+            current = found.setdefault(_signal(name), [])
+            current.append(value)
+        elif current is None:
+            raise DriverError(f"{what} '{word}' belongs to no signal; write SIGNAL={word}")
+        else:
+            current.append(word)
+    return {name: tuple(words) for name, words in found.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns (m, k) of one file and their names, () where the file has no header."""
+
+    path: Path
+    names: tuple[str, ...]
+    values: Array
+
+    def columns(self, selectors: Sequence[str], what: str) -> Array:
+        """The columns that selectors name, in their order.
+
+        A selector is a place (`3`, counted from 0), a half-open range of places (`2:9`, `2:`), a
+        name of the header, or a pattern of names (`q_*`).
+
+        Raises:
+            DriverError: a selector finds no column; `what` says what it was for.
+        """
+        places = [i for selector in selectors for i in self._places(selector, what)]
+        return self.values[:, places]
+
+    def _places(self, selector: str, what: str) -> list[int]:
+        count = self.values.shape[1]
+        if _INDEX.fullmatch(selector):
+            first, last = int(selector), int(selector) + 1
+        elif match := _RANGE.fullmatch(selector):
+            first, last = int(match[1] or 0), int(match[2] or count)
+        else:
+            return self._named(selector, what)
+        if not first < last <= count:
+            raise DriverError(
+                f"{self.path}: column {selector} for {what} isn't there; it has {count} columns, "
+                f"0 to {count - 1}{self._having()}"
+            )
+        return list(range(first, last))
+
+    def _named(self, selector: str, what: str) -> list[int]:
+        places = [i for i, name in enumerate(self.names) if name == selector]
+        places = places or [
+            i for i, name in enumerate(self.names) if fnmatch.fnmatchcase(name, selector)
+        ]
+        if not places:
+            having = self._having() or f"; it has no header, name columns 0 to {len(self) - 1}"
+            raise DriverError(f"{self.path}: no column '{selector}' for {what}{having}")
+        return places
+
+    def __len__(self) -> int:
+        return int(self.values.shape[1])
+
+    def has(self, selector: str) -> bool:
+        """Whether a name or pattern finds a column."""
+        return any(fnmatch.fnmatchcase(name, selector) for name in self.names)
+
+    def _having(self) -> str:
+        return f"; named {', '.join(self.names)}" if self.names else ""
+
+
+def read_table(path: Path) -> Table:
+    """A text table; separator and header are found out, `#` lines are comments.
+
+    The separator is `;` (then with decimal commas, if there are commas), `,` or white space. A
+    first line with anything but numbers is the header; a comment right before the numbers is, if
+    it has as many words as they have columns.
+
+    Raises:
+        DriverError: unreadable or empty, or a line has another number of values or no number;
+            names file, line and column.
+    """
+    lines = _lines(path)
+    comments = [text for _, text in lines if text.startswith("#")]
+    lines = [(number, text) for number, text in lines if not text.startswith("#")]
+    if not lines:
+        raise DriverError(f"{path}: holds no numbers")
+    separator = next((s for s in (";", ",") if s in lines[0][1]), None)
+    names: list[str] = []
+    words = _split(lines[0][1], separator)
+    if not all(map(_is_number, _decimal_points(words, separator))):
+        names, lines = words, lines[1:]
+    elif comments and len(_split(comments[-1].lstrip("# "), separator)) == len(words):
+        names = _split(comments[-1].lstrip("# "), separator)
+    if not lines:
+        raise DriverError(f"{path}: holds a header ({', '.join(names)}) and no numbers")
+    texts = [text for _, text in lines]
+    if separator == ";":
+        texts = [text.replace(",", ".") for text in texts]
+    try:
+        values = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
+    except ValueError as error:
+        raise DriverError(_blame(path, lines, separator, names)) from error
+    if names and len(names) != values.shape[1]:
+        raise DriverError(
+            f"{path}: the header names {len(names)} columns, line {lines[0][0]} has "
+            f"{values.shape[1]} values"
+        )
+    return Table(path, tuple(names), values)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Line numbers from 1 and stripped lines, without empty ones."""
+    try:
+        content = path.read_text("utf-8-sig")
+    except OSError as error:
+        raise DriverError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DriverError(f"{path}: is neither text nor .npz") from error
+    stripped = ((i, line.strip()) for i, line in enumerate(content.splitlines(), 1))
+    return [(i, line) for i, line in stripped if line]
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    return [word.strip() for word in next(csv.reader([line], delimiter=separator))]
+
+
+def _decimal_points(words: list[str], separator: str | None) -> list[str]:
+    return [w.replace(",", ".") for w in words] if separator == ";" else words
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _blame(
+    path: Path, lines: list[tuple[int, str]], separator: str | None, names: list[str]
+) -> str:
+    """The first line that keeps a table from being one."""
+    first, expected = lines[0][0], len(_split(lines[0][1], separator))
+    for number, text in lines:
+        words = _decimal_points(_split(text, separator), separator)
+        for column, word in enumerate(words):
+            if not _is_number(word):
+                named = f" ({names[column]})" if column < len(names) else ""
+                return f"{path}: line {number}, column {column}{named}: '{word}' is not a number"
+        if len(words) != expected:
+            return f"{path}: line {number} has {len(words)} values, line {first} has {expected}"
+    return f"{path}: is not a table of numbers"
+
+
+def read_npz(path: Path) -> dict[str, Array]:
+    """The number arrays of an npz file by key. Raises DriverError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {
+                key: file[key].astype(np.float64) for key in file if file[key].dtype.kind in "fiu"
+            }
+    except (OSError, ValueError, BadZipFile) as error:
+        raise DriverError(f"{path}: cannot be read as .npz: {error}") from error
+
+
+@dataclass(frozen=True)
+class ImportReport:
+    """What was written."""
+
+    out: Path
+    samples: int
+    joint_names: tuple[str, ...]
+    duration_s: float
+    rate_hz: float
+    warnings: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"out": str(self.out)}
+
+
+def import_table(spec: ImportSpec, out: Path) -> ImportReport:
+    """Write a recording from tables; it appears under its name only when it is complete.
+
+    Raises:
+        DriverError: a file, column, signal or unit is missing or unreadable; the sentence names
+            file, line or column, and the choices.
+    """
+    warnings: list[str] = []
+    reader = _Reader(spec)
+    stamp_ns, q, dq, tau = _signals(reader, spec)
+    names = spec.joint_names or tuple(f"joint{i + 1}" for i in range(q.shape[1]))
+    if not spec.joint_names:
+        warnings.append(f"{out}: no joint names given; they are called {names[0]} to {names[-1]}")
+    where = str(reader.source("q"))
+    if dq is None:
+        dq = derive_velocity(stamp_ns, q)
+        warnings.append(f"{where}: no velocities; derived from the positions")
+    else:
+        warnings += _velocity_doubts(where, stamp_ns, q, dq)
+    warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
+    if out.exists() and not spec.overwrite:
+        raise DriverError(f"{out}: exists; choose another name or delete it")
+    _write(spec, out, names, (stamp_ns, q, dq, tau))
+    duration_s = float(np.ptp(stamp_ns)) * 1e-9
+    rate_hz = (len(q) - 1) / duration_s if duration_s > 0 else 0.0
+    return ImportReport(out, len(q), names, duration_s, rate_hz, warnings)
+
+
+def _write(
+    spec: ImportSpec,
+    out: Path,
+    names: tuple[str, ...],
+    signals: tuple[NDArray[np.int64], Array, Array, Array],
+) -> None:
+    try:
+        version = importlib.metadata.version("panda-adapter")
+    except importlib.metadata.PackageNotFoundError:
+        version = "unknown"
+    source = {
+        "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},
+        "columns": spec.columns,
+        "units": spec.units,
+    }
+    part = out.with_name(out.name + ".part")
+    try:
+        metadata = {"version": version, "imported": source}
+        with McapWriter(part, names, metadata=metadata, overwrite=True) as writer:
+            for stamp_ns, q, dq, tau in zip(*signals, strict=True):
+                writer.write_joint_state(int(stamp_ns), q, dq, tau)
+        os.replace(part, out)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class _Reader:
+    """Finds signals in files; each file is read once."""
+
+    def __init__(self, spec: ImportSpec) -> None:
+        asked = (*spec.sources, *spec.columns, *spec.units)
+        unknown = [s for s in asked if s not in SIGNALS and s != ALL]
+        if unknown:
+            raise DriverError(f"no signal '{unknown[0]}'; have: {', '.join(SIGNALS)}")
+        self._spec = spec
+        self._tables: dict[Path, Table] = {}
+        self._arrays: dict[Path, dict[str, Array]] = {}
+
+    def source(self, signal: str) -> Path | None:
+        """The file of a signal."""
+        path = self._spec.sources.get(signal, self._spec.sources.get(ALL))
+        return None if path is None else Path(path)
+
+    def read(self, signal: str) -> Array | None:
+        """(m, k) values in SI units; None where the signal isn't there and wasn't asked for."""
+        path = self.source(signal)
+        factor = self._factor(signal)
+        if path is None:
+            return None
+        values = self._npz(path, signal) if path.suffix == ".npz" else self._text(path, signal)
+        return None if values is None else values * factor
+
+    def need(self, signal: str) -> Array:
+        """Like `read`. Raises DriverError where the signal isn't there."""
+        values = self.read(signal)
+        if values is not None:
+            return values
+        path = self.source(signal)
+        if path is None:
+            have = ", ".join(f"{s}={p}" for s, p in self._spec.sources.items())
+            raise DriverError(f"no file for {signal} (have: {have or 'none'}); add {signal}=FILE")
+        if path in self._arrays:
+            having = f"its arrays: {', '.join(self._arrays[path])}"
+        else:
+            table = self._tables[path]
+            having = f"its columns: {', '.join(table.names) or f'0 to {len(table) - 1}'}"
+        raise DriverError(f"{path}: which column is {signal}? Name it, {signal}=...; {having}")
+
+    def _factor(self, signal: str) -> float:
+        units = self._spec.units
+        usual = units.get("q", "rad") if signal == "dq" else next(iter(UNITS[signal]))
+        unit = units.get(signal, usual)
+        if unit not in UNITS[signal]:
+            raise DriverError(f"no unit '{unit}' for {signal}; have: {', '.join(UNITS[signal])}")
+        return UNITS[signal][unit]
+
+    def _text(self, path: Path, signal: str) -> Array | None:
+        if path not in self._tables:
+            self._tables[path] = read_table(path)
+        table = self._tables[path]
+        if signal in self._spec.columns:
+            return table.columns(self._spec.columns[signal], signal)
+        if signal in self._spec.sources:
+            return table.values
+        return next((table.columns([u], signal) for u in _USUAL[signal] if table.has(u)), None)
+
+    def _npz(self, path: Path, signal: str) -> Array | None:
+        if path not in self._arrays:
+            self._arrays[path] = read_npz(path)
+        arrays = self._arrays[path]
+        keys = self._spec.columns.get(signal)
+        if keys is None:
+            keys = tuple(u for u in _USUAL[signal] if u in arrays)[:1]
+        elif len(keys) != 1 or keys[0] not in arrays:
+            raise DriverError(
+                f"{path}: no array '{','.join(keys)}' for {signal}; have: {', '.join(arrays)}"
+            )
+        if not keys:
+            return None
+        values = arrays[keys[0]]
+        if values.ndim > 2:
+            raise DriverError(f"{path}: {keys[0]} has {values.ndim} dimensions, need 1 or 2")
+        return values.reshape(len(values), -1)
+
+
+def _signals(
+    reader: _Reader, spec: ImportSpec
+) -> tuple[NDArray[np.int64], Array, Array | None, Array]:
+    """Stamps (m,) and q, dq, tau (m, n), checked against one another."""
+    times = reader.read("time")
+    if times is None and spec.period_s is None:
+        reader.need("time")
+    q, dq, tau = reader.need("q"), reader.read("dq"), reader.need("tau")
+    if times is not None and times.shape[1] != 1:
+        raise DriverError(f"{reader.source('time')}: time has {times.shape[1]} columns, need 1")
+    samples = _sample_count(reader, spec, times, q)
+    q, tau = _shape(reader, "q", q, samples), _shape(reader, "tau", tau, samples)
+    dq = None if dq is None else _shape(reader, "dq", dq, samples)
+    count = len(spec.joint_names) or q.shape[1]
+    for signal, values in (("q", q), ("dq", dq), ("tau", tau)):
+        if values is not None and values.shape[1] != count:
+            raise DriverError(
+                f"{reader.source(signal)}: {signal} has {values.shape[1]} columns for {count} "
+                f"joints ({', '.join(spec.joint_names) or 'as many as q has columns'})"
+            )
+    seconds = np.arange(samples) * (spec.period_s or 0.0) if times is None else times[:, 0]
+    bad = np.flatnonzero(~np.isfinite(seconds))
+    if bad.size:
+        raise DriverError(f"{reader.source('time')}: the time of sample {bad[0]} is not a number")
+    return np.round(seconds * 1e9).astype(np.int64), q, dq, tau
+
+
+def _sample_count(reader: _Reader, spec: ImportSpec, times: Array | None, q: Array) -> int:
+    if times is not None:
+        return len(times)
+    if not spec.flat:
+        return len(q)
+    if not spec.joint_names:
+        raise DriverError(
+            f"{reader.source('q')}: how many values make a sample? Name the joints, or a time file"
+        )
+    return q.size // len(spec.joint_names)
+
+
+def _shape(reader: _Reader, signal: str, values: Array, samples: int) -> Array:
+    """(samples, n); a single column of n values a sample is cut into rows."""
+    if len(values) == samples:
+        return values
+    if values.shape[1] == 1 and samples and values.size % samples == 0:
+        return values.reshape(samples, -1)
+    raise DriverError(
+        f"{reader.source(signal)}: {signal} has {len(values)} lines of {values.shape[1]} values "
+        f"for {samples} samples; need as many lines, or one value a line and a whole number a "
+        "sample"
+    )
+
+
+def _doubts(
+    spec: ImportSpec, where: str, stamp_ns: NDArray[np.int64], signals: dict[str, Array]
+) -> list[str]:
+    """Sentences on what looks wrong but can be recorded."""
+    found = []
+    steps = np.diff(stamp_ns)
+    if np.any(steps < 0):
+        first = int(np.flatnonzero(steps < 0)[0]) + 1
+        found.append(
+            f"{where}: time runs backwards {int((steps < 0).sum())} times, first at sample {first}"
+        )
+    step_s = float(np.median(steps)) * 1e-9 if steps.size else _STEP_S[0]
+    if not _STEP_S[0] <= step_s <= _STEP_S[1]:
+        unit = spec.units.get("time", "s")
+        found.append(
+            f"{where}: samples are {step_s:.3g} s apart; is the time in {unit}? "
+            f"(units: {', '.join(UNITS['time'])})"
+        )
+    for name, values in signals.items():
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            found.append(
+                f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
+            )
+    if looks_like_degrees(signals["q"]):
+        found.append(
+            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they "
+            "degrees? Say q=deg"
+        )
+    return found
+
+
+def _velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array) -> list[str]:
+    """Whether the velocities are the positions' slope in the same unit."""
+    with np.errstate(invalid="ignore"):
+        slope = np.nanmedian(np.abs(derive_velocity(stamp_ns, q)))
+        said = np.nanmedian(np.abs(dq))
+    ratio = said / slope if slope > _MOVING and said > 0 else 1.0
+    if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
+        return []
+    return [
+        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
+        "of q, dq and time right?"
+    ]

@@ -1,0 +1,54 @@
+"""A recording's joints and links held against those of a robot."""
+
+from __future__ import annotations
+
+from adapter.model.self_model import SelfModel
+from drivers.files.mcap import Log
+from drivers.interface import DriverError
+
+
+def matching(log: Log, documented: SelfModel) -> Log:
+    """The recording with the robot's joints in the robot's order, and its links' motion.
+
+    Names that differ in nothing but what stands before their number (fer_joint3 for
+    panda_joint3) are taken to mean the same joint, with a warning.
+
+    Raises:
+        DriverError: a joint of the robot is not in the recording; names both lists.
+    """
+    tree = documented.tree
+    joints, warnings = _corresponding(tree.joint_names, log.joint_names, "joint")
+    missing = [name for name, found in zip(tree.joint_names, joints, strict=True) if found is None]
+    if missing:
+        raise DriverError(
+            f"{log.path}: has no joint {', '.join(missing)}; it has {', '.join(log.joint_names)}; "
+            f"{documented.name} has {', '.join(tree.joint_names)}"
+        )
+    links, more = _corresponding(tree.link_names, log.link_names, "link")
+    heard = all(links) and log.twists is not None and log.accels is not None
+    if log.link_names and not heard:
+        more.append(
+            f"{log.path}: motion of not all links was recorded (twists and accelerations of "
+            f"{', '.join(tree.link_names)}); link motion is synthesized instead"
+        )
+    log = log.select([name for name in joints if name], [name for name in links if name and heard])
+    log.warnings.extend(warnings + more)
+    return log
+
+
+def _corresponding(
+    want: tuple[str, ...], have: tuple[str, ...], what: str
+) -> tuple[list[str | None], list[str]]:
+    """For each wanted name the one in `have` (None: not there), and warnings."""
+    if all(name in have for name in want) or len(have) != len(want):
+        return [name if name in have else None for name in want], []
+    number = {_number(name): name for name in have}
+    found = [number.get(_number(name)) for name in want]
+    if len(number) < len(have) or None in found or "" in number:
+        return [name if name in have else None for name in want], []
+    pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
+    return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
+
+
+def _number(name: str) -> str:
+    return name[len(name.rstrip("0123456789")) :]

@@ -1,0 +1,235 @@
+"""The driver's end of the reader process: starts it, takes its records, starts it again."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import select
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from typing import NamedTuple
+
+from drivers.fci import reader
+from drivers.fci.reader import HEAD, READY, RECORD, SLOTS, TAIL, WORD
+from drivers.interface import DriverError
+
+# A reader that wakes up asks for the interpreter lock and waits this long before the running
+# thread is told to give it up. Python's default of 5 ms is five ticks of the robot.
+SWITCH_INTERVAL_S = 50e-6
+
+
+class QuickSwitching:
+    """Shortens the interpreter's switch interval while anybody needs it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._users, self._before_s = 0, 0.0
+
+    def begin(self) -> None:
+        """One more user."""
+        with self._lock:
+            if self._users == 0:
+                self._before_s = sys.getswitchinterval()
+                sys.setswitchinterval(min(self._before_s, SWITCH_INTERVAL_S))
+            self._users += 1
+
+    def end(self) -> None:
+        """One user less; the last one gives the old interval back."""
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                sys.setswitchinterval(self._before_s)
+
+
+QUICK_SWITCHING = QuickSwitching()
+
+
+RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
+_SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
+START_LIMIT_S = 10.0  # a reader needs about 0.05 s
+RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
+
+
+class Record(NamedTuple):
+    """A datagram as the reader passed it on.
+
+    Attributes:
+        start: of the datagram in `ReaderClient.data`; there until the next record is taken.
+        length: of the datagram, bytes; more than a state for anything longer.
+        port, address: of the sender, the latter in 4 bytes.
+        kernel_drops: by the kernel since the socket was opened, at this datagram.
+        dropped: by the reader since its last record, because the ring was full.
+        arrived_ns: CLOCK_MONOTONIC.
+    """
+
+    start: int
+    port: int
+    address: bytes
+    length: int
+    kernel_drops: int
+    dropped: int
+    arrived_ns: int
+
+
+def open_udp(host: str) -> socket.socket:
+    """A socket for states at a free port of this address, with a large receive buffer."""
+    udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        udp.bind((host, 0))
+        try:
+            udp.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
+        except PermissionError:
+            udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        reader.prepare(udp)
+    except OSError as error:
+        udp.close()
+        raise DriverError(f"no UDP socket for the robot's states at {host}: {error}") from error
+    return udp
+
+
+class ReaderClient:
+    """Records of a reader process, which is started again when it dies.
+
+    Args:
+        udp: from `open_udp`; stays the caller's.
+        state_size: bytes of a state.
+
+    Attributes:
+        data: memory that the records lie in.
+        restarts: readers that had to be replaced.
+    """
+
+    def __init__(self, udp: socket.socket, state_size: int) -> None:
+        self._udp, self._state_size = udp, state_size
+        self._step = reader.slot_size(state_size)
+        size = reader.ring_size(state_size)
+        self._memory = os.memfd_create("fci-states")
+        os.ftruncate(self._memory, size)
+        self._map = mmap.mmap(self._memory, size)
+        self.data = memoryview(self._map)
+        self._event = os.eventfd(0, os.EFD_CLOEXEC)
+        self._poll = select.epoll()
+        # Edge-triggered: each write of the reader wakes us once, and nothing has to be read.
+        self._poll.register(self._event, select.EPOLLIN | select.EPOLLET)
+        self._alive = -1  # a pipe without data; hangs up when the reader dies
+        self._process: subprocess.Popen[bytes] | None = None
+        self._deaths: deque[float] = deque(maxlen=RESTARTS)
+        self._cores = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+        self._taken = self._head = 0
+        self._closed = False
+        self.restarts = 0
+
+    @property
+    def pid(self) -> int:
+        """Process id of the reader."""
+        assert self._process is not None
+        return self._process.pid
+
+    def start(self) -> None:
+        """Start the reader and wait until it listens. Raises DriverError."""
+        self._spawn()
+        deadline = time.monotonic() + START_LIMIT_S
+        while not WORD.unpack_from(self._map, READY)[0]:
+            if self._wait(deadline - time.monotonic()) is not True:
+                raise DriverError("the process that reads the robot's states does not start")
+
+    def next(self, wait_s: float) -> Record | None:
+        """The next datagram; None where none came within this time. Raises DriverError."""
+        WORD.pack_into(self._map, TAIL, self._taken)  # the last one may be written over
+        if self._taken == self._head and not self._more(wait_s):
+            return None
+        start = reader.FIRST_SLOT + self._taken % SLOTS * self._step
+        self._taken += 1
+        return Record(start + RECORD.size, *RECORD.unpack_from(self._map, start))
+
+    def newest(self) -> int | None:
+        """Start of the newest datagram that waits in `data`, of right length; None without."""
+        self._head = WORD.unpack_from(self._map, HEAD)[0]
+        if self._head == self._taken:
+            return None
+        start = reader.FIRST_SLOT + (self._head - 1) % SLOTS * self._step
+        length = RECORD.unpack_from(self._map, start)[2]
+        return start + RECORD.size if length == self._state_size else None
+
+    def close(self) -> None:
+        """End the reader and free everything; may be called more than once."""
+        if self._closed:
+            return
+        self._closed = True
+        self._end_reader()
+        self._poll.close()
+        self.data.release()
+        self._map.close()
+        os.close(self._event)
+        os.close(self._memory)
+
+    def _more(self, wait_s: float) -> bool:
+        """Wait until the head is ahead of us; False where the time is over."""
+        deadline = 0.0
+        while True:
+            self._head = WORD.unpack_from(self._map, HEAD)[0]
+            if self._head != self._taken:
+                return True
+            now = time.monotonic()
+            deadline = deadline or now + wait_s
+            if deadline <= now:
+                return False
+            woken = self._wait(deadline - now)
+            if woken is None:
+                woken = not self._stuck()
+            if not woken:
+                self._restart()
+                deadline = 0.0  # the new one needs its time
+
+    def _wait(self, wait_s: float) -> bool | None:
+        """True when the reader woke us, False when it is gone, None after the time."""
+        events = self._poll.poll(max(0.0, wait_s), 2)
+        if not events:
+            return None
+        return all(descriptor == self._event for descriptor, _ in events)
+
+    def _spawn(self) -> None:
+        self._alive, theirs = os.pipe2(os.O_CLOEXEC)
+        descriptors = (self._udp.fileno(), self._event, theirs, self._memory)
+        arguments = [*descriptors, self._state_size, os.getpid()]
+        command = [sys.executable, "-I", "-S", reader.__file__, *map(str, arguments), self._cores]
+        try:
+            # A session of its own: a terminal's Ctrl-C must not take the eyes of a safe stop.
+            self._process = subprocess.Popen(
+                command, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+            )
+        except OSError as error:
+            raise DriverError(f"cannot start the reader of the robot's states: {error}") from error
+        finally:
+            os.close(theirs)
+        self._poll.register(self._alive, 0)  # hanging up is always told
+
+    def _end_reader(self) -> None:
+        if self._alive >= 0:
+            os.close(self._alive)
+            self._alive = -1
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def _restart(self) -> None:
+        """A new reader on the same socket, which kept the datagrams meanwhile."""
+        now = time.monotonic()
+        if len(self._deaths) == RESTARTS and now - self._deaths[0] < RESTARTS_WITHIN_S:
+            raise DriverError(
+                f"the process that reads the robot's states died {RESTARTS} times within "
+                f"{RESTARTS_WITHIN_S:.0f} s: look at this computer's log for what kills it"
+            )
+        self._deaths.append(now)
+        self._end_reader()
+        self._spawn()
+        self.restarts += 1
+
+    def _stuck(self) -> bool:
+        """Datagrams wait in the socket and the reader does not take them."""
+        return bool(select.select([self._udp], [], [], 0)[0])

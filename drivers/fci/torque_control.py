@@ -1,0 +1,267 @@
+"""One torque-controlled motion after the other: started, fed, watched and ended.
+
+The robot answers Move twice: when the motion starts and when it has ended. In between it sends
+its modes with every state and takes one command for each.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from drivers.fci import codec, tables
+from drivers.fci.codec import CommandEncoder, State, Status, WireError
+from drivers.fci.connect import Channel
+from drivers.fci.limits import TORQUE_STEP, TorqueLimiter
+from drivers.fci.reader import SLOTS
+from drivers.fci.tables import raised, told
+from drivers.interface import Array, DriverError
+
+START_LIMIT_S = 2.0  # from Move to the running modes
+END_LIMIT_S = 0.1  # for the second answer once the modes are left; TCP may hold it back 40 ms
+LOOK_EVERY = 100  # states between two looks at the TCP channel
+ENDED_AFTER = 2  # states in a row that say so; a single one may be a damaged datagram
+BRAKE_S, EASE_S, FINISH_S, STOP_MOVE_S = 0.3, 0.2, 0.3, 0.5
+QUIET_S = 0.1  # without a state for so long, a motion is stopped over TCP
+# N m s/rad, damping of a Panda's joints that an ordinary 1 kHz loop keeps stable.
+BRAKE_DAMPING = np.array([15.0, 25.0, 8.0, 15.0, 1.2, 1.6, 0.3])
+AT_REST = 0.02  # rad/s
+
+Send = Callable[[bytearray], None]
+NextState = Callable[[float], State | None]  # waits at most so many seconds
+
+_IDLE, _STARTING, _RUNNING = "idle", "starting", "running"
+
+
+class TorqueControl:
+    """Torque control over one connection.
+
+    Args:
+        version: of the protocol.
+        channel: connected.
+        send: sends a datagram to the robot.
+
+    Attributes:
+        fault: why the last motion ended by itself; None where it did not. Kept until `stop`.
+        sent: commands sent.
+        guard: the limits on what is sent.
+    """
+
+    def __init__(self, version: int, channel: Channel, send: Send) -> None:
+        self._version, self._channel, self._send = version, channel, send
+        self._encoder, self.limiter = CommandEncoder(version), TorqueLimiter()
+        self._phase, self._move_id, self._deadline = _IDLE, -1, 0.0
+        self._accepted, self._ticks, self._answered = False, 0, -SLOTS
+        self._status: Status | None = None
+        self._odd = self._odd_tick = 0  # states in a row that say the motion is over; the last
+        self.fault: str | None = None
+        self.sent = 0
+
+    @property
+    def active(self) -> bool:
+        """A motion was asked for and has not ended."""
+        return self._phase != _IDLE
+
+    def command(self, tau: Array, state: State, message_id: int, accepted: Array) -> None:
+        """Drive with (7,) N m; the first command starts the motion and is kept back itself.
+
+        Args:
+            tau: wanted, checked.
+            state: read last.
+            message_id: of the state to answer, which may be a later one.
+            accepted: (7,) what the robot had accepted there, N m.
+
+        Raises:
+            DriverError: the motion has ended or cannot be asked for.
+        """
+        if self.fault is not None:
+            raise DriverError(self.fault)
+        if self._phase == _IDLE:
+            self._begin(state.status.robot_mode)
+        elif self._phase == _RUNNING:
+            self._drive(tau.tolist(), accepted, message_id)
+
+    def _begin(self, robot_mode: int) -> None:
+        if robot_mode != tables.ROBOT_IDLE:
+            raise DriverError(f"no motion: the robot {tables.ROBOT_MODE_MEANING[robot_mode]}")
+        payload = codec.move_payload(self._version)
+        self._move_id = self._channel.send(tables.MOVE[self._version], payload)
+        self._phase, self._accepted = _STARTING, False
+        self._deadline = time.monotonic() + START_LIMIT_S
+        self.limiter.reset()
+        self._answered = -SLOTS
+
+    def _drive(
+        self, tau: list[float], accepted: Array, message_id: int, finished: bool = False
+    ) -> None:
+        """Answer a state, each one once: two steps must not fall into one tick of the robot."""
+        if 0 <= self._answered - message_id < SLOTS:
+            return
+        self._answered = message_id
+        allowed = tau if finished else self.limiter.limit(tau, accepted.tolist())
+        if allowed is not None:
+            self._send(self._encoder.encode(message_id, allowed, finished))
+            self.sent += 1
+
+    def look(self, state: State) -> None:
+        """See what a state means for the motion; trouble goes to `fault`."""
+        self._ticks += 1
+        try:
+            if self._phase == _STARTING:
+                self._look_at_start(state)
+            elif self._phase == _RUNNING:
+                if state.status is not self._status:
+                    self._look_at_change(state)
+                elif self._ticks % LOOK_EVERY == 0:
+                    self._channel.poll()
+                    if self._channel.closed:
+                        self._fail("the robot cut the connection; it brakes by itself: see Desk")
+        except WireError as error:
+            self._fail(f"the robot answers on TCP with {error}: connect again")
+
+    def _look_at_change(self, state: State) -> None:
+        """A status that is not that of the running motion, or another that is."""
+        if self._runs(state.status):
+            self._status, self._odd = state.status, 0
+            return
+        self._odd = self._odd + 1 if self._ticks == self._odd_tick + 1 else 1
+        self._odd_tick = self._ticks
+        if self._odd >= ENDED_AFTER:
+            self._ended(state)
+
+    def _runs(self, status: Status) -> bool:
+        return (
+            status.robot_mode == tables.ROBOT_MOVE
+            and status.controller == tables.CONTROLLER_TORQUE
+            and status.generator == tables.RUNNING_GENERATOR[self._version]
+        )
+
+    def _look_at_start(self, state: State) -> None:
+        self._channel.poll()
+        reply = self._channel.take(self._move_id)
+        if reply is not None:
+            name = self._move_status(reply)
+            if name != "motion_started" or self._accepted:
+                self._fail(f"the robot refused the motion: {tables.meaning(name)}")
+                return
+            self._accepted = True
+        if self._channel.closed:
+            self._fail("the robot cut the connection before the motion began: see Desk")
+        elif self._accepted and self._runs(state.status):
+            self._phase, self._status = _RUNNING, state.status
+        elif self._accepted and state.status.robot_mode >= tables.ROBOT_REFLEX:
+            self._ended(state)
+        elif time.monotonic() > self._deadline:
+            self._fail(
+                f"the robot did not begin to move within {START_LIMIT_S:.0f} s: look at Desk, "
+                "connect again"
+            )
+
+    def _move_status(self, payload: bytes) -> str:
+        return tables.status_name(tables.MOVE_STATUS[self._version], codec.status_reply(payload))
+
+    def _ended(self, state: State) -> None:
+        """The robot left the motion by itself: say why."""
+        reply = self._channel.wait(self._move_id, END_LIMIT_S)
+        name = "" if reply is None else self._move_status(reply)
+        status = state.status
+        if status.robot_mode == tables.ROBOT_REFLEX or name == "reflex":
+            flags = status.reflex_reason if any(status.reflex_reason) else status.errors
+            share = f"{100.0 * state.success_rate:.0f} % of the last commands had arrived"
+            self._fail(f"a reflex stopped the arm: {told(flags)}; {share}; recover with ?recover=1")
+        elif status.robot_mode == tables.ROBOT_USER_STOP or name == "user_stop":
+            self._fail(f"the arm was stopped: {tables.meaning('user_stop')}")
+        else:
+            why = tables.meaning(name) if name else "it does not say why: look at Desk"
+            self._fail(f"the robot ended the motion: {why}{_named(status)}")
+
+    def _fail(self, sentence: str) -> None:
+        self.fault, self._phase = sentence, _IDLE
+
+    def stop(self, next_state: NextState) -> None:
+        """Brake the arm, let its torque go and end the motion; takes a second at most.
+
+        Braking is damping against the measured velocity: the robot carries its weight itself.
+        Without states, or if that fails, the motion is ended over TCP.
+
+        Raises:
+            DriverError: the robot stopped by a fault of its own meanwhile, or does not say that
+                it stopped.
+        """
+        self.fault = None
+        if self._phase == _RUNNING:
+            self._brake(next_state)
+        if self._phase == _RUNNING:
+            self._finish(next_state)
+        if self._phase != _IDLE:
+            self._stop_move(next_state)
+        self._phase = _IDLE
+        if self.fault is not None:
+            fault, self.fault = self.fault, None
+            raise DriverError(f"while stopping: {fault}")
+
+    def _brake(self, next_state: NextState) -> None:
+        """Damp until the arm rests, then lower the torque step by step."""
+        begin = time.monotonic()
+        while time.monotonic() - begin < BRAKE_S + EASE_S:
+            state = next_state(QUIET_S)
+            if state is None:
+                return
+            self.look(state)
+            if self._phase != _RUNNING:
+                return
+            moving = np.isfinite(state.dq).all() and np.abs(state.dq).max() > AT_REST
+            brakes = moving and time.monotonic() - begin < BRAKE_S
+            tau = -BRAKE_DAMPING * state.dq if brakes else np.zeros_like(state.dq)
+            self._drive(tau.tolist(), state.tau_J_d, state.message_id)
+            if not brakes and max(map(abs, self.limiter.last)) < TORQUE_STEP:
+                return
+
+    def _finish(self, next_state: NextState) -> None:
+        """Repeat the last command with the finish flag until the robot has left the motion."""
+        deadline = time.monotonic() + FINISH_S
+        while time.monotonic() < deadline:
+            state = next_state(QUIET_S)
+            if state is None:
+                return
+            if not self._runs(state.status):
+                if state.status.robot_mode in (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP):
+                    self._ended(state)
+                else:
+                    self._channel.wait(self._move_id, END_LIMIT_S)
+                    self._phase = _IDLE
+                return
+            self._drive(self.limiter.last, state.tau_J_d, state.message_id, finished=True)
+
+    def _stop_move(self, next_state: NextState) -> None:
+        """End the motion by request; what cannot be confirmed becomes a fault."""
+        unsure = (
+            "the robot does not say that it stopped: press its user stop; without commands it "
+            "stops by itself after 20 ms"
+        )
+        try:
+            stop_id = self._channel.send(tables.STOP_MOVE[self._version])
+            reply = self._channel.wait(stop_id, STOP_MOVE_S)
+            if reply is None:
+                raise DriverError("it does not answer StopMove")
+            number = codec.status_reply(reply)
+        except DriverError as error:
+            self.fault = f"{unsure} ({error})"
+            return
+        name = tables.status_name(tables.STOP_STATUS[self._version], number)
+        state, deadline = next_state(QUIET_S), time.monotonic() + STOP_MOVE_S
+        while state is not None and state.status.robot_mode == tables.ROBOT_MOVE:
+            if time.monotonic() > deadline:
+                self.fault = f"{unsure} (StopMove: {tables.meaning(name)})"
+                return
+            state = next_state(QUIET_S)
+        if state is None and name != "success":
+            self.fault = f"{unsure} (StopMove: {tables.meaning(name)})"
+
+
+def _named(status: Status) -> str:
+    """The errors of a state as the end of a sentence; nothing where there are none."""
+    flags = status.errors if raised(status.errors) else status.reflex_reason
+    return f"; {told(flags)}" if any(flags) else ""

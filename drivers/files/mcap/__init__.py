@@ -1,0 +1,28 @@
+"""Recordings: MCAP files of profile ros2, written and read.
+
+`/joint_states` (sensor_msgs/msg/JointState), `/link_twists/<link>` and `/link_accels/<link>`
+(geometry_msgs/msg/TwistStamped and AccelStamped, frame_id the link), `/joint_commands` (JointState
+with effort only), `/estimates` (JSON), a metadata record with configuration and version. Read only,
+and only for discovery: sensor_msgs/msg/Imu on any topic.
+"""
+
+from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
+from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
+from drivers.files.mcap.recover import Recovery, recover
+from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
+
+__all__ = [
+    "FLUSH_S",
+    "Commands",
+    "Log",
+    "McapWriter",
+    "Recovery",
+    "Topic",
+    "derive_velocity",
+    "looks_like_degrees",
+    "read_estimates",
+    "read_log",
+    "recover",
+    "survey",
+    "to_json",
+]

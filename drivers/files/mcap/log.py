@@ -1,0 +1,273 @@
+"""Recordings as arrays: our own and those of others."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.files.mcap.imus import with_imus
+from drivers.files.mcap.joints import Commands, Joints, assemble_joints, read_commands
+from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
+from drivers.files.mcap.records import McapScan
+from drivers.files.mcap.series import Series, collect
+from drivers.files.mcap.writer import (
+    ESTIMATES,
+    JOINT_COMMANDS,
+    JOINT_STATES,
+    LINK_ACCELS,
+    LINK_TWISTS,
+    METADATA,
+)
+from drivers.files.ros import IMU, JOINT_STATE
+from drivers.interface import Array, DriverError
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """What a file says of a topic."""
+
+    schema: str
+    encoding: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class Log:
+    """A recording in memory.
+
+    Attributes:
+        path: where it came from.
+        joint_names: order of the columns.
+        stamp_ns: (m,) header stamps as recorded, not sorted.
+        q, dq, tau: (m, n) rad, rad/s, N m; read for discovery, dq and tau may be all not a number.
+        link_names: order of the links; of our own recordings link i is moved by joint i.
+        twists, accels: (m, links, 6) measured link motion, not a number where a stamp has none;
+            None where the file has none at all.
+        commands: commanded torques.
+        metadata: our own entries (configuration, version, ...) decoded, those of other tools under
+            their record's name.
+        attachments: files inside the recording.
+        topics: all topics of the file.
+        truncated: the file has no proper end.
+        warnings: what was repaired, left out or looks wrong, one sentence each.
+    """
+
+    path: Path
+    joint_names: tuple[str, ...]
+    stamp_ns: NDArray[np.int64]
+    q: Array
+    dq: Array
+    tau: Array
+    link_names: tuple[str, ...] = ()
+    twists: Array | None = None
+    accels: Array | None = None
+    commands: Commands | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    topics: dict[str, Topic] = field(default_factory=dict)
+    truncated: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def __repr__(self) -> str:
+        span_s = 1e-9 * float(np.ptp(self.stamp_ns)) if len(self) else 0.0
+        count = f"{len(self)} samples of {len(self.joint_names)} joints"
+        return f"Log({self.path.name}: {count}, {span_s:.1f} s)"
+
+    def select(self, joint_names: Sequence[str], link_names: Sequence[str] | None = None) -> Log:
+        """The same recording with these joints (and links) in this order.
+
+        Links follow their joints where `link_names` is None and the recording pairs them. Joints
+        that are left out are named in a warning. Raises DriverError for a joint or link that the
+        recording doesn't have.
+        """
+        columns = _places(self.joint_names, joint_names, f"{self.path}: has no joint")
+        extra = [name for name in self.joint_names if name not in joint_names]
+        warnings = list(self.warnings)
+        if extra:
+            warnings.append(f"{self.path}: joints not asked for are ignored: {', '.join(extra)}")
+        log = replace(
+            self,
+            joint_names=tuple(joint_names),
+            q=_columns(self.q, columns),
+            dq=_columns(self.dq, columns),
+            tau=_columns(self.tau, columns),
+            warnings=warnings,
+        )
+        if self.commands is not None:
+            commands = Commands(self.commands.stamp_ns, _columns(self.commands.tau, columns))
+            log = replace(log, commands=commands)
+        if link_names is None:
+            link_names = self._links_moved_by(joint_names)
+        return log if link_names is None else log._select_links(link_names)
+
+    def _links_moved_by(self, joint_names: Sequence[str]) -> list[str] | None:
+        """The links that these joints move, where the recording says so and has them all."""
+        joints, links = self.metadata.get("joint_names"), self.metadata.get("link_names")
+        if not (isinstance(joints, list) and isinstance(links, list) and len(joints) == len(links)):
+            return None
+        pairs = dict(zip(joints, links, strict=True))
+        moved = [pairs.get(name) for name in joint_names]
+        return [n for n in moved if n] if all(n in self.link_names for n in moved) else None
+
+    def _select_links(self, link_names: Sequence[str]) -> Log:
+        if not self.link_names:
+            return self
+        rows = _places(self.link_names, link_names, f"{self.path}: has no motion of link")
+        return replace(
+            self,
+            link_names=tuple(link_names),
+            twists=None if self.twists is None else _columns(self.twists, rows),
+            accels=None if self.accels is None else _columns(self.accels, rows),
+        )
+
+
+def _columns(values: Array, columns: list[int]) -> Array:
+    # In C order whatever was chosen: the order in memory can change the last bit of a product.
+    return np.ascontiguousarray(values[:, columns])
+
+
+def _places(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[int]:
+    missing = [name for name in want if name not in have]
+    if missing:
+        raise DriverError(f"{trouble} {', '.join(missing)}; have: {', '.join(have)}")
+    return [have.index(name) for name in want]
+
+
+def read_log(
+    path: str | Path,
+    joint_names: Sequence[str] | None = None,
+    topic: str = JOINT_STATES,
+    *,
+    sensors: bool = False,
+) -> Log:
+    """Read a recording, cut or whole, by whatever recorder.
+
+    Args:
+        path: an MCAP file; chunked or not; uncompressed, zstd or lz4.
+        joint_names: joints that must be there, in the order wanted; all joints where None.
+        topic: of the joint states.
+        sensors: read what sensors on links recorded beside the joints, for discovery: also
+            Imu topics and link motion with stamps of its own, carried to the joint samples'
+            stamps; efforts and velocities may be absent.
+
+    Raises:
+        DriverError: the file is unreadable or empty, or has no joint states with positions and
+            efforts; the sentence says what the file does have.
+    """
+    scan = McapScan(Path(path))
+    topics = collect(scan, lambda series: _wanted(series, topic, sensors))
+    series = topics.get(topic)
+    if series is None or not series.count:
+        raise DriverError(_nothing_found(scan, topics, topic))
+    with np.errstate(invalid="ignore"):  # not-a-number is counted, not computed with
+        joints = assemble_joints(series, scan.path, joint_names, effort=not sensors)
+    warnings = scan.warnings + joints.warnings
+    metadata = _metadata(scan)
+    links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
+    commands = None
+    if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
+        commands = read_commands(topics[JOINT_COMMANDS], scan.path, joints.names, warnings)
+    log = Log(
+        path=scan.path,
+        joint_names=joints.names,
+        stamp_ns=joints.stamp_ns,
+        q=joints.q,
+        dq=joints.dq,
+        tau=joints.tau,
+        link_names=links.names,
+        twists=links.twists,
+        accels=links.accels,
+        commands=commands,
+        metadata=metadata,
+        attachments={a.name: bytes(a.data) for a in scan.attachments},
+        topics=_summary(topics),
+        truncated=scan.truncated,
+        warnings=warnings,
+    )
+    return log if joint_names is None else log.select(joint_names)
+
+
+def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
+    """Topics, warnings and whether the file is cut, of any MCAP file. Raises DriverError."""
+    scan = McapScan(Path(path))
+    return _summary(collect(scan, lambda series: False)), scan.warnings, scan.truncated
+
+
+def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[str, Any]]:
+    """The JSON messages of a topic, in the order of the file. Raises DriverError."""
+    scan = McapScan(Path(path))
+    for region in scan.regions():
+        channels = region.channel.tolist()
+        wanted = {c.id for c in scan.channels.values() if c.topic == topic}
+        for i in (i for i, number in enumerate(channels) if number in wanted):
+            yield json.loads(region.data[region.start[i] : region.stop[i]].tobytes())
+
+
+def _wanted(series: Series, topic: str, sensors: bool) -> bool:
+    """Whether the messages of a topic are decoded."""
+    if series.topic in (topic, JOINT_COMMANDS):
+        return True
+    if series.schema == IMU:
+        return sensors
+    return series.topic.startswith((LINK_TWISTS, LINK_ACCELS))
+
+
+def _links(
+    topics: Mapping[str, Series],
+    joints: Joints,
+    order: Any,
+    path: Path,
+    warnings: list[str],
+    sensors: bool,
+) -> Links:
+    names = order if isinstance(order, list) else []
+    if not sensors:
+        return assemble_links(topics, names, Onto(joints.stamp_ns, path, warnings))
+    carrier = Carrier(joints.stamp_ns, path, warnings)
+    others = {name: series for name, series in topics.items() if series.schema != IMU}
+    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are found by their size
+        links = assemble_links(others, names, Onto(joints.stamp_ns, path, warnings, carrier))
+        links = with_imus(links, topics, carrier, path, warnings)
+    carrier.tell()
+    return links
+
+
+def _summary(topics: Mapping[str, Series]) -> dict[str, Topic]:
+    return {k: Topic(s.schema, s.encoding, s.count) for k, s in sorted(topics.items())}
+
+
+def _nothing_found(scan: McapScan, topics: Mapping[str, Series], topic: str) -> str:
+    others = [name for name, s in topics.items() if s.schema == JOINT_STATE and name != topic]
+    found = [f"{name} ({s.count} {s.schema or s.encoding})" for name, s in sorted(topics.items())]
+    hint = f"; other topics of joint states: {', '.join(others)}" if others else ""
+    cut = " up to the cut" if scan.truncated else ""
+    return (
+        f"{scan.path}: has no message on {topic}{cut}; found: {', '.join(found) or 'no topic'}"
+        f"{hint}"
+    )
+
+
+def _metadata(scan: McapScan) -> dict[str, Any]:
+    entries: dict[str, Any] = {}
+    for record in scan.metadata:
+        if record.name == METADATA:
+            entries.update({key: _decoded(value) for key, value in record.metadata.items()})
+        else:
+            entries[record.name] = dict(record.metadata)
+    return entries
+
+
+def _decoded(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text

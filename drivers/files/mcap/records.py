@@ -1,0 +1,362 @@
+"""The records of an MCAP file, read front to back, so that a cut or damaged file gives all it has.
+
+Chunks are decompressed, whole or cut, and walked over; messages come as a `Region`: arrays of
+places in the bytes of a chunk, or of the file itself where it is not chunked, so that numpy can
+take all messages of a topic at once. The index at the end of a file is not needed; where it is
+sound it helps past damage. Source: MCAP specification, "Records".
+"""
+
+from __future__ import annotations
+
+import bisect
+import importlib
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from numpy.typing import NDArray
+
+from drivers.interface import DriverError
+
+_COMPRESSIONS = ("", "zstd", "lz4")
+_CHUNK_LIMIT = 2**32  # bytes; a larger claim comes from a damaged chunk
+
+
+class DamagedChunk(ValueError):
+    """A chunk's bytes are not what its head says."""
+
+
+def decompress(name: str, data: memoryview, size: int, cut: bool = False) -> memoryview:
+    """The records of a chunk.
+
+    Args:
+        name: how it is compressed.
+        data: the compressed bytes.
+        size: how many bytes they make.
+        cut: the end is missing; give what can be had.
+
+    Raises:
+        DamagedChunk: the bytes cannot be decompressed, or make another size.
+    """
+    if name not in _COMPRESSIONS:
+        raise DamagedChunk(f"it is compressed by {name!r} (known: none, zstd, lz4)")
+    if size > _CHUNK_LIMIT:
+        raise DamagedChunk(f"it claims {size} bytes")
+    try:
+        content = _DECOMPRESSORS[name](data, size, cut)
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise DamagedChunk(f"{name} cannot read it ({error})") from error
+    if not cut and len(content) != size:
+        raise DamagedChunk(f"it makes {len(content)} bytes instead of {size}")
+    return content
+
+
+def _stored(data: memoryview, size: int, cut: bool) -> memoryview:
+    return data
+
+
+def _zstd(data: memoryview, size: int, cut: bool) -> memoryview:
+    if cut:
+        return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(data))
+    return memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+
+
+def _lz4(data: memoryview, size: int, cut: bool) -> memoryview:
+    frame = importlib.import_module("lz4.frame")  # comes with mcap; imported only where needed
+    return memoryview(frame.LZ4FrameDecompressor().decompress(data))
+
+
+_DECOMPRESSORS = {"": _stored, "zstd": _zstd, "lz4": _lz4}
+
+
+HEAD = 9  # opcode and length
+RECORD = struct.Struct("<BQ")
+_MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """Messages that lie in one stretch of bytes.
+
+    Attributes:
+        data: the bytes.
+        start: (k,) where each payload begins in `data`.
+        stop: (k,) where it ends.
+    """
+
+    data: NDArray[np.uint8]
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+
+    @property
+    def channel(self) -> NDArray[np.int64]:
+        """(k,) channel numbers."""
+        return self.rows(self.start - 22, 2).view("<u2")[:, 0].astype(np.int64)
+
+    @property
+    def sequence(self) -> NDArray[np.int64]:
+        """(k,) sequence numbers."""
+        return self.rows(self.start - 20, 4).view("<u4")[:, 0].astype(np.int64)
+
+    @property
+    def times(self) -> NDArray[np.uint64]:
+        """(k, 2) log time and publish time, ns."""
+        return self.rows(self.start - 16, 16).view("<u8").astype(np.uint64)
+
+    def rows(self, start: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
+        """(k, size) the bytes from each of `start` on."""
+        if size == 0 or len(start) == 0:
+            return np.empty((len(start), size), np.uint8)
+        rows: NDArray[np.uint8] = np.lib.stride_tricks.sliding_window_view(self.data, size)[start]
+        return rows
+
+
+@dataclass
+class Walk:
+    """What one pass over a stretch of records found; `end` is where it stopped."""
+
+    start: list[int] = field(default_factory=list)
+    stop: list[int] = field(default_factory=list)
+    others: list[tuple[int, int, int]] = field(default_factory=list)  # opcode, first, last byte
+    end: int = 0
+
+
+def walk(data: memoryview, at: int, until: frozenset[int]) -> Walk:
+    """Note all complete records from `at` on; stop before an opcode of `until` or a cut."""
+    found = Walk()
+    note_start, note_stop, unpack = found.start.append, found.stop.append, RECORD.unpack_from
+    message, size = int(Opcode.MESSAGE), len(data)
+    while at + HEAD <= size:
+        opcode, length = unpack(data, at)
+        stop = at + HEAD + length
+        if stop > size or opcode in until:
+            break
+        if opcode != message:
+            found.others.append((opcode, at + HEAD, stop))
+        elif length < _MESSAGE_HEAD:
+            break
+        else:
+            note_start(at + HEAD + _MESSAGE_HEAD)
+            note_stop(stop)
+        at = stop
+    found.end = at
+    return found
+
+
+MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its offsets, crc
+_CRC_SIZE = 4
+_CHUNK_PLACE = struct.Struct("<16xQ")  # in a chunk index, behind two times
+_LENGTH = struct.Struct("<Q")
+_OTHER_FORMATS = {
+    b"SQLite format 3": "it is a rosbag2 of storage sqlite3: turn it into mcap (ros2 bag convert)",
+    b"#ROSBAG": "it is a ROS 1 bag: turn it into a rosbag2 of storage mcap",
+}
+
+
+_INVALID = 0  # what a file system leaves behind a cut: zeros
+_IN_CHUNK = frozenset({_INVALID})
+_IN_FILE = frozenset({_INVALID, int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)})
+
+
+@dataclass(frozen=True, slots=True)
+class _ChunkHead:
+    name: str
+    size: int
+    crc: int
+    first: int
+    last: int
+
+
+class McapScan:
+    """One pass over a file. Its attributes are complete once `regions` is exhausted.
+
+    Attributes:
+        path: the file.
+        size: its bytes.
+        header: profile and library.
+        schemas, channels: by number.
+        metadata, attachments: in the order of the file.
+        truncated: the file has no proper end.
+        lost_bytes: bytes behind the cut that hold no complete record.
+        warnings: what was wrong with the file, one sentence each.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises DriverError where it cannot be an MCAP file."""
+        self.path = path
+        self._data = _open(path)
+        self.size = len(self._data)
+        self.header = Header("", "")
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.metadata: list[Metadata] = []
+        self.attachments: list[Attachment] = []
+        self.truncated = False
+        self.lost_bytes = 0
+        self._rescued = 0
+        self.warnings: list[str] = []
+        self._chunks: list[int] = []
+        self._read_index()
+
+    def regions(self) -> Iterator[Region]:
+        """All complete messages, in the order of the file; damaged chunks are passed over."""
+        at = len(MAGIC)
+        while True:
+            bound = self._next_chunk(at)
+            found = walk(self._data[:bound], at, _IN_FILE)
+            yield from self._use(found, self._data)
+            at = found.end
+            if at == bound < self.size:
+                continue
+            is_chunk = at + HEAD <= self.size and self._data[at] == Opcode.CHUNK
+            stop = at + HEAD + RECORD.unpack_from(self._data, at)[1] if is_chunk else bound + 1
+            if stop <= bound:
+                yield from self._chunk(at, stop)
+                at = stop
+            elif bound < self.size:
+                self.lost_bytes += bound - at
+                self._warn(f"bytes {at} to {bound} are damaged and were passed over")
+                at = bound
+            else:
+                if is_chunk:
+                    yield from self._cut_chunk(at)
+                break
+        self._judge_end(at)
+
+    def _next_chunk(self, at: int) -> int:
+        """Where the next chunk behind `at` begins, as far as the index knows, else the end."""
+        place = bisect.bisect_right(self._chunks, at)
+        return self._chunks[place] if place < len(self._chunks) else self.size
+
+    def _read_index(self) -> None:
+        """Channels and places of chunks from a sound index, of use where the data are damaged."""
+        end = self.size - len(MAGIC)
+        footer = end - _FOOTER.size
+        if bytes(self._data[end:]) != MAGIC or footer < len(MAGIC):
+            return
+        opcode, _, start, _, crc = _FOOTER.unpack_from(self._data, footer)
+        if opcode != Opcode.FOOTER or not len(MAGIC) <= start <= footer:
+            return
+        if crc and zlib.crc32(self._data[start : end - _CRC_SIZE]) != crc:
+            return
+        index = walk(self._data[:footer], start, _IN_CHUNK)
+        for opcode, first, last in index.others:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._note(opcode, self._data[first:last])
+            elif opcode == Opcode.CHUNK_INDEX and last - first >= _CHUNK_PLACE.size:
+                (place,) = _CHUNK_PLACE.unpack_from(self._data, first)
+                if place < start and self._data[place] == Opcode.CHUNK:
+                    self._chunks.append(place)
+        self._chunks.sort()
+
+    def _use(self, found: Walk, data: memoryview) -> Iterator[Region]:
+        for opcode, first, last in found.others:
+            self._note(opcode, data[first:last])
+        if found.start:
+            starts, stops = np.array(found.start, np.int64), np.array(found.stop, np.int64)
+            yield Region(np.frombuffer(data, np.uint8), starts, stops)
+
+    def _note(self, opcode: int, content: memoryview) -> None:
+        """Keep a record that isn't a message; summaries and indexes are of no use here."""
+        stream = ReadDataStream(BytesIO(content))
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(stream)
+                self.channels[channel.id] = channel
+            elif opcode == Opcode.HEADER:
+                self.header = Header.read(stream)
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(Metadata.read(stream))
+            elif opcode == Opcode.ATTACHMENT:
+                self.attachments.append(Attachment.read(stream))
+        except (McapError, struct.error, UnicodeDecodeError) as error:
+            self._warn(f"a record of type {opcode} is damaged and was passed over ({error})")
+
+    def _chunk(self, at: int, stop: int) -> Iterator[Region]:
+        try:
+            head = self._chunk_head(at)
+            content = decompress(head.name, self._data[head.first : head.last], head.size)
+            if head.crc and zlib.crc32(content) != head.crc:
+                raise DamagedChunk("its checksum is wrong")
+            found = walk(content, 0, _IN_CHUNK)
+            if found.end != len(content):
+                raise DamagedChunk(f"its record at byte {found.end} is broken")
+        except (DamagedChunk, struct.error, UnicodeDecodeError) as error:
+            self.lost_bytes += stop - at
+            self._warn(f"the chunk at byte {at} is damaged and was passed over: {error}")
+            return
+        yield from self._use(found, content)
+
+    def _cut_chunk(self, at: int) -> Iterator[Region]:
+        """What can be decompressed of the last chunk; no checksum holds it to anything."""
+        try:
+            head = self._chunk_head(at)
+            content = decompress(head.name, self._data[head.first :], head.size, cut=True)
+        except (DamagedChunk, struct.error, UnicodeDecodeError):
+            return
+        found = walk(content, 0, _IN_CHUNK)
+        self._rescued = len(found.start)
+        yield from self._use(found, content)
+
+    def _chunk_head(self, at: int) -> _ChunkHead:
+        _, _, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
+        name_at = at + HEAD + _CHUNK_HEAD.size
+        name = str(self._data[name_at : name_at + length], "utf-8")
+        (stored,) = _LENGTH.unpack_from(self._data, name_at + length)
+        first = name_at + length + _LENGTH.size
+        return _ChunkHead(name, size, crc, first, first + stored)
+
+    def _judge_end(self, at: int) -> None:
+        """Say whether the file was cut, and where."""
+        ended = at + HEAD <= self.size and self._data[at] in (Opcode.DATA_END, Opcode.FOOTER)
+        self.truncated = not ended or bytes(self._data[-len(MAGIC) :]) != MAGIC
+        if not self.truncated:
+            return
+        if ended:
+            self._warn("the file is cut in its index; no message is lost")
+            return
+        self.lost_bytes += self.size - at
+        rescued = f"; {self._rescued} messages of them could be read" if self._rescued else ""
+        self._warn(
+            f"the file is cut: of its {self.size} bytes the last {self.size - at} are an "
+            f"incomplete record{rescued} (`adapter recover` mends it)"
+        )
+
+    def _warn(self, sentence: str) -> None:
+        self.warnings.append(f"{self.path}: {sentence}")
+
+
+def _open(path: Path) -> memoryview:
+    if path.is_dir():
+        inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
+        raise DriverError(f"{path}: is a folder; name the file in it (has: {inside})")
+    try:
+        with path.open("rb") as file:
+            if path.stat().st_size == 0:
+                raise DriverError(f"{path}: is empty (0 bytes); nothing was recorded")
+            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    except OSError as error:
+        raise DriverError(f"{path}: cannot be read: {error.strerror}") from error
+    begin = bytes(data[: len(MAGIC)])
+    if begin == MAGIC:
+        return data
+    if MAGIC.startswith(begin):
+        raise DriverError(f"{path}: is cut after {len(begin)} bytes; nothing was recorded")
+    kind = next((v for k, v in _OTHER_FORMATS.items() if bytes(data[: len(k)]) == k), None)
+    hint = kind or f"it begins with {begin!r}; `adapter import` turns tables into recordings"
+    raise DriverError(f"{path}: is not an MCAP recording; {hint}")

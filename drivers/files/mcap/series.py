@@ -1,0 +1,139 @@
+"""All messages of the wanted topics of a file, decoded in bulk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from mcap.records import Channel
+from numpy.typing import NDArray
+
+from drivers.files.mcap.records import McapScan, Region
+from drivers.files.ros import (
+    ACCEL_STAMPED,
+    IMU,
+    JOINT_STATE,
+    TWIST_STAMPED,
+    Block,
+    Bytes,
+    Layout,
+    decode_many,
+    parse_imu,
+    parse_joint_state,
+    parse_motion,
+)
+
+_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
+    JOINT_STATE: parse_joint_state,
+    TWIST_STAMPED: parse_motion,
+    ACCEL_STAMPED: parse_motion,
+    IMU: parse_imu,
+}
+
+
+@dataclass
+class Series:
+    """The messages of one topic.
+
+    Attributes:
+        topic, schema: their names; a schema's name without the older spelling's missing `/msg/`.
+        encoding: of the messages; only `cdr` is decoded.
+        count: messages in the file.
+        places: for each block the (k,) places of its messages in the topic's order.
+        log_ns: for each block the (k,) log times.
+        blocks: the decoded messages, by layout.
+        bad: (place, reason) of messages that could not be read.
+    """
+
+    topic: str
+    schema: str
+    encoding: str
+    count: int = 0
+    places: list[NDArray[np.int64]] = field(default_factory=list)
+    log_ns: list[NDArray[np.int64]] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)
+    bad: list[tuple[int, str]] = field(default_factory=list)
+
+    def add(self, region: Region, which: NDArray[np.int64], times: NDArray[np.int64]) -> None:
+        """Decode the messages `which` of a region and append them."""
+        parse = _PARSERS[self.schema]
+        sizes = (region.stop - region.start)[which]
+        for size in np.unique(sizes):
+            here = np.flatnonzero(sizes == size)
+            rows = region.rows(region.start[which[here]], int(size))
+            blocks, bad = decode_many(rows, parse)
+            for block in blocks:
+                places = here[block.index]
+                self.places.append(self.count + places)
+                self.log_ns.append(times[which[places]])
+                self.blocks.append(block)
+            self.bad += [(self.count + int(here[i]), reason) for i, reason in bad]
+        self.count += len(which)
+
+    def in_order(self, arrays: list[NDArray]) -> NDArray:
+        """One array from an array for each block, in the order of the file."""
+        joined = np.concatenate(arrays)
+        places = np.concatenate(self.places)
+        if np.all(places[1:] > places[:-1]):
+            return joined
+        return joined[np.argsort(places, kind="stable")]
+
+    def only(self, keep: Callable[[Block], bool]) -> Series:
+        """The blocks that satisfy `keep`."""
+        chosen = [i for i, block in enumerate(self.blocks) if keep(block)]
+        part = Series(self.topic, self.schema, self.encoding)
+        part.places = [self.places[i] for i in chosen]
+        part.log_ns = [self.log_ns[i] for i in chosen]
+        part.blocks = [self.blocks[i] for i in chosen]
+        part.count = sum(len(p) for p in part.places)
+        return part
+
+
+def schema_name(scan: McapScan, channel: Channel) -> str:
+    """A channel's type, `pkg/msg/Name`; some recorders write `pkg/Name`."""
+    schema = scan.schemas.get(channel.schema_id)
+    if schema is None:
+        return ""
+    parts = schema.name.split("/")
+    return "/".join((parts[0], "msg", parts[1])) if len(parts) == 2 else schema.name
+
+
+def collect(scan: McapScan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
+    """Every topic of the file by name; those `wanted` are decoded, the others counted."""
+    topics: dict[str, Series] = {}
+    unknown = 0
+    for region in scan.regions():
+        channels = region.channel
+        times = region.times[:, 0].astype(np.int64)
+        for topic, numbers in _by_topic(scan, np.unique(channels)).items():
+            which = np.flatnonzero(np.isin(channels, numbers))
+            if not topic:
+                unknown += len(which)
+                continue
+            series = _series(topics, scan, scan.channels[numbers[0]])
+            if wanted(series) and series.encoding == "cdr" and series.schema in _PARSERS:
+                series.add(region, which, times)
+            else:
+                series.count += len(which)
+    if unknown:
+        scan.warnings.append(f"{scan.path}: {unknown} messages belong to no channel; left out")
+    for channel in scan.channels.values():
+        _series(topics, scan, channel)
+    return topics
+
+
+def _by_topic(scan: McapScan, numbers: NDArray[np.int64]) -> dict[str, list[int]]:
+    """Channel numbers by topic; a topic with several publishers has several channels."""
+    topics: dict[str, list[int]] = {}
+    for number in numbers.tolist():
+        channel = scan.channels.get(number)
+        topics.setdefault(channel.topic if channel else "", []).append(number)
+    return topics
+
+
+def _series(topics: dict[str, Series], scan: McapScan, channel: Channel) -> Series:
+    if channel.topic not in topics:
+        name = schema_name(scan, channel)
+        topics[channel.topic] = Series(channel.topic, name, channel.message_encoding)
+    return topics[channel.topic]

@@ -1,0 +1,245 @@
+"""Writes recordings: MCAP, profile ros2, zstd chunks, handed to the system within half a second."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from mcap.writer import Writer
+
+from drivers.files.ros import (
+    ACCEL_STAMPED,
+    JOINT_STATE,
+    SCHEMAS,
+    TWIST_STAMPED,
+    CdrError,
+    JointStateEncoder,
+    MotionEncoder,
+)
+from drivers.interface import Array, DriverError, JointSample, LinkMotion
+
+JOINT_STATES = "/joint_states"
+JOINT_COMMANDS = "/joint_commands"
+LINK_TWISTS = "/link_twists/"
+LINK_ACCELS = "/link_accels/"
+ESTIMATES = "/estimates"
+METADATA = "panda_adapter"  # name of the metadata record with our own settings
+LIBRARY = "panda-adapter"
+FLUSH_S = 0.5  # a killed recorder loses less than this and the chunk being written
+_ESTIMATE = "panda_adapter.Estimate"
+_ESTIMATE_SCHEMA = {
+    "title": _ESTIMATE,
+    "type": "object",
+    "properties": {"stamp_ns": {"type": "integer"}},
+}
+
+
+def to_json(value: Any) -> str:
+    """JSON of numbers, texts, arrays and mappings of them; not-a-number becomes null."""
+    return json.dumps(_plain(value), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if isinstance(value, str | int | bool | type(None)) else str(value)
+
+
+class McapWriter:
+    """A recording being written. Call from one thread, outside the real-time loop.
+
+    Whatever was written is handed to the operating system, in a closed chunk, at the first write
+    later than `flush_s` after it; call `flush` where writes may pause. A kill -9 then costs
+    `flush_s` at most.
+
+    Args:
+        path: the file; its folder must exist.
+        joint_names: order of the joint arrays.
+        link_names: order of the rows of LinkMotion; link i is moved by joint i.
+        metadata: configuration, version, ...: anything JSON can hold.
+        overwrite: replace an existing file instead of refusing.
+
+    Raises:
+        DriverError: the file exists or cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        joint_names: Sequence[str],
+        link_names: Sequence[str] = (),
+        metadata: Mapping[str, Any] | None = None,
+        *,
+        flush_s: float = FLUSH_S,
+        overwrite: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self.joint_names = tuple(joint_names)
+        self.link_names = tuple(link_names)
+        self.messages = 0
+        self._flush_s = flush_s
+        self._oldest: float | None = None  # monotonic time of the oldest message not on disk
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._states = JointStateEncoder(self.joint_names)
+        self._commands = JointStateEncoder(self.joint_names, fields=("effort",))
+        self._motions = tuple((name, MotionEncoder(name)) for name in self.link_names)
+        try:
+            self._file = self.path.open("wb" if overwrite else "xb")
+        except FileExistsError as error:
+            raise DriverError(f"{path}: exists; choose another name or delete it") from error
+        except OSError as error:
+            raise DriverError(f"{path}: cannot be written: {error.strerror}") from error
+        self._writer = Writer(self._file)
+        self._writer.start(profile="ros2", library=LIBRARY)
+        names = {"joint_names": self.joint_names, "link_names": self.link_names}
+        self.add_metadata(METADATA, {**names, **(metadata or {})})
+
+    def write(self, sample: JointSample) -> None:
+        """Record a sample: joint state, and link motion where it has any."""
+        self.write_joint_state(sample.stamp_ns, sample.q, sample.dq, sample.tau)
+        if sample.links is not None:
+            self.write_links(sample.stamp_ns, sample.links)
+
+    def write_joint_state(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> None:
+        """Record (n,) positions, velocities and torques: rad, rad/s, N m."""
+        data = self._encode(self._states, stamp_ns, q, dq, tau)
+        self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
+
+    def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
+        """Record the measured motion of the links, in the order of `link_names`."""
+        expected = (len(self._motions), 6)
+        if links.twist.shape != expected or links.accel.shape != expected:
+            raise DriverError(
+                f"{self.path}: link motion of shapes {links.twist.shape} and {links.accel.shape}, "
+                f"expected {expected} for the links {', '.join(self.link_names) or '(none named)'}"
+            )
+        for (name, encoder), twist, accel in zip(
+            self._motions, links.twist, links.accel, strict=True
+        ):
+            twist_channel = self._channel(LINK_TWISTS + name, TWIST_STAMPED)
+            self._add(twist_channel, stamp_ns, encoder.encode(stamp_ns, twist))
+            accel_channel = self._channel(LINK_ACCELS + name, ACCEL_STAMPED)
+            self._add(accel_channel, stamp_ns, encoder.encode(stamp_ns, accel))
+
+    def write_command(self, stamp_ns: int, tau: Array) -> None:
+        """Record (n,) commanded joint torques, N m."""
+        data = self._encode(self._commands, stamp_ns, tau, tau, tau)
+        self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
+
+    def write_estimate(self, stamp_ns: int, estimate: Mapping[str, Any]) -> None:
+        """Record an estimate as JSON; arrays become lists, not-a-number null."""
+        data = to_json({"stamp_ns": stamp_ns, **estimate}).encode()
+        self._add(self._channel(ESTIMATES, ""), stamp_ns, data)
+
+    def add_metadata(self, name: str, values: Mapping[str, Any]) -> None:
+        """Add a metadata record at once, each value as JSON text."""
+        with _Naming(self.path):
+            self._writer.add_metadata(name, {k: to_json(v) for k, v in values.items()})
+        self.flush()
+
+    def attach(self, name: str, data: bytes, media_type: str = "application/json") -> None:
+        """Add a file (a model, a configuration) to the recording at once."""
+        now = time.time_ns()
+        with _Naming(self.path):
+            self._writer.add_attachment(now, now, name, media_type, data)
+        self.flush()
+
+    def flush(self) -> None:
+        """Close the open chunk and hand it to the operating system."""
+        with _Naming(self.path):
+            self._writer.flush()
+        self._oldest = None
+
+    def close(self) -> None:
+        """Write the index and close the file; may be called more than once."""
+        if self._file.closed:
+            return
+        with _Naming(self.path):
+            try:
+                self._writer.finish()
+            finally:
+                self._file.close()
+
+    def __enter__(self) -> McapWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _encode(
+        self, encoder: JointStateEncoder, stamp_ns: int, q: Array, dq: Array, tau: Array
+    ) -> bytes:
+        try:
+            return encoder.encode(stamp_ns, q, dq, tau)
+        except CdrError as error:
+            raise DriverError(f"{self.path}: sample of {stamp_ns} ns: {error}") from error
+
+    def _channel(self, topic: str, schema: str) -> int:
+        number = self._channels.get(topic)
+        if number is None:
+            encoding = "cdr" if schema else "json"
+            number = self._writer.register_channel(topic, encoding, self._schema(schema))
+            self._channels[topic] = number
+        return number
+
+    def _schema(self, name: str) -> int:
+        if name not in self._schemas:
+            if name:
+                text, encoding = SCHEMAS[name], "ros2msg"
+            else:
+                text, encoding = json.dumps(_ESTIMATE_SCHEMA), "jsonschema"
+            number = self._writer.register_schema(name or _ESTIMATE, encoding, text.encode())
+            self._schemas[name] = number
+        return self._schemas[name]
+
+    def _add(self, channel: int, stamp_ns: int, data: bytes) -> None:
+        # Log times cannot be negative; the header stamp keeps what the arm said.
+        log_time = max(int(stamp_ns), 0)
+        with _Naming(self.path):
+            self._writer.add_message(channel, log_time, data, log_time, self.messages)
+        self.messages += 1
+        now = time.monotonic()
+        if self._oldest is None:
+            self._oldest = now
+        elif now - self._oldest >= self._flush_s:
+            self.flush()
+
+
+class _Naming:
+    """Turns a full disk and the like into a DriverError that names the file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> None:
+        return
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if isinstance(error, OSError):
+            raise DriverError(
+                f"{self._path}: cannot be written ({error.strerror}); "
+                "what was recorded before stays readable"
+            ) from error

@@ -1,0 +1,203 @@
+"""The host's side of a bus whose boards live in the same process: bus ends and whole drivers."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import can
+
+from drivers.interface import Array, Driver, Intake, JointSample
+from sim.damiao.faults import Faults
+from sim.damiao.line import Line, refuse
+from sim.damiao.server import Boards
+from sim.scenarios import Scenario
+
+SETTLE_TICKS = 300  # the motors take the arm over from its stand
+
+
+class Served(Protocol):
+    """Boards that work when they are called."""
+
+    def service(self) -> int:
+        """Handle the frames that have arrived."""
+
+
+class WrappedBus(can.BusABC):
+    """Any bus, everything going straight through; closing closes the bus inside as well."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+        self._can_protocol = bus.protocol
+        self.channel_info = bus.channel_info
+        super().__init__(channel=0)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send."""
+        self._bus.send(msg, timeout)
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Receive."""
+        return self._bus.recv(timeout)
+
+    def fileno(self) -> int:
+        """Of the bus inside."""
+        return self._bus.fileno()
+
+    def shutdown(self) -> None:
+        """Close."""
+        super().shutdown()
+        self._bus.shutdown()
+
+
+class ServedBus(WrappedBus):
+    """A host's bus whose boards live in the same process: whoever receives lets them work.
+
+    Attributes:
+        serving: whether to do so; without it the boards' owner calls `Boards.service`.
+    """
+
+    def __init__(self, bus: can.BusABC, boards: Served) -> None:
+        """Wrap the host's end of a bus."""
+        super().__init__(bus)
+        self._boards, self.serving = boards, True
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Let the boards work, then receive."""
+        if self.serving:
+            self._boards.service()
+        return self._bus.recv(timeout)
+
+
+class FailingBus(WrappedBus):
+    """Any bus, with fault `enobufs` on its sends."""
+
+    def __init__(
+        self, bus: can.BusABC, faults: Faults, now_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """Wrap a bus. The faults' time runs from here."""
+        super().__init__(bus)
+        self._faults, self._now_ns, self._begun_ns = faults, now_ns, now_ns()
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send, or raise CanOperationError (ENOBUFS)."""
+        if self._faults.strikes("enobufs", (self._now_ns() - self._begun_ns) * 1e-9):
+            raise refuse()
+        self._bus.send(msg, timeout)
+
+
+class WrappedDriver:
+    """A driver whose calls are passed on."""
+
+    paced = False
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self.joint_names, self.link_names = driver.joint_names, driver.link_names
+        self.period_ns, self.adds_gravity = driver.period_ns, driver.adds_gravity
+        self.can_move, self.delay_ns = driver.can_move, driver.delay_ns
+
+    @property
+    def intake(self) -> Intake:
+        """The driver's."""
+        return self._driver.intake
+
+    def command(self, tau: Array) -> None:
+        """Pass on (n,) N m. Raises DriverError."""
+        self._driver.command(tau)
+
+
+class InProcess(WrappedDriver):
+    """A driver whose motors work between its reads, in real time.
+
+    Args:
+        channel: of the virtual bus.
+        scenario: the arm.
+        make: builds the driver on a bus.
+
+    Attributes:
+        plant_time_ns: how long the boards worked in the last `read`; no part of a driver's time.
+    """
+
+    def __init__(
+        self, channel: str, scenario: Scenario, make: Callable[[can.BusABC], Driver]
+    ) -> None:
+        self._far = can.Bus(interface="virtual", channel=channel)
+        self._boards = Boards(self._far, scenario)
+        near = can.Bus(interface="virtual", channel=channel)
+        self._bus = ServedBus(near, self._boards)
+        super().__init__(make(self._bus))
+        self.plant_time_ns = 0
+        self._closed = False
+
+    @property
+    def arrived_ns(self) -> int:
+        """The driver's."""
+        return self._driver.arrived_ns
+
+    def connect(self) -> None:
+        """Connect; the boards answer. Raises DriverError."""
+        self._driver.connect()
+        self._bus.serving = False
+
+    def read(self) -> JointSample:
+        """Let the motors work up to now, then read. Raises DriverError."""
+        before = self._boards.compute_ns
+        self._boards.service()
+        self.plant_time_ns = self._boards.compute_ns - before
+        return self._driver.read()
+
+    def stop(self) -> None:
+        """Bring the arm to a stand. Raises DriverError."""
+        self._bus.serving = True
+        self._driver.stop()
+
+    def close(self) -> None:
+        """Release driver, boards and bus; may be called more than once."""
+        if self._closed:
+            return
+        self._closed, self._bus.serving = True, True
+        self._driver.close()
+        self._boards.close()
+        self._bus.shutdown()
+        self._far.shutdown()
+
+
+class Lockstep(WrappedDriver):
+    """A driver whose clock is the line's: each `read` lets one period of virtual time pass.
+
+    Args:
+        driver: built on `line.host` with the clock `line.now_ns`.
+        line: with the boards attached.
+    """
+
+    arrived_ns = 0
+
+    def __init__(self, driver: Driver, line: Line) -> None:
+        super().__init__(driver)
+        self._line, self._next_ns = line, 0
+
+    def connect(self) -> None:
+        """Connect and let the arm come to rest in its motors. Raises DriverError."""
+        with self._line.eager():
+            self._driver.connect()
+        self._next_ns = self._line.next_whole_ns(self.period_ns)
+        for _ in range(SETTLE_TICKS):
+            self.read()
+
+    def read(self) -> JointSample:
+        """The next sample. Raises DriverError."""
+        self._line.advance_to(self._next_ns)
+        self._next_ns += self.period_ns
+        return self._driver.read()
+
+    def stop(self) -> None:
+        """Bring the arm to a stand. Raises DriverError."""
+        with self._line.eager():
+            self._driver.stop()
+
+    def close(self) -> None:
+        """Release the driver."""
+        with self._line.eager():
+            self._driver.close()

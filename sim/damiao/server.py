@@ -1,0 +1,239 @@
+"""The seven boards: frames in, frames out, the arm between them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import can
+
+from sim.damiao.arm import World
+from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
+from sim.damiao.faults import Faults, Outbox
+from sim.damiao.motor import motor_set
+from sim.damiao.robot import MotorBank
+from sim.effects import ENCODER, TORQUE
+from sim.noise import NoiseLevels, levels_of
+from sim.scenarios import Scenario
+from sim.truth import Array
+
+IDLE_S = 5e-3  # longest wait without frames: the arm goes on in steps of this
+ACTIVE_NS = 10_000_000  # so long after a frame the ticks keep their rhythm
+FIFO_PRIORITY = 40
+MOST_UNREADABLE = 1000  # failures to receive in a row, then the bus counts as gone
+
+
+class Stop(Protocol):
+    """Says when to end, like `threading.Event`."""
+
+    def is_set(self) -> bool:
+        """Whether to end."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardOptions:
+    """How the boards are set up.
+
+    Attributes:
+        motors: a set of `sim.damiao.motor.SETS`.
+        noise: what the sensors add before the frames quantise; nothing where None.
+        q0: (7,) posture at the start, rad; the scenario's where None.
+        stand: whether the arm rests in a stand at first.
+    """
+
+    motors: str = "panda"
+    noise: NoiseLevels | None = None
+    q0: Array | None = None
+    stand: bool = True
+
+
+class Boards:
+    """A simulated arm whose joints are Damiao motors in MIT mode on a CAN bus.
+
+    Until every motor has been enabled and has had a command the arm rests in a stand: an arm
+    without brakes would lie on its end stops before anybody connects. From then on a motor
+    without torque is limp. A reply has the format (classic or FD) of the frame it answers.
+
+    Attributes:
+        motors: joint 1 first.
+        world: the arm.
+        faults: what is broken, with counts.
+        frames: what arrived, by what it was.
+        compute_ns: time spent in `service` so far; on a real arm it would pass in the motors.
+    """
+
+    def __init__(
+        self,
+        bus: can.BusABC,
+        scenario: Scenario,
+        options: BoardOptions | None = None,
+        faults: Iterable[str] | Faults = (),
+        now_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Switch the motors on, disabled.
+
+        Args:
+            bus: where the motors are; not closed here.
+            scenario: the arm and the seed of noise and faults; its own noise is not used.
+            options: motors, noise and start.
+            faults: texts `NAME[=VALUE][@SECONDS]`, or faults that something else shares.
+            now_ns: the clock.
+
+        Raises:
+            ValueError: no such motors or fault (names the choices), or an arm that has not seven
+                joints or has effects in its sensors.
+        """
+        options, seed = options or BoardOptions(), scenario.seed
+        fittings, truth = motor_set(options.motors), scenario.truth
+        if truth.n != len(fittings):
+            raise ValueError(f"the boards drive {len(fittings)} joints; this arm has {truth.n}")
+        if have := sorted({e.name for e in truth.effects if e.place in (ENCODER, TORQUE)}):
+            raise ValueError(
+                f"joint boards simulate no effects in sensors, this arm has: {', '.join(have)}"
+            )
+        self.faults = faults if isinstance(faults, Faults) else Faults(faults, seed)
+        self._bus, self._now_ns = bus, now_ns
+        levels = replace(
+            options.noise or levels_of("none"), dropouts=0.0, repeats=0.0, stamp_jitter_s=0.0
+        )
+        self.world = World(truth, options.q0, now_ns(), levels, seed)
+        self.world.held = options.stand
+        self._bank = MotorBank(options.motors, self.world, self.faults)
+        self.motors, self.frames = self._bank.motors, self._bank.frames
+        self.compute_ns = 0
+        self._outbox = Outbox(bus, self.faults)
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._off = False
+
+    def service(self) -> int:
+        """Handle every frame that has arrived, each at the clock's present instant.
+
+        Returns:
+            How many frames arrived.
+        """
+        begun, count = time.perf_counter_ns(), 0
+        self._advance(self._now_ns())
+        while (message := self._receive(0.0)) is not None:
+            self._handle(message)
+            count += 1
+        self.compute_ns += time.perf_counter_ns() - begun
+        return count
+
+    def serve(self, stop: Stop) -> None:
+        """Handle frames as they come until told to stop; for a process of its own.
+
+        Asks for SCHED_FIFO and goes on without where that is not permitted.
+        """
+        with contextlib.suppress(OSError, AttributeError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
+        while not stop.is_set():
+            message = self._receive(self._patience_s())
+            begun = time.perf_counter_ns()
+            if message is not None:
+                self._handle(message)
+            self._advance(self._now_ns())
+            self.compute_ns += time.perf_counter_ns() - begun
+
+    def next_ns(self) -> int | None:
+        """When the boards have something to send without being asked; None for never."""
+        return None if self._off else self._outbox.next_ns()
+
+    def report(self) -> dict[str, Any]:
+        """What happened so far, as plain numbers."""
+        world = self.world
+        return {
+            "frames": dict(self.frames),
+            "replies": self._outbox.sent,
+            "replies_not_sent": self._outbox.failed,
+            "faults": dict(self.faults.counts),
+            "ticks": world.ticks,
+            "slipped_ms": world.slipped_ns / 1e6,
+            "limp_ticks": world.limp_ticks,
+            "stop_ticks": world.stop_ticks,
+            "fastest_rad_s": world.fastest,
+            "in_stand": world.held,
+            "status": [m.status for m in self.motors],
+            "rotor_c": [round(m.rotor_c, 1) for m in self.motors],
+            "compute_s": self.compute_ns / 1e9,
+        }
+
+    def close(self) -> None:
+        """Free the simulator; the bus stays open."""
+        self.world.close()
+
+    def _receive(self, patience_s: float) -> can.Message | None:
+        """The next frame; what cannot be read is counted and passed over.
+
+        Raises can.CanError where the bus itself is gone.
+        """
+        for _ in range(MOST_UNREADABLE):
+            try:
+                return self._bus.recv(patience_s)
+            except can.CanError:
+                self.frames["unreadable"] += 1
+        return self._bus.recv(patience_s)
+
+    def _patience_s(self) -> float:
+        """How long to wait for a frame before the arm has to move on."""
+        now = self._now_ns()
+        until = self.world.next_ns() if now - self._last_ns < ACTIVE_NS else now + IDLE_S * 1e9
+        due = self._outbox.next_ns()
+        until = until if due is None else min(until, due)
+        return min(max((until - now) * 1e-9, 0.0), IDLE_S)
+
+    def _advance(self, now_ns: int) -> None:
+        """Bring everything that moves by itself to an instant."""
+        self.world.advance(now_ns, self._bank.law, self._first_ns)
+        if self.faults:
+            off = self.faults.within("bus_off", self._seconds(now_ns))
+            if off and not self._off:
+                self._outbox.tell(error_frame(BUS_OFF))
+                self.faults.counts["bus_off"] += 1
+            self._off = off
+            if not off:
+                self._outbox.flush(now_ns)
+
+    def _measured_ns(self) -> int:
+        """The instant that a frame handled now measures, with the arm brought there.
+
+        Bringing the arm there takes time of its own, which should not make the answer older.
+        """
+        self._advance(self._now_ns())
+        self._last_ns = self._now_ns()
+        if self._last_ns >= self.world.next_ns():
+            self._advance(self._last_ns)
+        if self._first_ns is None:
+            self._first_ns = self._last_ns
+        return self._last_ns
+
+    def _seconds(self, now_ns: int) -> float:
+        """Scenario time: since the first frame to a motor; before it, negative."""
+        return -1.0 if self._first_ns is None else (now_ns - self._first_ns) * 1e-9
+
+    def _handle(self, message: can.Message) -> None:
+        """One frame from the bus, which may also be one of our own or somebody else's."""
+        if self._off:
+            self.frames["while bus off"] += 1
+            return
+        if not is_command(message):
+            self.frames["not for motors"] += 1
+            return
+        identifier, data = message.arbitration_id, bytes(message.data)
+        j = self._bank.addressed(identifier, data)
+        if j is None:
+            self.frames["other ids"] += 1
+            return
+        now = self._measured_ns()
+        now_s, faults = self._seconds(now), self.faults
+        if faults and (faults.hits("silent", j + 1, now_s) or faults.strikes("deaf", now_s)):
+            self.frames["unheard"] += 1
+            return
+        reply = self._bank.answer(j, identifier, data, now, now_s)
+        if reply is not None:
+            frame = data_frame(self.motors[j].reply_id, reply, message.is_fd)
+            self._outbox.put(frame, now, now_s)

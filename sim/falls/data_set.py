@@ -1,0 +1,273 @@
+"""Data sets of trees in free fall: made on demand, kept in a cache folder, the same for a seed.
+
+One file per trajectory, its name carrying a hash of everything that decides what is in it. A file
+is written under another name and then renamed, so that a cut run leaves no half file behind; one
+that cannot be read is made again. A trajectory of ATLAS (10 s at 1 kHz) takes 10.6 MB and 1.4 s
+of one core; worker processes share the work and change no bit of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+import pybullet as bullet
+
+from sim.falls.babbling import Babbling
+from sim.falls.fall import BANDWIDTH, DAMPING, RATE_HZ, FallRecord, babble
+from sim.falls.noise import TreeNoise, measured
+from sim.falls.tree_truth import TreeTruth, atlas
+from sim.truth import Array
+
+TRAJECTORIES, SECONDS = 63, 10.0  # the paper's, section IV-A
+PART = ".part"  # of files that are being written
+ABANDONED_S = 3600.0  # after which such a file is a killed run's
+FORMAT = 1  # of the files; a new one whenever what they hold is computed otherwise
+ROBOTS = {"atlas": atlas}
+CACHE_VARIABLE = "PANDA_ADAPTER_CACHE"  # environment variable, folder
+SIGNALS = tuple(item.name for item in fields(FallRecord))
+UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+SHUTDOWN_S = 10.0  # that a worker has left once it is asked to end
+MOTION, NOISE = 1, 2  # streams of random numbers
+
+
+@dataclass(frozen=True)
+class Flight:
+    """How a tree falls.
+
+    Attributes:
+        seconds: length of a trajectory.
+        rate_hz: of simulation and samples.
+        seed: of motion and noise.
+        babbling: how the robot moves.
+
+    Raises:
+        ValueError: less than one sample, or a seed below 0.
+    """
+
+    seconds: float = SECONDS
+    rate_hz: float = RATE_HZ
+    seed: int = 0
+    babbling: Babbling = field(default_factory=Babbling)
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.seconds * self.rate_hz < np.inf:
+            raise ValueError("seconds * rate_hz must be 1 or more")
+        if self.seed < 0:
+            raise ValueError(f"seed must be 0 or more, got {self.seed}")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """All that decides the content of one file."""
+
+    truth: TreeTruth
+    number: int
+    flight: Flight
+    path: Path
+
+    def make(self) -> FallRecord:
+        """Simulate the trajectory and write its file."""
+        how = self.flight
+        rng = np.random.default_rng([how.seed, MOTION, self.number])
+        record = babble(self.truth, how.seconds, rng, how.babbling, how.rate_hz)
+        handle, name = tempfile.mkstemp(dir=self.path.parent, suffix=PART)
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, **{key: getattr(record, key) for key in SIGNALS})
+            os.replace(name, self.path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        return record
+
+    def check(self, record: FallRecord) -> None:
+        """Raises ValueError where a record is not of this job's length and tree."""
+        rows = round(self.flight.seconds * self.flight.rate_hz)
+        joints = {"q", "dq", "ddq", "tau"}
+        for key in SIGNALS:
+            wanted = rows, self.truth.n if key in joints else 3
+            if getattr(record, key).shape != wanted:
+                raise ValueError(f"{self.path}: {key} must have shape {wanted}")
+
+
+@dataclass(frozen=True)
+class FallData:
+    """Trajectories of a tree in free fall; an item is a dictionary of signals by name.
+
+    Without noise an item holds the exact signals (attributes of `FallRecord`); with noise what
+    sensors make of them (see `sim.falls.noise.measured`). Items are read from the folder each time.
+
+    Attributes:
+        truth: the tree.
+        folder: where the files are.
+        noise: what the sensors add; None for none.
+        jobs: what decides each trajectory, and the path of its file.
+    """
+
+    truth: TreeTruth
+    folder: Path
+    noise: TreeNoise | None
+    jobs: tuple[_Job, ...]
+
+    def __len__(self) -> int:
+        return len(self.jobs)
+
+    def __iter__(self) -> Iterator[dict[str, Array]]:
+        return (self[k] for k in range(len(self)))
+
+    def __getitem__(self, k: int) -> dict[str, Array]:
+        record = self.exact(k)
+        if self.noise is None:
+            return {key: getattr(record, key) for key in SIGNALS}
+        job = self.jobs[k]
+        rng = np.random.default_rng([job.flight.seed, NOISE, job.number])
+        return measured(self.truth, record, self.noise, job.flight.rate_hz, rng)
+
+    def exact(self, k: int) -> FallRecord:
+        """Trajectory k without noise; made again if its file cannot be read."""
+        job = self.jobs[k]
+        try:
+            with np.load(job.path, allow_pickle=False) as file:
+                record = FallRecord(**{key: file[key] for key in SIGNALS})
+            job.check(record)
+            return record
+        except UNREADABLE:
+            return job.make()
+
+
+def data_set(
+    robot: str | TreeTruth = "atlas",
+    trajectories: int = TRAJECTORIES,
+    flight: Flight = Flight(),
+    folder: str | Path | None = None,
+    noise: bool | TreeNoise = False,
+    processes: int = 2,
+) -> FallData:
+    """Trajectories of a robot that falls and babbles; those that are not there yet are made.
+
+    Args:
+        robot: `atlas`, or any tree.
+        trajectories: how many; a longer set begins with the same ones.
+        flight: how it falls.
+        folder: for the files; `cache_folder()` where None.
+        noise: whether items are what sensors measure, or what those sensors add.
+        processes: at work at once; of no influence on the data.
+
+    Raises:
+        ValueError: an unknown robot, a count that is not above 0.
+        RuntimeError: a motion that leaves the joints' ranges, or a worker process that failed;
+            what it said is in the message.
+    """
+    if isinstance(robot, str):
+        if robot not in ROBOTS:
+            raise ValueError(f"no robot {robot!r}; have: {', '.join(ROBOTS)}, or a TreeTruth")
+        robot = ROBOTS[robot]()
+    if trajectories < 1 or processes < 1:
+        raise ValueError("trajectories and processes must be 1 or more")
+    place = cache_folder() if folder is None else Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    _sweep(place)
+    levels = (TreeNoise() if noise else None) if isinstance(noise, bool) else noise
+    key = _key(robot, flight)
+    jobs = tuple(
+        _Job(robot, k, flight, place / f"{robot.name}_{k:04d}_{key}.npz")
+        for k in range(trajectories)
+    )
+    _make([job for job in jobs if not _sound(job.path)], processes)
+    return FallData(robot, place, levels, jobs)
+
+
+def cache_folder() -> Path:
+    """Where data sets are kept: $PANDA_ADAPTER_CACHE, or the user's cache folder (XDG)."""
+    if chosen := os.environ.get(CACHE_VARIABLE):
+        return Path(chosen)
+    general = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(general) / "panda-adapter" / "free_fall"
+
+
+def _key(truth: TreeTruth, flight: Flight) -> str:
+    """16 hexadecimal digits that change with anything that decides a trajectory's content."""
+    facts = {
+        "format": FORMAT,
+        "simulator": bullet.getAPIVersion(),
+        "tree": [truth.parent, *(x.tolist() for x in (truth.R, truth.p, truth.theta))],
+        "limits": truth.as_dict()["limits"],
+        "gravity": truth.gravity.tolist(),
+        "feedback": [BANDWIDTH, DAMPING],
+        "babbling": flight.babbling.as_dict(),
+        "run": [flight.seconds, flight.rate_hz, flight.seed],
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _sweep(place: Path) -> None:
+    """Remove what a killed run left behind; nobody writes at one file for so long."""
+    for left in place.glob(f"*{PART}"):
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - left.stat().st_mtime > ABANDONED_S:
+                left.unlink()
+
+
+def _sound(path: Path) -> bool:
+    """Whether a file is there and complete, by its directory, which is written last."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return set(file.files) == set(SIGNALS)
+    except UNREADABLE:
+        return False
+
+
+def _make(jobs: list[_Job], processes: int) -> None:
+    """Make all files, in this process or shared out to several of their own.
+
+    The workers are fresh interpreters: unlike a forked one they share no library's threads with
+    this process, and unlike a spawned one they do not run the caller's script again.
+    """
+    count = min(processes, len(jobs))
+    if count < 2:
+        for job in jobs:
+            job.make()
+        return
+    command = [sys.executable, "-c", "from sim.falls.data_set import work; work()"]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
+    workers = [
+        subprocess.Popen(
+            command, env=environment, stdin=subprocess.PIPE, stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+        )
+        for _ in range(count)
+    ]  # fmt: skip
+    try:
+        for k, worker in enumerate(workers):
+            assert worker.stdin is not None
+            with contextlib.suppress(BrokenPipeError), worker.stdin as pipe:
+                pickle.dump(jobs[k::count], pipe)
+            worker.stdin = None
+        said = [worker.communicate()[1].decode(errors="replace") for worker in workers]
+    finally:
+        for worker in workers:
+            if worker.poll() is None:
+                worker.terminate()
+                worker.wait(SHUTDOWN_S)
+    for worker, text in zip(workers, said, strict=True):
+        if worker.returncode:
+            raise RuntimeError(f"a worker ended with {worker.returncode}: {text.strip()}")
+
+
+def work() -> None:
+    """A worker process: makes the files of the jobs that come in on standard input."""
+    for job in pickle.load(sys.stdin.buffer):
+        job.make()

@@ -1,0 +1,246 @@
+"""A tree of rigid bodies in free fall, by PyBullet, sampled so that every sample is exact.
+
+PyBullet steps by semi-implicit Euler: v' = v + h a(q, v, tau), then q' = q + h v'. The sample
+(q_k, v_k, (v_{k+1} - v_k) / h, tau_k) therefore satisfies the equations of motion to rounding
+error, at any step. That holds for the base too, where PyBullet integrates the velocity of its
+centre of mass in world axes. The motion of its link frame follows from that by formula:
+differencing the velocity of any other point would leave an error of order h.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+import pybullet as bullet
+
+from sim.falls.babbling import Babbling, plan
+from sim.falls.tree_truth import TreeTruth
+from sim.rigid_bodies import disconnect, load_urdf
+from sim.truth import Array, body_of
+from sim.urdf_writer import joint_text, link_text, principal
+
+RATE_HZ = 1000.0
+PUSH = 1.0  # N m, by which the controller's designer feels a joint's inertia
+BANDWIDTH = 2 * np.pi * 15.0  # rad/s, of the feedback on a joint whose neighbours are free
+DAMPING = 1.0  # ratio, likewise
+
+
+@dataclass(frozen=True, eq=False)
+class FallRecord:
+    """Exact samples of a fall; row k of everything belongs to one instant.
+
+    Attributes:
+        q, dq, ddq: (m, n) rad, rad/s, rad/s².
+        tau: (m, n) joint torques, N m.
+        base_v: (m, 3) velocity of the base link's origin in base axes, m/s.
+        base_w: (m, 3) angular velocity of the base in base axes, rad/s.
+        base_a: (m, 3) acceleration of that origin minus gravity in base axes, m/s².
+        base_dw: (m, 3) angular acceleration in base axes, rad/s².
+    """
+
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    base_v: Array
+    base_w: Array
+    base_a: Array
+    base_dw: Array
+
+
+class FreeFall:
+    """A tree that falls: knows how to be put somewhere and to move on by one step."""
+
+    def __init__(self, truth: TreeTruth, rate_hz: float = RATE_HZ) -> None:
+        """Load the tree.
+
+        Raises:
+            ValueError: a rate that is not above 0.
+        """
+        if not rate_hz > 0:
+            raise ValueError(f"rate_hz must be above 0, got {rate_hz}")
+        self.truth = truth
+        self.h_s = 1.0 / rate_hz
+        self._world = bullet.connect(bullet.DIRECT)
+        self._close = weakref.finalize(self, disconnect, [self._world])
+        self._robot = load_urdf(_urdf(truth), self._world, fixed=False)
+        count = bullet.getNumJoints(self._robot, physicsClientId=self._world)
+        infos = [bullet.getJointInfo(self._robot, j, self._world) for j in range(count)]
+        number = {info[1].decode(): info[0] for info in infos}
+        self._joints = [number[name] for name in truth.joint_names]
+        _, self._com, inertia = body_of(truth.theta[0])
+        self._axes = principal(inertia)[1]
+        bullet.setTimeStep(self.h_s, physicsClientId=self._world)
+        bullet.setGravity(*truth.gravity.tolist(), physicsClientId=self._world)
+
+    def place(self, q: Array, dq: Array, w: Array) -> None:
+        """Put the tree at the origin, its base level.
+
+        Args:
+            q: (n,) rad.
+            dq: (n,) rad/s.
+            w: (3,) angular velocity of the base in world axes, rad/s; its centre is at rest.
+        """
+        at = (0.0, 0.0, 0.0)
+        bullet.resetBasePositionAndOrientation(
+            self._robot, at, (0.0, 0.0, 0.0, 1.0), physicsClientId=self._world
+        )
+        bullet.resetBaseVelocity(self._robot, at, w.tolist(), physicsClientId=self._world)
+        for j, angle, speed in zip(self._joints, q.tolist(), dq.tolist(), strict=True):
+            bullet.resetJointState(self._robot, j, angle, speed, physicsClientId=self._world)
+
+    def step(self, tau: Array) -> None:
+        """Move on by one step under torques (n,) N m."""
+        bullet.setJointMotorControlArray(
+            self._robot,
+            self._joints,
+            bullet.TORQUE_CONTROL,
+            forces=tau.tolist(),
+            physicsClientId=self._world,
+        )
+        bullet.stepSimulation(physicsClientId=self._world)
+
+    def joints(self) -> tuple[Array, Array]:
+        """q (n,) rad and dq (n,) rad/s."""
+        states = bullet.getJointStates(self._robot, self._joints, physicsClientId=self._world)
+        both = np.array([state[:2] for state in states])
+        return both[:, 0], both[:, 1]
+
+    def base(self) -> Array:
+        """(10,) as PyBullet has it: quaternion x y z w of the base's principal axes, velocity of
+        its centre of mass and angular velocity in world axes."""
+        _, turned = bullet.getBasePositionAndOrientation(self._robot, physicsClientId=self._world)
+        v, w = bullet.getBaseVelocity(self._robot, physicsClientId=self._world)
+        return np.array((*turned, *v, *w))
+
+    def felt_inertia(self) -> Array:
+        """(n,) kg m²: what each joint feels at mid range with all the others free.
+
+        Each joint is pushed once; the tree may be anywhere afterwards.
+        """
+        limits, rest = self.truth.limits, np.zeros(self.truth.n)
+        middle, felt = (limits.lower + limits.upper) / 2, np.empty(self.truth.n)
+        for j in range(self.truth.n):
+            self.place(middle, rest, np.zeros(3))
+            push = rest.copy()
+            push[j] = PUSH
+            self.step(push)
+            felt[j] = PUSH * self.h_s / self.joints()[1][j]
+        return felt
+
+    def record(self, q: Array, dq: Array, tau: Array, bases: Array) -> FallRecord:
+        """The exact samples of a run of m steps.
+
+        Args:
+            q: (m + 1, n) rad; dq: (m + 1, n) rad/s; bases: (m + 1, 10), see `base`.
+            tau: (m, n) N m.
+        """
+        v, w = bases[:, 4:7], bases[:, 7:]
+        R = _rotations(bases[:-1, :4]) @ self._axes.T
+
+        def into_base(x: Array) -> Array:
+            return np.asarray(np.einsum("kij,ki->kj", R, x))
+
+        c, gravity = self._com, self.truth.gravity
+        base_w = into_base(w[:-1])
+        base_dw = into_base(np.diff(w, axis=0) / self.h_s)
+        turning = np.cross(base_w, c)
+        base_a = into_base(np.diff(v, axis=0) / self.h_s - gravity)
+        return FallRecord(
+            q=q[:-1],
+            dq=dq[:-1],
+            ddq=np.diff(dq, axis=0) / self.h_s,
+            tau=tau,
+            base_v=into_base(v[:-1]) - turning,
+            base_w=base_w,
+            base_a=base_a - np.cross(base_dw, c) - np.cross(base_w, turning),
+            base_dw=base_dw,
+        )
+
+    def close(self) -> None:
+        """Free the PyBullet client; may be called more than once."""
+        self._close()
+
+
+def babble(
+    truth: TreeTruth,
+    seconds: float,
+    rng: np.random.Generator,
+    settings: Babbling | None = None,
+    rate_hz: float = RATE_HZ,
+) -> FallRecord:
+    """Let a tree fall for a while and babble, its joints under pure feedback.
+
+    Torques are those of a position and velocity feedback on the wanted motion, cut at the joints'
+    effort limits; it starts on the wanted motion.
+
+    Args:
+        truth: the tree.
+        seconds: how long.
+        rng: all that is random comes from it.
+        settings: of the babbling.
+        rate_hz: of simulation, controller and samples.
+
+    Raises:
+        RuntimeError: a joint left its range, or the simulation diverged.
+    """
+    settings = settings or Babbling()
+    m = round(seconds * rate_hz)
+    want_q, want_dq = plan(truth.limits, np.arange(m) / rate_hz, settings, rng)
+    tumble = settings.tumble * rng.standard_normal(3)
+    fall = FreeFall(truth, rate_hz)
+    try:
+        felt = fall.felt_inertia()
+        stiff, damp = BANDWIDTH**2 * felt, 2 * DAMPING * BANDWIDTH * felt
+        effort = truth.limits.effort
+        q, dq = np.empty((m + 1, truth.n)), np.empty((m + 1, truth.n))
+        tau, bases = np.empty((m, truth.n)), np.empty((m + 1, 10))
+        fall.place(want_q[0], want_dq[0], tumble)
+        for k in range(m):
+            q[k], dq[k] = fall.joints()
+            bases[k] = fall.base()
+            wanted = stiff * (want_q[k] - q[k]) + damp * (want_dq[k] - dq[k])
+            tau[k] = np.clip(wanted, -effort, effort)
+            fall.step(tau[k])
+        q[m], dq[m] = fall.joints()
+        bases[m] = fall.base()
+    finally:
+        fall.close()
+    _check_range(truth, q)
+    return fall.record(q, dq, tau, bases)
+
+
+def _check_range(truth: TreeTruth, q: Array) -> None:
+    """Refuse a motion q (m, n) that is not inside the limits; NaN is not."""
+    limits = truth.limits
+    inside = np.all((q >= limits.lower) & (q <= limits.upper), axis=0)
+    if not inside.all():
+        names = ", ".join(np.asarray(truth.joint_names)[~inside])
+        raise RuntimeError(
+            f"{truth.name}: the feedback did not keep {names} in range; babble more slowly "
+            "(high_hz, top_speed) or over a smaller share of the range"
+        )
+
+
+def _urdf(truth: TreeTruth) -> str:
+    """The tree as URDF that PyBullet reads without loss: inertial frames in principal axes."""
+    names = (truth.base_name, *truth.link_names)
+    parts = [
+        link_text(name, *body_of(theta)) for name, theta in zip(names, truth.theta, strict=True)
+    ]
+    for j, (joint, link) in enumerate(zip(truth.joint_names, truth.link_names, strict=True)):
+        parent = names[truth.parent[j] + 1]
+        parts.append(joint_text(joint, parent, link, truth.p[j], truth.R[j]))
+    return "\n".join([f'<robot name="{truth.name}">', *parts, "</robot>"])
+
+
+def _rotations(quaternions: Array) -> Array:
+    """(m, 3, 3) of unit quaternions (m, 4) x y z w: R = (2w² - 1) I + 2 u uᵀ + 2 w [u x]."""
+    u, w = quaternions[:, :3], quaternions[:, 3, None, None]
+    x, y, z = u.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    outer = u[:, :, None] * u[:, None, :]
+    return np.asarray((2 * w * w - 1) * np.eye(3) + 2 * outer + 2 * w * cross)

@@ -1,0 +1,170 @@
+"""What is true of a simulated tree with a floating base, such as a humanoid, and random trees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sim.truth import Array, facts_of, from_rpy, lam_of, theta_of, turn
+
+BASE = -1
+GRAVITY = (0.0, 0.0, -9.81)  # m/s², world axes
+FEWEST, MOST = 5, 60  # links of a random tree
+NEAR = 16  # a random tree's link hangs on one of so many before it: chains as well as branches
+REACH_M = 0.12  # rms distance between two joints of a random tree, per axis
+DENSITY = 1000.0  # kg/m³, of the boxes that random links are made of (water; robots are close)
+SHORTEST_M, LONGEST_M = 0.05, 0.2  # edges of those boxes
+RANGE_RAD, SPEED, EFFORT = (0.8, 2.0), 12.0, 1000.0  # rad, rad/s, N m: ATLAS has the like
+
+
+@dataclass(frozen=True, slots=True)
+class TreeLimits:
+    """Joint limits, (n,) each: rad, rad, rad/s, N m."""
+
+    lower: Array
+    upper: Array
+    velocity: Array
+    effort: Array
+
+
+@dataclass(frozen=True, eq=False)
+class TreeTruth:
+    """Everything that decides how a simulated tree of rigid bodies moves; no friction, no drives.
+
+    Attributes:
+        name: of the robot.
+        joint_names: n names.
+        link_names: n names, link j moves with joint j.
+        base_name: of the base link.
+        parent: for each joint the index of the link it hangs on, -1 the base; parents come first.
+        R: (n, 3, 3) orientation of joint frame j in its parent's frame at q_j = 0; axis z.
+        p: (n, 3) its position there, m.
+        theta: (n + 1, 10) [m mX mY mZ XX XY XZ YY YZ ZZ] about the link-frame origin, SI; the
+            base first.
+        limits: of the joints.
+        gravity: (3,) acceleration of gravity in world axes, m/s².
+
+    Raises:
+        ValueError: a parent that does not come earlier, or shapes that do not fit.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    base_name: str
+    parent: tuple[int, ...]
+    R: Array
+    p: Array
+    theta: Array
+    limits: TreeLimits
+    gravity: Array
+
+    def __post_init__(self) -> None:
+        n = len(self.parent)
+        shapes = (self.R.shape, self.p.shape, self.theta.shape, self.limits.lower.shape)
+        if shapes != ((n, 3, 3), (n, 3), (n + 1, 10), (n,)):
+            raise ValueError(f"{n} joints don't fit shapes {shapes} of R, p, theta, limits")
+        if not len(self.joint_names) == len(self.link_names) == n:
+            raise ValueError(f"{n} joints need {n} joint names and {n} link names")
+        for k, i in enumerate(self.parent):
+            if not BASE <= i < k:
+                raise ValueError(f"joint {k} hangs on link {i}; have: -1 (the base) to {k - 1}")
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.parent)
+
+    @property
+    def lam(self) -> Array:
+        """λ (n, 6), see `lam_of`."""
+        return lam_of(self.R, self.p)
+
+    @property
+    def mass(self) -> float:
+        """Of the whole robot, kg."""
+        return float(self.theta[:, 0].sum())
+
+    def as_dict(self) -> dict[str, Any]:
+        """The truth as plain numbers; keys of a truth file, and the tree's own."""
+        return {
+            "robot": self.name,
+            "base": self.base_name,
+            "joints": list(self.joint_names),
+            "links": list(self.link_names),
+            "parent": list(self.parent),
+            "lambda": self.lam.tolist(),
+            "theta": self.theta.tolist(),
+            "limits": {k: getattr(self.limits, k).tolist() for k in TreeLimits.__slots__},
+            "gravity": self.gravity.tolist(),
+        }
+
+
+def atlas() -> TreeTruth:
+    """The humanoid ATLAS: 30 joints on a floating pelvis; facts in `sim/models/atlas.toml`."""
+    facts = facts_of("atlas")
+    base, joints = facts["base"], facts["joint"]
+    links = [j["link"] for j in joints]
+    place = {base["link"]: BASE} | {name: k for k, name in enumerate(links)}
+    return TreeTruth(
+        name=facts["robot"]["name"],
+        joint_names=tuple(j["name"] for j in joints),
+        link_names=tuple(links),
+        base_name=base["link"],
+        parent=tuple(place[j["parent"]] for j in joints),
+        R=np.array([from_rpy(j["rpy"]) for j in joints]),
+        p=np.array([j["xyz"] for j in joints]),
+        theta=np.array([theta_of(x["mass"], x["com"], x["inertia"]) for x in (base, *joints)]),
+        limits=TreeLimits(*(np.array([j[k] for j in joints]) for k in TreeLimits.__slots__)),
+        gravity=np.array(facts["robot"]["gravity"]),
+    )
+
+
+def random_tree(links: int, seed: int) -> TreeTruth:
+    """A tree of random shape: boxes of water's density, joined anywhere, turning about any axis.
+
+    Args:
+        links: moving ones, 5 to 60.
+        seed: same seed, same tree.
+
+    Raises:
+        ValueError: fewer or more links than that.
+    """
+    if not FEWEST <= links <= MOST:
+        raise ValueError(f"a random tree has {FEWEST} to {MOST} moving links, got {links}")
+    rng = np.random.default_rng([seed, links])
+    parent = tuple(int(rng.integers(max(BASE, k - NEAR), k)) for k in range(links))
+    half = rng.uniform(*RANGE_RAD, links)
+    middle = rng.uniform(-0.5, 0.5, links)
+    everywhere = np.ones(links)
+    return TreeTruth(
+        name=f"tree{links}",
+        joint_names=tuple(f"joint{k + 1}" for k in range(links)),
+        link_names=tuple(f"link{k + 1}" for k in range(links)),
+        base_name="base",
+        parent=parent,
+        R=np.array([_any_rotation(rng) for _ in range(links)]),
+        p=REACH_M * rng.standard_normal((links, 3)),
+        theta=np.array([_random_body(rng) for _ in range(links + 1)]),
+        limits=TreeLimits(middle - half, middle + half, SPEED * everywhere, EFFORT * everywhere),
+        gravity=np.array(GRAVITY),
+    )
+
+
+def _random_body(rng: np.random.Generator) -> Array:
+    """(10,) of a box of random size, place and orientation."""
+    edges = rng.uniform(SHORTEST_M, LONGEST_M, 3)
+    m = DENSITY * float(np.prod(edges))
+    axes = _any_rotation(rng)
+    square = edges * edges
+    inertia = axes @ np.diag(m / 12 * (square.sum() - square)) @ axes.T
+    com = REACH_M / 2 * rng.standard_normal(3)
+    return theta_of(m, com.tolist(), inertia[np.triu_indices(3)].tolist())
+
+
+def _any_rotation(rng: np.random.Generator) -> Array:
+    """A rotation (3, 3), uneven but full in its range: three turns by any angle."""
+    first, second, third = rng.uniform(-np.pi, np.pi, 3)
+    return turn(2, first) @ turn(0, second) @ turn(2, third)

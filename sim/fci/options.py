@@ -1,0 +1,32 @@
+"""What the simulated robot can be asked for; light, so that wrong use is told at once."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sim.fci.codec import HOST, PORT, VERSIONS
+from sim.fci.faults import Fault, describe
+from sim.options import add_scenario, options_of
+from sim.options import check as check_scenario
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe()
+    add = parser.add_argument
+    add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
+    add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
+    add_scenario(parser)
+    add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
+    add("--core", type=int, default=None, help="processor to stay on")
+    add("--duration", type=float, default=None, metavar="S", help="stop after so many seconds")
+    add("--json", type=Path, default=None, metavar="FILE", help="write the summary there as well")
+
+
+def check(args: argparse.Namespace) -> None:
+    """Raises ValueError for an arm or a fault that does not exist."""
+    check_scenario(args.scenario, options_of(args.set))
+    for text in args.fault:
+        Fault.of(text)

@@ -1,0 +1,22 @@
+"""Hidden-effect trials: `draw` a seed's trial, `write` its recording, nominal model and truth."""
+
+from __future__ import annotations
+
+from sim.hidden.record import Recording, pybullet_recording, simulate, write, write_files
+from sim.hidden.trial import KINDS, MODEL_ERROR, SHARES, Trial, draw, nominal_urdf, seal, unseal
+
+__all__ = [
+    "KINDS",
+    "MODEL_ERROR",
+    "SHARES",
+    "Recording",
+    "Trial",
+    "draw",
+    "nominal_urdf",
+    "pybullet_recording",
+    "seal",
+    "simulate",
+    "unseal",
+    "write",
+    "write_files",
+]

@@ -1,0 +1,243 @@
+"""Hidden-effect trials: a seed decides what is wrong with an arm, the recording says no more.
+
+The nominal model is the documented Panda. The simulated arm differs from it by 2 % of every
+inertial number and by the effects drawn; a coloured disturbance torque acts on every joint.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from sim.effects import Effect
+from sim.hidden.motion import DrawnMotion, draw_motion
+from sim.hidden.sizes import (
+    CATALOGUE,
+    OUTSIDE,
+    SECONDS,
+    WRIST,
+    WRIST_SHARE,
+    draw_effect,
+    log_uniform,
+)
+from sim.noise import NoiseLevels, levels_of
+from sim.truth import Array, Truth, body_of, panda
+from sim.urdf_writer import urdf
+
+FORMAT, VERSION = "panda-adapter/hidden-truth", 1
+KINDS = ("null", "single", "pair", "outside")
+SHARES = (0.25, 0.40, 0.25, 0.10)
+COMMANDS_SHARE = 0.5  # of the recordings have /joint_commands
+MODEL_ERROR = 0.02  # rms error of each of the nominal model's inertial numbers, of its size
+DISTURBANCE_NM = (0.02, 0.08)  # rms; WRIST_SHARE of it on joints 5 to 7
+DISTURBANCE_HZ = (0.3, 3.0)  # corner of the low-pass that colours it
+TRIAL_STREAM, DISTURBANCE_STREAM = 34, 35  # apart from the streams of the noise
+ATTEMPTS = 1000
+# Of two friction laws on one joint, or of two of these, only the sum can be seen.
+FRICTION = {
+    "coulomb_friction",
+    "asymmetric_friction",
+    "stribeck_friction",
+    "load_dependent_friction",
+    "friction_drift",
+}
+LOOK_ALIKE = (
+    FRICTION,
+    {"joint_spring", "torque_ripple", "torque_offset"},
+    {"payload", "link_inertia", "base_tilt"},
+    {"encoder_offset", "encoder_ripple", "torque_offset"},
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """What a seed decides.
+
+    Attributes:
+        seed, kind: of the draw; one of `KINDS`.
+        effects: what is hidden in the arm.
+        arm: the simulated arm without the effects; 2 % off the nominal one.
+        nominal: the documented arm, the model that the workflow gets.
+        motion: that the arm is told to make.
+        disturbance_nm: (n,) rms of the disturbance torque, N m.
+        disturbance_hz: corner of its first-order low-pass.
+        noise: of the sensors.
+        commands: whether the recording has the commanded torques.
+        seconds: length of the recording.
+    """
+
+    seed: int
+    kind: str
+    effects: tuple[Effect, ...]
+    arm: Truth
+    nominal: Truth
+    motion: DrawnMotion
+    disturbance_nm: Array
+    disturbance_hz: float
+    noise: NoiseLevels
+    commands: bool
+    seconds: float = SECONDS
+
+    @property
+    def times(self) -> Array:
+        """(m,) s of the samples, 1 ms apart."""
+        return np.arange(round(self.seconds * 1000), dtype=np.float64) * 1e-3
+
+    def disturbance(self) -> Array:
+        """(m, n) N m: first-order low-passed noise, the same at every call."""
+        m, n = len(self.times), self.arm.n
+        rng = np.random.default_rng([self.seed, DISTURBANCE_STREAM])
+        keep = float(np.exp(-2 * np.pi * self.disturbance_hz * 1e-3))
+        return self.disturbance_nm * _first_order(rng.standard_normal((m, n)), keep)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a truth file holds: enough to know, simulate and score the trial."""
+        arm = self.arm.as_dict()
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "seed": self.seed,
+            "kind": self.kind,
+            "effects": [effect.as_dict() for effect in self.effects],
+            "seconds": self.seconds,
+            "commands": self.commands,
+            "motion": self.motion.as_dict(),
+            "disturbance": {"rms_nm": self.disturbance_nm.tolist(), "hz": self.disturbance_hz},
+            "noise": self.noise.as_dict(),
+            "joints": arm["joints"],
+            "lambda": arm["lambda"],
+            "gravity": arm["gravity"],
+            "theta": arm["theta"],
+            "nominal_theta": self.nominal.theta.tolist(),
+        }
+
+
+def draw(seed: int, kind: str | None = None, effect: str | None = None) -> Trial:
+    """The trial of a seed.
+
+    Args:
+        seed: decides everything.
+        kind: one of `KINDS`; drawn by `SHARES` where None.
+        effect: name of the single effect; drawn where None.
+
+    Raises:
+        ValueError: unknown kind or effect; the message has the choices.
+    """
+    rng = np.random.default_rng([seed, TRIAL_STREAM])
+    drawn = str(rng.choice(KINDS, p=SHARES))
+    kind = kind or ("single" if effect else drawn)
+    if kind not in KINDS:
+        raise ValueError(f"no kind of trial {kind!r}; have: {', '.join(KINDS)}")
+    if effect is not None and effect not in {**CATALOGUE, **OUTSIDE}:
+        raise ValueError(f"no effect {effect!r}; have: {', '.join((*CATALOGUE, *OUTSIDE))}")
+    nominal = panda()
+    arm = nominal.with_changes(theta=_wrong(nominal.theta, rng))
+    motion = draw_motion(rng, arm.limits, arm.ready)
+    arm = arm.with_changes(ready=motion.middle)
+    share = np.where(np.arange(1, arm.n + 1) >= WRIST, WRIST_SHARE, 1.0)
+    return Trial(
+        seed=seed,
+        kind=kind,
+        disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, arm.n),
+        disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
+        commands=bool(rng.random() < COMMANDS_SHARE),
+        effects=_effects(rng, kind, arm, effect),
+        arm=arm,
+        nominal=nominal,
+        motion=motion,
+        noise=levels_of("real"),
+    )
+
+
+def _effects(
+    rng: np.random.Generator, kind: str, arm: Truth, name: str | None
+) -> tuple[Effect, ...]:
+    if kind == "null":
+        return ()
+    if kind == "outside":
+        return (draw_effect(rng, name or str(rng.choice(list(OUTSIDE))), arm),)
+    if kind == "single":
+        return (draw_effect(rng, name or str(rng.choice(list(CATALOGUE))), arm),)
+    for _ in range(ATTEMPTS):
+        names = rng.choice(list(CATALOGUE), 2, replace=False)
+        pair = draw_effect(rng, name or str(names[0]), arm), draw_effect(rng, str(names[1]), arm)
+        if _apart(*pair):
+            return pair
+    raise AssertionError("no pair of distinct effects found")
+
+
+def _apart(first: Effect, second: Effect) -> bool:
+    """Whether two effects can be told from one another and from their sum."""
+    if first.name == second.name:
+        return False
+    names = {first.name, second.name}
+    same_place = not first.joints or not second.joints or first.joints == second.joints
+    alike = any(names <= group for group in LOOK_ALIKE)
+    return not (alike and (same_place or "payload" in names))
+
+
+def _wrong(theta: Array, rng: np.random.Generator) -> Array:
+    """θ (n, 10) with each number changed by `MODEL_ERROR` rms, every body still possible."""
+    wrong = theta.copy()
+    for j, body in enumerate(theta):
+        for _ in range(ATTEMPTS):
+            wrong[j] = body * (1 + MODEL_ERROR * rng.standard_normal(10))
+            if _possible(wrong[j]):
+                break
+        else:
+            raise AssertionError(f"no possible body near that of link {j + 1}")
+    return wrong
+
+
+def _possible(theta: Array) -> bool:
+    """Whether moments about the centre are those of some distribution of mass."""
+    moments = np.linalg.eigvalsh(body_of(theta)[2])
+    return bool(moments[0] > 0 and moments[0] + moments[1] > moments[2])
+
+
+def _first_order(white: Array, keep: float) -> Array:
+    """AR(1) of unit variance along the first axis: x_k = keep x_{k-1} + sqrt(1 - keep^2) white."""
+    gain = np.sqrt(1 - keep * keep)
+    start = keep * white[:1]
+    out, _ = lfilter([gain], [1.0, -keep], white[1:], axis=0, zi=start)
+    return np.concatenate((white[:1], out))
+
+
+def nominal_urdf(nominal: Truth) -> str:
+    """The nominal model as URDF text with the joints' limits."""
+    text = urdf(nominal)
+    limits = nominal.limits
+    for j, name in enumerate(nominal.joint_names):
+        low, high, fast, strong = (
+            float(x[j]) for x in (limits.lower, limits.upper, limits.velocity, limits.effort)
+        )
+        old = f'<joint name="{name}" type="continuous">'
+        bound = f'<limit lower="{low!r}" upper="{high!r}" velocity="{fast!r}" effort="{strong!r}"/>'
+        text = text.replace(old, f'<joint name="{name}" type="revolute">{bound}')
+    return text
+
+
+def seal(contents: dict[str, Any]) -> str:
+    """Text of a truth file: its contents and their SHA-256, so that a change shows."""
+    body = json.dumps(contents, sort_keys=True)
+    return json.dumps({"sha256": _digest(body), "truth": contents}) + "\n"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def unseal(path: Path | str) -> dict[str, Any]:
+    """Contents of a sealed truth file. Raises ValueError if they were changed."""
+    outer = json.loads(Path(path).read_text("utf-8"))
+    body = json.dumps(outer["truth"], sort_keys=True)
+    if _digest(body) != outer["sha256"]:
+        raise ValueError(f"{path}: the truth was changed after it was sealed")
+    contents: dict[str, Any] = outer["truth"]
+    return contents

@@ -1,0 +1,203 @@
+"""Effects in the motion of the joints: their torques, and the step that friction allows.
+
+Each effect on a joint becomes one row of numbers; one compiled walk over the rows adds them up.
+Where the torque is stiff in the velocity (friction) a row adds to the coefficients of
+
+    f(v) = viscous v + (level_pos if v > 0 else level_neg) tanh(v / COULOMB_WIDTH),
+
+which enters the step implicitly; all else is taken as it is at the middle of the sub-step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from sim.effects import MOTION, Effect
+from sim.truth import Array, Truth
+
+COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_WIDTH)
+NEWTON_ROUNDS = 8
+NEWTON_DONE = 1e-12  # rad/s
+
+KINDS = {
+    "viscous_friction": (0, ("Fv",)),
+    "coulomb_friction": (1, ("Fc", "Fc")),
+    "asymmetric_friction": (1, ("Fc_pos", "Fc_neg")),
+    "stribeck_friction": (2, ("Fc", "Fs", "vs")),
+    "load_dependent_friction": (3, ("Fl",)),
+    "friction_drift": (4, ("dFc",)),
+    "motor_inertia": (5, ("B",)),
+    "torque_ripple": (6, ("a", "n", "phase")),
+    "joint_spring": (7, ("k", "q0")),
+    "x_quadratic_drag": (8, ("c",)),
+    "x_cubic_spring": (9, ("c", "q0")),
+    "x_position_friction": (10, ("A", "phase")),
+    "x_sine_disturbance": (11, ("a", "f", "phase")),
+    "x_velocity_ripple": (12, ("a", "n", "phase")),
+    "x_hysteresis": (13, ("F", "sigma")),
+    "x_cross_viscous": (14, ("c",)),
+}
+ROW = 8  # kind, joint, other joint, three parameters, start, end
+
+
+@dataclass(frozen=True, eq=False)
+class Losses:
+    """Torques of the effects at one instant, (n,) each; `explicit` is all but friction."""
+
+    explicit: Array
+    viscous: Array
+    positive: Array
+    negative: Array
+    armature: Array
+
+    def friction(self, v: Array) -> Array:
+        """f(v) (n,) N m."""
+        level = np.where(v > 0, self.positive, self.negative)
+        return self.viscous * v + level * np.tanh(v / COULOMB_WIDTH)
+
+
+def rows_of(truth: Truth) -> Array:
+    """A truth's effects in the motion of its joints as rows of numbers (r, ROW)."""
+    effects = (effect for effect in truth.effects if effect.place == MOTION)
+    rows = [row for effect in effects for row in _rows(effect, truth.n)]
+    return np.array(rows).reshape(-1, ROW)
+
+
+def _rows(effect: Effect, n: int) -> list[list[float]]:
+    kind, keys = KINDS[effect.name]
+    numbers = [effect.number(key) for key in keys] + [0.0] * (3 - len(keys))
+    columns: Sequence[int] = effect.columns(n)
+    pairs = [(j, j) for j in columns]
+    if effect.name == "x_cross_viscous":
+        pairs = [(columns[1], columns[0])]
+    return [[kind, j, other, *numbers, effect.start_s, effect.end_s] for j, other in pairs]
+
+
+def losses_at(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array) -> Losses:
+    """Everything the rows say at t (s), q, v (n,) under the rigid arm's torque `rigid` (n,).
+
+    Args:
+        bent: (r,) N m, what each row of the Dahl model holds in its bristles.
+    """
+    return Losses(*add_up(rows, t, q, v, rigid, bent))
+
+
+@njit(cache=True)
+def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array) -> Array:
+    """(5, n): explicit, viscous, positive, negative, armature; arguments as in `losses_at`."""
+    out = np.zeros((5, len(q)))
+    for r in range(len(rows)):
+        kind, j, other, a, b, c, start, end = rows[r]
+        if t < start or t >= end:
+            continue
+        i = int(j)
+        if kind == 0:
+            out[1, i] += a
+        elif kind == 1:
+            out[2, i] += a
+            out[3, i] += b
+        elif kind in (2, 3, 4, 10):
+            level = _level(rows[r], q[i], v[i], rigid[i], t)
+            out[2, i] += level
+            out[3, i] += level
+        elif kind == 5:
+            out[4, i] += a
+        elif kind == 8:
+            out[1, i] += a * abs(v[i])
+        elif kind == 12:
+            out[1, i] += a * np.sin(b * q[i] + c)
+        elif kind == 13:
+            out[0, i] += bent[r]
+        elif kind == 14:
+            out[0, i] += a * v[int(other)]
+        else:
+            out[0, i] += _torque(rows[r], q[i], t)
+    return out
+
+
+@njit(cache=True)
+def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
+    """Level of a friction that is alike in both directions, N m."""
+    kind, a, b, c = row[0], row[3], row[4], row[5]
+    if kind == 2:
+        return a + (b - a) * np.exp(-((v / c) ** 2))
+    if kind == 3:
+        return a * abs(rigid)
+    if kind == 4:
+        return a * (t - max(row[6], 0.0))
+    return a * (1.0 + np.sin(q + b))
+
+
+@njit(cache=True)
+def _torque(row: Array, q: float, t: float) -> float:
+    """Torque of position or time alone, N m."""
+    kind, a, b, c = row[0], row[3], row[4], row[5]
+    if kind == 6:
+        return a * np.sin(b * q + c)
+    if kind == 7:
+        return a * (q - b)
+    if kind == 9:
+        return a * (q - b) ** 3
+    return a * np.sin(2 * np.pi * b * t + c)
+
+
+@njit(cache=True)
+def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
+    """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,): dz/dq = sigma (1 - z/F s)."""
+    for r in range(len(rows)):
+        if rows[r, 0] == 13:
+            speed, F, sigma = v[int(rows[r, 1])], rows[r, 3], rows[r, 4]
+            goal = F if speed > 0 else -F
+            bent[r] = goal + (bent[r] - goal) * np.exp(-sigma * abs(speed) * h / F)
+
+
+@njit(cache=True)
+def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) -> Array:
+    """What of the drives' torques reaches the rigid arm in a sub-step of h (s), (n,) N m.
+
+    Solves (M + B) dv = h (tau(dv) - explicit - bias - f(v + share dv)) for dv by Newton's method.
+    The share is one half (second order) as long as friction is not stiff on its joint, and goes
+    to one where it is: there the midpoint rule would keep a joint swinging about its standstill.
+    tau(dv) is what the drives give: push - damping (v + dv / 2), cut at their limits.
+
+    Args:
+        M: (n, n) mass matrix, kg m²; overwritten.
+        bias: (n,) inverse dynamics without acceleration, N m.
+        v: (n,) rad/s at the start of the sub-step.
+        parts: (5, n) of `add_up`.
+        drive: (3, n) push (N m), damping (N m s/rad), limit (N m).
+    """
+    n = len(v)
+    explicit, viscous, positive, negative, armature = parts
+    push, damping, most = drive
+    share, f, slope = np.empty(n), np.empty(n), np.empty(n)
+    tau, tau_slope = np.empty(n), np.empty(n)
+    for i in range(n):
+        M[i, i] += armature[i]
+        stiff = max(positive[i], negative[i], 0.0) / COULOMB_WIDTH * h / M[i, i]
+        share[i] = max(0.5, 1.0 - 1.0 / max(stiff, 1.0))
+    dv = np.zeros(n)
+    for _ in range(NEWTON_ROUNDS):
+        A = M / h
+        for i in range(n):
+            speed = v[i] + share[i] * dv[i]
+            level = positive[i] if speed > 0 else negative[i]
+            s = np.tanh(speed / COULOMB_WIDTH)
+            f[i] = viscous[i] * speed + level * s
+            slope[i] = share[i] * (viscous[i] + max(level, 0.0) / COULOMB_WIDTH * (1.0 - s * s))
+            tau[i] = push[i] - damping[i] * (v[i] + dv[i] / 2)
+            tau_slope[i] = damping[i] / 2
+            if abs(tau[i]) > most[i]:
+                tau[i], tau_slope[i] = min(max(tau[i], -most[i]), most[i]), 0.0
+            A[i, i] += slope[i] + tau_slope[i]
+        gap = tau - explicit - bias - f - M @ dv / h
+        change = np.linalg.solve(A, gap)
+        dv += change
+        if np.abs(change).max() < NEWTON_DONE:
+            break
+    # f and tau belong to the dv before the last change; the slopes carry them over.
+    return tau - explicit - f - (slope + tau_slope) * change - armature * dv / h

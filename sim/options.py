@@ -1,0 +1,84 @@
+"""What can be asked of a simulated arm, by name; light, so that wrong use is told at once."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+
+class ScenarioKind(NamedTuple):
+    """What a scenario offers: options (numbers from 0 up), and whether links are measured."""
+
+    options: tuple[str, ...] = ()
+    links: bool = False
+
+
+SCENARIOS = {
+    "nominal": ScenarioKind(),
+    "bent_link": ScenarioKind(("angle_deg", "offset_m"), links=True),
+    "payload_at_20s": ScenarioKind(("mass", "t_s")),
+    "friction": ScenarioKind(),
+    "wall_mounted": ScenarioKind(),
+}
+DEFAULT_SCENARIO = "nominal"
+COMMON_OPTIONS = ("noise", "links", "levels")
+NOISES = ("real", "none")
+
+
+def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
+    """The scenario's own options as numbers.
+
+    Raises:
+        ValueError: unknown scenario, option or noise, or a value out of range; with the choices.
+    """
+    if name not in SCENARIOS:
+        raise ValueError(f"no scenario {name!r}; have: {', '.join(SCENARIOS)}")
+    own = SCENARIOS[name].options
+    for key in options.keys() - {*own, *COMMON_OPTIONS}:
+        raise ValueError(f"{name} has no option {key!r}; have: {', '.join(own + COMMON_OPTIONS)}")
+    numbers = {key: _size(name, key, options[key]) for key in own if key in options}
+    links, noise = options.get("links", False), options.get("noise", NOISES[0])
+    if not isinstance(links, bool):
+        raise ValueError(f"{name}: links is {links!r}; have: True, False")
+    if noise not in NOISES:
+        raise ValueError(f"no noise {noise!r}; have: {', '.join(NOISES)}")
+    return numbers
+
+
+def options_of(texts: Sequence[str]) -> dict[str, Any]:
+    """Options of a scenario from KEY=VALUE texts; values are JSON, or text as it stands.
+
+    Raises ValueError for a text without a key.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ValueError(f"--set takes KEY=VALUE, got '{text}'")
+        try:
+            found[key] = json.loads(value)
+        except json.JSONDecodeError:
+            found[key] = value
+    return found
+
+
+def add_scenario(parser: argparse.ArgumentParser, of_set: str = "as in noise=none") -> None:
+    """Declare which arm is simulated: `--scenario`, `--set` (told more of), `--seed`."""
+    add = parser.add_argument
+    add("--scenario", default=DEFAULT_SCENARIO, metavar="NAME", help=", ".join(SCENARIOS))
+    words = f"option of the scenario, {of_set}"
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help=words)
+    add("--seed", type=int, default=0, help="of the arm, noise and faults")
+
+
+def _size(name: str, key: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = -1.0
+    if not 0.0 <= number < math.inf:
+        raise ValueError(f"{name}: {key} is {value!r}; have: numbers from 0 up")
+    return number

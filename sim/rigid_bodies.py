@@ -1,0 +1,180 @@
+"""The rigid arm in PyBullet, as it is between two changes: inertias, payloads, the base's tilt."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pybullet as bullet
+
+from sim import dynamics
+from sim.effects import BODY, Effect
+from sim.truth import Array, Truth, body_of, theta_of, turn
+from sim.urdf_writer import principal, urdf
+
+NO_CAP = 1e6  # rad/s and m/s, in place of PyBullet's velocity cap of 100
+FLAT = 1e-6  # of the largest moment: so far below zero a principal moment may be by rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """An arm in a PyBullet client of its own that holds from `start_s` on.
+
+    PyBullet keeps what it computed of a body's masses: a change is another body.
+
+    Attributes:
+        start_s: from when on.
+        truth: the rigid arm.
+        client: where the arm moves.
+        arm: its number there.
+    """
+
+    start_s: float
+    truth: Truth
+    client: int
+    arm: int
+
+    def mass_matrix(self, q: Array) -> Array:
+        """(n, n) kg m²."""
+        return np.asarray(dynamics.mass_matrix(self.truth.frames, self.truth.theta, q))
+
+    def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
+        """Inverse dynamics (n,) N m."""
+        truth = self.truth
+        return np.asarray(dynamics.torques(truth.frames, truth.theta, truth.base, q, dq, ddq))
+
+
+def rigid_truths(truth: Truth, grid_s: float) -> list[tuple[float, Truth]]:
+    """From when on which rigid arm holds, first start -inf, effects on the bodies worked in.
+
+    Args:
+        truth: with its effects.
+        grid_s: of the ticks; a change acts from the tick on whose start is nearest to it.
+    """
+    bodies = [effect for effect in truth.effects if effect.place == BODY]
+    times = {time for effect in bodies for time in (effect.start_s, effect.end_s)}
+    starts = [-np.inf, *sorted(time for time in times if np.isfinite(time))]
+    out = []
+    for start in starts:
+        theta, gravity = truth.theta.copy(), truth.gravity
+        for effect in bodies:
+            if effect.start_s <= start < effect.end_s:
+                gravity = _work_in(effect, theta, gravity)
+        rigid = truth.with_changes(theta=theta, gravity=gravity, effects=())
+        out.append((start - grid_s / 2, rigid))
+    return out
+
+
+def _work_in(effect: Effect, theta: Array, gravity: Array) -> Array:
+    """Add an effect to theta (n, 10) in place; gravity (3,) as it is seen from then on."""
+    if effect.name == "payload":
+        theta[-1] += payload_theta(effect)
+    elif effect.name == "link_inertia":
+        theta[effect.columns(len(theta))[0]] += np.asarray(effect.parameters["dtheta"], float)
+    else:
+        return _tilted(gravity, effect.number("rx"), effect.number("ry"))
+    return gravity
+
+
+def payload_theta(load: Effect) -> Array:
+    """(10,) of an effect `payload` about the origin of the last link."""
+    com = [load.number(key) for key in ("cx", "cy", "cz")]
+    inertia = np.asarray(load.parameters.get("inertia", [0.0] * 6), float)
+    return theta_of(load.number("m"), com, inertia.tolist())
+
+
+def _tilted(gravity: Array, rx: float, ry: float) -> Array:
+    """R(r)^T g for the base turned by the rotation vector [rx, ry, 0]."""
+    angle, way = float(np.hypot(rx, ry)), float(np.arctan2(ry, rx))
+    about_x = turn(2, way) @ turn(0, angle) @ turn(2, -way)
+    return np.asarray(about_x.T @ gravity)
+
+
+def load(start_s: float, truth: Truth, period_s: float) -> Stage:
+    """The rigid arm of a truth in a fresh PyBullet client that steps by `period_s`.
+
+    Raises:
+        ValueError: a body without mass or with a negative moment of inertia.
+    """
+    moments = np.array([_checked(truth, j) for j in range(truth.n)])
+    client = bullet.connect(bullet.DIRECT)
+    arm = load_urdf(urdf(truth.with_changes(theta=_round_bodies(truth))), client, fixed=True)
+    # The reader of URDF files sets moments to zero that no rigid body has, learned ones among
+    # them; set one by one they are kept.
+    for j, three in enumerate(moments.tolist()):
+        bullet.changeDynamics(arm, j, localInertiaDiagonal=three, physicsClientId=client)
+    bullet.setGravity(*truth.gravity.tolist(), physicsClientId=client)
+    bullet.setTimeStep(period_s, physicsClientId=client)
+    return Stage(start_s, truth, client, arm)
+
+
+def load_urdf(text: str, client: int, fixed: bool) -> int:
+    """A robot of revolute joints, bare of all that PyBullet adds on its own account; its number.
+
+    That is damping, friction, sleep, the cap of velocities and the motors that hold joints.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.urdf"
+        path.write_text(text, "utf-8")
+        flags = bullet.URDF_USE_INERTIA_FROM_FILE
+        robot: int = bullet.loadURDF(
+            str(path), useFixedBase=fixed, flags=flags, physicsClientId=client
+        )
+    count = bullet.getNumJoints(robot, physicsClientId=client)
+    for link in range(-1, count):
+        bullet.changeDynamics(
+            robot,
+            link,
+            linearDamping=0.0,
+            angularDamping=0.0,
+            jointDamping=0.0,
+            lateralFriction=0.0,
+            maxJointVelocity=NO_CAP,
+            activationState=bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            physicsClientId=client,
+        )
+    bullet.setJointMotorControlArray(
+        robot,
+        list(range(count)),
+        bullet.VELOCITY_CONTROL,
+        forces=[0.0] * count,
+        physicsClientId=client,
+    )
+    return robot
+
+
+def disconnect(clients: list[int]) -> None:
+    """Free PyBullet's clients, those that are still there."""
+    for client in clients:
+        if bullet.isConnected(physicsClientId=client):
+            bullet.disconnect(physicsClientId=client)
+    clients.clear()
+
+
+def _checked(truth: Truth, j: int) -> Array:
+    """Principal moments (3,) of link j, kg m². Raises ValueError for what cannot be simulated."""
+    name, mass = truth.link_names[j], truth.theta[j, 0]
+    if not np.isfinite(truth.theta[j]).all() or not mass > 0.0:
+        raise ValueError(f"{name} has a mass of {mass} kg; a simulated body needs mass above 0")
+    moments, _ = principal(body_of(truth.theta[j])[2])
+    if moments.min() < -FLAT * max(moments.max(), 0.0) or moments.max() < 0.0:
+        told = ", ".join(f"{moment:.3g}" for moment in moments)
+        raise ValueError(
+            f"{name} has principal moments of inertia of {told} kg m² about its centre; "
+            "a simulated body needs them from 0 up"
+        )
+    return np.maximum(moments, 0.0)
+
+
+def _round_bodies(truth: Truth) -> Array:
+    """theta (n, 10) with bodies that PyBullet's reader takes, axes and centres unchanged."""
+    out = truth.theta.copy()
+    for j in range(truth.n):
+        m, c, inertia = body_of(truth.theta[j])
+        moments, axes = principal(inertia)
+        spread = 0.1 * np.array([1.0, 1.1, 1.2]) * max(moments.max(), 1e-9)
+        about_origin = axes @ np.diag(spread) @ axes.T + m * (c @ c * np.eye(3) - np.outer(c, c))
+        out[j, 4:] = about_origin[np.triu_indices(3)]
+    return out

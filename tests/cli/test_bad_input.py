@@ -1,0 +1,152 @@
+"""Bad input gets one clear sentence that names the file, the place and the choices."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.cli import main
+from adapter.model.robots import documented
+from drivers.files.mcap import McapWriter, read_log
+from drivers.interface import JointSample
+
+ROBOT = documented("panda")
+MIDDLE = np.array([0.0, -0.7, 0.0, -2.3, 0.0, 1.6, 0.8])
+LINK = '<link name="{}"><inertial><mass value="{}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" {}'
+INERTIA = 'iyz="0" izz="1"/></inertial></link>'
+
+
+def motion(count: int = 400) -> list[JointSample]:
+    """A little motion."""
+    t = 1e-3 * np.arange(count)[:, None]
+    w = 3.0 + 0.5 * np.arange(7)
+    q = MIDDLE + 0.2 * np.sin(w * t)
+    dq, tau = 0.2 * w * np.cos(w * t), np.cos(w * t)
+    return [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(count)]
+
+
+def record(path: Path, samples: list[JointSample], names=ROBOT.tree.joint_names) -> Path:
+    with McapWriter(path, names) as writer:
+        for sample in samples:
+            writer.write(sample)
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run the command; it must refuse with one sentence and no traceback. The sentence."""
+    assert main([str(argument) for argument in arguments]) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert said.count("error:") == 1
+    return " ".join(said.split())
+
+
+def replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str], path: Path) -> str:
+    """Replay a recording that can be used; what was said about it."""
+    out = tmp_path / "out"
+    assert main(["replay", str(path), "--quiet", "--no-report", "--out", str(out)]) == 0
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_unknown_robot(tmp_path, capsys) -> None:
+    path = record(tmp_path / "log.mcap", motion(20))
+    said = refused(capsys, "replay", path, "--robot", "pnada")
+    assert "pnada" in said and "panda" in said
+
+
+def test_missing_joint(tmp_path, capsys) -> None:
+    names = ("a", "b", "c", "d", "e", "f", "g")
+    said = refused(capsys, "replay", record(tmp_path / "log.mcap", motion(20), names))
+    assert "log.mcap" in said and "panda_joint1" in said and "a, b, c" in said
+
+
+def test_degrees(tmp_path, capsys) -> None:
+    samples = [JointSample(s.stamp_ns, 57.3 * s.q, 57.3 * s.dq, s.tau) for s in motion()]
+    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
+    assert "degrees" in said
+
+
+def test_a_reading_that_is_no_number(tmp_path, capsys) -> None:
+    samples = motion()
+    samples[100].q[3] = np.nan
+    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
+    assert "1 non_finite" in said
+
+
+def test_time_running_backwards(tmp_path, capsys) -> None:
+    samples = motion()
+    late = samples[200]
+    samples[200] = JointSample(samples[190].stamp_ns, late.q, late.dq, late.tau)
+    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
+    assert "1 time_backwards" in said
+
+
+def test_a_gap(tmp_path, capsys) -> None:
+    samples = motion()
+    path = record(tmp_path / "log.mcap", samples[:200] + samples[250:])
+    assert "0.051 s without a sample" in replayed(tmp_path, capsys, path)
+
+
+def test_a_cut_file(tmp_path, capsys) -> None:
+    path = record(tmp_path / "log.mcap", motion(3000))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    said = replayed(tmp_path, capsys, path)
+    assert "warning" in said and "log.mcap" in said
+    assert main(["recover", str(path)]) == 0
+    assert len(read_log(tmp_path / "log.recovered.mcap")) > 0
+
+
+@pytest.mark.parametrize("content", [b"", b"this is no recording"])
+def test_no_recording(tmp_path, capsys, content: bytes) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(content)
+    assert "log.mcap" in refused(capsys, "replay", path)
+
+
+def test_a_file_that_is_not_there(tmp_path, capsys) -> None:
+    assert "gone.mcap" in refused(capsys, "replay", tmp_path / "gone.mcap")
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ('<joint name="j" type="prismatic">', "prismatic"),
+        ("", "root"),
+        ('<joint name="j" type="revolute">', "mass"),
+    ],
+)
+def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> None:
+    mass = 0 if said == "mass" else 1
+    links = "".join(LINK.format(name, m, INERTIA) for name, m in (("a", 1), ("b", mass)))
+    if body:
+        body += '<parent link="a"/><child link="b"/><axis xyz="0 0 1"/></joint>'
+    urdf = tmp_path / "arm.urdf"
+    urdf.write_text(f'<robot name="r">{links}{body}</robot>')
+    path = record(tmp_path / "log.mcap", motion(20))
+    sentence = refused(capsys, "replay", path, "--robot", urdf)
+    assert said in sentence and "arm.urdf" in sentence
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "--driver", "pybullet:pnada"], "panda"),
+        (["run", "--driver", "serial:1"], "pybullet"),
+        (["run", "--driver", "panda"], "pybullet:panda"),
+        (["run", "--scenario", "nothing"], "bent_link"),
+        (["run", "--set", "mass"], "KEY=VALUE"),
+        (["run", "--scenario", "payload_at_20s", "--set", "weight=1"], "mass"),
+        (["run", "--duration", "-1"], "--duration"),
+        (["run", "--effects", "magic"], "coulomb_friction"),
+        (["run", "--truth", "nowhere.json"], "nowhere.json"),
+        (["run", "--config", "nowhere.toml"], "nowhere.toml"),
+        (["export", "nowhere.json", "--urdf", "x.urdf"], "nowhere.json"),
+        (["info", "nowhere.mcap"], "nowhere.mcap"),
+        (["recover", "nowhere.mcap"], "nowhere.mcap"),
+        (["import", "nowhere.csv", "--to", "x.mcap"], "nowhere.csv"),
+        (["report", "nowhere"], "nowhere"),
+    ],
+)
+def test_wrong_use(tmp_path, capsys, monkeypatch, arguments: list[str], said: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert said in refused(capsys, *arguments)

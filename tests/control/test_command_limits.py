@@ -1,0 +1,308 @@
+"""Commands stay inside every limit, whatever the samples do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from importlib import resources
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adapter.control.controller import ExcitationController
+from adapter.control.excitation import ExcitationSettings
+from adapter.control.limits import MotionLimits
+from adapter.errors import ControlError
+from adapter.model.urdf import read_urdf
+from adapter.realtime.session import run_lockstep
+from adapter.signals.front_end import FrontEnd
+from drivers.interface import JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+
+PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+LIMITS = MotionLimits.of(PANDA)
+READY = build("nominal").truth.ready
+PERIOD_NS, TICKS = 1_000_000, 1300
+INERTIA = np.array([1.5, 1.5, 1.0, 1.0, 0.05, 0.05, 0.02])  # kg m², about those of a Panda
+HELD = np.array([0.0, -30.0, 0.0, 15.0, 1.0, 2.0, 0.0])  # N m
+MOTION = ExcitationSettings(seed=7, start_s=0.3, stop_s=0.3)
+
+
+class Arm:
+    """Seven free joints that carry themselves; one tick is one period of true time."""
+
+    paced, adds_gravity, period_ns, arrived_ns = True, False, PERIOD_NS, 1
+    delay_ns = PERIOD_NS
+
+    def __init__(self) -> None:
+        self.q, self.dq = READY.copy(), np.zeros(7)
+
+    def tick(self, tau) -> None:
+        self.dq = self.dq + 1e-3 * (tau - HELD) / INERTIA
+        self.q = self.q + 1e-3 * self.dq
+
+    def sample(self, tick: int) -> JointSample:
+        return JointSample(tick * PERIOD_NS, self.q, self.dq, HELD)
+
+
+@dataclass
+class Fault:
+    kind: str
+    at: int
+    length: int = 1
+    joint: int = 0
+    size: float = 0.0
+
+    def on(self, tick: int) -> bool:
+        return self.at <= tick < self.at + self.length
+
+
+ANY_TICK = st.integers(0, TICKS - 1)
+JOINT = st.integers(0, 6)
+CLOCKS = st.one_of(
+    st.integers(-30, 30).map(lambda ms: 1e-3 * ms), st.sampled_from([-3600.0, -1.0, 1.0, 3600.0])
+)
+faults = st.lists(
+    st.one_of(
+        st.builds(Fault, st.sampled_from(["nan", "lost"]), ANY_TICK, st.integers(1, 30)),
+        # Held back for longer, the reference waits: the arm has tripped by then, or stood still.
+        st.builds(Fault, st.just("held"), ANY_TICK, st.integers(1, 3)),
+        st.builds(Fault, st.sampled_from(["repeated", "stale", "swapped"]), ANY_TICK),
+        st.builds(Fault, st.just("stuck"), ANY_TICK, st.integers(1, 400), JOINT),
+        st.builds(Fault, st.just("jump"), ANY_TICK, st.just(TICKS), JOINT, st.floats(-1, 1)),
+        st.builds(Fault, st.just("spike"), ANY_TICK, st.just(1), JOINT, st.floats(-100, 100)),
+        st.builds(Fault, st.just("fast"), ANY_TICK, st.just(1), JOINT, st.floats(-1e6, 1e6)),
+        st.builds(Fault, st.just("clock"), ANY_TICK, st.just(TICKS), st.just(0), CLOCKS),
+    ),
+    max_size=6,
+)
+
+
+class Line:
+    """What arrives in each tick of true time: the samples of an arm, as faults leave them."""
+
+    def __init__(self, faults: list[Fault]) -> None:
+        self._faults, self._last, self._queue = faults, None, []
+        self._frozen: dict[int, tuple[float, float]] = {}
+
+    def arrive(self, sample: JointSample, tick: int) -> list[JointSample]:
+        on = [fault for fault in self._faults if fault.on(tick)]
+        sample = self._altered(sample, on)
+        kinds = {fault.kind for fault in on}
+        before, self._last = self._last, sample
+        if "lost" in kinds:
+            return []
+        self._queue.append(sample)
+        if kinds & {"held", "swapped"}:
+            return []
+        swapped = any(f.kind == "swapped" and f.on(tick - 1) for f in self._faults)
+        out, self._queue = self._queue, []
+        if swapped:
+            out.reverse()
+        if "stale" in kinds and before is not None:
+            out = [before]
+        return out + out[-1:] if "repeated" in kinds else out
+
+    def _altered(self, sample: JointSample, on: list[Fault]) -> JointSample:
+        q, dq, stamp_ns = sample.q.copy(), sample.dq.copy(), sample.stamp_ns
+        for fault in on:
+            j = fault.joint
+            if fault.kind == "nan":
+                q[fault.at % 7] = dq[(fault.at + 3) % 7] = np.nan
+            elif fault.kind == "stuck":
+                q[j], dq[j] = self._frozen.setdefault(id(fault), (q[j], dq[j]))
+            elif fault.kind in ("jump", "spike"):
+                q[j] += fault.size
+            elif fault.kind == "fast":
+                dq[j] += fault.size
+            elif fault.kind == "clock":
+                stamp_ns += round(1e9 * fault.size)
+        return replace(sample, stamp_ns=stamp_ns, q=q, dq=dq)
+
+
+class Record:
+    """Reference and command of each call, in true time."""
+
+    def __init__(self) -> None:
+        self.ticks, self.q, self.tau = [], [], [HELD.copy()]
+
+    def add(self, tick: int, q, tau) -> None:
+        assert np.isfinite(tau).all()
+        self.tau.append(tau)
+        if self.ticks and self.ticks[-1] == tick:
+            assert (q == self.q[-1]).all()  # nothing moves where no time goes by
+            return
+        self.ticks.append(tick)
+        self.q.append(q)
+
+    def check(self, share: float) -> None:
+        """All limits; with divided differences, which a bounded derivative bounds."""
+        steps = np.abs(np.diff(np.array(self.tau), axis=0))
+        assert (steps <= share * LIMITS.torque_rate * 1e-3 + 1e-9).all()
+        assert (np.abs(np.array(self.tau)) <= 0.95 * LIMITS.effort + 1e-9).all()
+        if len(self.q) < 5:
+            return
+        t, q = 1e-3 * np.array(self.ticks), np.array(self.q)
+        assert (q >= LIMITS.lower).all() and (q <= LIMITS.upper).all()
+        table, factor = q, 1.0
+        for order, limit in enumerate((LIMITS.velocity, LIMITS.acceleration, LIMITS.jerk), 1):
+            table = np.diff(table, axis=0) / (t[order:] - t[:-order])[:, None]
+            factor *= order
+            assert (factor * np.abs(table) <= limit).all(), order
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    faults=faults,
+    stop=st.one_of(st.none(), ANY_TICK),
+    seed=st.integers(0, 1000),
+    late=st.floats(0.0, 0.3),
+)
+def test_every_limit_holds_in_the_arm_s_own_time_whatever_arrives(faults, stop, seed, late):
+    arm, line, record = Arm(), Line(faults), Record()
+    rng = np.random.default_rng(seed)
+    controller = ExcitationController(LIMITS, replace(MOTION, seed=seed))
+    controller.attend(arm)
+    controller.prepare(arm.sample(0))
+    tau = HELD
+    try:
+        for tick in range(TICKS):
+            if tick == stop:
+                controller.begin_stop()
+            instant = 10**15 + tick * PERIOD_NS + round(late * PERIOD_NS * rng.random())
+            for sample in line.arrive(arm.sample(tick), tick):
+                tau = controller.step(sample, instant)
+                record.add(tick, controller.reference.q, tau)
+            arm.tick(tau)
+    except ControlError as error:
+        assert faults and "joint" in str(error)
+    record.check(share=0.9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(faults=faults, stop=st.one_of(st.none(), ANY_TICK), seed=st.integers(0, 1000))
+def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults, stop, seed):
+    arm, line, record = Arm(), Line(faults), Record()
+    controller = ExcitationController(LIMITS, replace(MOTION, seed=seed))
+    controller.prepare(arm.sample(0))
+    tau, calls = HELD, 0
+    try:
+        for tick in range(TICKS):
+            if tick == stop:
+                controller.begin_stop()
+            for sample in line.arrive(arm.sample(tick), tick):
+                tau = controller.step(sample)
+                calls += 1
+                record.add(calls, controller.reference.q, tau)
+                ref = controller.reference
+                assert (np.abs(ref.dq) <= LIMITS.velocity).all()
+                assert (np.abs(ref.ddq) <= LIMITS.acceleration).all()
+            arm.tick(tau)
+    except ControlError as error:
+        assert faults and "joint" in str(error)
+    record.q.clear()  # in whose time these were, stamps alone cannot tell
+    record.check(share=1.0)
+
+
+def _run(faults: list[Fault], ticks: int = TICKS):
+    """The arm's own positions and speeds, and why the controller gave up."""
+    arm, line = Arm(), Line(faults)
+    controller = ExcitationController(LIMITS, MOTION)
+    controller.attend(arm)
+    controller.prepare(arm.sample(0))
+    tau, speeds = HELD, []
+    for tick in range(ticks):
+        try:
+            for sample in line.arrive(arm.sample(tick), tick):
+                tau = controller.step(sample, 10**15 + tick * PERIOD_NS)
+        except ControlError as error:
+            return np.array(speeds), str(error), tick, controller
+        arm.tick(tau)
+        speeds.append(arm.dq)
+    return np.array(speeds), None, ticks, controller
+
+
+def test_without_faults_nothing_is_refused():
+    _, said, _, controller = _run([])
+    assert said is None and controller.tracking()["unusable"] == 0
+
+
+@pytest.mark.parametrize("size", [0.5, -0.3, 0.05])
+def test_a_jump_of_an_encoder_stops_the_arm_and_does_not_fling_it(size):
+    calm = _run([])[0]
+    speeds, said, tick, _ = _run([Fault("jump", 700, TICKS, 1, size)])
+    assert said is not None and "joint 2" in said and "encoder" in said and 700 < tick < 725
+    np.testing.assert_array_equal(speeds[:700], calm[:700])
+    assert np.abs(speeds[700:] - calm[700 : len(speeds)]).max() < 0.4
+
+
+def test_a_single_spike_changes_next_to_nothing():
+    calm = _run([])[0]
+    speeds, said, _, controller = _run([Fault("spike", 700, 1, 1, 0.5)])
+    assert said is None and controller.tracking()["unusable"] == 1
+    assert np.abs(speeds - calm).max() < 0.02
+
+
+def test_a_joint_that_reads_the_same_while_it_should_move_stops_the_arm():
+    speeds, said, _, _ = _run([Fault("stuck", 500, TICKS, 0)])
+    assert said is not None and "joint 1 reads the same" in said
+    assert (np.abs(speeds) <= LIMITS.velocity).all()
+
+
+@pytest.mark.parametrize("length", [5, 15])
+def test_a_short_hole_is_bridged_and_a_long_one_stops(length):
+    assert _run([Fault("lost", 600, length)])[1] is None
+    said = _run([Fault("lost", 600, 25)])[1]
+    assert said is not None and "no usable joint reading for 0.02 s" in said
+
+
+@pytest.mark.parametrize("seconds", [3600.0, -3600.0, 0.5, -0.005, 0.005])
+def test_a_clock_that_is_set_is_no_hole(seconds):
+    calm = _run([])[0]
+    speeds, said, _, _ = _run([Fault("clock", 600, TICKS, 0, seconds)])
+    assert said is None
+    assert np.abs(speeds - calm).max() < 0.1
+
+
+class Lying(PyBulletArm):
+    """A simulated arm whose readings are what the faults make of them."""
+
+    def __init__(self, faults: list[Fault]) -> None:
+        self.plant = build("nominal", seed=3).plant()
+        super().__init__(self.plant)
+        self._line = Line(faults)
+
+    def read(self) -> JointSample:
+        while True:
+            sample = super().read()
+            for found in self._line.arrive(sample, sample.stamp_ns // PERIOD_NS):
+                return found
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        Fault("jump", 2500, 10**6, 1, 0.5),
+        Fault("jump", 2500, 10**6, 3, -0.1),
+        Fault("jump", 2500, 10**6, 5, 0.05),
+        Fault("stuck", 2500, 10**6, 0),
+        Fault("stuck", 2500, 10**6, 4),
+        Fault("nan", 2500, 10**6),
+    ],
+    ids=lambda fault: f"{fault.kind} of joint {fault.joint + 1}",
+)
+def test_the_simulated_arm_is_braked_inside_its_limits(fault):
+    arm = Lying([fault])
+    controller = ExcitationController(LIMITS, ExcitationSettings(seed=3))
+    result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 10.0)
+    assert result.ended == "driver_error" and "joint" in result.fault
+    assert arm.plant.fault is None and arm.plant.braked  # the arm itself had nothing to say
+    before = arm.plant.link_state()[0].copy()
+    for _ in range(500):
+        arm.plant.read()
+    q, dq, _ = arm.plant.link_state()
+    assert np.abs(dq).max() < 0.01 and np.abs(q - before).max() < 0.3
+    assert arm.plant.fault is None
+    arm.close()

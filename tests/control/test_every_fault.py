@@ -1,0 +1,193 @@
+"""What the loop does upon each fault of single samples: one test for each row of the README."""
+
+import numpy as np
+import pytest
+
+from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.signals.front_end import FrontEnd
+from adapter.signals.records import stamp_of
+from drivers.faults.driver import with_faults
+from drivers.files.log import LogArm
+from drivers.files.mcap import McapWriter
+from tests.helpers.arm_data import Motion, arm, panda_model, record
+from tests.helpers.fault_runs import FaultRun, clean_run, run_faulty
+from tests.helpers.live_tools import simulated_arm
+
+SECONDS = 4.0
+USUAL = ("filter_settling", "at_rest")
+
+
+def unusual(run: FaultRun) -> dict[str, int]:
+    """What was refused beside what every start refuses."""
+    return {name: count for name, count in run.refused.items() if name not in USUAL}
+
+
+def went_on(text: str) -> FaultRun:
+    """A run that a fault does not end."""
+    run = run_faulty(text, SECONDS)
+    assert (run.result.ended, run.result.fault) == ("duration", None)
+    run.check_balance()
+    assert run.finite and not run.learner.changes
+    return run
+
+
+def ended(text: str, *said: str) -> FaultRun:
+    """A run that ends with one sentence which contains all that was said."""
+    run = run_faulty(text, SECONDS)
+    assert run.result.ended == "driver_error" and run.result.fault is not None
+    assert all(part in run.result.fault for part in said), run.result.fault
+    assert "\n" not in run.result.fault
+    account = run.driver.account
+    assert account.balanced and run.finite
+    assert run.result.samples == run.result.passed_on + sum(run.refused.values())
+    return run
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_lost(share: float) -> None:
+    run = went_on(f"lost={share}")
+    assert run.driver.account.injected["lost"] > 0 and not unusual(run)
+    # each hole costs the samples in it and nothing else
+    assert run.result.samples + run.driver.account.injected["lost"] == run.driver.account.taken
+    assert run.learner.learned > 0.9 * (1.0 - share) * clean_run(SECONDS).learner.learned
+
+
+@pytest.mark.parametrize("text", ["late=0.01", "late=0.1", "reordered=0.01", "reordered=0.1"])
+def test_late_and_reordered(text: str) -> None:
+    run = went_on(text)
+    assert set(unusual(run)) <= {"time_backwards", "implausible_step"}
+    assert run.refused.get("implausible_step", 0) <= 3
+    assert 0 < run.refused["time_backwards"] <= run.driver.account.injected[text.split("=")[0]]
+    assert any("time does not increase" in said for said in run.front_end.messages)
+
+
+def test_repeated() -> None:
+    run = went_on("repeated=0.01")
+    assert unusual(run) == {"repeated": run.driver.account.injected["repeated"]}
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_corrupt(share: float) -> None:
+    run = went_on(f"corrupt={share}")
+    known = {"non_finite", "out_of_range", "implausible_step", "repeated"}
+    assert set(unusual(run)) <= known
+    # what is not refused changed a number by less than noise does
+    assert sum(unusual(run).values()) <= 1.2 * run.driver.account.injected["corrupt"] + 3
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_nan(share: float) -> None:
+    run = went_on(f"nan={share}")
+    assert unusual(run) == {"non_finite": run.driver.account.injected["nan"]}
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_spike(share: float) -> None:
+    run = went_on(f"spike={share}")
+    refused = unusual(run)
+    hit = run.driver.account.injected["spike"]
+    assert set(refused) <= {"implausible_step", "out_of_range"}
+    assert 0.8 * hit - 1 <= sum(refused.values()) <= 1.4 * hit + 3
+
+
+@pytest.mark.parametrize("size", ["0.1", "0.03"])
+def test_a_jump_of_an_encoder_ends_the_run_with_the_last_good_parameters(size: str) -> None:
+    run = ended(f"jump:3@2.5+{size}", "joint 3")
+    assert run.refused["encoder_jump"] > 0
+    assert any("panda_joint3 jumped" in said for said in run.front_end.messages)
+    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    assert np.array_equal(run.learner.theta.theta, before)
+    assert 2500 - 260 < run.learner.learned < 2500
+
+
+def listened(path, text: str) -> tuple[LockstepResult, FrontEnd, list[int]]:
+    """A recording of a moving arm behind faults; the stamps of what would be learned, in ms."""
+    front_end, learned = FrontEnd(panda_model()), []
+    with McapWriter(path, panda_model().tree.joint_names) as writer:
+        for sample in record(arm(), Motion(3.0, seed=1)).samples():
+            writer.write(sample)
+    driver = with_faults(LogArm(path), text)
+    result = run_lockstep(driver, front_end, Stamps(learned))
+    assert result.ended == "end_of_stream"
+    assert result.samples == result.passed_on + sum(front_end.refused.values())
+    return result, front_end, learned
+
+
+class Stamps:
+    """A learner that notes when its states were."""
+
+    def __init__(self, learned: list[int]) -> None:
+        self.learned = learned
+
+    def step(self, state) -> None:
+        self.learned.append(stamp_of(state) // 1_000_000)
+
+
+def test_in_passive_mode_nothing_is_learned_behind_a_jump(tmp_path) -> None:
+    _, front_end, learned = listened(tmp_path / "a.mcap", "jump:3@1.5+0.05")
+    assert learned[-1] < 1500 and front_end.refused["encoder_jump"] > 1400
+    assert front_end.fault is not None and "panda_joint3" in front_end.fault
+
+
+def test_in_passive_mode_a_stuck_joint_is_left_out_until_it_moves(tmp_path) -> None:
+    _, front_end, learned = listened(tmp_path / "a.mcap", "stuck:1@1.5+0.5")
+    assert 300 < front_end.refused["stuck_joint"] <= 500
+    assert not [t for t in learned if 1600 < t < 1950] and learned[-1] > 2900
+
+
+def test_in_passive_mode_a_silence_restarts_the_filter(tmp_path) -> None:
+    _, front_end, learned = listened(tmp_path / "a.mcap", "silence@1.5+0.05")
+    assert front_end.gaps == [(1_499_000_000, pytest.approx(0.051))]
+    assert "without a sample" in front_end.messages[0] and learned[-1] > 2900
+
+
+def test_a_joint_stuck_for_a_moment_is_left_out() -> None:
+    run = went_on("stuck:2@2+0.015")
+    assert set(unusual(run)) <= {"stuck_joint", "implausible_step"}
+
+
+def test_a_stuck_joint_ends_the_run_with_the_last_good_parameters() -> None:
+    run = ended("stuck:2@2.5+1", "joint")
+    assert run.refused["stuck_joint"] > 0
+    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    std = np.sqrt(run.learner.theta.covariance().diagonal()[:70]).reshape(7, 10)
+    assert (np.abs(run.learner.theta.theta - before) < std).all()
+
+
+@pytest.mark.parametrize("offset", ["+3600", "+1", "-0.05", "-3600"])
+def test_a_clock_jump(offset: str) -> None:
+    """Stamps that go on from elsewhere cost a restart of the filter, not the run."""
+    run = run_faulty(f"clock@2{offset}", SECONDS)
+    run.check_balance()
+    assert (run.result.ended, run.result.fault) == ("duration", None), run.result
+    assert run.finite and not run.learner.changes
+    assert set(unusual(run)) <= {"time_ahead", "time_backwards", "implausible_step"}
+    assert sum(unusual(run).values()) <= 110
+    assert run.refused["filter_settling"] > clean_run(SECONDS).refused["filter_settling"]
+
+
+def test_a_single_wrong_stamp() -> None:
+    run = went_on("stamp=0.002")
+    assert set(unusual(run)) <= {"time_ahead", "time_backwards"}
+
+
+def test_a_short_silence_is_bridged() -> None:
+    run = went_on("silence@2+0.015")
+    assert run.driver.account.injected["silence"] == 15 and not run.front_end.gaps
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("silence@2+5", "nothing heard"), ("died@2", "connection to the arm is gone")],
+)
+def test_a_silent_or_dead_connection_ends_the_run(text: str, said: str) -> None:
+    run = ended(text, said)
+    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    assert np.array_equal(run.learner.theta.theta, before)
+
+
+def test_a_slow_read_in_lockstep_changes_nothing() -> None:
+    run = run_faulty("slow=0.01+0.002", SECONDS)
+    assert run.driver.account.injected["slow"] > 10
+    assert np.array_equal(run.learner.theta.theta, clean_run(SECONDS).learner.theta.theta)
+    assert with_faults(simulated_arm(), "slow=0.5").faults.items[0].amount == 0.005

@@ -1,0 +1,190 @@
+"""The random motion keeps every limit, whenever it stops; the controller those of the torque."""
+
+from __future__ import annotations
+
+import re
+from importlib import resources
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from adapter.control.controller import ControlSettings, ExcitationController
+from adapter.control.excitation import ExcitationSettings, RandomMotion, plan_lines
+from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
+from adapter.errors import ControlError, SettingsError
+from adapter.model.urdf import read_urdf
+from drivers.interface import JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+
+PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+LIMITS = MotionLimits.of(PANDA)
+DT = 2e-3
+READY = build("nominal").truth.ready
+NUMBERS = r"([+-][\d.]+) \.\. ([+-][\d.]+) rad .* at first ([\d.]+), then ([\d.]+) rad/s"
+
+
+def _starts(draw_share):
+    start = LIMITS.lower + np.array(draw_share) * (LIMITS.upper - LIMITS.lower)
+    return np.minimum(start, LIMITS.upper)  # rounding may lead a last bit beyond
+
+
+shares = st.lists(st.floats(0.0, 1.0), min_size=7, max_size=7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    share=shares,
+    stop_s=st.floats(0.0, 8.0),
+    rest=st.one_of(st.none(), st.floats(0.0, 3.0)),
+    slow=st.one_of(st.just(0.0), st.floats(1.0, 4.0)),
+    slow_share=st.floats(0.01, 1.0),
+)
+def test_keeps_every_limit_for_every_seed_start_and_stop(
+    seed, share, stop_s, rest, slow, slow_share
+):
+    shift = 0.0 if slow == 0.0 else slow + 1.0  # no rest while it becomes quicker
+    rests = () if rest is None else ((shift + rest, shift + rest + 1.5),)
+    start = _starts(share)
+    how = ExcitationSettings(seed=seed, rests=rests, slow_s=slow, slow_share=slow_share)
+    motion = RandomMotion(LIMITS, start, how)
+    q, dq, ddq = [start], [np.zeros(7)], [np.zeros(7)]
+    while not motion.at_rest:
+        if motion.time_s >= stop_s:
+            motion.begin_stop()
+        motion.advance(DT)
+        for history, value in zip((q, dq, ddq), (motion.q, motion.dq, motion.ddq), strict=True):
+            history.append(value)
+    q, dq, ddq = (np.array(x) for x in (q, dq, ddq))
+    assert (q >= LIMITS.lower - 1e-9).all() and (q <= LIMITS.upper + 1e-9).all()
+    low, high = (
+        np.minimum(LIMITS.lower + how.margin, start),
+        np.maximum(LIMITS.upper - how.margin, start),
+    )
+    assert (q >= low - 1e-9).all() and (q <= high + 1e-9).all()  # further out only to begin with
+    bounds = motion.bounds()
+    assert (q >= bounds[0] - 1e-9).all() and (q <= bounds[1] + 1e-9).all()
+    assert (bounds[1] - bounds[0] <= how.range_share * (high - low) + 1e-9).all()
+    assert (np.abs(dq) <= 0.95 * LIMITS.velocity).all()
+    assert (np.abs(ddq) <= 0.95 * LIMITS.acceleration).all()
+    assert (np.abs(np.diff(ddq, axis=0)) / DT <= LIMITS.jerk).all()
+    # It starts from where the arm is, is smooth, and stands still in the end.
+    np.testing.assert_allclose(q[0], q[1], atol=1e-6)
+    np.testing.assert_allclose(np.diff(q, axis=0) / DT, 0.5 * (dq[1:] + dq[:-1]), atol=1e-4)
+    np.testing.assert_allclose(np.diff(dq, axis=0) / DT, 0.5 * (ddq[1:] + ddq[:-1]), atol=2e-2)
+    assert (dq[-1] == 0.0).all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), slow_share=st.floats(0.05, 0.5))
+def test_a_slow_start_takes_the_same_path_at_a_share_of_the_speed(seed, slow_share):
+    how = ExcitationSettings(seed=seed, slow_s=3.0, slow_share=slow_share)
+    slow, full = (RandomMotion(LIMITS, READY, h) for h in (how, ExcitationSettings(seed=seed)))
+    most = slow_share * full.bounds()[2]
+    while slow.time_s < 3.0:
+        slow.advance(DT)
+        assert (np.abs(slow.dq) <= most + 1e-12).all()
+    for _ in range(1000):
+        slow.advance(DT)
+    # At full speed it moves along the path of a motion that never was slow.
+    gap = full._s - slow._s
+    while gap < -1e-12:
+        full.advance(min(-gap, DT) if full.time_s > 1.0 else DT)
+        gap = full._s - slow._s
+    np.testing.assert_allclose(full.q, slow.q, atol=1e-9)
+    np.testing.assert_allclose(full.dq, slow.dq, atol=1e-9)
+
+
+def test_a_plan_says_how_far_how_fast_and_how_to_stop():
+    how = ExcitationSettings(seed=4, slow_s=10.0)
+    motion = RandomMotion(LIMITS, READY, how)
+    lines = plan_lines(motion, LIMITS, PANDA.tree.joint_names, 30.0)
+    assert "7 joints, for 30 s and 1 s of coming to rest" in lines[0]
+    assert "first 10 s go at 10% of the speed" in lines[1] and "Ctrl-C" in lines[-1]
+    lowest, highest, fastest = np.full(7, np.inf), np.full(7, -np.inf), np.zeros(7)
+    for _ in range(20_000):
+        motion.advance(5e-3)
+        lowest, highest = np.minimum(lowest, motion.q), np.maximum(highest, motion.q)
+        fastest = np.maximum(fastest, np.abs(motion.dq))
+    for j, name in enumerate(PANDA.tree.joint_names):
+        (line,) = (line for line in lines if line.startswith(name))
+        low, high, slow, fast = map(float, re.findall(NUMBERS, line)[0])
+        assert low - 5e-4 <= lowest[j] and highest[j] <= high + 5e-4
+        assert fastest[j] <= fast + 5e-4 and abs(slow - 0.1 * fast) < 2e-3
+        assert high - low < 1.3 * (highest[j] - lowest[j]) and fast < 1.5 * fastest[j]
+    endless = plan_lines(RandomMotion(LIMITS, READY), LIMITS, PANDA.tree.joint_names)
+    assert "until somebody stops it" in endless[0] and "speed" not in endless[1]
+
+
+def test_is_rich_and_does_not_repeat():
+    motion = RandomMotion(LIMITS, build("nominal").truth.ready, ExcitationSettings(seed=3))
+    path = []
+    for _ in range(30_000):
+        motion.advance(1e-2)
+        path.append(np.concatenate([motion.q, motion.dq]))
+    path = np.array(path)[200:]
+    assert (np.ptp(path[:, :7], axis=0) > 0.8).all()
+    assert (np.abs(path[:, 7:]).max(axis=0) > 0.7).all()
+    window = path[:500, :7]
+    for lag in range(500, len(path) - 500, 25):
+        assert np.abs(path[lag : lag + 500, :7] - window).max() > 0.1
+
+
+def test_settings_and_starts_that_cannot_be_are_refused():
+    with pytest.raises(SettingsError, match="outside its range"):
+        RandomMotion(LIMITS, np.full(7, 3.2))
+    with pytest.raises(SettingsError, match="shorter than a stop"):
+        ExcitationSettings(rests=((1.0, 1.2),))
+    with pytest.raises(SettingsError, match="low_hz"):
+        ExcitationSettings(low_hz=2.0)
+    for wrong in ({"slow_s": 0.5}, {"slow_s": -1.0}, {"slow_share": 0.0}, {"slow_share": 2.0}):
+        with pytest.raises(SettingsError, match="slow_s"):
+            ExcitationSettings(**wrong)
+    with pytest.raises(SettingsError, match=r"becomes quicker, 10\.0 to 11\.0 s"):
+        ExcitationSettings(slow_s=10.0, rests=((10.5, 12.0),))
+    with pytest.raises(SettingsError, match="7 joints"):
+        ExcitationController(LIMITS, control=ControlSettings(stiffness=(1.0, 2.0)))
+
+
+@pytest.mark.parametrize("with_model", [False, True])
+@pytest.mark.parametrize("scenario", ["nominal", "friction", "bent_link"])
+def test_the_simulated_arm_follows(scenario, with_model):
+    arm = PyBulletArm(build(scenario, seed=2).plant())
+    arm.connect()
+    feedforward = ModelFeedforward.of(PANDA) if with_model else None
+    controller = ExcitationController(LIMITS, ExcitationSettings(seed=2), feedforward=feedforward)
+    last = None
+    for k in range(6000):
+        sample = arm.read()
+        if k == 4500:
+            controller.begin_stop()
+        tau = controller.step(sample)
+        if last is not None:
+            # 1000 N m/s; stamps carry no jitter here
+            assert (np.abs(tau - last) <= 1.0 + 1e-9).all()
+        assert (np.abs(tau) <= 0.95 * LIMITS.effort).all()
+        arm.command(tau)
+        last = tau
+    assert controller.at_rest and np.abs(sample.dq).max() < 0.1
+    tracking = controller.tracking()
+    assert tracking["saturated"] == 0
+    found = tracking["feedforward" if with_model else "feedback"]
+    assert max(found["max_rad"]) < (0.06 if with_model else 0.1)
+    if with_model and scenario == "nominal":
+        assert max(found["rms_rad"]) < 0.002
+    arm.close()
+
+
+def test_blind_for_long_the_controller_gives_up():
+    controller = ExcitationController(LIMITS)
+    q = build("nominal").truth.ready
+    good = JointSample(0, q, np.zeros(7), np.zeros(7))
+    first = controller.step(good)
+    bad = np.full(7, np.nan)
+    np.testing.assert_array_equal(controller.step(JointSample(10**7, bad, bad, bad)), first)
+    with pytest.raises(ControlError, match="no usable joint reading"):
+        controller.step(JointSample(3 * 10**7, bad, bad, bad))

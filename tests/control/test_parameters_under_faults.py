@@ -1,0 +1,70 @@
+"""The parameters after a run with faults are those of the run without, within their deviations.
+
+Compared are two runs of the simulated Panda, same motion, same sensor noise:
+
+* every θ: |with - without| at most two roots of the sum of both variances. Much of θ is not seen
+  by any torque, and its deviations are wide; therefore also
+* the torques that both predict on motion that neither has seen: rms of their difference over its
+  deviation at most 0.6 (two runs that differ in nothing but sensor noise: 0.5);
+* their errors against the true torque there: at most 1.6 times that of the run without faults;
+* λ, where it can be seen: as near as a bolt's play.
+
+The whole grid of faults and shares: `python -m tests.helpers.fault_runs`.
+"""
+
+import numpy as np
+import pytest
+
+from tests.helpers.fault_runs import FaultRun, clean_run, difference, run_faulty
+
+SECONDS = 10.0
+THETA_STD, TORQUE_STD, ERROR_RATIO = 2.0, 0.6, 1.6
+ROTATION_RAD, POSITION_M = 1e-3, 1e-3
+FEW = (
+    "lost=0.1",
+    "reordered=0.1",
+    "corrupt=0.01",
+    *(pytest.param(text, marks=pytest.mark.slow) for text in ("late=0.1", "nan=0.1", "spike=0.01")),
+)
+ALL_AT_ONCE = "lost=0.01,late=0.01,repeated=0.01,reordered=0.01,corrupt=0.01,nan=0.01,spike=0.01"
+
+
+def check(run: FaultRun) -> None:
+    """The run went to its end, all is accounted for, and the parameters agree."""
+    assert (run.result.ended, run.result.fault) == ("duration", None)
+    run.check_balance()
+    assert run.finite and not run.learner.changes
+    apart = difference(clean_run(SECONDS).learner, run.learner)
+    assert apart.theta < THETA_STD, apart
+    assert apart.torque < TORQUE_STD, apart
+    assert apart.error_ratio < ERROR_RATIO, apart
+    assert apart.rotation_rad < ROTATION_RAD and apart.position_m < POSITION_M, apart
+
+
+@pytest.mark.parametrize("text", FEW)
+def test_parameters_agree(text: str) -> None:
+    run = run_faulty(text, SECONDS)
+    assert run.driver.account.injected[text.partition("=")[0]] > 50
+    check(run)
+
+
+def test_parameters_agree_with_every_fault_at_once() -> None:
+    run = run_faulty(ALL_AT_ONCE, SECONDS)
+    assert min(run.driver.account.injected.values()) > 50
+    check(run)
+
+
+def test_repeated_samples_change_nothing_at_all() -> None:
+    clean, run = clean_run(SECONDS), run_faulty("repeated=0.1", SECONDS)
+    run.check_balance()
+    assert run.refused["repeated"] == run.driver.account.injected["repeated"] > 500
+    assert np.array_equal(run.learner.theta.theta, clean.learner.theta.theta)
+    assert np.array_equal(run.learner.schema.lam, clean.learner.schema.lam)
+
+
+def test_the_check_can_fail() -> None:
+    """A run of two seconds is not taken for one of ten."""
+    clean = clean_run(SECONDS).learner
+    other = run_faulty("", 2.0).learner
+    assert difference(clean, other).error_ratio > ERROR_RATIO
+    assert difference(clean, clean).theta == 0.0

@@ -1,0 +1,149 @@
+"""Sensors glued on links, with stamps, rates and frames of their own: the tree comes back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap_ros2.writer import Writer as RosWriter
+
+from adapter.cli import main
+from adapter.model.model_file import load_model
+from adapter.model.self_model import SelfModel
+from drivers.files.mcap import read_log
+from drivers.files.ros import IMU, JOINT_STATE, SCHEMAS
+from drivers.interface import DriverError
+from tests.helpers.discovery_data import Case, Motion, anyhow, panda, record
+from tests.helpers.mcap_tools import START_NS, foreign, payloads, samples
+from tests.helpers.mcap_tools import record as write_samples
+from tests.helpers.ros_messages import header, imu
+
+FINE = Motion(seconds=3.0, rate_hz=2000.0)  # joints take every other sample, sensors those between
+EVERY = 10  # 200 Hz
+JITTER_NS = 200_000  # of all stamps
+
+
+@cache
+def _case(seed: int, floating: bool, base: bool) -> Case:
+    robot = panda()
+    if floating:
+        theta = np.concatenate([robot.theta[:1], robot.theta])
+        tree = replace(robot.tree, floating=True)
+        robot = SelfModel(
+            name="floating", tree=tree, lam=robot.lam, theta=theta, gravity=robot.gravity
+        )
+    mounts = anyhow(seed, range(8), 8)
+    return record(robot, FINE, seed, base=base, noise=0.5, mounts=mounts)
+
+
+def _write(
+    path: Path, case: Case, frame: Callable[[str], str], *, dq: bool = False, tau: bool = False
+) -> Path:
+    """Joint states at 1 kHz and each link's Imu at 200 Hz, by another encoder than ours."""
+    rng = np.random.default_rng(4)
+    log = case.log
+    assert log.twists is not None and log.accels is not None
+    stamp_ns = START_NS + log.stamp_ns + (JITTER_NS * rng.normal(size=len(log))).astype(np.int64)
+    with path.open("wb") as file:
+        writer = RosWriter(file)
+        states = writer.register_msgdef(JOINT_STATE, SCHEMAS[JOINT_STATE])
+        sensors = writer.register_msgdef(IMU, SCHEMAS[IMU])
+        for i, at in enumerate(stamp_ns.tolist()):
+            if i % 2 == 0:
+                state = {"header": header(at, ""), "name": list(log.joint_names)}
+                state["position"] = log.q[i].tolist()
+                state["velocity"] = log.dq[i].tolist() if dq else []
+                state["effort"] = log.tau[i].tolist() if tau else []
+                writer.write_message("/joint_states", states, state, at)
+            for k, name in enumerate(log.link_names):
+                if i % EVERY == 2 * k % EVERY + 1:
+                    w, a = log.twists[i, k, 3:], log.accels[i, k, :3]
+                    message = imu(at, frame(name), w, a)
+                    writer.write_message(f"/{name}/data", sensors, message, at)
+        writer.finish()
+    return path
+
+
+def _discovered(path: Path, *options: str) -> dict:
+    out = path.with_suffix(".json")
+    assert main(["discover", str(path), "--json", str(out), *options]) == 0
+    found: dict = json.loads(out.read_text())
+    return found
+
+
+def _edges(figures: dict) -> set[tuple[str, str, str]]:
+    return {(e["joint"], e["link"], e["parent"]) for e in figures["edges"]}
+
+
+def test_command_finds_the_tree_of_glued_sensors(tmp_path, capsys) -> None:
+    case = _case(0, False, True)
+    path = _write(tmp_path / "a.mcap", case, str)
+    model = tmp_path / "model.json"
+    figures = _discovered(path, "--model", str(model))
+    assert _edges(figures) == case.edges and figures["root"] == case.root
+    assert min(e["confidence"] for e in figures["edges"]) > 0.99
+    assert figures["undecided"] == [] and figures["measured"] == ["w", "a"]
+    assert set(figures["mounting"]) == {link for _, link, _ in case.edges}
+    assert figures["torque_rmse_nm"] is None
+    found = load_model(model)
+    assert found.provenance["discovered"]["theta"] == "not learned"
+    told = " ".join(capsys.readouterr().err.split())
+    for sentence in ("200 Hz, carried to the joint", "no efforts", "no velocities", "(no torques)"):
+        assert sentence in told
+    assert "sensor of" in told and "axis in its frame" in told
+    for link, place in figures["mounting"].items():
+        turn, origin = case.mounts[case.body[link]]
+        axis = np.array(place["rotation"])[2]  # the joint's z in the sensor's frame
+        assert np.linalg.norm(np.cross(axis, turn[2])) < 3e-3 and axis @ turn[2] > 0.0
+        across = turn.T @ origin - np.array(place["rotation"]).T @ place["position"]
+        assert np.linalg.norm(np.cross(across, axis)) < 6e-3
+
+
+def test_sensors_of_one_frame_id_and_torques(tmp_path) -> None:
+    case = _case(1, False, False)
+    path = _write(tmp_path / "a.mcap", case, lambda _: "imu_link", dq=True, tau=True)
+    figures = _discovered(path, "--model", str(tmp_path / "model.json"))
+    topics = {(j, f"/{k}/data", f"/{i}/data" if i != "base" else i) for j, k, i in case.edges}
+    assert _edges(figures) == topics and figures["root"] == "base"
+    assert max(figures["torque_rmse_nm"]) < 0.3  # N m, of torques up to 60
+
+
+def test_floating_base_needs_a_word(tmp_path, capsys) -> None:
+    case = _case(2, True, True)
+    path = _write(tmp_path / "a.mcap", case, str, dq=True)
+    assert any("--base" in line for line in _discovered(path)["undecided"])
+    assert "this way or the other" in capsys.readouterr().err
+    figures = _discovered(path, "--base", case.root)
+    assert _edges(figures) == case.edges and figures["undecided"] == []
+    assert main(["discover", str(path), "--base", "nobody"]) != 0
+    assert "choose from" in capsys.readouterr().err
+
+
+def test_other_commands_see_nothing_of_it(tmp_path) -> None:
+    path = _write(tmp_path / "a.mcap", _case(1, False, False), str, tau=True)
+    log = read_log(path)
+    assert log.link_names == () and log.twists is None and np.isfinite(log.tau).all()
+    bare = foreign(tmp_path / "b.mcap", payloads(samples(5), fields=("position", "velocity")))
+    with pytest.raises(DriverError, match="has no effort"):
+        read_log(bare)
+    whole = read_log(bare, sensors=True)
+    assert np.isnan(whole.tau).all() and "no efforts" in whole.warnings[0]
+    ours = write_samples(tmp_path / "c.mcap", samples(40, links=True))
+    one, two = read_log(ours), read_log(ours, sensors=True)
+    for name in ("stamp_ns", "q", "dq", "tau", "twists", "accels"):
+        assert np.array_equal(getattr(one, name), getattr(two, name)), name
+    assert one.warnings == two.warnings == []
+
+
+def test_nothing_left_is_told(tmp_path, capsys) -> None:
+    still = foreign(tmp_path / "a.mcap", payloads(samples(5), fields=("velocity",)))
+    assert main(["discover", str(still)]) != 0
+    assert "has no position" in capsys.readouterr().err
+    alone = foreign(tmp_path / "b.mcap", payloads(samples(5), fields=("position",)))
+    assert main(["discover", str(alone)]) != 0
+    assert "has: /joint_states (5 sensor_msgs/msg/JointState)" in capsys.readouterr().err

@@ -1,0 +1,258 @@
+"""Sensors mounted anyhow and accelerations alone: the tree, the mountings and λ come back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from adapter.discovery import Discovery, discover, learn, self_model
+from adapter.discovery.hypotheses import FREE
+from adapter.errors import ModelError, SettingsError
+from adapter.model.spatial import matrix_from_zxz
+from drivers.files.mcap import Log
+from tests.helpers.discovery_data import Case, Motion, anyhow, record, robot
+
+TRUSTED = 0.9
+RATE_HZ = 250.0
+SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
+
+
+@cache
+def _case(
+    name: str,
+    seed: int,
+    motion: Motion = SHORT,
+    share: float = 1.0,
+    turned: bool = True,
+    shifted: bool = True,
+    noise: float = 1.0,
+    base: bool | None = None,
+) -> Case:
+    model = robot(name)
+    bodies = 1 + model.tree.n
+    which = np.random.default_rng([seed, 31]).permutation(bodies)[: round(share * bodies)]
+    mounts = anyhow(seed, which.tolist(), bodies, turned=turned, shifted=shifted)
+    return record(model, motion, seed, noise=noise, base=base, mounts=mounts)
+
+
+def _named(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
+    return {(e.joint, e.link, e.parent): e.confidence for e in found.edges if e.joint}
+
+
+def _pairs(case: Case) -> set[tuple[str, frozenset[str]]]:
+    return {(joint, frozenset((link, parent))) for joint, link, parent in case.edges}
+
+
+def _connected(found: Discovery) -> set[tuple[str | None, frozenset[str | None]]]:
+    return {(joint, frozenset((link, parent))) for joint, link, parent in _named(found)}
+
+
+def _worst_wrong(case: Case, found: Discovery) -> float:
+    """Most confidence in a connection that is not there, or in an edge as it is not."""
+    pairs, worst = _pairs(case), 0.0
+    for e in (e for e in found.edges if e.joint is not None):
+        if (e.joint, frozenset((e.link, e.parent))) not in pairs:
+            worst = max(worst, e.connected)
+        elif (e.joint, e.link, e.parent) not in case.edges:
+            worst = max(worst, e.confidence)
+    return worst
+
+
+def _heard(log: Log, parts: str) -> Log:
+    twists, accels = log.twists, log.accels
+    return replace(
+        log, twists=twists if "t" in parts else None, accels=accels if "a" in parts else None
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "parts", "turned", "shifted"),
+    [
+        (0, "ta", True, True),
+        (1, "t", True, False),
+        (2, "a", True, True),
+        (3, "ta", False, True),
+    ],
+)
+def test_fixed_base_decides_everything(seed: int, parts: str, turned: bool, shifted: bool) -> None:
+    case = _case("panda", seed, turned=turned, shifted=shifted)
+    found = discover(_heard(case.log, parts))
+    assert set(_named(found)) == case.edges and found.root == case.root == "base"
+    assert min(_named(found).values()) > 0.99 and all(e.directed for e in found.edges)
+    assert found.undecided == () and set(found.mountings) == set(case.log.link_names)
+    assert "axes were found" in found.notes[-1]
+
+
+@pytest.mark.parametrize(("seed", "parts"), [(0, "ta"), (1, "t")])
+def test_floating_base_decides_what_is_connected_and_a_word_the_rest(seed: int, parts: str) -> None:
+    case = _case("atlas", seed)
+    log = _heard(case.log, parts)
+    found = discover(log)
+    assert _connected(found) == _pairs(case) and not any(e.directed for e in found.edges)
+    assert min(e.connected for e in found.edges) > 0.99
+    assert list(_named(found).values()) == pytest.approx([0.5] * 30, abs=0.01)  # either way
+    assert found.root_confidence == pytest.approx(1 / 31, rel=0.05)
+    assert len(found.undecided) == 1 and "--base" in found.undecided[0]
+    named = discover(log, base=case.root)
+    assert set(_named(named)) == case.edges and named.root == case.root
+    assert min(_named(named).values()) > 0.99 and all(e.directed for e in named.edges)
+    assert named.undecided == () and named.root_confidence > 0.99
+
+
+def test_links_that_keep_the_convention_tell_the_direction() -> None:
+    case = _case("atlas", 0, share=0.2)
+    found = discover(case.log)
+    assert _connected(found) == _pairs(case) and _worst_wrong(case, found) < 0.51
+    assert sum(e.directed for e in found.edges) >= 20
+    turned = {name for name, b in case.body.items() if case.mounts[b][0][2, 2] < 1.0}
+    named = discover(case.log, base=case.root)
+    assert set(_named(named)) == case.edges and min(_named(named).values()) > 0.98
+    assert set(named.mountings) == turned - {case.root}
+
+
+@pytest.mark.parametrize(("name", "seed"), [("panda", 0), ("atlas", 0)])
+def test_mountings_and_lambda_are_true(name: str, seed: int) -> None:
+    """Whatever the gauge: axes, and where each joint's axis lies between two sensors."""
+    case = _case(name, seed)
+    found = discover(case.log, base=None if case.root == "base" else case.root)
+    learned = learn(found)
+    for link, mounting in found.mountings.items():
+        turn, place = case.mounts[case.body[link]]
+        assert np.linalg.norm(np.cross(mounting.axis, turn[2])) < 3e-3
+        assert mounting.axis @ turn[2] > 0.0
+        off = mounting.origin + turn.T @ place
+        assert np.linalg.norm(np.cross(off, mounting.axis)) < 6e-3
+    turns = matrix_from_zxz(learned.schema.lam[:, :3])
+    true = matrix_from_zxz(case.model.lam[:, :3])
+    body = [case.body[link] - 1 for link in learned.data.tree.link_names]
+    for j, i in enumerate(learned.data.tree.parent):
+        if i >= 0 and learned.schema.ranks[j] == 6:  # the angle between two neighbouring axes
+            assert turns[j, 2, 2] == pytest.approx(true[body[j], 2, 2], abs=3e-3)
+    if name == "panda":
+        model, left = self_model(found, learned, "found")
+        assert left is not None and left.max() < 0.2  # N m of up to 60, noise 0.1 a sample
+        assert set(model.provenance["discovered"]["mounting"]) == set(found.mountings)
+    figures = found.as_dict()["mounting"]
+    assert all(np.shape(place["rotation"]) == (3, 3) for place in figures.values())
+
+
+@pytest.mark.parametrize(
+    ("seed", "seconds", "noise", "still", "alike"),
+    [
+        (8, 2.0, 1.0, (1, 2, 5, 6), ()),
+        pytest.param(9, 4.0, 1.0, (), ((3, 5),), marks=pytest.mark.slow),
+        (10, 2.0, 50.0, (), ()),
+    ],
+)
+def test_no_wrong_edge_is_trusted(
+    seed: int, seconds: float, noise: float, still: tuple[int, ...], alike: tuple
+) -> None:
+    motion = Motion(seconds=seconds, rate_hz=RATE_HZ, still=still, alike=alike)
+    case = _case("panda", seed, motion, noise=noise)
+    found = discover(case.log)
+    assert _worst_wrong(case, found) < TRUSTED
+    doubtful = [e for e in found.edges if e.confidence < TRUSTED]
+    assert all(any(e.link in line for line in found.undecided) for e in doubtful)
+    if still or alike:
+        assert doubtful
+
+
+def test_a_base_at_rest_whose_gyroscope_is_biased_is_the_root() -> None:
+    """As all the other gyroscopes are, by 0.3 °/s."""
+    case = _case("panda", 0, Motion(seconds=8.0, rate_hz=RATE_HZ), base=True)
+    twists = case.log.twists
+    assert twists is not None
+    drawn = np.random.default_rng(0).normal(size=twists.shape[1:])[:, 3:]
+    bias = np.radians(0.3) * drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+    found = discover(replace(case.log, twists=twists + np.pad(bias, ((0, 0), (3, 0)))))
+    assert found.root == case.root
+    assert {(e.joint, e.link, e.parent) for e in found.edges} == case.edges
+
+
+def test_base_at_rest_is_the_root_also_where_frames_are_any() -> None:
+    case = _case("panda", 13, base=True)
+    found = discover(case.log)
+    assert set(_named(found)) == case.edges and found.root == case.root != "base"
+    with pytest.raises(ModelError, match=r"no link nobody.*choose from imu_0"):
+        discover(case.log, base="nobody")
+
+
+@pytest.mark.parametrize("name", ["panda", "atlas"])
+def test_accelerations_alone_in_motion(name: str) -> None:
+    whole = _case(name, 14, share=0.0)
+    found = discover(_heard(whole.log, "a"))
+    assert set(_named(found)) == whole.edges and found.root == whole.root
+    assert min(_named(found).values()) > 0.99 and not found.hypotheses.mounted
+    assert "at the start is found" in found.log.notes[0]
+    true = discover(whole.log).log.motion["w"]
+    assert np.abs(found.log.motion["w"] - true).max() < 0.05  # rad/s, most of it drift
+    assert float(np.sqrt(np.mean(true[0] ** 2))) > 0.3
+
+
+def test_some_links_with_gyros_and_others_with_accelerometers() -> None:
+    case = _case("panda", 15, base=True)
+    log = case.log
+    assert log.twists is not None and log.accels is not None
+    twists, accels = log.twists.copy(), log.accels.copy()
+    twists[:, ::2], accels[:, 1::2] = np.nan, np.nan
+    found = discover(replace(log, twists=twists, accels=accels), base=case.root)
+    assert set(_named(found)) == case.edges and min(_named(found).values()) > 0.99
+    assert any("from turning alone" in note for note in found.notes)
+    accels[:, 4] = np.nan
+    with pytest.raises(SettingsError, match=f"neither: {log.link_names[4]}$"):
+        discover(replace(log, twists=twists, accels=accels))
+
+
+def test_angles_that_wrap_and_sensors_with_stamps_of_their_own() -> None:
+    fast = Motion(seconds=4.0, rate_hz=RATE_HZ, speed=6.0)
+    case = _case("panda", 16, fast)
+    log = case.log
+    assert np.ptp(log.q, axis=0).max() > np.pi
+    wrapped = replace(log, q=(log.q + np.pi) % (2 * np.pi) - np.pi)
+    assert set(_named(discover(wrapped))) == case.edges
+    case = _case("panda", 0)
+    assert set(_named(discover(_interleaved(case.log)))) == case.edges
+
+
+def _interleaved(log: Log) -> Log:
+    """Joints at every other stamp, links at those between."""
+    assert log.twists is not None and log.accels is not None
+    even = (np.arange(len(log)) % 2 == 0)[:, None]
+    return replace(
+        log,
+        q=np.where(even, log.q, np.nan),
+        dq=np.where(even, log.dq, np.nan),
+        tau=np.where(even, log.tau, np.nan),
+        twists=np.where(even[..., None], np.nan, log.twists),
+        accels=np.where(even[..., None], np.nan, log.accels),
+    )
+
+
+def test_late_sensors_make_edges_doubtful_not_wrong() -> None:
+    case = _case("panda", 1, replace(SHORT, seconds=6.0))
+    log = case.log
+    assert log.twists is not None and log.accels is not None
+    late = 2  # samples, 8 ms
+    moved = {k: getattr(log, k)[late:] for k in ("stamp_ns", "q", "dq", "tau")}
+    found = discover(replace(log, **moved, twists=log.twists[:-late], accels=log.accels[:-late]))
+    assert _worst_wrong(case, found) < TRUSTED and max(found.hypotheses.excess.values()) > 4.0
+
+
+def test_a_sliding_joint_is_never_trusted_to_turn() -> None:
+    """What a joint that slides would say: links move as one, the joint's speed shows nowhere."""
+    case = _case("panda", 0)
+    log = case.log
+    rng = np.random.default_rng(3)
+    joint = sorted(case.edges)[3][0]
+    s = log.joint_names.index(joint)
+    strange = np.cumsum(rng.normal(size=len(log))) / RATE_HZ
+    q, dq = log.q.copy(), log.dq.copy()
+    q[:, s], dq[:, s] = np.cumsum(strange) / RATE_HZ, strange
+    found = discover(replace(log, q=q, dq=dq))
+    assert all(e.confidence < TRUSTED for e in found.edges if e.joint == joint)
+    assert _worst_wrong(case, found) < TRUSTED
+    free = [o for o in found.structure.chosen if o.parent == FREE]
+    assert free and found.undecided

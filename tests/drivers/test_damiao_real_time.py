@@ -1,0 +1,230 @@
+"""The CAN arm's driver and its guardian in real time, on real python-can buses."""
+
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from drivers.damiao.arm import DamiaoArm
+from drivers.damiao.bus import wire_of
+from tests.helpers.damiao_tools import Bank, Served
+
+pytestmark = pytest.mark.alone
+
+N = 7
+
+
+@pytest.mark.parametrize("fd", [0, 1])
+def test_in_real_time_on_a_virtual_bus(fd):
+    """Motors in a thread: every reply is accounted for, whatever the machine's load."""
+    name = f"real-{os.getpid()}-{fd}"
+    with Served(Bank(), can.Bus(name, interface="virtual")):
+        arm = DamiaoArm(f"can://{name}?interface=virtual&fd={fd}&rate=200", allow_motion=True)
+        arm.connect()
+        whole = 0
+        for _ in range(100):
+            sample = arm.read()
+            arm.command(np.full(N, 2.0))
+            whole += bool(np.isfinite(sample.tau).all())
+            time.sleep(0.005)
+        arm.close()
+    intake = arm.intake
+    assert whole > 20
+    assert intake.used > 50 * N
+    assert intake.received == intake.used + sum(intake.refused.values())
+
+
+def socketcan_reason():
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+        socket.if_nametoindex("vcan0")
+    except (OSError, AttributeError) as error:
+        return f"no vcan0 on this kernel: {error}"
+    return None
+
+
+@pytest.mark.skipif(socketcan_reason() is not None, reason=str(socketcan_reason()))
+def test_on_vcan():
+    with Served(Bank(), can.Bus("vcan0", interface="socketcan", fd=True)):
+        arm = DamiaoArm("can://vcan0?guardian=0&rate=200", allow_motion=True)
+        arm.connect()
+        for _ in range(50):
+            arm.read()
+            arm.command(np.full(N, 2.0))
+            time.sleep(0.005)
+        arm.close()
+    assert arm.intake.used > 20 * N
+
+
+GROUP = "239.74.163.2"
+PORTS = itertools.count(46000 + os.getpid() % 2000 * 5)
+
+
+def multicast_reason():
+    try:
+        with can.Bus(GROUP, interface="udp_multicast", port=45999, hop_limit=0) as bus:
+            bus.send(can.Message(arbitration_id=1, is_extended_id=False))
+            return None if bus.recv(2.0) else "multicast frames do not come back on this machine"
+    except (OSError, can.CanError) as error:
+        return f"no multicast on this machine: {error}"
+
+
+needs_multicast = pytest.mark.skipif(multicast_reason() is not None, reason=str(multicast_reason()))
+
+
+@pytest.fixture
+def served():
+    """(address, motors) between processes."""
+    port = next(PORTS)
+    bank = Bank()
+    with Served(bank, can.Bus(GROUP, interface="udp_multicast", port=port, hop_limit=0)):
+        yield f"can://{GROUP}:{port}?interface=udp_multicast&rate=200", bank
+
+
+LOOP = """
+import sys, time
+import numpy as np
+from drivers.damiao.arm import DamiaoArm
+arm = DamiaoArm(sys.argv[1], allow_motion=True)
+arm.connect()
+print(arm.guardian_pid, flush=True)
+tau = 2.0
+while True:
+    sample = arm.read()
+    arm.command(np.where(sample.dq < 0.4, 2.4, 1.95))
+    if sys.argv[2] == "hang" and sample.dq.min() > 0.3:
+        time.sleep(1e6)
+    time.sleep(0.005)
+"""
+
+
+def wait_for(condition, what, timeout_s=30.0):
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.005)
+
+
+def ended(pid):
+    """Wait for the end of a process; make sure of it."""
+    try:
+        wait_for(lambda: gone(pid), "the guardian ends")
+    finally:
+        if not gone(pid):
+            os.kill(pid, signal.SIGKILL)
+
+
+def gone(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return True
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@needs_multicast
+@pytest.mark.parametrize("how", ["kill", "hang"])
+def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
+    address, bank = served
+    loop = subprocess.Popen(
+        [sys.executable, "-c", LOOP, address, how], stdout=subprocess.PIPE, text=True
+    )
+    guardian = int(loop.stdout.readline())
+    try:
+        wait_for(lambda: bank.dq.min() > 0.3, "the loop drives the arm")
+        q0 = bank.q.copy()
+        if how == "kill":
+            loop.send_signal(signal.SIGKILL)
+            loop.wait()
+        wait_for(lambda: np.abs(bank.dq).max() < 0.02, "the guardian brakes the arm")
+        time.sleep(1.0)
+        assert (np.abs(bank.q - q0) < 0.5).all()
+        q1 = bank.q.copy()
+        time.sleep(1.0)
+        assert np.abs(bank.q - q1).max() < 0.02
+        assert not bank.limp
+        assert bank.status == [1] * N
+        os.kill(guardian, signal.SIGTERM)  # the operator has put something under the arm
+        wait_for(lambda: bank.status == [0] * N, "the motors are switched off")
+    finally:
+        loop.kill()
+        loop.wait()
+        loop.stdout.close()
+        ended(guardian)
+    assert "braked and held" in capfd.readouterr().err
+
+
+@needs_multicast
+def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
+    address, bank = served
+    arm = DamiaoArm(address, allow_motion=True)
+    arm.connect()
+    first = arm.guardian_pid
+    assert any(f"kill {first}" in note for note in arm.intake.notes)
+    for _ in range(100):
+        arm.read()
+        arm.command(np.full(N, 2.0))
+        time.sleep(0.005)
+    arm.close()
+    assert not gone(first)
+    q0 = bank.q.copy()
+    time.sleep(1.5)  # three of the motors' time-outs
+    assert bank.status == [1] * N
+    listener = DamiaoArm(address)
+    listener.connect()
+    assert any(f"process {first} holds" in note for note in listener.intake.notes)
+    assert np.isfinite(listener.read().q).all()
+    listener.close()
+    arm.connect()
+    second = arm.guardian_pid
+    assert second != first
+    wait_for(lambda: gone(first), "the first guardian goes")
+    time.sleep(0.5)
+    assert np.abs(bank.q - q0).max() < 0.05
+    assert not bank.limp
+    arm.close()
+    os.kill(second, signal.SIGTERM)
+    wait_for(lambda: gone(second), "the second guardian ends")
+
+
+@needs_multicast
+def test_own_frames_do_not_come_back():
+    port = next(PORTS)
+    with can.Bus(GROUP, interface="udp_multicast", port=port, hop_limit=0) as bus:
+        wire = wire_of(bus)
+        wire.ignore(0x08)
+        for can_id in (1, 7, 8, 0x11, 0x7F, 0x80, 0x7FF):
+            bus.send(can.Message(arbitration_id=can_id, is_extended_id=False, data=bytes(8)))
+        seen = []
+        wait_for(lambda: seen.extend(wire.waiting()) or 0x7FF in [f[0] for f in seen], "the last")
+        wire.close()
+    if sys.platform == "linux":
+        assert [frame[0] for frame in seen] == [8, 0x11, 0x7F, 0x80, 0x7FF]
+    assert all(time.time() - 60 < frame[2] < time.time() + 1 for frame in seen)
+
+
+@needs_multicast
+def test_garbage_between_processes_is_counted(served):
+    address, _ = served
+    port = int(address.split(":")[2].split("?")[0])
+    arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
+    arm.connect()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for k in range(100):
+            sender.sendto(bytes(range(k)), (GROUP, port))
+            if k % 10 == 0:
+                arm.read()
+                arm.command(np.full(N, 2.0))
+    wait_for(lambda: (arm.read(), arm.intake.refused["unreadable"] == 100)[1], "all were seen")
+    arm.close()
+    intake = arm.intake
+    assert intake.received == intake.used + sum(intake.refused.values())

@@ -1,0 +1,111 @@
+"""One contract over every driver, each also with faults put in.
+
+A new driver joins by an entry in `RIGS`; see drivers/README.md.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.register_assert_rewrite("tests.helpers.contract_suite")
+
+from drivers.example_arm import ExampleArm  # noqa: E402
+from drivers.faults.driver import with_faults  # noqa: E402
+from drivers.files.log import LogArm  # noqa: E402
+from tests.helpers.contract_suite import CHECKS, Make, Rig, Tapped  # noqa: E402
+from tests.helpers.hardware_rigs import can_multicast, can_virtual, fci  # noqa: E402
+from tests.helpers.live_tools import simulated_arm  # noqa: E402
+from tests.helpers.mcap_tools import record, samples  # noqa: E402
+from tests.helpers.udp_arm import running  # noqa: E402
+
+FAULTS = ("lost", "late", "repeated", "reordered", "corrupt", "nan", "spike")
+
+
+@contextmanager
+def pybullet() -> Iterator[Make]:
+    with ExitStack() as stack:
+
+        def make():
+            arm = simulated_arm()
+            stack.callback(arm.close)
+            return arm
+
+        yield make
+
+
+@contextmanager
+def log() -> Iterator[Make]:
+    with tempfile.TemporaryDirectory() as folder:
+        path = record(Path(folder) / "a.mcap", samples(500, links=True))
+        yield lambda: LogArm(path)
+
+
+@contextmanager
+def example() -> Iterator[Make]:
+    with running(joints=6) as port:
+        yield lambda: ExampleArm(f"udp://127.0.0.1:{port}?timeout_ms=500", allow_motion=True)
+
+
+@contextmanager
+def example_listening() -> Iterator[Make]:
+    """An arm whose wire loses, doubles and cuts datagrams, and a driver that may not move it."""
+    with running(joints=3, bad=0.02) as port:
+        yield lambda: ExampleArm(f"udp://127.0.0.1:{port}?joints=3&timeout_ms=500")
+
+
+RIGS = [
+    Rig("pybullet", pybullet),
+    Rig("log", log, ends=True, moves=False),
+    Rig("example", example, steady=False),
+    Rig("example_listening", example_listening, moves=False, steady=False),
+    Rig("fci_5", fci(5, True), steady=False, wire=True),
+    Rig("fci_10", fci(10, True), steady=False, wire=True),
+    Rig("fci_listening", fci(10, False), moves=False, steady=False, wire=True),
+    Rig("can_virtual", can_virtual, steady=False, wire=True),
+    Rig("can_multicast", can_multicast, steady=False, wire=True),
+]
+
+
+def with_trouble(rig: Rig) -> Rig:
+    """The same driver behind faults."""
+
+    text = ",".join(f"{name}=0.05" for name in FAULTS)
+
+    @contextmanager
+    def start() -> Iterator[Make]:
+        with rig.start() as make:
+            yield lambda: with_faults(Tapped(make()), text, seed=3)
+
+    return replace(rig, name=f"faulty_{rig.name}", start=start, steady=False, faulty=FAULTS)
+
+
+ALL = [*RIGS, *map(with_trouble, RIGS)]
+
+
+@pytest.fixture(scope="module")
+def rigged(request: pytest.FixtureRequest) -> Iterator[tuple[Rig, Make]]:
+    """A driver, and what it speaks to, for all checks of this module."""
+    rig: Rig = request.param
+    with rig.start() as make:
+        yield rig, make
+
+
+CASES = [
+    pytest.param(
+        rig, check, id=f"{rig.name}-{check.__name__}", marks=pytest.mark.alone if rig.wire else ()
+    )
+    for rig in ALL
+    for check in CHECKS
+    if rig.takes(check)
+]
+
+
+@pytest.mark.parametrize(("rigged", "check"), CASES, indirect=["rigged"])
+def test_contract(rigged: tuple[Rig, Make], check) -> None:
+    check(*rigged)

@@ -1,0 +1,252 @@
+"""The FCI's bytes, held against offsets and frames written down independently of the codec.
+
+Offsets, sizes and codes are those of the reference tables (libfranka 0.9.2 and 0.21.2 headers).
+"""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from drivers.fci import codec, tables
+from drivers.fci.codec import COMMAND_DTYPE, STATE_DTYPE, CommandEncoder, StateDecoder, WireError
+from tests.helpers import fci_peer
+
+# name: offset in protocol 5, in protocol 10 (None where it has no such field)
+STATE_OFFSETS = {
+    "message_id": (0, 0),
+    "O_T_EE": (8, 8),
+    "O_T_EE_d": (136, 72),
+    "F_T_EE": (264, 136),
+    "EE_T_K": (392, 200),
+    "F_T_NE": (520, 264),
+    "NE_T_EE": (648, 328),
+    "m_ee": (776, 392),
+    "I_ee": (784, 396),
+    "F_x_Cee": (856, 432),
+    "m_load": (880, 444),
+    "I_load": (888, 448),
+    "F_x_Cload": (960, 484),
+    "elbow": (984, 496),
+    "elbow_d": (1000, 504),
+    "tau_J": (1016, 512),
+    "tau_J_d": (1072, 540),
+    "dtau_J": (1128, 568),
+    "q": (1184, 596),
+    "q_d": (1240, 624),
+    "dq": (1296, 652),
+    "dq_d": (1352, 680),
+    "ddq_d": (1408, 708),
+    "joint_contact": (1464, 736),
+    "cartesian_contact": (1520, 764),
+    "joint_collision": (1568, 788),
+    "cartesian_collision": (1624, 816),
+    "tau_ext_hat_filtered": (1672, 840),
+    "O_F_ext_hat_K": (1728, 868),
+    "K_F_ext_hat_K": (1776, 892),
+    "O_dP_EE_d": (1824, 916),
+    "O_ddP_O": (1872, 940),
+    "elbow_c": (1896, 952),
+    "delbow_c": (1912, 960),
+    "ddelbow_c": (1928, 968),
+    "O_T_EE_c": (1944, 976),
+    "O_dP_EE_c": (2072, 1040),
+    "O_ddP_EE_c": (2120, 1064),
+    "theta": (2168, 1088),
+    "dtheta": (2224, 1116),
+    "accelerometer_top": (None, 1144),
+    "accelerometer_bottom": (None, 1216),
+    "motion_generator_mode": (2280, 1288),
+    "controller_mode": (2281, 1289),
+    "errors": (2282, 1290),
+    "reflex_reason": (2323, 1331),
+    "robot_mode": (2364, 1372),
+    "control_command_success_rate": (2365, 1373),
+}
+COMMAND_OFFSETS = {
+    "message_id": 0,
+    "q_c": 8,
+    "dq_c": 64,
+    "O_T_EE_c": 120,
+    "O_dP_EE_c": 248,
+    "elbow_c": 296,
+    "valid_elbow": 312,
+    "motion_generation_finished": 313,
+    "tau_J_d": 314,
+    "torque_command_finished": 370,
+}
+PROTOCOLS = pytest.mark.parametrize("protocol", [5, 10])
+Q = tuple(0.25 * k for k in range(1, 8))  # exact in f32 as well
+DQ = tuple(-0.5 * k for k in range(1, 8))
+TAU = tuple(8.0 + k for k in range(7))
+TAU_D = tuple(-16.0 - k for k in range(7))
+
+
+def frame(protocol, **changes):
+    fields = {"q": Q, "dq": DQ, "tau": TAU, "tau_d": TAU_D, "rate": 0.5, **changes}
+    return fci_peer.state(protocol, 123456789, **fields)
+
+
+def decode(protocol, data):
+    return StateDecoder(protocol).decode(memoryview(data))
+
+
+@pytest.mark.parametrize(("column", "protocol", "size"), [(0, 5, 2373), (1, 10, 1377)])
+def test_every_field_of_a_state_lies_where_the_table_says(column, protocol, size):
+    dtype = STATE_DTYPE[protocol]
+    expected = {n: o[column] for n, o in STATE_OFFSETS.items() if o[column] is not None}
+    assert {name: dtype.fields[name][1] for name in dtype.names} == expected
+    assert dtype.itemsize == size
+
+
+@pytest.mark.parametrize(("protocol", "size"), [(5, 370), (10, 371)])
+def test_every_field_of_a_command_lies_where_the_table_says(protocol, size):
+    dtype = COMMAND_DTYPE[protocol]
+    assert {n: dtype.fields[n][1] for n in dtype.names} == {
+        name: offset for name, offset in COMMAND_OFFSETS.items() if offset < size
+    }
+    assert dtype.itemsize == size
+
+
+@PROTOCOLS
+def test_a_golden_state_is_read_back(protocol):
+    got = decode(protocol, frame(protocol, modes=(2, 1, 3), errors=(0, 40), reflex=(25,)))
+    assert got.message_id == 123456789
+    for values, expected in ((got.q, Q), (got.dq, DQ), (got.tau_J, TAU), (got.tau_J_d, TAU_D)):
+        assert values.dtype == np.float64
+        assert tuple(values) == expected
+    assert got.success_rate == 0.5
+    assert (got.status.generator, got.status.controller, got.status.robot_mode) == (2, 1, 3)
+    assert tables.raised(got.status.errors) == (
+        "joint_position_limits_violation",
+        "base_acceleration_invalid_reading",
+    )
+    assert tables.raised(got.status.reflex_reason) == ("communication_constraints_violation",)
+
+
+@PROTOCOLS
+def test_a_state_lies_anywhere_in_the_buffer_and_owns_its_numbers(protocol):
+    data = bytearray(b"\xff" * 37 + frame(protocol) + b"\xff" * 11)
+    size = fci_peer.STATE_SIZE[protocol]
+    got = StateDecoder(protocol).decode(memoryview(data), 37, size)
+    data[:] = bytes(len(data))
+    assert tuple(got.q) == Q
+    assert tuple(got.tau_J) == TAU
+
+
+@PROTOCOLS
+def test_numbers_that_are_none_are_delivered(protocol):
+    got = decode(protocol, frame(protocol, q=(math.nan, math.inf, *Q[2:])))
+    assert math.isnan(got.q[0])
+    assert math.isinf(got.q[1])
+    assert tuple(got.q[2:]) == Q[2:]
+
+
+@PROTOCOLS
+def test_what_is_no_state_is_refused_with_a_sentence(protocol):
+    good = frame(protocol)
+    _, _, _, _, _, modes, _ = fci_peer.PLACES[protocol]
+    for data, why in (
+        (good[:-1], "bytes; protocol"),
+        (good + b"\0", "bytes; protocol"),
+        (b"", "a state of 0 bytes"),
+        (struct.pack("<Q", 1 << 41) + good[8:], "absurd message id"),
+        (fci_peer.state(protocol, 1, modes=(0, 4, 1)), "unknown controller mode 4"),
+        (fci_peer.state(protocol, 1, modes=(9, 3, 1)), "unknown motion generator mode 9"),
+        (fci_peer.state(protocol, 1, modes=(0, 3, 8)), "unknown robot mode 8"),
+        (good[: modes + 10] + b"\2" + good[modes + 11 :], "unknown error flag 2"),
+    ):
+        with pytest.raises(WireError, match=why):
+            decode(protocol, data)
+
+
+def test_modes_that_change_are_seen_each_time():
+    decoder = StateDecoder(5)
+    idle, moving = frame(5), frame(5, modes=(2, 2, 2))
+    first = decoder.decode(memoryview(idle)).status
+    assert decoder.decode(memoryview(frame(5, rate=0.75))).status is first
+    assert decoder.decode(memoryview(moving)).status.robot_mode == 2
+    assert decoder.decode(memoryview(idle)).status == first
+    with pytest.raises(WireError):
+        decoder.decode(memoryview(frame(5, modes=(2, 9, 2))))
+    assert decoder.decode(memoryview(idle)).status == first
+
+
+@PROTOCOLS
+@pytest.mark.parametrize("finished", [False, True])
+def test_a_golden_command(protocol, finished):
+    expected = bytearray(fci_peer.COMMAND_SIZE[protocol])
+    struct.pack_into("<Q", expected, 0, 77)
+    struct.pack_into("<7d", expected, 314, *TAU)
+    expected[313 if protocol == 5 else 370] = finished
+    encoder = CommandEncoder(protocol)
+    encoder.encode(1, np.ones(7), not finished)  # leaves nothing behind
+    assert encoder.encode(77, np.array(TAU), finished) == expected
+
+
+def test_golden_requests():
+    connect = codec.request(0, 3, codec.connect_payload(5, 50000))
+    assert connect == struct.pack("<IIIHH", 0, 3, 16, 5, 50000)
+    deviation = (10.0, 3.12, 2 * math.pi)
+    v5 = codec.request(1, 4, codec.move_payload(5))
+    assert v5 == struct.pack("<IIIII6d", 1, 4, 68, 2, 1, *deviation, *deviation)
+    v10 = codec.request(1, 4, codec.move_payload(10))
+    rest = bytes(1 + 7 * 8)
+    assert v10 == struct.pack("<IIIII6d", 1, 4, 125, 2, 4, *deviation, *deviation) + rest
+    assert codec.request(12, 5) == struct.pack("<III", 12, 5, 12)
+
+
+def test_replies_are_cut_out_of_the_stream_however_it_comes():
+    first = fci_peer.reply(0, 7, struct.pack("<BH", 1, 9) + bytes(50))
+    second = fci_peer.reply(1, 8, b"\1")
+    parser = codec.ReplyParser()
+    got = [reply for k in (first + second) for reply in parser.feed(bytes([k]))]
+    assert [reply.command_id for reply in got] == [7, 8]
+    assert codec.connect_reply(got[0].payload) == (1, 9)
+    assert codec.status_reply(got[1].payload) == 1
+    assert [r.command_id for r in codec.ReplyParser().feed(first + second)] == [7, 8]
+
+
+@pytest.mark.parametrize("size", [0, 11, 1 << 30])
+def test_an_impossible_reply_length_is_refused(size):
+    with pytest.raises(WireError, match=f"says {size} bytes"):
+        codec.ReplyParser().feed(struct.pack("<III", 1, 2, size))
+
+
+def test_replies_cut_short_are_refused():
+    with pytest.raises(WireError, match="without a status"):
+        codec.status_reply(b"")
+    with pytest.raises(WireError, match="14 bytes; it has 15"):
+        codec.connect_reply(b"\0\0")
+
+
+def test_codes_shift_between_the_versions():
+    for protocol, reflex, stopped in ((5, 6, 7), (10, 8, 9)):
+        statuses = tables.MOVE_STATUS[protocol]
+        assert tables.status_name(statuses, reflex) == "reflex"
+        assert tables.status_name(statuses, stopped) == "user_stop"
+    assert tables.status_name(tables.MOVE_STATUS[5], 3) == "not_possible"
+    assert tables.status_name(tables.MOVE_STATUS[10], 5) == "not_possible"
+    assert [len(tables.MOVE_STATUS[p]) for p in (5, 10)] == [10, 12]
+    assert [len(tables.STOP_STATUS[p]) for p in (5, 10)] == [5, 6]
+    assert [len(tables.RECOVER_STATUS[p]) for p in (5, 10)] == [6, 7]
+    assert tables.status_name(tables.MOVE_STATUS[5], 200) == "status 200"
+
+
+def test_each_error_and_status_says_what_to_do():
+    assert len(tables.ERROR_NAMES) == tables.ERROR_COUNT == 41
+    for index, name in (
+        (6, "joint_reflex"),
+        (25, "communication_constraints_violation"),
+        (32, "controller_torque_discontinuity"),
+        (36, "joint_move_in_wrong_direction"),
+        (40, "base_acceleration_invalid_reading"),
+    ):
+        assert tables.ERROR_NAMES[index] == name
+        bitmap = bytes(int(k == index) for k in range(41))
+        assert tables.told(bitmap) == f"{name} ({tables.ERRORS[name]})"
+    assert all(len(advice) > 20 for advice in tables.ERRORS.values())
+    for table in (tables.MOVE_STATUS, tables.STOP_STATUS, tables.RECOVER_STATUS):
+        assert all(name in tables.MEANING for names in table.values() for name in names)
+    assert "not defined" in tables.meaning("status 200")

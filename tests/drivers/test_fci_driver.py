@@ -1,0 +1,765 @@
+"""The FCI driver against a scripted peer that speaks the real wire formats."""
+
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.fci import FciArm, reader_client
+from drivers.fci.codec import id_at
+from drivers.fci.limits import TORQUE_STEP
+from drivers.interface import Driver, DriverError
+from tests.helpers import fci_peer
+from tests.helpers.fci_peer import Peer
+
+PROTOCOLS = pytest.mark.parametrize("protocol", [5, 10])
+TAU = np.array([3.0, -3.0, 2.0, 1.0, 0.5, -0.5, 0.1])
+LIMIT_S = 20.0
+
+
+@pytest.fixture(params=[5, 10])
+def peer(request):
+    with Peer(request.param) as it:
+        yield it
+
+
+@pytest.fixture
+def peer5():
+    with Peer(5) as it:
+        yield it
+
+
+@pytest.fixture
+def connected():
+    """Builds connected arms and closes them in the end."""
+    arms = []
+
+    def build(peer, options="", **arguments):
+        arm = FciArm(peer.address + options, **arguments)
+        arms.append(arm)
+        arm.connect()
+        return arm
+
+    yield build
+    for arm in arms:
+        arm.close()
+
+
+def quiet(arm, peer):
+    """Stop the peer's stream, send one state more and read up to it; its id."""
+    peer.message_id = last = peer.pause() + 1
+    peer.send(peer.state(last))
+    while arm.read().stamp_ns < last * 1_000_000:
+        pass
+    return last
+
+
+def ids_until(arm, last):
+    """Ids of the samples up to one of them."""
+    got = []
+    while not got or got[-1] != last:
+        got.append(arm.read().stamp_ns // 1_000_000)
+    return got
+
+
+def drive(arm, until, tau=TAU):
+    """Read and command until something is true."""
+    deadline = time.monotonic() + LIMIT_S
+    while not until():
+        assert time.monotonic() < deadline
+        arm.read()
+        arm.command(tau)
+
+
+def moving(arm, peer, tau=TAU):
+    """A motion that has taken some commands."""
+    drive(arm, lambda: len(peer.commands) >= 20 and peer.commands[-1][1] == tuple(tau), tau)
+
+
+def exact(intake):
+    return intake.received == intake.used + sum(intake.refused.values())
+
+
+# Connecting
+
+
+def test_it_is_a_driver_and_finds_the_version(peer, connected):
+    before = sys.getswitchinterval()
+    arm: Driver = connected(peer)
+    assert arm.version == peer.protocol
+    name = "panda" if peer.protocol == 5 else "fr3"
+    assert arm.joint_names == tuple(f"{name}_joint{k}" for k in range(1, 8))
+    assert (arm.link_names, arm.period_ns) == ((), 1_000_000)
+    assert (arm.paced, arm.adds_gravity, arm.can_move) == (True, True, False)
+    asked = [struct.unpack_from("<H", payload)[0] for _, payload in peer.requests]
+    assert asked == ([5] if peer.protocol == 5 else [5, 10])
+    assert sys.getswitchinterval() < before
+    arm.close()
+    arm.close()
+    assert sys.getswitchinterval() == before
+    with pytest.raises(DriverError, match="not connected"):
+        arm.read()
+    arm.connect()
+    assert arm.read().stamp_ns > 0
+    assert arm.intake.used == 1
+
+
+def test_samples_carry_what_was_sent(peer, connected):
+    arm = connected(peer, f"?protocol={peer.protocol}")
+    last = quiet(arm, peer)
+    q, dq, tau = (np.arange(7.0) + k for k in (0.5, 10.25, 20.125))
+    before = time.monotonic_ns()
+    peer.send(peer.state(last + 1, q=q, dq=dq, tau=tau))
+    sample = arm.read()
+    after = time.monotonic_ns()
+    assert sample.stamp_ns == (last + 1) * 1_000_000
+    assert np.array_equal(sample.q, q)
+    assert np.array_equal(sample.dq, dq)
+    assert np.array_equal(sample.tau, tau)
+    assert before <= arm.arrived_ns <= after
+    peer.send(peer.state(last + 2, q=[np.nan, *q[1:]]))
+    assert np.isnan(arm.read().q[0])
+    assert np.array_equal(sample.q, q)  # a sample keeps its numbers
+
+
+def test_names_and_addresses_are_checked():
+    assert FciArm("fci://robot", "abcdefg").joint_names == tuple("abcdefg")
+    assert FciArm("fci://robot?protocol=10").joint_names[0] == "fr3_joint1"
+    with pytest.raises(DriverError, match="7 joints, got 2"):
+        FciArm("fci://robot", ["a", "b"])
+    for address, why in (
+        ("fci://robot?protocol=7", "have: auto, 5, 10"),
+        ("fci://robot?recover=yes", "write recover=1"),
+        ("fci://robot?speed=1", "have: protocol, recover"),
+        ("fci://", "names nobody"),
+    ):
+        with pytest.raises(DriverError, match=why):
+            FciArm(address)
+
+
+def test_nobody_there():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(DriverError, match=r"no FCI at .* activate FCI in Desk"):
+        FciArm(f"fci://127.0.0.1:{port}").connect()
+
+
+@pytest.mark.parametrize("server", [6, 9, 77])
+def test_versions_that_nobody_supports(peer5, server):
+    peer5.protocol = server
+    with pytest.raises(DriverError, match=f"protocol {server} .*supported are 5 .* and 10 "):
+        FciArm(peer5.address).connect()
+
+
+@PROTOCOLS
+def test_the_wrong_version_asked_for(protocol):
+    with Peer(protocol) as peer:
+        arm = FciArm(f"{peer.address}?protocol={15 - protocol}")
+        with pytest.raises(DriverError, match=rf"use \?protocol={protocol}"):
+            arm.connect()
+
+
+def test_a_handshake_byte_by_byte_with_surplus(peer5, connected):
+    peer5.slowly = True
+    peer5.connect_reply = lambda version, command_id: fci_peer.reply(
+        0, command_id, struct.pack("<BH", 0, 5) + bytes(50)
+    )
+    assert connected(peer5).read().stamp_ns > 0
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (b"", "answer to Connect of 12 bytes; it has 15"),
+        (b"\0\0", "answer to Connect of 14 bytes; it has 15"),
+        (b"\7\5\0", "status 7, which is not defined"),
+    ],
+)
+def test_a_handshake_that_is_none(peer5, answer, why):
+    peer5.connect_reply = lambda version, command_id: fci_peer.reply(0, command_id, answer)
+    with pytest.raises(DriverError, match=why):
+        FciArm(peer5.address).connect()
+
+
+def test_another_kind_of_server(peer5):
+    peer5.connect_reply = lambda version, command_id: b"HTTP/1.1 400 Bad Request\r\n"
+    with pytest.raises(DriverError, match="is this an FCI port"):
+        FciArm(peer5.address).connect()
+
+
+def test_no_answer_and_a_hang_up(peer5, monkeypatch):
+    monkeypatch.setattr("drivers.fci.connect.REPLY_LIMIT_S", 0.2)
+    peer5.connect_reply = lambda version, command_id: None
+    with pytest.raises(DriverError, match="does not answer Connect"):
+        FciArm(peer5.address).connect()
+    peer5.connect_reply = lambda version, command_id: peer5.hang_up()
+    with pytest.raises(DriverError, match="hung up during the handshake"):
+        FciArm(peer5.address).connect()
+
+
+def test_no_state_after_the_handshake(peer5):
+    peer5.streaming.clear()
+    before = sys.getswitchinterval()
+    with pytest.raises(DriverError, match="no state for 1 s while the connection stands"):
+        FciArm(peer5.address).connect()
+    assert sys.getswitchinterval() == before
+
+
+def test_states_of_the_other_version_only(peer5):
+    peer5.connect_reply = lambda version, command_id: fci_peer.reply(
+        0, command_id, struct.pack("<BH", 0, 5)
+    )
+    peer5.protocol = 10  # says 5 and sends states of 10
+    with pytest.raises(DriverError, match=r"nothing of use.*1377 bytes.*2373.*\?protocol"):
+        FciArm(peer5.address).connect()
+
+
+# The account
+
+
+def test_every_datagram_is_accounted_for(peer, connected):
+    arm = connected(peer)
+    last = quiet(arm, peer)
+    received, used = arm.intake.received, arm.intake.used
+    peer.send_ids(last + 1, last + 2, last + 2, last + 4, last + 3)  # repeated; lost, then late
+    peer.send(peer.state(last + 5)[:-1])  # cut short: arrived, so not lost
+    peer.send(peer.state(last + 6) + b"\0" * 100)
+    peer.send(peer.state(last + 7, modes=(0, 77, 1)))
+    peer.send_ids(last + 8, 1 << 41, last + 3_600_001, last + 50_000, last + 12)
+    assert ids_until(arm, last + 12) == [last + k for k in (1, 2, 4, 8, 12)]
+    assert arm.intake.received - received == 13
+    assert arm.intake.used - used == 5
+    assert arm.intake.refused == {"repeated": 1, "out_of_order": 1, "malformed": 6}
+    assert arm.intake.lost == 1  # of 9 to 11, three datagrams arrived and could not be read
+    assert exact(arm.intake)
+    notes = " ".join(arm.intake.notes)
+    for said in ("repeated a state", "after a later one", "no state of this", "got lost"):
+        assert notes.count(said) == 1
+
+
+def test_lost_ids_are_counted_one_by_one(peer5, connected):
+    arm = connected(peer5)
+    last = quiet(arm, peer5)
+    rng = np.random.default_rng(3)
+    ids = [last + k for k in range(1, 400) if rng.random() > 0.1 or k == 399]
+    for message_id in ids:
+        peer5.send_ids(message_id)
+    assert ids_until(arm, ids[-1]) == ids
+    assert arm.intake.lost == 399 - len(ids)
+    assert arm.intake.refused == {}
+
+
+@pytest.mark.parametrize(("jump", "refused"), [(-900, 99), (10_000, 9), (4_000_000, 9)])
+def test_another_count_is_followed_after_a_while(peer5, connected, jump, refused):
+    arm = connected(peer5)
+    first = quiet(arm, peer5) + jump
+    for message_id in range(first, first + 120):
+        peer5.send_ids(message_id)
+    assert ids_until(arm, first + 119) == list(range(first + refused, first + 120))
+    assert sum(arm.intake.refused.values()) == refused
+    assert arm.intake.lost == 0
+    assert any("another count" in note for note in arm.intake.notes)
+    assert exact(arm.intake)
+
+
+def test_states_of_strangers_are_refused(peer5, connected):
+    arm = connected(peer5)
+    last = quiet(arm, peer5)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.bind(("127.0.0.2", 0))
+        stranger.sendto(peer5.state(last + 1, q=[9.0] * 7), peer5._where)
+    peer5.send(peer5.state(last + 1))
+    assert arm.read().q[0] == 0.0
+    assert arm.intake.refused == {"stranger": 1}
+
+
+def test_a_loop_that_was_away_gets_fresh_states_and_an_exact_account(peer5, connected):
+    arm = connected(peer5)
+    first = quiet(arm, peer5)
+    before = arm.intake.received
+    peer5.streaming.set()
+    deadline = time.monotonic() + LIMIT_S
+    while peer5.message_id < first + 1500:  # more than are kept
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    sample = arm.read()
+    assert time.monotonic_ns() - arm.arrived_ns < 600_000_000
+    assert sample.stamp_ns > (first + 400) * 1_000_000
+    last = quiet(arm, peer5)
+    assert arm.intake.refused["loop_too_slow"] > 0
+    assert exact(arm.intake)
+    assert arm.intake.received - before + arm.intake.lost == last - first
+
+
+def test_silence_and_a_cut_connection(peer5, connected):
+    arm = connected(peer5)
+    quiet(arm, peer5)
+    begin = time.monotonic()
+    with pytest.raises(DriverError, match="while the connection stands: check the cable"):
+        arm.read()
+    assert time.monotonic() - begin < LIMIT_S
+    peer5.hang_up()
+    with pytest.raises(DriverError, match="has cut the connection"):
+        arm.read()
+
+
+# The reader's process
+
+
+def test_a_killed_reader_is_replaced(peer5, connected):
+    arm = connected(peer5)
+    first = arm.read().stamp_ns // 1_000_000
+    used = arm.intake.used
+    for _ in range(3):
+        pid = arm.reader_pid
+        os.kill(pid, signal.SIGKILL)
+        deadline = time.monotonic() + LIMIT_S
+        while arm.reader_pid == pid:
+            assert time.monotonic() < deadline
+            arm.read()
+        for _ in range(50):
+            arm.read()
+    last = quiet(arm, peer5)
+    assert exact(arm.intake)
+    assert arm.intake.refused.keys() <= {"stale", "loop_too_slow"}
+    there = arm.intake.used - used + sum(arm.intake.refused.values())
+    assert there + arm.intake.lost == last - first
+    assert len(peer5.requests) == 1  # the session went on
+    assert sum("was replaced" in note for note in arm.intake.notes) == 1
+
+
+def test_a_reader_that_stands_still_is_replaced(peer5, connected):
+    arm = connected(peer5)
+    pid = arm.reader_pid
+    os.kill(pid, signal.SIGSTOP)
+    for _ in range(100):
+        arm.read()
+    deadline = time.monotonic() + LIMIT_S
+    while arm.reader_pid == pid:
+        assert time.monotonic() < deadline
+        arm.read()
+    assert exact(arm.intake)
+
+
+def test_a_reader_that_keeps_dying_is_an_error(peer5, connected, monkeypatch):
+    monkeypatch.setattr(reader_client, "RESTARTS_WITHIN_S", 1000.0)  # a slow computer kills slowly
+    arm = connected(peer5)
+
+    def kill_again_and_again():
+        for _ in range(reader_client.RESTARTS + 1):
+            pid = arm.reader_pid
+            os.kill(pid, signal.SIGKILL)
+            while arm.reader_pid == pid:
+                arm.read()
+
+    with pytest.raises(DriverError, match="died 5 times within 1000 s"):
+        kill_again_and_again()
+    with pytest.raises(DriverError, match="died 5 times"):
+        arm.read()
+    arm.close()
+    arm.connect()
+    assert arm.read().stamp_ns > 0
+
+
+def test_the_reader_goes_when_its_driver_is_killed(peer5):
+    lines = (
+        "import time",
+        "from drivers.fci import FciArm",
+        f"arm = FciArm('{peer5.address}')",
+        "arm.connect()",
+        "print(arm.reader_pid, flush=True)",
+        "time.sleep(100)",
+    )
+    driver = subprocess.Popen(
+        [sys.executable, "-c", "\n".join(lines)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    )
+    pid = int(driver.stdout.readline())
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.wait()
+    driver.stdout.close()
+    deadline = time.monotonic() + LIMIT_S
+    while _alive(pid):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def _alive(pid):
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+@PROTOCOLS
+def test_a_busy_thread_beside_the_loop_costs_no_samples(protocol):
+    """Every state is accounted for; of those unused, none is lost to the busy thread.
+
+    Where this machine itself stood still, the states of that time are refused as stale: the
+    stalls that the reading thread saw are counted apart.
+    """
+    count = 2000
+    peer = subprocess.Popen(
+        [sys.executable, fci_peer.__file__, str(protocol), "1000"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    over = threading.Event()
+
+    def spin():
+        while not over.is_set():
+            sum(range(100))
+
+    busy = threading.Thread(target=spin)
+    arm = FciArm(f"fci://127.0.0.1:{int(peer.stdout.readline())}?protocol={protocol}")
+    try:
+        busy.start()
+        begin = time.monotonic()
+        arm.connect()
+        ids, stalled_s = [0], 0.0
+        while ids[-1] < count:
+            ids.append(arm.read().stamp_ns // 1_000_000)
+            now = time.monotonic()
+            begin, gap_s = now, now - begin
+            stalled_s += gap_s if gap_s > 0.1 else 0.0
+    finally:
+        over.set()
+        busy.join()
+        arm.close()
+        peer.kill()
+        peer.wait()
+        peer.stdout.close()
+    assert np.diff(ids).min() > 0
+    assert exact(arm.intake) and arm.intake.used == len(ids) - 1
+    assert arm.intake.received + arm.intake.lost == ids[-1]
+    assert arm.intake.lost == arm.kernel_drops
+    assert arm.intake.refused.keys() <= {"stale", "loop_too_slow"}
+    assert ids[-1] - arm.intake.used <= 1000.0 * stalled_s
+
+
+# Motion
+
+
+def test_without_permission_nothing_moves(peer, connected):
+    arm = connected(peer)
+    arm.read()
+    with pytest.raises(DriverError, match="needs --allow-motion"):
+        arm.command(TAU)
+    arm.stop()
+    assert [command for command, _ in peer.requests if command != 0] == []
+
+
+def test_a_motion_is_started_fed_and_finished(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    assert arm.can_move
+    with pytest.raises(DriverError, match="no state was read"):
+        arm.command(TAU)
+    moving(arm, peer)
+    arm.stop()
+    arm.stop()
+    moves = [payload for command, payload in peer.requests if command == fci_peer.MOVE]
+    assert len(moves) == 1
+    assert struct.unpack_from("<II", moves[0]) == (2, 1 if peer.protocol == 5 else 4)
+    assert len(moves[0]) == (56 if peer.protocol == 5 else 113)
+    assert fci_peer.STOP_MOVE not in [command for command, _ in peer.requests]
+    torques = np.array([tau for _, tau, _ in peer.commands])
+    ids = [message_id for message_id, _, _ in peer.commands]
+    assert all(np.diff(ids) >= 0)
+    assert np.abs(np.diff(torques, axis=0, prepend=0.0)).max() <= 1.0
+    assert np.abs(torques - TAU).max(axis=1).min() < 1e-9
+    finished = [flag for _, _, flag in peer.commands]
+    assert finished.index(True) > 20
+    assert all(finished[finished.index(True) :])
+    assert np.abs(torques[-1]).max() < 1.0
+    assert peer.modes == (0, 3, 1)
+    assert exact(arm.intake)
+    moving_again = len(peer.commands) + 10
+    drive(arm, lambda: len(peer.commands) >= moving_again)  # a stop is no end
+    assert peer.modes[2] == 2
+
+
+def test_commands_wait_until_the_modes_show_the_motion(peer5, connected):
+    arm = connected(peer5, allow_motion=True)
+    quiet(arm, peer5)
+    arm.command(TAU)
+    deadline = time.monotonic() + LIMIT_S
+    while peer5.modes[2] != 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    base = peer5.message_id
+    for k in range(1, 6):  # the robot has answered, its states still show no motion
+        peer5.send(peer5.state(base + k, modes=(0, 3, 1)))
+        arm.read()
+        arm.command(TAU)
+    time.sleep(0.1)
+    assert peer5.commands == []
+    peer5.send(peer5.state(base + 6))
+    arm.read()
+    arm.command(TAU)
+    while not peer5.commands:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert [message_id for message_id, _, _ in peer5.commands] == [base + 6]
+
+
+def test_torques_and_steps_are_cut_at_the_robots_limits(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    wanted = np.array([1e3, -1e3] * 3 + [1e3])
+    limits = [87, 87, 87, 87, 12, 12, 12]
+
+    def all_reached():
+        return bool(peer.commands) and np.allclose(np.abs(peer.commands[-1][1]), limits)
+
+    drive(arm, all_reached, wanted)
+    torques = np.array([tau for _, tau, _ in peer.commands])
+    assert np.abs(np.diff(torques, axis=0, prepend=0.0)).max() <= 1.0
+    assert np.allclose(np.abs(torques).max(axis=0), limits)
+    before = len(peer.commands)
+    arm.stop()
+    after = np.array([tau for _, tau, _ in peer.commands[before:]])
+    assert np.isfinite(after).all()
+    assert np.abs(np.diff(after, axis=0)).max() <= 1.0
+
+
+@pytest.mark.parametrize(("first", "sign"), [(True, 1.0), (False, 1.0), (True, -1.0)])
+def test_a_command_answers_the_newest_state_with_what_was_accepted_there(
+    peer5, connected, first, sign
+):
+    """The robot is past a state behind which another waits: its id and its torque count."""
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5, np.full(7, sign * 3.0))  # in steps of 0.99 N m
+    base, sent = quiet(arm, peer5), arm._control.sent
+    older, newer = sign * 2 * TORQUE_STEP, sign * 3.0
+    peer5.send(peer5.state(base + 1, tau_d=(older,) * 7))
+    if first:
+        peer5.send(peer5.state(base + 2, tau_d=(newer,) * 7))
+        assert patiently(lambda: waits(arm, base + 2))
+    arm.read()
+    arm.command(np.full(7, sign * 9.0))
+    assert patiently(lambda: len(peer5.commands) > sent)
+    message_id, tau, _ = peer5.commands[sent]
+    # A step counts from the command sent last, 3 N m, and from what was accepted.
+    accepted = newer if first else older
+    assert message_id == base + (2 if first else 1)
+    assert tau[0] == pytest.approx(accepted + sign * TORQUE_STEP)
+
+
+def waits(arm, message_id):
+    """Whether the state of this id is the newest that waits."""
+    start = arm._connection.reader.newest()
+    return start is not None and id_at(arm._connection.reader.data, start) == message_id
+
+
+def patiently(condition):
+    """Whether it comes true."""
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def test_stopping_brakes_a_moving_arm(peer5, connected):
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5)
+    before = len(peer5.commands)
+    peer5.dq = (0.5, -0.5, 0.5, -0.5, 1.0, -1.0, 1.0)
+    begin = time.monotonic()
+    arm.stop()
+    assert time.monotonic() - begin < LIMIT_S
+    torques = np.array([tau for _, tau, _ in peer5.commands[before:]])
+    braking = torques[np.argmax(np.abs(torques).sum(axis=1))]
+    assert (np.sign(braking) == -np.sign(peer5.dq)).all()
+    assert np.abs(np.diff(torques, axis=0)).max() <= 1.0
+    assert np.abs(torques[-1]).max() < 1.0
+    assert peer5.commands[-1][2]
+
+
+@pytest.mark.parametrize(
+    ("statuses", "why"),
+    [
+        (fci_peer.NOT_POSSIBLE, "refused the motion: it is not possible now: unlock the brakes"),
+        (fci_peer.REFLEX, "refused the motion: a reflex stopped the arm"),
+        (fci_peer.USER_STOP, "refused the motion: the user stop is pressed"),
+        ({5: 4, 10: 6}, "refused the motion: the arm starts in a singular posture"),
+        ({5: 0, 10: 0}, "refused the motion: it says that all is done"),
+        ({5: 99, 10: 99}, "answers status 99, which is not defined"),
+    ],
+)
+def test_a_refused_motion_says_why(peer, connected, statuses, why):
+    arm = connected(peer, allow_motion=True)
+    peer.first_status = statuses[peer.protocol]
+    with pytest.raises(DriverError, match=why):
+        drive(arm, lambda: False)
+    with pytest.raises(DriverError, match=why):
+        arm.read()
+    with pytest.raises(DriverError, match=why):
+        arm.command(TAU)
+    arm.stop()
+    assert peer.commands == []
+    arm.read()
+
+
+def test_a_motion_that_never_starts(peer5, connected, monkeypatch):
+    monkeypatch.setattr("drivers.fci.torque_control.START_LIMIT_S", 0.2)
+    arm = connected(peer5, allow_motion=True)
+    peer5._move = lambda command_id: None
+    with pytest.raises(DriverError, match="did not begin to move"):
+        drive(arm, lambda: False)
+
+
+def test_a_reflex_names_its_reason(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    peer.end_motion(4, fci_peer.REFLEX[peer.protocol], reflex=(25, 32))
+    with pytest.raises(DriverError, match="reflex stopped") as error:
+        drive(arm, lambda: False)
+    for said in ("communication_constraints_violation", "missed 20 commands", "recover=1"):
+        assert said in str(error.value)
+    assert "controller_torque_discontinuity" in str(error.value)
+    arm.stop()
+    assert arm.read().stamp_ns > 0  # it can still be listened to
+    with pytest.raises(DriverError, match="no motion: the robot is in reflex"):
+        arm.command(TAU)
+
+
+def test_one_state_with_a_damaged_mode_ends_no_motion(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    last = quiet(arm, peer)
+    for modes in ((0, 3, 4), peer.modes, (0, 2, 2), peer.modes):  # every other one is damaged
+        last += 1
+        peer.send(peer.state(last, modes=modes))
+        arm.read()
+        arm.command(TAU)
+    for _ in range(2):
+        last += 1
+        peer.send(peer.state(last, modes=(0, 3, 4)))
+        arm.read()
+    with pytest.raises(DriverError, match="a reflex stopped the arm"):
+        arm.command(TAU)
+
+
+@pytest.mark.parametrize(
+    ("mode", "statuses", "why"),
+    [
+        (5, fci_peer.USER_STOP, "user stop is pressed: release it"),
+        (1, {5: 2, 10: 2}, "was preempted: end the other program"),
+        (1, {5: 9, 10: 11}, "it aborted: look at Desk"),
+    ],
+)
+def test_other_ends_of_a_motion(peer, connected, mode, statuses, why):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    peer.end_motion(mode, statuses[peer.protocol])
+    with pytest.raises(DriverError, match=why):
+        drive(arm, lambda: False)
+
+
+def test_a_reflex_and_a_user_stop_are_notes_while_only_reading(peer5, connected):
+    arm = connected(peer5)
+    peer5.modes, peer5.reflex = (0, 3, 4), (6,)
+    base = quiet(arm, peer5)
+    peer5.send(peer5.state(base + 1, modes=(0, 3, 5)))
+    arm.read()
+    notes = " ".join(arm.intake.notes)
+    assert "in reflex" in notes
+    assert "joint_reflex (a joint felt a collision" in notes
+    assert "user stop pressed" in notes
+
+
+def test_a_robot_without_the_finish_flag_is_stopped_over_tcp(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    peer.obeys_finish = False
+    arm.stop()
+    assert peer.requests[-1][0] == fci_peer.STOP_MOVE
+    assert peer.modes == (0, 3, 1)
+
+
+def test_a_stop_that_nobody_confirms_ends_and_says_so(peer, connected):
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    peer.obeys_finish, peer.stop_status = False, None
+    begin = time.monotonic()
+    with pytest.raises(DriverError, match="press its user stop"):
+        arm.stop()
+    assert time.monotonic() - begin < LIMIT_S
+    arm.stop()
+
+
+def test_a_stop_without_states_goes_over_tcp(peer5, connected):
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5)
+    peer5.pause()
+    arm.stop()
+    assert peer5.requests[-1][0] == fci_peer.STOP_MOVE
+
+
+def test_the_connection_cut_in_a_motion(peer5, connected):
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5)
+    peer5.hang_up()
+    with pytest.raises(DriverError, match="cut the connection"):
+        drive(arm, lambda: False)
+    arm.stop()
+
+
+def test_closing_stops_the_arm(peer5, connected):
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5)
+    arm.close()
+    assert peer5.commands[-1][2]
+    assert peer5.modes == (0, 3, 1)
+
+
+# Recovery
+
+
+def test_motion_from_a_reflex_needs_a_recovery(peer, connected):
+    peer.modes, peer.reflex = (0, 3, 4), (6,)
+    with pytest.raises(DriverError, match=r"is in reflex: .*\?recover=1"):
+        connected(peer, allow_motion=True)
+    arm = connected(peer, f"?recover=1&protocol={peer.protocol}", allow_motion=True)
+    assert peer.requests[-1][0] == fci_peer.RECOVER[peer.protocol]
+    moving(arm, peer)
+    assert exact(arm.intake)
+
+
+@pytest.mark.parametrize(
+    ("statuses", "why"),
+    [
+        ({5: 2, 10: 3}, "does not recover: the error needs hands"),
+        ({5: 4, 10: 5}, "does not recover: the user stop is pressed"),
+        ({5: None, 10: None}, "no answer to the error recovery"),
+    ],
+)
+def test_a_recovery_that_fails_says_why(peer, statuses, why, monkeypatch):
+    monkeypatch.setattr("drivers.fci.connect.RECOVERY_LIMIT_S", 0.3)
+    peer.modes, peer.recover_status = (0, 3, 4), statuses[peer.protocol]
+    with pytest.raises(DriverError, match=why):
+        FciArm(f"{peer.address}?recover=1").connect()
+
+
+@pytest.mark.parametrize(
+    ("mode", "why"), [(0, "unlock the brakes"), (2, "another program"), (5, "user stop")]
+)
+def test_motion_needs_an_idle_robot(peer5, connected, mode, why):
+    peer5.modes = (0, 3, mode)
+    listening = connected(peer5)
+    assert listening.read().stamp_ns > 0
+    listening.close()
+    with pytest.raises(DriverError, match=f"no motion: the robot .*{why}"):
+        connected(peer5, allow_motion=True)

@@ -1,0 +1,509 @@
+"""Each effect's torque against the equation of the table, computed with Pinocchio alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.effects.active import active_effects, check_effects
+from adapter.effects.backlash import play
+from adapter.effects.base import Effect, Motion, polar, smooth_sign
+from adapter.effects.catalogue import CATALOGUE, LEARNED
+from adapter.effects.payload import parameters_of, theta_of
+from adapter.effects.splits import experiments
+from adapter.effects.torque import ModelTorque, sensed_torque
+from adapter.errors import ModelError
+from adapter.model.robots import documented
+from adapter.physics.rigid_arm import RigidArm
+from sim.truth import panda
+from tests.helpers.arm_data import pin_model as truth_model
+from tests.helpers.arm_data import rnea
+from tests.helpers.robot_models import pin_model, pinocchio_case, random_urdf, relative, urdf_text
+
+N, J = 7, 3  # joints; the one that most effects sit on, from 0
+PERIOD_S = 1e-3
+MODEL = documented("panda")
+ARM = RigidArm.of(MODEL)
+ORACLE = truth_model(panda())
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def motion(seconds: float = 4.0) -> Motion:
+    """Sines with exact rates; every joint reverses."""
+    t = np.arange(0.0, seconds, PERIOD_S)[:, None]
+    rng = np.random.default_rng(5)
+    w, phase = rng.uniform(2.0, 4.0, N), rng.uniform(0.0, 6.0, N)
+    middle = np.array([0.3, -0.4, 0.2, -1.6, 0.3, 1.8, 0.4])
+    size = 0.5
+    sine, cosine = np.sin(w * t + phase), np.cos(w * t + phase)
+    moved = middle + size * sine, size * w * cosine, -size * w**2 * sine
+    return Motion(t[:, 0], *moved, ARM)
+
+
+MOVES = motion()
+Q, DQ, DDQ, T = MOVES.q, MOVES.dq, MOVES.ddq, MOVES.t
+RIGID = rnea(ORACLE, Q, DQ, DDQ)
+SIGN = np.tanh(DQ[:, J] / 0.01)
+
+
+def entry(name: str, joints: object = (J + 1,), **parameters: object) -> dict[str, object]:
+    return {"effect": name, "joints": list(joints), "parameters": parameters}  # type: ignore[call-overload]
+
+
+def sensed(*entries: dict[str, object]) -> np.ndarray:
+    return sensed_torque(MOVES, active_effects(entries, N))
+
+
+def on_joint(torque: np.ndarray, joint: int = J) -> np.ndarray:
+    out = RIGID.copy()
+    out[:, joint] += torque
+    return out
+
+
+def pin_inertia(theta: np.ndarray) -> pin.Inertia:
+    return pin.Inertia.FromDynamicParameters(np.asarray(theta)[[0, 1, 2, 3, 4, 5, 7, 6, 8, 9]])
+
+
+def changed_body(joint: int, body: pin.Inertia) -> pin.Model:
+    model = truth_model(panda())
+    model.appendBodyToJoint(joint + 1, body, pin.SE3.Identity())
+    return model
+
+
+def jacobians(q: np.ndarray) -> np.ndarray:
+    """(m, 6, n) of the last joint's frame, axes of the base, linear rows first."""
+    data = ORACLE.createData()
+    frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    found = []
+    for row in q:
+        pin.computeJointJacobians(ORACLE, data, row)
+        pin.updateFramePlacements(ORACLE, data)
+        found.append(pin.getJointJacobian(ORACLE, data, N, frame).copy())
+    return np.array(found)
+
+
+def test_the_rigid_arm_is_pinocchios() -> None:
+    assert relative(ARM.torque(Q, DQ, DDQ), RIGID) < 1e-9
+    assert relative(ARM.regressor(Q, DQ, DDQ) @ ARM.theta.ravel(), RIGID) < 1e-9
+    assert relative(sensed(), RIGID) < 1e-9
+
+
+@pytest.mark.parametrize("robot", ["panda", "lwr4", "tree5", "tree17", "two_arms"])
+def test_rigid_arms_of_any_shape(robot: str) -> None:
+    text = random_urdf(8, seed=3) if robot == "two_arms" else urdf_text(robot)
+    case = pinocchio_case(text, floating=False, samples=6, seed=2)
+    arm = RigidArm.of(case.model)
+    q, dq, ddq = (x.numpy() for x in (case.q, case.dq, case.ddq))
+    assert relative(arm.torque(q, dq, ddq), case.tau) < 1e-9
+    assert relative(arm.regressor(q, dq, ddq) @ arm.theta.ravel(), case.tau) < 1e-9
+    assert arm.torque(q[:0], dq[:0], ddq[:0]).shape == (0, arm.n)
+
+
+def test_wrench_torque_is_pinocchios_jacobian() -> None:
+    wrench = np.array([11.0, -7.0, 5.0, 0.6, -0.9, 1.3])
+    rows = slice(0, None, 50)
+    theirs = np.einsum("mij,i->mj", jacobians(Q[rows]), wrench)
+    assert relative(ARM.wrench_torque(Q[rows], wrench), theirs) < 1e-9
+
+
+def test_wrench_torque_on_a_tree_leaves_other_branches_alone() -> None:
+    text = urdf_text("tree17")
+    model = pinocchio_case(text, floating=False, samples=1).model
+    oracle = pin_model(text)
+    arm, rng = RigidArm.of(model), np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (1, arm.n))
+    wrench = rng.normal(size=6)
+    data, there = oracle.createData(), pin.neutral(oracle)
+    order = [oracle.joints[oracle.getJointId(name)] for name in model.tree.joint_names]
+    for joint, angle in zip(order, q[0], strict=True):
+        at = slice(joint.idx_q, joint.idx_q + joint.nq)
+        there[at] = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+    pin.computeJointJacobians(oracle, data, there)
+    last = oracle.getJointId(model.tree.joint_names[-1])
+    J6 = pin.getJointJacobian(oracle, data, last, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+    theirs = (J6.T @ wrench)[[joint.idx_v for joint in order]]
+    assert relative(arm.wrench_torque(q, wrench)[0], theirs) < 1e-9
+
+
+AT_JOINT = {
+    "viscous_friction": ({"Fv": 0.4}, 0.4 * DQ[:, J]),
+    "coulomb_friction": ({"Fc": 0.7}, 0.7 * SIGN),
+    "asymmetric_friction": (
+        {"Fc_pos": 0.9, "Fc_neg": 0.4},
+        np.where(DQ[:, J] > 0, 0.9, 0.4) * SIGN,
+    ),
+    "stribeck_friction": (
+        {"Fc": 0.5, "Fs": 1.1, "vs": 0.08},
+        (0.5 + 0.6 * np.exp(-((DQ[:, J] / 0.08) ** 2))) * SIGN,
+    ),
+    "load_dependent_friction": ({"Fl": 0.06}, 0.06 * np.abs(RIGID[:, J]) * SIGN),
+    "motor_inertia": ({"B": 0.2}, 0.2 * DDQ[:, J]),
+    "torque_ripple": ({"a": 0.3, "n": 4, "phase": 0.5}, 0.3 * np.sin(4 * Q[:, J] + 0.5)),
+    "joint_spring": ({"k": 1.4, "q0": -1.1}, 1.4 * (Q[:, J] + 1.1)),
+    "torque_offset": ({"o": -0.6}, np.full(len(T), -0.6)),
+    "torque_gain": ({"g": 0.05}, 0.05 * RIGID[:, J]),
+    "friction_drift": ({"dFc": 0.05}, 0.05 * T * SIGN),
+}
+
+
+@pytest.mark.parametrize("name", AT_JOINT)
+def test_torque_at_a_joint(name: str) -> None:
+    parameters, torque = AT_JOINT[name]
+    assert relative(sensed(entry(name, **parameters)), on_joint(torque)) < 1e-9
+
+
+def test_signs_of_friction_oppose_motion() -> None:
+    """The joint needs more torque to go on moving."""
+    for name in ("viscous_friction", "coulomb_friction", "stribeck_friction"):
+        parameters, _ = AT_JOINT[name]
+        extra = (sensed(entry(name, **parameters)) - RIGID)[:, J]
+        moving = np.abs(DQ[:, J]) > 0.05
+        assert (extra[moving] * DQ[moving, J] > 0).all()
+
+
+def test_encoder_offset_is_q_measured_minus_the_links() -> None:
+    there = Q.copy()
+    there[:, J] -= 0.015
+    ours = sensed(entry("encoder_offset", o=0.015))
+    assert relative(ours, rnea(ORACLE, there, DQ, DDQ)) < 1e-9
+
+
+def test_encoder_ripple() -> None:
+    """Link motion first, then what the encoder makes of it; rates by differences."""
+    a, phase = 0.006, 0.8
+    link = Q[:, J]
+    read = link + a * np.sin(link + phase)
+    dread = np.gradient(read, T, edge_order=2)
+    ddread = np.gradient(dread, T, edge_order=2)
+    seen = MOVES.moved(J, read - link, dread - DQ[:, J], ddread - DDQ[:, J])
+    ours = sensed_torque(seen, active_effects([entry("encoder_ripple", a=a, phase=phase)], N))
+    inner = slice(5, -5)
+    gap = np.abs(rnea(ORACLE, seen.q, seen.dq, seen.ddq) - RIGID)[inner].max()
+    assert gap > 0.05
+    assert np.abs(ours - RIGID)[inner].max() < 0.02 * gap  # what is left is of second order in a
+
+
+def test_joint_elasticity_puts_the_encoder_on_the_motor_side() -> None:
+    k = 4000.0
+    twist = RIGID[:, J] / k
+    dtwist = np.gradient(twist, T, edge_order=2)
+    ddtwist = np.gradient(dtwist, T, edge_order=2)
+    seen = MOVES.moved(J, twist, dtwist, ddtwist)
+    ours = sensed_torque(seen, active_effects([entry("joint_elasticity", k=k)], N))
+    inner = slice(10, -10)
+    gap = np.abs(rnea(ORACLE, seen.q, seen.dq, seen.ddq) - RIGID)[inner].max()
+    assert gap > 0.1
+    assert np.abs(ours - RIGID)[inner].max() < 0.05 * gap  # torque of the seen, not true motion
+
+
+def test_backlash_lags_by_half_its_width_on_either_flank() -> None:
+    b = 0.02
+    link = np.empty(len(T))
+    play(np.ascontiguousarray(Q[:, J]), b / 2, Q[0, J] - b / 2 * np.sign(DQ[0, J]), link)
+    behind = Q[:, J] - link
+    assert np.abs(behind).max() <= b / 2 * (1 + 1e-12)
+    far = np.abs(Q[:, J, None] - Q[np.flatnonzero(np.diff(np.sign(DQ[:, J]))), J]).min(axis=1) > b
+    np.testing.assert_allclose(behind[far], (b / 2 * np.sign(DQ[:, J]))[far], atol=1e-12)
+    there = Q.copy()
+    there[:, J] = link
+    assert relative(sensed(entry("backlash", b=b)), rnea(ORACLE, there, DQ, DDQ)) < 1e-6
+
+
+def test_signal_delay_makes_the_torque_late() -> None:
+    d = 0.004
+    late = np.array([np.interp(T - d, T, column) for column in RIGID.T]).T
+    inner = slice(20, -20)
+    for joints, columns in (([], slice(None)), ([J + 1], [J])):
+        theirs = RIGID.copy()
+        theirs[:, columns] = late[:, columns]
+        ours = sensed(entry("signal_delay", joints, d=d))
+        gap = np.abs(theirs - RIGID)[inner].max()
+        assert gap > 0.2
+        assert np.abs(ours - theirs)[inner].max() < 0.05 * gap
+
+
+LOAD = {"m": 1.3, "cx": 0.02, "cy": -0.03, "cz": 0.09}
+SIX = [4e-3, 1e-4, -2e-4, 5e-3, 3e-4, 6e-3]
+TENSOR = np.array([[4e-3, 1e-4, -2e-4], [1e-4, 5e-3, 3e-4], [-2e-4, 3e-4, 6e-3]])
+
+
+@pytest.mark.parametrize("inertia", [None, SIX])
+def test_payload_is_a_body_on_the_last_link(inertia: list[float] | None) -> None:
+    more = {} if inertia is None else {"inertia": inertia}
+    tensor = np.zeros((3, 3)) if inertia is None else TENSOR
+    body = pin.Inertia(LOAD["m"], np.array([LOAD["cx"], LOAD["cy"], LOAD["cz"]]), tensor)
+    theirs = rnea(changed_body(N - 1, body), Q, DQ, DDQ)
+    assert relative(sensed(entry("payload", (), **LOAD, **more)), theirs) < 1e-9
+
+
+def test_link_inertia_is_added_to_the_link() -> None:
+    dtheta = np.array([0.4, 0.02, -0.01, 0.03, 0.01, 1e-3, 2e-3, 0.012, -1e-3, 0.008])
+    theirs = rnea(changed_body(J, pin_inertia(dtheta)), Q, DQ, DDQ)
+    assert relative(sensed(entry("link_inertia", dtheta=dtheta.tolist())), theirs) < 1e-9
+
+
+def test_base_tilt_turns_the_base_under_gravity() -> None:
+    tilt = np.array([0.03, -0.02, 0.0])
+    model = truth_model(panda())
+    model.gravity.linear = pin.exp3(tilt).T @ GRAVITY
+    theirs = rnea(model, Q, DQ, DDQ)
+    assert relative(sensed(entry("base_tilt", (), rx=0.03, ry=-0.02)), theirs) < 1e-9
+
+
+def test_external_wrench_pushes_the_arm() -> None:
+    keys = ("fx", "fy", "fz", "mx", "my", "mz")
+    wrench = np.array([10.0, -6.0, 15.0, 0.4, 0.7, -0.2])
+    pushed = entry("external_wrench", (), **dict(zip(keys, wrench.tolist(), strict=True)))
+    theirs = RIGID - np.einsum("mij,i->mj", jacobians(Q), wrench)
+    assert relative(sensed(pushed), theirs) < 1e-9
+    force = [pin.Force.Zero() for _ in range(ORACLE.njoints)]
+    data = ORACLE.createData()
+    pin.forwardKinematics(ORACLE, data, Q[100])
+    turn = data.oMi[N].rotation.T
+    force[N] = pin.Force(turn @ wrench[:3], turn @ wrench[3:])
+    one = pin.rnea(ORACLE, data, Q[100], DQ[100], DDQ[100], force)
+    assert relative(sensed(pushed)[100], one) < 1e-9
+
+
+MOVING = {
+    "encoder_offset": ((J + 1,), {"o": 0.02}),
+    "base_tilt": ((), {"rx": 0.02, "ry": 0.03}),
+    "payload": ((), LOAD),
+    "coulomb_friction": ((J + 1,), {"Fc": 0.5}),
+    "torque_gain": ((J + 1,), {"g": 0.1}),
+}
+
+
+@pytest.mark.parametrize("name", MOVING)
+def test_effects_act_in_their_interval_alone(name: str) -> None:
+    joints, parameters = MOVING[name]
+    whole = sensed(entry(name, joints, **parameters))
+    for interval in ([1.0, 2.5], [1.0, None], [None, 2.5]):
+        part = sensed({**entry(name, joints, **parameters), "interval_s": interval})
+        begin = -np.inf if interval[0] is None else interval[0]
+        end = np.inf if interval[1] is None else interval[1]
+        on = (begin <= T) & (end > T)
+        assert on.any() and not on.all()
+        np.testing.assert_allclose(part[on], whole[on], rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(part[~on], RIGID[~on], atol=1e-9)
+
+
+def test_stages_work_on_each_other() -> None:
+    """A gain reads friction too; friction by load knows the payload; the payload feels the tilt."""
+    model = truth_model(panda())
+    body = pin.Inertia(LOAD["m"], np.array([LOAD["cx"], LOAD["cy"], LOAD["cz"]]), np.zeros((3, 3)))
+    model.appendBodyToJoint(N, body, pin.SE3.Identity())
+    model.gravity.linear = pin.exp3(np.array([0.02, 0.01, 0.0])).T @ GRAVITY
+    theirs = rnea(model, Q, DQ, DDQ)
+    theirs[:, J] += 0.05 * np.abs(theirs[:, J]) * SIGN + 0.5 * SIGN
+    theirs[:, J] *= 1.08
+    ours = sensed(
+        entry("torque_gain", g=0.08),
+        entry("coulomb_friction", Fc=0.5),
+        entry("load_dependent_friction", Fl=0.05),
+        entry("payload", (), **LOAD),
+        entry("base_tilt", (), rx=0.02, ry=0.01),
+    )
+    assert relative(ours, theirs) < 1e-9
+
+
+def test_model_torque_without_time_takes_what_has_no_end() -> None:
+    friction = {**entry("coulomb_friction", Fc=0.5), "interval_s": [2.0, None]}
+    contact = {**entry("torque_offset", o=3.0), "interval_s": [1.0, 2.0]}
+    torque = ModelTorque(replace(MODEL, effects=(friction, contact)))
+    assert relative(torque(Q, DQ, DDQ), on_joint(0.5 * SIGN)) < 1e-9
+    timed = 0.5 * SIGN * (T >= 2.0) + 3.0 * ((T >= 1.0) & (T < 2.0))
+    assert relative(torque(Q, DQ, DDQ, T), on_joint(timed)) < 1e-9
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_templates_are_linear_for_small_sizes(name: str) -> None:
+    """decode(x) is absent at zero and its torque all but linear in x."""
+    effect = CATALOGUE[name]
+    joints = () if effect.scope in ("flange", "base", "all") else (J + 1,)
+    rng = np.random.default_rng(1)
+    for template in effect.templates():
+        x = np.array(template.prior_std) * np.sign(rng.normal(size=len(template.prior_std)))
+        if name == "payload":
+            x = theta_of({"m": 1.0, "cx": 0.02, "cy": 0.0, "cz": 0.05, "inertia": SIX})
+        sizes = []
+        for scale in (1e-4, 1e-3):
+            values = template.decode(x * scale)
+            found = active_effects([entry(name, joints, **_checked(name, values))], N)
+            sizes.append((sensed_torque(MOVES, found) - RIGID) / scale)
+        inner = slice(5, -5)
+        size = np.sqrt(np.mean(sizes[1][inner] ** 2))
+        assert size > 1e-4
+        error = np.sqrt(np.mean((sizes[0] - sizes[1])[inner] ** 2))
+        # how long a gear takes to cross its play goes with the root of its width
+        assert error < (0.2 if name == "backlash" else 0.05) * size, template.label
+
+
+def _checked(name: str, values: dict[str, object]) -> dict[str, object]:
+    """Signs that the catalogue does not allow mean the same size the other way."""
+    if name == "backlash":
+        return {"b": abs(float(values["b"]))}  # type: ignore[arg-type]
+    return values
+
+
+def test_payload_parameters_are_there_and_back() -> None:
+    theta = theta_of({**LOAD, "inertia": SIX})
+    back = parameters_of(theta)
+    np.testing.assert_allclose(theta_of(back), theta, rtol=1e-12)
+    assert back["m"] == pytest.approx(1.3)
+    assert back["inertia"] == pytest.approx(SIX)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_columns_are_the_laws_derivative(name: str) -> None:
+    effect = LEARNED[name]
+    law = effect.law(Q, DQ, DDQ, RIGID, {effect.key: np.full(N, 2.0)})
+    np.testing.assert_allclose(law, 2.0 * effect.column(Q, DQ, DDQ))
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [*combinations(CATALOGUE.values(), 2)],
+    ids=lambda pair: f"{pair[0].name}-{pair[1].name}",
+)
+def test_an_experiment_tells_each_pair_apart(pair: tuple[Effect, Effect]) -> None:
+    """And it says what either shows in it, which is not the same."""
+    for one, other in (pair, pair[::-1]):
+        (said,) = experiments(one, [other])
+        first, second = said.partition(": ")[2].split(", the ")
+        assert first.startswith(f"the {one.title} ") and second.startswith(f"{other.title} ")
+        assert first.removeprefix(f"the {one.title}") != second.removeprefix(other.title)
+
+
+EXPERIMENTS = {
+    ("coulomb_friction", "load_dependent_friction"): "ladder of loads",
+    ("coulomb_friction", "stribeck_friction"): "constant speeds",
+    ("coulomb_friction", "asymmetric_friction"): "forwards and backwards",
+    ("coulomb_friction", "friction_drift"): "ten minutes",
+    ("asymmetric_friction", "torque_offset"): "hold the joint still",
+    ("torque_offset", "torque_ripple"): "much of a turn",
+    ("joint_spring", "torque_ripple"): "much of a turn",
+    ("base_tilt", "external_wrench"): "nothing near",
+    ("payload", "link_inertia"): "take off",
+    ("motor_inertia", "link_inertia"): "weigh the link",
+    ("viscous_friction", "signal_delay"): "ladder of loads",
+    ("torque_gain", "link_inertia"): "ladder of loads",
+}
+
+
+@pytest.mark.parametrize("pair", EXPERIMENTS)
+def test_the_experiment_of_a_pair_is_the_right_one(pair: tuple[str, str]) -> None:
+    """The pairs that the same data are known to confuse."""
+    one, other = (CATALOGUE[name] for name in pair)
+    assert EXPERIMENTS[pair] in experiments(one, [other])[0].partition(":")[0]
+
+
+def test_rivals_of_one_experiment_are_in_one_sentence() -> None:
+    names = ("load_dependent_friction", "stribeck_friction", "torque_gain")
+    said = experiments(CATALOGUE["coulomb_friction"], [CATALOGUE[name] for name in names])
+    assert len(said) == 2 and "load-dependent friction" in said[0] and "gain" in said[0]
+
+
+POSSIBLE = {
+    "viscous_friction": ({"Fv": 0.1}, {"Fv": -0.1}),
+    "coulomb_friction": ({"Fc": 0.1}, {"Fc": -0.1}),
+    "asymmetric_friction": ({"Fc_pos": 0.1, "Fc_neg": 0.4}, {"Fc_pos": 0.1, "Fc_neg": -0.4}),
+    "stribeck_friction": (
+        {"Fc": 0.1, "Fs": 0.4, "vs": 0.1},
+        {"Fc": 0.4, "Fs": 0.1, "vs": 0.1},
+    ),
+    "load_dependent_friction": ({"Fl": 0.1}, {"Fl": -0.1}),
+    "motor_inertia": ({"B": 0.1}, {"B": -0.1}),
+    "joint_elasticity": ({"k": 1e4}, {"k": -1e4}),
+    "backlash": ({"b": 0.01}, {"b": -0.01}),
+    "signal_delay": ({"d": 0.011}, {"d": 0.013}),
+    "payload": ({"m": 0.1}, {"m": -0.1}),
+    "friction_drift": ({"dFc": -0.009}, {"dFc": 0.007}),
+    "torque_gain": ({"g": -0.1}, None),
+    "torque_offset": ({"o": -0.1}, None),
+}
+
+
+@pytest.mark.parametrize("name", POSSIBLE)
+def test_what_physics_allows(name: str) -> None:
+    allowed, refused = POSSIBLE[name]
+    assert CATALOGUE[name].possible(allowed)
+    assert refused is None or not CATALOGUE[name].possible(refused)
+
+
+def test_a_jump_is_as_smooth_as_the_filter_makes_it() -> None:
+    """Friction turns over as far as dq goes while the filter takes a step, never faster."""
+    dq, ddq = np.array([0.02, -0.02, 0.02]), np.array([0.0, -2.0, 2.0])
+    np.testing.assert_allclose(
+        smooth_sign(dq, ddq, 0.03), np.tanh(dq / np.sqrt(0.01**2 + (0.03 * ddq) ** 2))
+    )
+    np.testing.assert_allclose(smooth_sign(dq, ddq), np.tanh(dq / 0.01))
+
+
+BAD = {
+    "no such effect": ([entry("stiction", Fc=1.0)], r"'stiction'; have: .*coulomb_friction"),
+    "joint 0": ([entry("coulomb_friction", (0,), Fc=1.0)], r"no joint 0; have: 1 to 7"),
+    "joint 8": ([entry("coulomb_friction", (8,), Fc=1.0)], r"no joint 8; have: 1 to 7"),
+    "half a joint": ([entry("coulomb_friction", (1.5,), Fc=1.0)], r"no joint 1.5"),
+    "no joints": ([entry("coulomb_friction", (), Fc=1.0)], r"needs 'joints'; have: 1 to 7"),
+    "no key": ([entry("stribeck_friction", Fc=1.0, vs=0.1)], r"needs 'Fs' \(N m\)"),
+    "other key": ([entry("coulomb_friction", Fx=1.0)], r"no parameter 'Fx'; have: Fc"),
+    "nan": ([entry("coulomb_friction", Fc=float("nan"))], r"'Fc' must hold a finite number"),
+    "null": ([entry("coulomb_friction", Fc=None)], r"'Fc' must hold a finite number"),
+    "words": ([entry("coulomb_friction", Fc="much")], r"must hold a finite number.*'much'"),
+    "range": ([entry("backlash", b=-0.1)], r"'b' is -0.1, outside 0 to inf"),
+    "nine": ([entry("link_inertia", dtheta=[0.0] * 9)], r"10 finite numbers"),
+    "two of three": ([entry("coulomb_friction", (1, 2, 3), Fc=[1.0, 2.0])], r"not one value.* 3"),
+    "backwards": (
+        [{**entry("coulomb_friction", Fc=1.0), "interval_s": [3.0, 2.0]}],
+        r"does not end after it begins",
+    ),
+    "not an interval": ([{**entry("coulomb_friction", Fc=1.0), "interval_s": 3}], r"\[from, to\]"),
+    "not an entry": (["coulomb_friction"], r"needs effect and parameters"),
+    "no parameters": ([{"effect": "coulomb_friction"}], r"needs effect and parameters"),
+    "values": ([{"effect": "coulomb_friction", "joints": [1], "parameters": 3}], r"hold 'Fc'"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_bad_entries_are_refused_with_the_choices(fault: str) -> None:
+    entries, message = BAD[fault]
+    with pytest.raises(ModelError, match=message):
+        active_effects(entries, N)  # type: ignore[arg-type]
+    with pytest.raises(ModelError, match=r"arm\.json: .*" + message):
+        check_effects(replace(MODEL, effects=tuple(entries)), "arm.json")  # type: ignore[arg-type]
+
+
+def test_both_forms_of_an_entry() -> None:
+    """The learner's, with a value for each joint, and a finding's, with what goes along."""
+    values = [0.1, 0.2, 0.3]
+    learned = active_effects([entry("viscous_friction", (1, 2, 4), Fv=values)], N)
+    assert [(a.joint, a.values["Fv"]) for a in learned] == [(0, 0.1), (1, 0.2), (3, 0.3)]
+    (same,) = {a.values["Fv"] for a in active_effects([entry("viscous_friction", (1, 2), Fv=1)], N)}
+    assert same == 1
+    finding = {
+        **entry("stribeck_friction", (2,), Fc=0.1, Fs=0.2, vs=0.1),
+        "interval_s": [4.0, None],
+        "std": {"Fc": 0.01, "Fs": None},
+        "units": {"Fc": "N m", "Fs": "N m", "vs": "rad/s"},
+        "evidence": 0.98,
+        "ambiguous_with": ["coulomb_friction"],
+    }
+    (one,) = active_effects([finding], N)
+    assert (one.joint, one.interval_s, one.std["Fc"]) == (1, (4.0, np.inf), 0.01)
+    ten = [float(k) for k in range(10)]
+    two = active_effects([entry("link_inertia", (1, 2), dtheta=[ten, ten])], N)
+    assert [list(a.values["dtheta"]) for a in two] == [ten, ten]
+
+
+@pytest.mark.parametrize("x", [(0.3, 0.1), (-0.2, 0.5), (0.0, -0.4), (-0.1, 0.0)])
+def test_size_and_phase_are_those_of_the_wave(x: tuple[float, float]) -> None:
+    size, phase = polar(np.array(x))
+    angle = np.linspace(-4.0, 4.0, 50)
+    wave = x[0] * np.sin(angle) + x[1] * np.cos(angle)
+    assert size > 0.0
+    np.testing.assert_allclose(size * np.sin(angle + phase), wave, atol=1e-12)

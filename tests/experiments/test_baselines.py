@@ -1,0 +1,374 @@
+"""The baselines on small arms and functions, their mechanics and scores by independent means."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from adapter.errors import ModelError
+from adapter.experiments.baselines.compare import HeldOut, Tables, select
+from adapter.experiments.baselines.elm import ElmCommittee
+from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
+from adapter.experiments.baselines.gaussian_process import GaussianProcess, negative_log_likelihood
+from adapter.experiments.baselines.lagrangian import DeepLagrangian, MassNetwork, lagrange_torque
+from adapter.experiments.baselines.learner import Baseline, Scale
+from adapter.experiments.baselines.least_squares import RegressorLeastSquares
+from adapter.experiments.baselines.network import FeedForward
+from adapter.experiments.baselines.presets import DEFAULT_MEMBERS, Choice, learners
+from adapter.learning.tree_data import BodyMotion, TreeData
+from adapter.model.spatial import matrix_from_zxz
+from adapter.model.tree import Tree
+from adapter.physics.networks import (
+    DTYPE,
+    LinkMotion,
+    inverse_dynamics,
+    link_motion,
+    theta_from_log_cholesky,
+)
+
+# A leg (joint 0), a torso (1) and an arm on it that branches (2, 3, 4).
+TREE = Tree((-1, -1, 1, 2, 2), floating=True)
+ARM, CARRIER = ("joint3", "joint4", "joint5"), "link2"
+NAMES = ("network", "committee", "process", "lagrangian", "least squares")
+
+
+def robot(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """λ (n, 6) and consistent θ (bodies, 10) of `TREE`."""
+    rng = np.random.default_rng(seed)
+    lam = np.column_stack([rng.uniform(-2, 2, (TREE.n, 3)), rng.uniform(-0.4, 0.4, (TREE.n, 3))])
+    return lam, theta_from_log_cholesky(rng.normal(size=(TREE.bodies, 10)) * 0.3)
+
+
+def samples(seed: int, count: int, links: bool = True) -> TreeData:
+    """Independent random states of the robot, torques from Pinocchio."""
+    lam, theta = robot(seed)
+    rng = np.random.default_rng([seed, count])
+    q, dq, ddq = (rng.uniform(-s, s, (count, TREE.n)) for s in (1.0, 1.0, 3.0))
+    base = BodyMotion(*(rng.normal(size=(count, 3)) for _ in range(4)))
+    tau = _pinocchio(lam, theta, q, dq, ddq, base)
+    moving = None
+    if links:
+        signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
+        v, w, a, dw = (
+            x[:, 1:].numpy()
+            for x in link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
+        )
+        moving = BodyMotion(w, a, dw, v)
+    return TreeData(TREE, q, dq, ddq, tau, base, moving)
+
+
+def _pinocchio(
+    lam: np.ndarray,
+    theta: np.ndarray,
+    q: np.ndarray,
+    dq: np.ndarray,
+    ddq: np.ndarray,
+    base: BodyMotion,
+) -> np.ndarray:
+    """Torques (m, 6 + n): the base is a free body in a world without gravity."""
+    model = pin.Model()
+    model.gravity.linear = np.zeros(3)
+    order = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
+    joints = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")]
+    for j, i in enumerate(TREE.parent):
+        place = pin.SE3(matrix_from_zxz(lam[j, :3]), lam[j, 3:])
+        joints.append(model.addJoint(joints[i + 1], pin.JointModelRZ(), place, f"j{j}"))
+    for joint, body in zip(joints, theta, strict=True):
+        inertia = pin.Inertia.FromDynamicParameters(body[order])
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    data = model.createData()
+    at = [model.joints[j].idx_v for j in joints[1:]]
+    tau = np.zeros((len(q), 6 + TREE.n))
+    for k in range(len(q)):
+        place, speed, accel = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        place[[i + 1 for i in at]] = q[k]
+        speed[:3], speed[3:6], speed[at] = base.v[k], base.w[k], dq[k]
+        # Pinocchio's spatial acceleration of the free flyer: d/dt of [v; w] in body axes.
+        accel[:3] = base.a[k] - np.cross(base.w[k], base.v[k])
+        accel[3:6], accel[at] = base.dw[k], ddq[k]
+        found = pin.rnea(model, data, place, speed, accel)
+        tau[k] = np.concatenate([found[:6], found[at]])
+    return tau
+
+
+def relative(found: np.ndarray, true: np.ndarray) -> float:
+    """Largest error over the largest true value."""
+    return float(np.abs(found - true).max() / np.abs(true).max())
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_arm_problem_is_well_posed_and_complete(seed: int) -> None:
+    """Known λ and X alone give the torques; λ gives the carrier's motion as sensors do."""
+    data = samples(seed, 40)
+    lam, _ = robot(seed)
+    x, y = arm_problem(data, ARM, CARRIER)
+    columns = Columns(3)
+    assert x.shape == (40, columns.width) and np.array_equal(y, data.tau[:, [8, 9, 10]])
+    bare = TreeData(TREE, data.q, data.dq, data.ddq, data.tau, data.base)
+    computed, _ = arm_problem(bare, ARM, CARRIER, lam, velocity=True)
+    np.testing.assert_allclose(computed[:, : columns.width], x, atol=1e-12)
+    assert np.allclose(Columns(3, True).carrier(computed).v, data.links.v[:, 1], atol=1e-12)
+    squares = least_squares(seed)
+    squares.fit(x, y)
+    more, truth = arm_problem(samples(seed, 60), ARM, CARRIER)
+    assert relative(squares.predict(more), truth) < 1e-9
+
+
+def least_squares(seed: int) -> RegressorLeastSquares:
+    index = sub_chain(TREE, ARM, CARRIER)
+    assert sub_parents(TREE, index) == (-1, 0, 0)
+    return RegressorLeastSquares(Columns(3), sub_parents(TREE, index), robot(seed)[0][index])
+
+
+def test_what_is_no_sub_chain_is_refused() -> None:
+    data = samples(0, 5, links=False)
+    for joints, carrier, words in (
+        (("joint3", "joint4"), CARRIER, "all that hangs on it"),
+        (("joint3", "joint5", "joint4", "joint1"), CARRIER, "all that hangs on it"),
+        (ARM, "link1", "hangs on link 'link2'"),
+        (("elbow",), CARRIER, "no joint 'elbow'"),
+        (ARM, CARRIER, "not measured; give lam"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            arm_problem(data, joints, carrier)
+
+
+def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
+    """Against Pinocchio's torques on a moving base; v is free to choose (Galilei)."""
+    data = samples(0, 30, links=False)
+    lam, theta = (torch.from_numpy(x) for x in robot(0))
+
+    def mass(q: torch.Tensor) -> torch.Tensor:
+        """Columns are wrench and torques of unit accelerations from rest."""
+        still, columns = torch.zeros_like(q), []
+        zero = q.new_zeros((len(q), 3))
+        for unit in torch.eye(6 + TREE.n, dtype=DTYPE):
+            a, dw, ddq = (x.expand(len(q), -1) for x in unit.split([3, 3, TREE.n]))
+            base = LinkMotion(zero, zero, a, dw)
+            columns.append(inverse_dynamics(TREE, lam, theta, (q, still, ddq), base))
+        return torch.stack(columns, dim=2)
+
+    base = data.base.torch()
+    for v in (base.v, torch.zeros_like(base.v)):
+        moving = LinkMotion(v, base.w, base.a, base.dw)
+        tau = lagrange_torque(mass, *data.joint_signals(), moving).detach().numpy()
+        assert relative(tau, data.tau[:, 6:]) < 1e-9
+
+
+def test_mass_matrix_of_the_network_is_positive_definite_and_learns() -> None:
+    """Symmetric, and the torque's gradient by the weights is that by differences."""
+    torch.manual_seed(0)
+    net = MassNetwork(torch.rand(8, 8, dtype=DTYPE) + 0.5, (5, 4), seed=0).double()
+    q, dq, ddq = (torch.randn(3, 2, dtype=DTYPE) for _ in range(3))
+    base = LinkMotion(*(torch.randn(3, 3, dtype=DTYPE) for _ in range(4)))
+    m = net(10.0 * q)
+    assert torch.equal(m, m.mT) and torch.linalg.eigvalsh(m).min() > 0.0
+
+    def run(weight: torch.Tensor) -> torch.Tensor:
+        def mass(at: torch.Tensor) -> torch.Tensor:
+            return torch.func.functional_call(net, {"inner.0.weight": weight}, (at,))
+
+        return lagrange_torque(mass, q, dq, ddq, base)
+
+    weight = net.inner[0].weight.detach().clone().requires_grad_()
+    assert torch.autograd.gradcheck(run, (weight,))
+
+
+def learner(name: str) -> Baseline:
+    """Small sizes of each."""
+    if name == "network":
+        return FeedForward(units=60, epochs=24, batch=50)
+    if name == "committee":
+        return ElmCommittee(members=3, units=300, points=1200)
+    if name == "process":
+        return GaussianProcess(points=500, tuned_on=120, steps=15)
+    if name == "lagrangian":
+        return DeepLagrangian(Columns(3), (24, 24), steps=200, batch=64, rate=1e-2)
+    return least_squares(1)
+
+
+# Share of the torque's deviation that is left on samples not seen, at these small sizes.
+REST = dict(zip(NAMES, (0.5, 0.35, 0.35, 0.25, 1e-9), strict=True))
+
+
+@pytest.fixture(scope="module")
+def table() -> tuple[np.ndarray, np.ndarray]:
+    return arm_problem(samples(1, 2000), ARM, CARRIER)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_learner_learns_an_arm(name: str, table: tuple[np.ndarray, np.ndarray]) -> None:
+    x, y = table
+    told: list[str] = []
+    found = learner(name)
+    with pytest.raises(ModelError, match="call fit first"):
+        found.predict(x)
+    with pytest.raises(ModelError, match="call fit first"):
+        found.facts()
+    found.fit(x[:1500], y[:1500], told.append)
+    rest = found.predict(x[1500:]) - y[1500:]
+    share = np.sqrt(np.mean(rest**2, axis=0)) / y.std(axis=0)
+    assert np.max(share) < REST[name], share
+    facts = found.facts()
+    assert told and facts.tuning and facts.train_s > 0.0 and facts.sizes
+
+    again = learner(name)
+    again.fit(x[:1500], y[:1500])
+    np.testing.assert_allclose(again.predict(x[1500:]), found.predict(x[1500:]), atol=1e-6)
+
+    with pytest.raises(ModelError, match="got shape"):
+        found.predict(x[:, 1:])
+    bad = x[:50].copy()
+    bad[3, 2] = np.nan
+    with pytest.raises(ModelError, match="X holds values that are not finite"):
+        found.fit(bad, y[:50])
+    with pytest.raises(ModelError, match="Y holds values that are not finite"):
+        found.fit(x[:50], np.full_like(y[:50], np.inf))
+
+
+def test_gradient_of_the_likelihood() -> None:
+    """By differences, and the optimum over the signal variance by the full formula."""
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(25, 3)), rng.normal(size=(25, 2))
+    at = np.array([0.1, 0.6, -0.2, -2.0])
+    value, gradient = negative_log_likelihood(at, x, y)
+    for k in range(4):
+        step = np.zeros(4)
+        step[k] = 1e-5
+        ahead, behind = (negative_log_likelihood(at + s * step, x, y)[0] for s in (1, -1))
+        assert gradient[k] == pytest.approx((ahead - behind) / 2e-5, rel=1e-5)
+
+    def full(variance: float, column: np.ndarray) -> float:
+        lag = (x[:, None] - x[None]) / np.exp(at[:3])
+        gram = variance * (np.exp(-0.5 * np.sum(lag**2, axis=2)) + np.exp(at[3]) * np.eye(25))
+        return 0.5 * np.linalg.slogdet(gram)[1] + 0.5 * column @ np.linalg.solve(gram, column)
+
+    best = sum(min(full(v, c) for v in np.geomspace(0.1, 10, 2001)) for c in y.T)
+    assert value + 25.0 == pytest.approx(best, abs=1e-3)  # 2 outputs x 25 / 2: the constant
+
+
+def test_a_process_in_rounding_noise_still_solves() -> None:
+    """Twice the same points: a singular kernel, unless noise is raised until it is not."""
+    rng = np.random.default_rng(0)
+    x = np.repeat(rng.normal(size=(60, 2)), 2, axis=0)
+    y = np.sin(x[:, :1]) + x[:, 1:]
+    found = GaussianProcess(points=120, tuned_on=60, steps=20)
+    found.fit(x, y)
+    assert np.abs(found.predict(x) - y).max() < 1e-2
+
+
+def test_too_weak_a_ridge_is_said() -> None:
+    """Equal samples: the Gram matrix has rank one."""
+    with pytest.raises(ModelError, match="take a ridge above 1e-30"):
+        ElmCommittee(1, 50, 20, ridge=1e-30).fit(np.ones((20, 2)), np.ones((20, 1)))
+
+
+@pytest.mark.parametrize(
+    "learner", [ElmCommittee(2, 40, 60), GaussianProcess(points=60, tuned_on=30, steps=10)]
+)
+def test_a_gpu_s_way_through_torch_gives_the_same(
+    learner: ElmCommittee | GaussianProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Torch's way on whatever device there is, here mostly the CPU, against numpy's."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(80, 3))
+    y = np.column_stack([np.sin(x[:, 0]), x[:, 1] * x[:, 2]])
+    answers = []
+    for place in (None, torch.device("cuda" if torch.cuda.is_available() else "cpu")):
+        monkeypatch.setattr(
+            "adapter.experiments.baselines.dense.accelerator", lambda place=place: place
+        )
+        learner.fit(x, y)
+        answers.append(learner.predict(x))
+    np.testing.assert_allclose(answers[1], answers[0], rtol=1e-4, atol=1e-6)
+
+
+def test_scale_guards_constant_columns() -> None:
+    table = np.column_stack([np.full(9, 0.1) * 3, np.arange(9.0)])
+    scale = Scale.of(table)
+    scaled = scale(table)
+    assert np.abs(scaled[:, 0]).max() < 1e-12
+    assert scaled[:, 1].std() == pytest.approx(1.0)
+    np.testing.assert_allclose(scale.undo(scaled), table)
+
+
+def test_the_experiments_learners_have_the_papers_sizes() -> None:
+    """Full: as in section IV; else the committee is smaller; GPR has its 10 000 points in both."""
+    index = sub_chain(TREE, ARM, CARRIER)
+    schema = Columns(3), sub_parents(TREE, index), robot(0)[0][index]
+    for full, members in ((True, 50), (False, DEFAULT_MEMBERS)):
+        found = {choice.key: choice.make() for choice in learners(*schema, full=full)}
+        assert list(found) == ["FFNN", "ELM", "GPR", "DeLaN", "WLS"]
+        elm, gpr, net = found["ELM"], found["GPR"], found["FFNN"]
+        assert isinstance(elm, ElmCommittee) and isinstance(gpr, GaussianProcess)
+        assert isinstance(net, FeedForward) and net.units == 1000
+        assert (elm.members, elm.units, elm.points, gpr.points) == (members, 4000, 10_000, 10_000)
+
+
+class Echo(Baseline):
+    """Answers with the torques' mean over what it learned from, and an error of its own."""
+
+    def __init__(self, error: float, fitted: list[np.ndarray]) -> None:
+        self.error, self.fitted = error, fitted
+
+    def _learn(self, X, Y, progress):  # type: ignore[no-untyped-def]
+        self.fitted.append(X)
+        self.mean = Y.mean(axis=0)
+        return {"samples": len(X)}, ()
+
+    def _answer(self, x: np.ndarray) -> np.ndarray:
+        return np.tile(self.mean, (len(x), 1)) + self.error
+
+
+def test_settings_are_chosen_on_trajectories_that_no_trial_saw_and_on_no_other_set() -> None:
+    """Test and control set would end it: they are not numbers."""
+    where = np.repeat(np.arange(10), 30)[np.random.default_rng(0).permutation(300)]
+    x = np.column_stack([where, np.arange(300.0)])
+    y = np.full((300, 2), 5.0)
+    broken = np.full((9, 2), np.nan)
+    sets = {"train": (x, y), "test": (broken, broken), "control": (broken, broken)}
+    held_out = HeldOut.of(Tables(sets, where), seed=3)
+    assert len(held_out.trajectories) == 2
+    assert set(held_out.judge[0][:, 0]) == set(held_out.trajectories)
+    assert len(held_out.judge[0]) == 60 and len(held_out.fit[0]) == 240
+    fitted: list[np.ndarray] = []
+    errors = (2.0, -0.5, 3.0)
+    choice = Choice("X", "X", partial(Echo, fitted=fitted), tuple({"error": e} for e in errors))
+    found = select(choice, held_out, lambda said: None)
+    assert found["chosen"] == {"error": -0.5}
+    told = [row["validation_median"] for row in found["candidates"]]
+    assert told == pytest.approx([2 / 7, 0.1, 3 / 8])
+    for table in fitted:
+        assert not set(table[:, 0]) & set(held_out.trajectories)
+    alone = Choice("Y", "Y", partial(Echo, fitted=fitted))
+    assert select(alone, held_out, lambda said: None) == {"chosen": {}, "candidates": []}
+
+
+def test_without_scikit_learn_the_error_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
+    with pytest.raises(ModelError, match=r"pip install 'panda-adapter\[experiment\]'"):
+        FeedForward(units=3).fit(np.ones((5, 2)), np.ones((5, 1)))
+
+
+def test_sizes_that_cannot_be_are_refused() -> None:
+    for make, words in (
+        (lambda: FeedForward(units=0), "units must be at least 1, got 0"),
+        (lambda: FeedForward(epochs=2), "epochs must be at least 4"),
+        (lambda: ElmCommittee(members=0), "members must be at least 1"),
+        (lambda: ElmCommittee(ridge=0.0), "ridge must be positive"),
+        (lambda: GaussianProcess(points=0), "points must be at least 1"),
+        (lambda: DeepLagrangian(Columns(2), steps=0), "steps must be at least 1"),
+        (lambda: DeepLagrangian(Columns(2), rate=np.nan), "rate must be positive"),
+        (lambda: DeepLagrangian(Columns(2), ()), "hidden_layers must be at least 1"),
+        (lambda: RegressorLeastSquares(Columns(2), (-1, 0), np.zeros((3, 6))), "as many parents"),
+        (lambda: RegressorLeastSquares(Columns(1), (-1,), np.full((1, 6), np.nan)), "finite"),
+    ):
+        with pytest.raises(ModelError, match=words):
+            make()

@@ -1,0 +1,635 @@
+"""What the gap's search computes, against known motions, known noise and plain Gaussian algebra.
+
+Products, Schur complements and running sums of the search are compared with full covariances
+(scipy's multivariate normal), signatures with finite differences of the full predicted torque.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.signal import lfilter
+from scipy.stats import multivariate_normal
+
+from adapter.effects import CATALOGUE
+from adapter.effects.active import WHOLE, Active
+from adapter.effects.base import LINK, Motion
+from adapter.effects.torque import sensed_torque
+from adapter.gap.candidates import (
+    Candidate,
+    log_odds,
+    patterns,
+    signatures,
+    stages_of,
+)
+from adapter.gap.evidence import LEAST_NM, ORDER, WHITE, Carried, Noise, noise_of, score, scores
+from adapter.gap.findings import parameter_std
+from adapter.gap.fit import Fit, Model, Named, beside, refitted, theta_prior, worth
+from adapter.gap.rivals import fold_rows, pays_held_out, standings
+from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
+from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
+from adapter.model.robots import documented
+from adapter.physics.rigid_arm import RigidArm
+from sim.hidden import draw
+
+Array = np.ndarray
+ARM = RigidArm.of(documented("panda"))
+N = ARM.n
+DRAWN = draw(3, "null").motion
+SECONDS = 8.0
+TAU_NOISE, RUBS, FC = 0.05, 3, 0.4  # N m; joint (from 0) with friction, N m
+EVERYWHERE = tuple(range(N))
+
+
+def noisy(x: Array, size: float, seed: int) -> Array:
+    return x + size * np.random.default_rng(seed).standard_normal(x.shape)
+
+
+# ---------------------------------------------------------------- smooth motion
+
+
+def known(seconds: float = 12.0) -> tuple[Array, tuple[Array, Array, Array]]:
+    t = np.arange(0.0, seconds, 1e-3)
+    return t, DRAWN.at(t)
+
+
+def errors(t: Array, q: Array, dq: Array, late_s: float = 0.0) -> list[float]:
+    """rms errors of q, dq, ddq, of their own rms about the mean, away from the ends."""
+    inside = (t > 0.2) & (t < t[-1] - 0.2)
+    found = smooth_motion(t, q, dq, late_s).at(t[inside])
+    truth = DRAWN.at(t[inside])
+    return [float((a - b).std() / b.std()) for a, b in zip(found, truth, strict=True)]
+
+
+def test_spline_through_a_motion_without_noise():
+    t, (q, dq, _) = known()
+    assert max(errors(t, q, dq)) < 1e-3
+
+
+def test_spline_through_noise_of_a_real_arm():
+    t, (q, dq, _) = known()
+    q, dq = noisy(q, 1e-4, 1), noisy(dq, 5e-3, 2)
+    found = errors(t, q, dq)
+    raw = np.gradient(dq, t, axis=0)
+    assert found[0] < 2e-4 and found[1] < 5e-3 and found[2] < 0.03
+    assert found[2] < 0.05 * (raw - known()[1][2]).std() / raw.std()
+
+
+def test_spline_knows_the_noise_levels():
+    t, (q, dq, _) = known()
+    found = smooth_motion(t, noisy(q, 1e-4, 3), noisy(dq, 5e-3, 4))
+    assert np.allclose(found.q_noise, 1e-4, rtol=0.1)
+    assert np.allclose(found.dq_noise, 5e-3, rtol=0.1)
+
+
+def test_rates_are_those_of_the_curve():
+    t, (q, dq, _) = known()
+    spline = smooth_motion(t, noisy(q, 1e-4, 5), noisy(dq, 5e-3, 6))
+    at = np.arange(1.0, 10.0, 0.0137)
+    h = 1e-5
+    q, dq, ddq = spline.at(at)
+    ahead, behind = spline.at(at + h), spline.at(at - h)
+    assert np.allclose(dq, (ahead[0] - behind[0]) / (2 * h), atol=1e-6)
+    assert np.allclose(ddq, (ahead[1] - behind[1]) / (2 * h), atol=1e-5)
+
+
+def test_spline_through_jitter_and_a_hole():
+    t, _ = known()
+    rng = np.random.default_rng(7)
+    kept = (rng.random(len(t)) > 0.1) & ~((t > 5.0) & (t < 5.02))
+    t = t[kept] + rng.uniform(-3e-4, 3e-4, kept.sum())
+    q, dq, _ = DRAWN.at(t)
+    assert max(errors(t, q, dq)) < 2e-3
+
+
+@pytest.mark.parametrize("late_s", [-1e-3, 5e-4, 3e-3])
+def test_a_late_dq_is_put_right(late_s: float):
+    t, (q, _, _) = known()
+    dq = DRAWN.at(np.maximum(t - late_s, 0.0))[1]
+    q, dq = noisy(q, 1e-4, 8), noisy(dq, 2e-3, 9)
+    right, ignored = errors(t, q, dq, late_s), errors(t, q, dq)
+    assert right[1] < 3e-3 and right[2] < 0.03
+    assert right[1] < ignored[1]
+
+
+# ---------------------------------------------------------------- low-pass
+
+
+def recorded(tau: Array, t: Array, q: Array, dq: Array, name: str = "a") -> Recorded:
+    return Recorded(name, t, q, dq, tau)
+
+
+def test_low_pass_keeps_its_band_and_its_instants():
+    t = np.arange(0.0, 20.0, 1.0 / RATE_HZ)
+    at = low(t[:, None])[:, 0]  # a ramp goes through a symmetric filter as it is
+    assert np.allclose(np.diff(at), 0.04)
+    for hz, share in ((0.5, 1.0), (4.0, 1.0), (6.0, 1.0), (13.5, 0.0), (30.0, 0.0)):
+        out = low(np.sin(2 * np.pi * hz * t)[:, None])[:, 0]
+        assert np.allclose(out, share * np.sin(2 * np.pi * hz * at), atol=0.02), hz
+
+
+def test_low_pass_is_linear_and_takes_tables():
+    x = np.random.default_rng(0).standard_normal((700, 3, 2))
+    assert np.allclose(low(x)[:, 1, 0], low(x[:, 1, :1])[:, 0])
+    assert np.allclose(low(2.0 * x[:, 0] - x[:, 1]), 2.0 * low(x[:, 0]) - low(x[:, 1]))
+
+
+@pytest.mark.parametrize(("sharp", "room"), [(False, 2e-3), (True, 2e-2)])
+def test_one_filter_for_measured_and_modelled_torque(sharp: bool, room: float):
+    """1 kHz through the measured torque's path, 250 Hz through the modelled one's."""
+    t, (q, dq, ddq) = known()
+    law = np.sign if sharp else lambda v: np.tanh(v / 0.3)
+
+    def torque(*moved: Array) -> Array:
+        return ARM.torque(*moved) + 0.5 * law(moved[1])
+
+    signals = prepare(recorded(torque(q, dq, ddq), t, q, dq), ARM)
+    assert np.allclose(signals.low(signals.motion.t[:, None])[:, 0], signals.t)
+    modelled = signals.low(torque(*DRAWN.at(signals.motion.t)))
+    off = modelled - signals.tau
+    assert np.sqrt(np.mean(off**2, axis=0)).max() < room
+
+
+def test_what_lies_above_the_band_does_not_fold_into_it():
+    t, (q, dq, ddq) = known()
+    tau = ARM.torque(q, dq, ddq)
+    shaken = tau + np.sin(2 * np.pi * np.array([20.0, 33, 47, 120, 240, 251, 490]) * t[:, None])
+    clean, other = (prepare(recorded(x, t, q, dq), ARM).tau for x in (tau, shaken))
+    assert np.abs(other - clean).max() < 0.02
+
+
+def test_too_short_a_recording_is_refused():
+    t, (q, dq, _) = known(1.5)
+    with pytest.raises(ValueError, match="2 s"):
+        prepare(recorded(q, t, q, dq), ARM)
+
+
+def test_repeats_are_told_from_other_motions():
+    t, (q, dq, _) = known(6.0)
+    first, again = (
+        recorded(q, t, noisy(q, 1e-4, k), noisy(dq, 5e-3, k + 9), str(k)) for k in (1, 2)
+    )
+    p, dp, _ = draw(4, "null").motion.at(t)
+    other = recorded(p, t, p, dp, "other")
+    assert first.repeated_in((first, other, again)) is again
+    assert other.repeated_in((first, other, again)) is None
+    moved = prepare(first, ARM, again).motion
+    assert np.array_equal(moved.q, prepare(again, ARM).motion.q)
+
+
+# ---------------------------------------------------------------- noise
+
+ROWS = 480  # 19 s at 25 Hz
+PROCESSES = {
+    "white": [],
+    "first order": [0.8],
+    "resonant": [1.5, -0.9],
+    "rough": [-0.5],
+}
+
+
+def process(name: str, seed: int, columns: int = N, rows: int = ROWS) -> Array:
+    """x_t = sum a_i x_(t-i) + e_t with unit e, in its steady state."""
+    e = np.random.default_rng(seed).standard_normal((rows + 300, columns))
+    return lfilter([1.0], [1.0, *(-a for a in np.array(PROCESSES[name], float))], e, axis=0)[300:]
+
+
+def spread(name: str) -> float:
+    """Standard deviation of a process, from its Lyapunov equation."""
+    a = PROCESSES[name]
+    if not a:
+        return 1.0
+    step = np.eye(len(a), k=-1)
+    step[0] = a
+    drive = np.zeros((len(a), len(a)))
+    drive[0, 0] = 1.0
+    return float(np.sqrt(solve_discrete_lyapunov(step, drive)[0, 0]))
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_noise_model_of_a_known_process(name: str):
+    found = [noise_of(0.3 * process(name, seed)) for seed in range(30)]
+    levels = np.array([x.level for x in found])
+    assert np.mean(levels) == pytest.approx(0.3 * spread(name), rel=0.15)
+    sigmas = np.array([x.sigma for x in found])
+    assert 0.3 * 0.9 < np.mean(sigmas) < 0.3 * 1.5  # 2 % of white noise are added
+    first = np.mean([x.ar[:, 0] for x in found])
+    assert np.sign(np.round(first, 1)) == np.sign((PROCESSES[name] or [0.0])[0])
+
+
+@pytest.mark.parametrize("name", PROCESSES)
+def test_whitened_noise_is_white(name: str):
+    """With the share of white noise that the model adds to what it was made of."""
+    shares, lags = [], []
+    for seed in range(30):
+        x = process(name, 100 + seed)
+        model = noise_of(x)
+        white = model.whiten(x)
+        assert white.shape == (ROWS - ORDER, N)
+        assert np.mean(white**2) < 1.2  # the model's white noise is not there
+        x = x + np.sqrt(WHITE) * spread(name) * process("white", 500 + seed)
+        white = model.whiten(x)
+        shares.append(np.mean(white**2))
+        lags.append([np.mean(white[k:] * white[:-k]) / shares[-1] for k in range(1, 9)])
+    assert 0.85 < np.mean(shares) < 1.15
+    assert np.abs(np.mean(lags, axis=0)).max() < 0.1
+
+
+def test_white_noise_counts_as_it_is():
+    chi2 = [np.mean(noise_of(x).whiten(x) ** 2) for x in (process("white", k) for k in range(40))]
+    assert 0.9 < np.mean(chi2) < 1.08
+
+
+def test_whitening_undoes_a_process_exactly():
+    rng = np.random.default_rng(0)
+    ar = 0.2 * rng.uniform(-1, 1, (3, ORDER))
+    sigma = np.array([0.5, 1.0, 2.0])
+    e = rng.standard_normal((200, 3))
+    x = np.column_stack(
+        [lfilter([s], [1.0, *-a], e[:, j]) for j, (a, s) in enumerate(zip(ar, sigma, strict=True))]
+    )
+    white = Noise(ar, sigma, sigma).whiten(np.stack([x, 2.0 * x]))
+    assert np.allclose(white, np.stack([e[ORDER:], 2.0 * e[ORDER:]]))
+
+
+def test_what_happens_once_is_no_noise():
+    x = 0.1 * process("first order", 1)
+    struck = x.copy()
+    struck[200:240] += 3.0  # a contact of 1.6 s
+    found = noise_of(struck).level
+    assert np.all(found < 2.0 * noise_of(x).level)
+    assert np.all(found < 0.4 * struck.std(axis=0))
+
+
+def test_no_sensor_is_quieter_than_the_floor():
+    found = noise_of(np.zeros((ROWS, 2)))
+    assert np.all(found.level >= LEAST_NM) and np.all(np.isfinite(found.ar))
+
+
+# ---------------------------------------------------------------- evidence
+
+
+def gaussians(seed: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Signatures X with priors, carried ones N that they overlap with, and data."""
+    rng = np.random.default_rng(seed)
+    N_, own = rng.standard_normal((4, 30)), rng.uniform(0.2, 2.0, 3)
+    X = rng.standard_normal((3, 30)) + 2.0 * rng.standard_normal((3, 4)) @ N_
+    carried = rng.uniform(0.1, 3.0, 4)
+    data = rng.standard_normal(30) + (own * rng.standard_normal(3)) @ X
+    return X, own, N_, carried, data + (carried * rng.standard_normal(4)) @ N_
+
+
+def covariance(*parts: tuple[Array, Array]) -> Array:
+    """Of the data when coefficients of signatures have these priors and noise is white."""
+    size = parts[0][0].shape[1]
+    return np.eye(size) + sum((x.T * std**2) @ x for x, std in parts)
+
+
+def log_likelihood(data: Array, cov: Array) -> float:
+    return float(multivariate_normal(np.zeros(len(data)), cov).logpdf(data))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_score_is_a_ratio_of_marginal_likelihoods(seed: int):
+    X, own, _, _, data = gaussians(seed)
+    found = score(X @ X.T, X @ data, own)
+    cov = covariance((X, own))
+    expected = log_likelihood(data, cov) - log_likelihood(data, np.eye(len(data)))
+    assert found.log_evidence == pytest.approx(expected, rel=1e-9)
+    assert found.chi2 == pytest.approx(data @ data - data @ np.linalg.solve(cov, data), rel=1e-9)
+    assert np.allclose(found.x, own**2 * (X @ np.linalg.solve(cov, data)))
+
+
+def test_scores_of_a_stack_are_those_one_by_one():
+    parts = [gaussians(seed) for seed in range(4)]
+    G = np.array([X @ X.T for X, *_ in parts])
+    g = np.array([X @ data for X, *_, data in parts])
+    own = parts[0][1]
+    evidence, chi2, x = scores(G, g, own)
+    each = [score(a, b, own) for a, b in zip(G, g, strict=True)]
+    assert np.allclose(evidence, [one.log_evidence for one in each])
+    assert np.allclose(chi2, [one.chi2 for one in each])
+    assert np.allclose(x, [one.x for one in each])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_is_carried_along_is_integrated_out(seed: int):
+    X, own, N_, std, data = gaussians(seed)
+    carried = Carried(N_, std, data)
+    found = score(*carried.without(X), own)
+    with_it, without = covariance((X, own), (N_, std)), covariance((N_, std))
+    expected = log_likelihood(data, with_it) - log_likelihood(data, without)
+    assert found.log_evidence == pytest.approx(expected, rel=1e-8)
+    assert np.allclose(found.x, own**2 * (X @ np.linalg.solve(with_it, data)))
+    fall = data @ np.linalg.solve(without, data) - data @ np.linalg.solve(with_it, data)
+    assert found.chi2 == pytest.approx(fall, rel=1e-8)
+
+
+def test_what_is_known_of_carried_coefficients():
+    _, _, N_, std, data = gaussians(9)
+    carried, cov = Carried(N_, std, data), covariance((gaussians(9)[2], std))
+    gain = (std**2)[:, None] * N_ @ np.linalg.inv(cov)
+    assert np.allclose(carried.x, gain @ data)
+    assert np.allclose(carried.covariance(), np.diag(std**2) - gain @ (N_.T * std**2))
+    assert np.allclose(carried.std() ** 2, np.diagonal(carried.covariance()))
+
+
+def test_reduced_takes_stacks_of_products():
+    X, _, N_, std, data = gaussians(2)
+    carried = Carried(N_, std, data)
+    G, g = carried.reduced(
+        np.stack([X @ X.T] * 2), np.stack([X @ N_.T] * 2), np.stack([X @ data] * 2)
+    )
+    one = carried.without(X)
+    assert np.allclose(G, one[0]) and np.allclose(g, one[1])
+
+
+# ---------------------------------------------------------------- signatures
+
+
+def recording(seed: int = 1, friction: float = FC, noise: float = TAU_NOISE) -> Recorded:
+    """Eight seconds of the nominal arm, friction on one joint, white noise."""
+    t, (q, dq, ddq) = known(SECONDS)
+    tau = ARM.torque(q, dq, ddq)
+    tau[:, RUBS] += friction * np.tanh(dq[:, RUBS] / 0.01)
+    return recorded(noisy(tau, noise, seed), t, q, dq)
+
+
+def fit_of(*recordings: Recorded) -> Fit:
+    """The nominal model on recordings."""
+    signals = tuple(prepare(r, ARM) for r in recordings)
+    zero = np.zeros_like(ARM.theta)
+    return Fit(Model(signals, zero), theta_prior(ARM.theta, 0.02)).with_noise()
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    return prepare(recording(), ARM)
+
+
+@pytest.fixture(scope="module")
+def table(signals: Signals) -> tuple[Array, list[Candidate]]:
+    """Every signature of the recording, and what each belongs to."""
+    return signatures(stages_of(signals, ()), EVERYWHERE)
+
+
+@pytest.fixture(scope="module")
+def field() -> SignatureTable:
+    """Of a recording whose joint RUBS + 1 has friction that the model lacks."""
+    return SignatureTable(fit_of(recording()), EVERYWHERE)
+
+
+SMALL = 0.02  # of a coefficient's size, a difference
+
+
+def full_torque(motion: Motion, *effects: Active) -> Array:
+    return low(sensed_torque(motion, effects))
+
+
+@pytest.mark.parametrize("name", [name for name in CATALOGUE if not CATALOGUE[name].is_theta])
+def test_signatures_are_slopes_of_the_full_torque(
+    name: str, signals: Signals, table: tuple[Array, list[Candidate]]
+):
+    """For every template of the effect: on the arm or all joints, and on three of them."""
+    slopes, candidates = table
+    assert len(slopes) == 1 + max(k for c in candidates for k in c.columns)
+    nothing = full_torque(signals.motion)
+    own = [c for c in candidates if c.effect.name == name and c.joint in (-1, 1, 3, 6)]
+    assert own
+    for c in own:
+        for i, (column, std) in enumerate(zip(c.columns, c.prior_std, strict=True)):
+            x = np.zeros(len(c.columns))
+            x[i] = SMALL * std
+            active = Active(c.effect, c.joint, c.template.decode(x))
+            slope = (full_torque(signals.motion, active) - nothing) / x[i]
+            assert np.allclose(slopes[column], slope, atol=1e-6 * np.abs(slope).max() + 1e-9), c
+
+
+def test_first_signatures_are_those_of_theta(
+    signals: Signals, table: tuple[Array, list[Candidate]]
+):
+    slopes, candidates = table
+    nothing = full_torque(signals.motion)
+    for k in (0, 13, 27, 44, 69):
+        theta = ARM.theta.copy()
+        theta.ravel()[k] += 0.1
+        moved = full_torque(replace(signals.motion, arm=ARM.changed(theta))) - nothing
+        assert np.allclose(slopes[k], moved / 0.1, atol=1e-8 * (1.0 + np.abs(moved).max()))
+    bodies = {c.key: c.columns for c in candidates if c.columns_are_theta}
+    assert bodies["payload", -1] == tuple(range(60, 70))
+    assert bodies["link_inertia", 2] == tuple(range(20, 30))
+
+
+def test_joints_that_stand_still_have_no_candidates(signals: Signals):
+    _, candidates = signatures(stages_of(signals, ()), (0, 2))
+    places = {c.joint for c in candidates if c.effect.scope != LINK}
+    assert places == {-1, 0, 2}
+
+
+NAMED = {  # effect -> joint (from 0) and coefficients about which it is differentiated
+    "coulomb_friction": (1, [0.4]),
+    "torque_ripple": (2, [0.2, -0.1]),
+    "joint_elasticity": (3, [1.5e-4]),
+    "torque_gain": (1, [0.05]),
+    "encoder_offset": (3, [0.01]),
+    "payload": (-1, [1.0, 0.02, -0.01, 0.15, 0.03, 0.0, 0.0, 0.03, 0.0, 0.01]),
+    "base_tilt": (-1, [0.02, -0.03]),
+    "external_wrench": (-1, [5.0, -3.0, 8.0, 0.1, 0.2, 0.0]),
+}
+
+
+def named(fit: Fit, name: str, interval_s: tuple[float, float] = WHOLE) -> Named:
+    joint, x = NAMED[name]
+    candidates = signatures(stages_of(fit.recordings[0], ()), EVERYWHERE)[1]
+    first = next(c for c in candidates if c.key == (name, joint))
+    return Named(first, np.array(x), interval_s)
+
+
+@pytest.mark.parametrize("interval_s", [WHOLE, (3.0, np.inf), (2.0, 4.5)])
+@pytest.mark.parametrize("name", NAMED)
+def test_carried_signatures_are_slopes_of_the_fit(name: str, interval_s: tuple[float, float]):
+    fit = fit_of(SHORT)
+    fit = replace(fit, model=replace(fit.model, delay_s=1e-3))
+    fit = fit.with_named([named(fit, name, interval_s)])
+    tables, x = fit.model.signatures(0), fit.coefficients
+    assert len(tables) == len(x) == len(fit.prior_std)
+    own = range(fit.dtheta.size + 1, len(x))
+    for k in (0, 33, 60, 70, *own):
+        # θ and delay are linear, so only rounding limits their step
+        h = np.zeros(len(x))
+        h[k] = 1e-3 * fit.prior_std[k] if k in own else fit.prior_std[k]
+        slope = (fit.at(x + h).model.predicted(0) - fit.at(x - h).model.predicted(0)) / (2 * h[k])
+        size = np.sqrt(np.mean(slope**2)) + 1e-9
+        room = 0.02 if k in own else 0.06  # a delay and a gain multiply, an offset moves the arm
+        assert np.sqrt(np.mean((tables[k] - slope) ** 2)) < room * size, (name, k)
+
+
+SHORT = recording(2)
+
+# ---------------------------------------------------------------- the fit
+
+
+def test_prior_of_theta_is_a_share_of_its_size():
+    prior = theta_prior(ARM.theta, 0.02)
+    assert np.all(prior >= 0.02 * np.abs(ARM.theta))
+    assert np.all(prior > 0.0)  # of a number that happens to be zero too
+    assert np.allclose(theta_prior(ARM.theta, 0.1), 5.0 * prior)
+
+
+def test_worth_is_a_ratio_of_marginal_likelihoods():
+    fit = fit_of(SHORT)
+    fit, carried = refitted(fit.with_named([named(fit, "coulomb_friction")]).with_noise())
+    own, rest = beside(fit, 0)
+    thin = slice(None, None, 4)  # a covariance of all rows is large
+    part = Carried(carried.N[:, thin], carried.prior_std, carried.data[thin])
+    found = worth(fit, part, 0)
+    both = covariance((part.N, part.prior_std))
+    others = covariance((part.N[rest], part.prior_std[rest]))
+    expected = log_likelihood(part.data, both) - log_likelihood(part.data, others)
+    assert list(own) == [71]
+    assert found.log_evidence == pytest.approx(expected, rel=1e-5, abs=1e-3)
+
+
+def test_a_refit_finds_what_was_planted():
+    pulls = []
+    for seed in range(6):
+        fit = fit_of(recording(10 + seed))
+        there = next(c for c in _frictions(fit) if c.joint == RUBS)
+        fit = fit.with_named([Named(there, np.array([0.2]))])
+        fit, _ = refitted(fit)
+        fit, carried = refitted(fit.with_noise())
+        std = parameter_std(fit, carried.covariance(), 0)["Fc"]
+        pulls.append((fit.named[0].values["Fc"] - FC) / std)
+        assert std < 0.05 * FC
+    assert np.abs(pulls).max() < 4.5
+    assert np.sqrt(np.mean(np.square(pulls))) < 2.5
+
+
+def _frictions(fit: Fit) -> list:
+    found = signatures(stages_of(fit.recordings[0], ()), EVERYWHERE)[1]
+    return [c for c in found if c.effect.name == "coulomb_friction"]
+
+
+def test_held_out_blocks_pay_for_what_is_there_and_not_for_what_is_not():
+    fit = fit_of(SHORT)
+    fold = fold_rows(fit)
+    assert len(fold) == (len(fit.recordings[0].t) - ORDER) * N
+    assert set(fold) == {0, 1, 2, 3}
+    there = next(c for c in _frictions(fit) if c.joint == RUBS)
+    fit, carried = refitted(fit.with_named([Named(there, np.array([FC]))]))
+    assert pays_held_out(fit.with_noise(), carried, 0)
+    shuffled = Carried(carried.N, carried.prior_std, -carried.data * np.sign(fold - 1.5))
+    assert not pays_held_out(fit, shuffled, 0)  # another sign in every other pair of blocks
+
+
+# ---------------------------------------------------------------- the scan
+
+
+def test_effects_that_act_all_the_time_are_scored_by_brute_force(field: SignatureTable):
+    leads = {lead.candidate.key: lead for lead in field.whole()}
+    for key in (("coulomb_friction", RUBS), ("motor_inertia", 1), ("base_tilt", -1)):
+        lead = leads[key]
+        X = field.X[list(lead.candidate.columns)]
+        found = score(*field.carried.without(X), lead.candidate.prior_std)
+        assert lead.log_evidence == pytest.approx(
+            found.log_evidence + log_odds(lead.candidate), abs=1e-6
+        )
+        assert np.allclose(lead.x, found.x)
+
+
+def gated(
+    field: SignatureTable, columns: tuple[int, ...], begin: float, end: float = np.inf
+) -> Array:
+    """White signatures without the rows outside an interval."""
+    t = np.repeat(np.concatenate(field.times), N)
+    return field.X[list(columns)] * ((t >= begin) & (t < end))
+
+
+@pytest.mark.parametrize("key", [("coulomb_friction", RUBS), ("torque_offset", 0), ("payload", -1)])
+def test_running_sums_are_sums(key: tuple[str, int], field: SignatureTable):
+    c = next(c for c in field.candidates if c.key == key)
+    t = field.times[0]
+    starts = np.arange(t[0], t[-1], BLOCK_S)
+    starts = starts[(starts > t[0] + MARGIN_S) & (starts < t[-1] - MARGIN_S)]
+    each = [
+        score(*field.carried.without(gated(field, c.columns, begin)), c.prior_std)
+        for begin in starts
+    ]
+    best = int(np.argmax([x.log_evidence for x in each]))
+    lead = field.timed([c])[0]
+    assert lead.interval_s == (pytest.approx(starts[best]), np.inf)
+    expected = each[best].log_evidence + log_odds(c, timed=True) - np.log(len(starts))
+    assert lead.log_evidence == pytest.approx(expected, abs=1e-5)
+    assert lead.chi2 == pytest.approx(each[best].chi2, rel=1e-6)
+    assert np.allclose(lead.x, each[best].x, rtol=1e-5, atol=1e-8)
+
+
+def test_differences_of_running_sums_are_sums(field: SignatureTable):
+    c = next(c for c in field.candidates if c.key == ("external_wrench", -1))
+    lead = field.passing([c])[0]
+    begin, end = lead.interval_s
+    assert 0.0 < end - begin < 8.5
+    direct = score(*field.carried.without(gated(field, c.columns, begin, end)), c.prior_std)
+    assert lead.chi2 == pytest.approx(direct.chi2, rel=1e-5)
+    assert np.allclose(lead.x, direct.x, rtol=1e-4, atol=1e-6)
+
+
+def test_an_honest_lead_is_what_it_says_together_with_none(field: SignatureTable):
+    own = next(x for x in field.whole() if x.candidate.key == ("coulomb_friction", RUBS))
+    honest, alone = field.honest(own), field.together([own])
+    assert honest.log_evidence == pytest.approx(alone.log_evidence + own.odds)
+    assert honest.x[0] == pytest.approx(FC, rel=0.1)
+    assert honest.log_evidence > BELIEF
+    # what leaves the friction in its noise cannot claim what the friction can
+    other = next(x for x in field.whole() if x.candidate.key == ("torque_offset", RUBS))
+    assert field.honest(other).log_evidence < honest.log_evidence
+
+
+def test_the_best_move_is_what_was_planted(field: SignatureTable):
+    first = honest_moves(field, set())[0].leads[0].candidate
+    assert first.key == ("coulomb_friction", RUBS)
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23])
+def test_noise_gives_no_move(seed: int):
+    fit = fit_of(recording(seed, friction=0.0))
+    fit, _ = refitted(fit)
+    assert honest_moves(SignatureTable(fit, EVERYWHERE), set()) == []
+
+
+def test_rivals_explain_a_share_between_nothing_and_all():
+    fit = fit_of(SHORT)
+    there = next(c for c in _frictions(fit) if c.joint == RUBS)
+    fit, carried = refitted(fit.with_named([Named(there, np.array([FC]))]))
+    fit, carried = refitted(fit.with_noise())
+    (found,) = standings(fit, carried, SignatureTable(fit, EVERYWHERE, rich=False))
+    shares = {r.candidate.key: r.overlap for r in found.rivals}
+    assert all(-1e-6 <= x <= 1.0 + 1e-6 for x in shares.values())
+    assert shares["asymmetric_friction", RUBS] > 0.99  # its finer form can do all that it can
+    assert shares["viscous_friction", RUBS] > shares["viscous_friction", 0]
+    assert shares["coulomb_friction", 0] < 0.2
+    assert found.probability > 0.9
+
+
+def test_patterns_hold_every_smooth_curve_of_their_signal(signals: Signals):
+    motion, tau = (
+        signals.motion,
+        ARM.torque(signals.motion.q, signals.motion.dq, signals.motion.ddq),
+    )
+    x = motion.dq[:, RUBS]
+    curve = next(p for p in patterns(N, RUBS) if p.depends_on == (f"dq{RUBS + 1}",))
+    basis = np.column_stack(
+        [curve.torque(motion, tau, RUBS, {"x": unit})[:, RUBS] for unit in np.eye(8)]
+    )
+    for shape in (np.ones_like(x), x, x**2, x**3, np.tanh(x)):
+        left = shape - basis @ np.linalg.lstsq(basis, shape, rcond=None)[0]
+        assert np.abs(left).max() < 0.02 * np.abs(shape).max()
+
+
+def test_pattern_fields_look_at_patterns_alone():
+    found = SignatureTable(fit_of(SHORT), (RUBS,), PATTERNS)
+    assert {c.joint for c in found.candidates} == {RUBS}
+    assert not {c.effect.name for c in found.candidates} & set(CATALOGUE)

@@ -1,0 +1,190 @@
+"""The watch over the residual names what is new, soon and once, and is quiet where nothing is."""
+
+import time
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adapter.cli.results import disagreement_lines
+from adapter.gap.monitor import Monitor
+from adapter.gap.monitor_evidence import Blocks
+from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.outcome import collect
+from adapter.runs.pipeline import PipelineSettings
+from adapter.runs.replay import ReplayOptions, replay
+from adapter.signals.front_end import FrontEnd
+from adapter.signals.records import StateLayout
+from sim.scenarios import build
+from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
+
+AT_S, SECONDS, CONTACT_S = 15.0, 18.0, 1.5
+FORCE_N = np.array([-6.0, 3.0, 7.4])  # 10 N in all
+FRICTION_NM = np.array([0.27, 0.20, 0.14, 0.45, 0.30, 0.15, 0.25])
+ROWS = 10  # states at a time where ADAM's path does not matter
+
+
+def disturbed(kind: str, seed: int) -> ArmData:
+    """A recording with something new at 15 s; torques made here, not by the catalogue."""
+    truth = build("payload_at_20s", mass=0.5, t_s=AT_S).truth if kind == "payload" else arm()
+    data = record(truth, Motion(SECONDS, seed))
+    q, dq, _, tau = data.true
+    t = 1e-9 * data.stamp_ns
+    on, add = t >= AT_S, np.zeros_like(tau)
+    if kind == "coulomb_friction":
+        add[:, 3] = 0.5 * np.tanh(dq[:, 3] / 0.01) * on
+    elif kind == "viscous_friction":
+        add[:, 2] = 0.5 * dq[:, 2] * on
+    elif kind == "torque_offset":
+        add[:, 1] = 0.5 * on
+    elif kind == "torque_gain":
+        add[:, 1] = 0.05 * tau[:, 1] * on
+    elif kind == "external_wrench":
+        push = RigidArm.of(panda_model()).wrench_torque(q, np.r_[FORCE_N, np.zeros(3)])
+        add = -push * (on & (t < AT_S + CONTACT_S))[:, None]
+    elif kind == "oscillation":  # in no catalogue
+        add[:, 2] = np.sin(2 * np.pi * 3.0 * t) * on
+    elif kind == "friction":
+        add = FRICTION_NM * np.tanh(dq / 0.01)
+    return replace(data, tau=data.tau + add)
+
+
+@dataclass
+class Watched:
+    """What a monitor said, when on the arm's clock, and what a state cost it."""
+
+    reports: list[dict[str, Any]]
+    said: list[str]
+    cost_us: float
+    changes: int
+
+
+@cache
+def watch(kind: str, seed: int, rows: int = ROWS, effects: tuple[str, ...] = ()) -> Watched:
+    states = states_of(disturbed(kind, seed))
+    learner = learner_for(seed=seed, effects=effects)
+    said: list[str] = []
+    monitor = Monitor(7, None, FrontEnd(panda_model()).delay_s, said.append)
+    spent = 0.0
+    for k in range(0, len(states), rows):
+        table = states[k : k + rows]
+        learner.step_table(table)
+        before = time.perf_counter()
+        monitor(learner, table)
+        spent += time.perf_counter() - before
+    cost_us = 1e6 * spent / len(states)
+    return Watched(monitor.reports, said, cost_us, len(learner.changes))
+
+
+NEW = {
+    "coulomb_friction": ([4], {"Fc": 0.5}),
+    "torque_offset": ([2], {"o": 0.5}),
+    "viscous_friction": ([3], {"Fv": 0.5}),
+    "torque_gain": ([2], {"g": 0.05}),
+    "payload": ([], {"m": 0.5}),
+    "external_wrench": ([], dict(zip(("fx", "fy", "fz"), FORCE_N, strict=True))),
+}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("kind", NEW)
+def test_what_is_new_is_named_within_two_seconds(kind: str, seed: int) -> None:
+    joints, size = NEW[kind]
+    (report,) = watch(kind, seed).reports
+    assert report["what"] == kind or kind in {x["what"] for x in report["ambiguous_with"]}
+    assert report["joints"] == joints
+    assert abs(report["since_s"] - AT_S) < 0.3
+    assert AT_S < report["reported_s"] < AT_S + 2.0
+    scale = np.linalg.norm(list(size.values()))
+    if report["what"] == kind:
+        assert all(abs(report["size"][key] - x) < 0.1 * scale for key, x in size.items())
+
+
+@pytest.mark.parametrize("kind", ["coulomb_friction", "payload"])
+def test_a_learner_that_takes_each_state_alone_is_watched_as_well(kind: str) -> None:
+    """As live: the learner's own alarm goes off, and what it makes of it does not interfere."""
+    found = watch(kind, 1, rows=1)
+    assert [report["what"] for report in found.reports] == [kind]
+    assert found.changes == 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_contact_ends(seed: int) -> None:
+    found = watch("external_wrench", seed)
+    assert found.reports[0]["over_s"] == pytest.approx(AT_S + CONTACT_S, abs=0.15)
+    assert len(found.said) == 2 and "over at" in found.said[1]
+
+
+@pytest.mark.parametrize("kind", ["coulomb_friction", "torque_offset", "payload"])
+def test_what_lasts_is_not_called_over(kind: str) -> None:
+    assert all(watch(kind, seed).reports[0]["over_s"] is None for seed in (1, 2, 3))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_is_in_no_catalogue_is_unexplained(seed: int) -> None:
+    report = watch("oscillation", seed).reports[0]
+    assert report["what"] == "unexplained" and report["joints"] == [3]
+    assert AT_S < report["reported_s"] < AT_S + 2.0
+
+
+@pytest.mark.parametrize("seed", range(20, 30))
+def test_nothing_new_nothing_said(seed: int) -> None:
+    assert not watch("nothing", seed).reports
+
+
+@pytest.mark.parametrize("effects", [(), ("coulomb_friction", "viscous_friction")])
+@pytest.mark.parametrize("seed", range(20, 23))
+def test_friction_that_was_always_there_is_not_new(seed: int, effects: tuple[str, ...]) -> None:
+    """Learned beside θ, or left out of the model for good."""
+    assert not watch("friction", seed, effects=effects).reports
+
+
+def test_rests_are_not_new() -> None:
+    motion = Motion(25.0, 6, rests=((8.0, 11.0), (15.0, 20.0)))
+    learner = learner_for(seed=6)
+    monitor = Monitor(7)
+    states = states_of(record(arm(), motion))
+    for k in range(0, len(states), ROWS):
+        learner.step_table(states[k : k + ROWS])
+        monitor(learner, states[k : k + ROWS])
+    assert not monitor.reports
+
+
+def test_it_costs_little() -> None:
+    """Some 20 µs of a state's millisecond, in the learner's process; far off, not to be timed."""
+    assert watch("nothing", 20).cost_us < 500.0
+
+
+def test_a_replay_reports_and_a_batch_says_that_it_does_not_watch() -> None:
+    log = disturbed("torque_offset", 1).log()
+    said: list[str] = []
+    exact = replay(log, panda_model(), PipelineSettings(), ReplayOptions(say=said.append)).outcome
+    assert exact.disagreements is not None
+    (report,) = exact.disagreements
+    assert report["what"] == "torque_offset" and len(said) == 1
+    assert disagreement_lines(list(exact.disagreements))[0].startswith("torque offset on joint 2")
+    batch = replay(log, panda_model(), PipelineSettings(), ReplayOptions(every=20)).outcome
+    assert batch.disagreements is None
+    assert "not watched" in disagreement_lines(None)[0]
+
+
+def test_without_a_monitor_nothing_is_claimed() -> None:
+    learner = learner_for(seed=1)
+    learner.step_table(states_of(disturbed("nothing", 20))[:ROWS])
+    assert collect(learner).disagreements is None
+
+
+def test_a_hole_ends_a_block() -> None:
+    """Rows are means of 40 ms without a hole."""
+    layout, blocks = StateLayout(2), Blocks(2)
+    table = layout.new(100)
+    stamps = 1_000_000 * np.arange(100, dtype=np.int64)
+    stamps[30:] += 500_000_000
+    table[:, 0] = stamps.view(np.float64)
+    table[:, layout.q] = 1.0
+    table[30:, layout.q] = 2.0
+    (row,) = blocks.add(table)
+    assert row[0] == pytest.approx(0.530 + 0.0195)
+    assert row[1][:2] == pytest.approx([2.0, 2.0])

@@ -1,0 +1,269 @@
+"""Recordings of robots whose links carry sensors, for discovery: motion from Pinocchio, noise.
+
+Names and orders are shuffled; what is true is handed along.
+"""
+
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.errors import ModelWarning
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import exp_rotation, matrix_from_zxz
+from adapter.model.tree import BASE
+from adapter.model.urdf import read_urdf
+from drivers.files.mcap import Log
+
+SHARED = Path(__file__).parents[2].parent / "shared"
+ATLAS = SHARED / "models" / "atlas_v5.urdf"
+ENCODER_STEP = 2 * np.pi / 2**19  # rad
+GYRO = np.radians(0.007)  # rad/s/√Hz
+ACCELEROMETER = 150e-6 * 9.81  # m/s²/√Hz
+DRAWN_KEPT = 8  # motions kept for other noise, mountings or channels
+DQ_NOISE, V_NOISE, DW_NOISE, TAU_NOISE = 1e-3, 1e-3, 0.05, 0.1  # rad/s, m/s, rad/s², N m
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the robot moves: sines of random frequency in every joint, and of a floating base.
+
+    Attributes:
+        seconds, rate_hz: length and sampling.
+        still: joints (indices of the robot) that rest.
+        alike: pairs of joints of which the second moves as the first.
+        speed: rad/s, the most of a joint.
+    """
+
+    seconds: float = 10.0
+    rate_hz: float = 500.0
+    still: tuple[int, ...] = ()
+    alike: tuple[tuple[int, int], ...] = ()
+    speed: float = 1.5
+
+
+@dataclass(frozen=True)
+class Case:
+    """A recording and the truth about it: (joint, link, parent or "base") names, recorded ones.
+
+    Attributes:
+        body: body of the robot (0 the base) by recorded link name.
+        mounts: (rotation, place) of each body's sensor in its joint frame.
+    """
+
+    log: Log
+    edges: frozenset[tuple[str, str, str]]
+    root: str
+    model: SelfModel
+    body: dict[str, int] = field(default_factory=dict)
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+
+
+def panda() -> SelfModel:
+    """The documented Panda on its fixed base."""
+    return documented("panda")
+
+
+def atlas() -> SelfModel:
+    """ATLAS on a free base; needs the shared folder."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return read_urdf(ATLAS, floating=True)
+
+
+@cache
+def robot(name: str) -> SelfModel:
+    """The Panda or ATLAS by name; a test that wants ATLAS skips where it is not at hand."""
+    if name == "panda":
+        return panda()
+    if not ATLAS.exists():
+        pytest.skip(f"{ATLAS} is not here: the shared folder stays with the project's makers")
+    return atlas()
+
+
+def _sines(rng: np.random.Generator, t: np.ndarray, n: int, speed: float) -> tuple[np.ndarray, ...]:
+    """Value, rate and second rate (m, n) of sums of sines that start at rest."""
+    value, rate, second = (np.zeros((len(t), n)) for _ in range(3))
+    for _ in range(4):
+        k = 2 * np.pi * rng.uniform(0.1, 1.0, n)
+        a = rng.normal(size=n) / np.sqrt(k)
+        phase = rng.uniform(0, 2 * np.pi, n)
+        angle = np.outer(t, k) + phase
+        value, rate = value + a * np.sin(angle), rate + a * k * np.cos(angle)
+        second = second - a * k * k * np.sin(angle)
+    share = speed / np.maximum(np.abs(rate).max(axis=0), 1e-9)
+    return value * share, rate * share, second * share
+
+
+def _pin_model(model: SelfModel) -> pin.Model:
+    out = pin.Model()
+    out.gravity.linear = model.gravity
+    root = out.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
+    ids: list[int] = []
+    turns = matrix_from_zxz(model.lam[:, :3])
+    order = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
+    theta = model.theta[1:] if model.tree.floating else model.theta
+    for j, i in enumerate(model.tree.parent):
+        place = pin.SE3(turns[j], model.lam[j, 3:])
+        parent = root if i == BASE else ids[i]
+        ids.append(out.addJoint(parent, pin.JointModelRZ(), place, f"j{j}"))
+        body = pin.Inertia.FromDynamicParameters(theta[j][order])
+        out.appendBodyToJoint(ids[-1], body, pin.SE3.Identity())
+    return out
+
+
+def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """q, dq, ddq, tau (m, n), twists and accels (m, 1 + n, 6), the base first."""
+    t = np.arange(round(motion.seconds * motion.rate_hz)) / motion.rate_hz
+    n = model.tree.n
+    q, dq, ddq = _sines(rng, t, n, motion.speed)
+    for first, second in motion.alike:
+        for x in (q, dq, ddq):
+            x[:, second] = x[:, first]
+    for j in motion.still:
+        q[:, j], dq[:, j], ddq[:, j] = q[0, j], 0.0, 0.0
+    _, speed, change = _sines(rng, t, 6, 0.6 if model.tree.floating else 0.0)
+    arm = _pin_model(model)
+    data = arm.createData()
+    pose = pin.neutral(arm)
+    twists, accels = (np.zeros((len(t), 1 + n, 6)) for _ in range(2))
+    tau = np.zeros((len(t), n))
+    v = np.zeros(arm.nv)
+    for k in range(len(t)):
+        pose[7:] = q[k]
+        rates, seconds = np.concatenate([speed[k], dq[k]]), np.concatenate([change[k], ddq[k]])
+        tau[k] = pin.rnea(arm, data, pose, rates, seconds)[6:]
+        pin.forwardKinematics(arm, data, pose, rates, seconds)
+        for b in range(1 + n):
+            twists[k, b] = data.v[b + 1].vector
+            a = data.a[b + 1]
+            w = data.v[b + 1].angular
+            down = data.oMi[b + 1].rotation.T @ model.gravity
+            accels[k, b, :3] = a.linear + np.cross(w, data.v[b + 1].linear) - down
+            accels[k, b, 3:] = a.angular
+        v[:6] = speed[k]
+        pose = pin.integrate(arm, pose, v / motion.rate_hz)
+    return q, dq, ddq, tau, twists, accels
+
+
+def anyhow(
+    seed: int,
+    bodies: Collection[int],
+    count: int,
+    *,
+    turned: bool = True,
+    shifted: bool = True,
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Mountings (rotation, place in m) of `count` bodies, random for those named, else none."""
+    rng = np.random.default_rng([seed, 29])
+    mounts = []
+    for b in range(count):
+        axis, angle = rng.normal(size=3), rng.uniform(0.5, np.pi)
+        place = rng.uniform(-0.15, 0.15, 3)
+        own_turn = exp_rotation(axis / np.linalg.norm(axis) * angle)
+        mounts.append(
+            (
+                own_turn if turned and b in bodies else np.eye(3),
+                place if shifted and b in bodies else np.zeros(3),
+            )
+        )
+    return tuple(mounts)
+
+
+def _seen(
+    twists: np.ndarray,
+    accels: np.ndarray,
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What sensors mounted so see of motion given in joint frames (m, bodies, 6)."""
+    twists, accels = twists.copy(), accels.copy()
+    for b, (rotation, place) in enumerate(mounts):
+        w, dw = twists[:, b, 3:].copy(), accels[:, b, 3:].copy()
+        v = twists[:, b, :3] + np.cross(w, place)
+        a = accels[:, b, :3] + np.cross(dw, place) + np.cross(w, np.cross(w, place))
+        twists[:, b] = np.concatenate([v @ rotation, w @ rotation], axis=1)
+        accels[:, b] = np.concatenate([a @ rotation, dw @ rotation], axis=1)
+    return twists, accels
+
+
+_DRAWN: dict[tuple[int, Motion, int], tuple[SelfModel, tuple[np.ndarray, ...], np.random.Generator]]
+_DRAWN = {}
+
+
+def _drawn(
+    model: SelfModel, motion: Motion, seed: int
+) -> tuple[tuple[np.ndarray, ...], np.random.Generator]:
+    """The motion of a seed, and its generator as that left it; the latest few are kept."""
+    key = id(model), motion, seed
+    if key not in _DRAWN:
+        while len(_DRAWN) >= DRAWN_KEPT:
+            del _DRAWN[next(iter(_DRAWN))]
+        rng = np.random.default_rng([seed, 17])
+        _DRAWN[key] = model, _moved(model, motion, rng), rng
+    _, moved, rng = _DRAWN[key]
+    return moved, copy.deepcopy(rng)
+
+
+def record(
+    model: SelfModel,
+    motion: Motion,
+    seed: int,
+    *,
+    noise: float = 1.0,
+    base: bool | None = None,
+    parts: str = "ta",
+    mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = (),
+) -> Case:
+    """A shuffled recording.
+
+    Args:
+        noise: times that of real parts.
+        base: whether the base's motion is in it; where None, if it floats.
+        parts: "t" with twists, "a" with accelerations.
+        mounts: (rotation, place) of the sensor of each body, the base first, in its joint frame.
+    """
+    moved, rng = _drawn(model, motion, seed)
+    q, dq, _, tau, twists, accels = moved
+    twists, accels = _seen(twists, accels, mounts)
+    root = np.sqrt(motion.rate_hz / 2)
+    q = np.round(q / ENCODER_STEP) * ENCODER_STEP
+    dq = dq + noise * DQ_NOISE * rng.normal(size=q.shape)
+    tau = tau + noise * TAU_NOISE * rng.normal(size=q.shape)
+    levels = [V_NOISE] * 3 + [GYRO * root] * 3, [ACCELEROMETER * root] * 3 + [DW_NOISE] * 3
+    twists = twists + noise * np.array(levels[0]) * rng.normal(size=twists.shape)
+    accels = accels + noise * np.array(levels[1]) * rng.normal(size=accels.shape)
+    n = model.tree.n
+    logged = (
+        list(range(1 + n))
+        if (model.tree.floating if base is None else base)
+        else list(range(1, 1 + n))
+    )
+    joints, links = rng.permutation(n), rng.permutation(logged)
+    joint_name = {int(j): f"motor_{k}" for k, j in enumerate(joints)}
+    link_name = {int(b): f"imu_{k}" for k, b in enumerate(links)}
+    edges = frozenset(
+        (joint_name[j], link_name[j + 1], link_name.get(i + 1, "base"))
+        for j, i in enumerate(model.tree.parent)
+    )
+    log = Log(
+        Path("discovery_data.mcap"),
+        tuple(joint_name[int(j)] for j in joints),
+        (1e9 / motion.rate_hz * np.arange(len(q))).astype(np.int64),
+        q[:, joints],
+        dq[:, joints],
+        tau[:, joints],
+        tuple(link_name[int(b)] for b in links),
+        twists[:, links] if "t" in parts else None,
+        accels[:, links] if "a" in parts else None,
+    )
+    body = {name: b for b, name in link_name.items()}
+    return Case(log, edges, link_name.get(0, "base"), model, body, mounts)

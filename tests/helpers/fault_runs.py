@@ -1,0 +1,171 @@
+"""Lockstep runs of the simulated Panda behind faults, and how two learners compare."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from adapter.control.controller import ExcitationController
+from adapter.control.excitation import ExcitationSettings
+from adapter.control.limits import MotionLimits
+from adapter.learning.learner import Learner
+from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.runs.outcome import collect, frame_errors
+from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.signals.front_end import FrontEnd
+from drivers.faults.driver import FaultyDriver, with_faults
+from tests.helpers.arm_data import Motion, arm, model_torque, panda_model, record, rms
+from tests.helpers.live_tools import simulated_arm
+
+N = 7
+SEED, FAULT_SEED = 5, 1
+SHARES = (0.001, 0.01, 0.1)
+SHARED = ("lost", "late", "repeated", "reordered", "corrupt", "nan", "spike")
+EVERY_SHARE = tuple(f"{name}={share}" for name in SHARED for share in SHARES)
+
+
+class Watched:
+    """A learner that asks of every estimate whether it is finite, and keeps it."""
+
+    def __init__(self, learner: Learner) -> None:
+        self.learner, self.finite = learner, True
+        self.history: list[np.ndarray] = []
+
+    def step(self, state) -> None:
+        assert np.isfinite(state[2:30]).all(), "a state that is no number reached the learner"
+        self.learner.step(state)
+        theta = self.learner.theta.theta
+        self.history.append(theta.copy())
+        known = theta, self.learner.schema.lam, self.learner.theta.effect_values
+        self.finite = self.finite and all(np.isfinite(x).all() for x in known)
+
+
+@dataclass(frozen=True)
+class FaultRun:
+    """What a run came to; `history` is θ (7, 10) after each state learned from."""
+
+    text: str
+    driver: FaultyDriver
+    front_end: FrontEnd
+    learner: Learner
+    result: LockstepResult
+    finite: bool
+    history: list[np.ndarray]
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """By reason."""
+        return dict(self.front_end.refused)
+
+    def check_balance(self) -> None:
+        """Every sample is accounted for, from the driver to the learner."""
+        account, intake = self.driver.account, self.driver.intake
+        assert account.balanced, account
+        assert intake.received == intake.used + sum(intake.refused.values())
+        assert intake.used == account.taken
+        # a sample that a fault of the loop ends the run with was still delivered
+        assert account.delivered == self.result.samples
+        assert self.result.samples == self.result.passed_on + sum(self.refused.values())
+        assert self.learner.learned == self.result.passed_on
+
+
+def run_faulty(text: str, seconds: float, seed: int = SEED) -> FaultRun:
+    """The simulated Panda in motion, behind these faults, for so long on its own stamps."""
+    settings, robot = PipelineSettings(), panda_model()
+    front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
+    controller = ExcitationController(MotionLimits.of(robot), ExcitationSettings(seed=seed))
+    driver, watched = with_faults(simulated_arm(seed), text, FAULT_SEED), Watched(learner)
+    try:
+        result = run_lockstep(driver, front_end, watched, controller, seconds)
+    finally:
+        driver.close()
+    return FaultRun(text, driver, front_end, learner, result, watched.finite, watched.history)
+
+
+@cache
+def clean_run(seconds: float) -> FaultRun:
+    """The same without faults."""
+    return run_faulty("", seconds)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far two learners are apart.
+
+    Attributes:
+        theta: largest |θa - θb| over the root of the sum of both variances.
+        torque: rms of the same for torques (m, n) that the two predict on held-out motion.
+        rotation_rad, position_m: of λ, in its observable directions, largest over the links.
+        error_ratio: torque error of b on held-out motion over that of a.
+        torque_nm: rms of the difference of the predicted torques.
+    """
+
+    theta: float
+    torque: float
+    rotation_rad: float
+    position_m: float
+    error_ratio: float
+    torque_nm: float
+
+    def __str__(self) -> str:
+        return (
+            f"theta {self.theta:.2f} std, torque {self.torque:.2f} std ({self.torque_nm:.4f} N m), "
+            f"lambda {self.rotation_rad:.1e} rad {self.position_m:.1e} m, "
+            f"error x {self.error_ratio:.2f}"
+        )
+
+
+@cache
+def _held_out() -> tuple[np.ndarray, ...]:
+    return tuple(x[500::40] for x in record(arm(), Motion(6.0, 105), noisy=False).true)
+
+
+def _torque(learner: Learner, theta: np.ndarray) -> np.ndarray:
+    q, dq, ddq, _ = _held_out()
+    return model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq)
+
+
+def difference(a: Learner, b: Learner) -> Difference:
+    """Of the learner b from the learner a."""
+    one, two = collect(a), collect(b)
+    apart = (one.theta - two.theta).ravel()
+    covariance = (one.covariance + two.covariance)[: 10 * N, : 10 * N]
+    columns = np.array([_torque(a, unit.reshape(N, 10)) for unit in np.eye(10 * N)])
+    spread = np.sqrt(np.einsum("amj,ab,bmj->mj", columns, covariance, columns))
+    torque = np.einsum("a,amj->mj", apart, columns)
+    rotation, position = frame_errors(two.lam, one.lam, one.lam_identifiable)
+    tau = _held_out()[3]
+    errors = [np.linalg.norm(rms(tau - _torque(x, x.theta.theta))) for x in (a, b)]
+    return Difference(
+        theta=float((np.abs(apart) / np.sqrt(covariance.diagonal())).max()),
+        torque=float(np.sqrt(np.mean((torque / spread) ** 2))),
+        rotation_rad=float(rotation.max()),
+        position_m=float(position.max()),
+        error_ratio=float(errors[1] / errors[0]),
+        torque_nm=float(np.sqrt(np.mean(torque**2))),
+    )
+
+
+def grid(texts: tuple[str, ...] = EVERY_SHARE, seconds: float = 15.0) -> list[str]:
+    """A line for each of these faults, for people; what the soak prints."""
+    lines = []
+    for text in texts:
+        run = run_faulty(text, seconds)
+        run.check_balance()
+        reached = run.result.samples
+        end = f"{run.result.ended}: {run.result.fault}" if run.result.fault else run.result.ended
+        apart = difference(clean_run(seconds).learner, run.learner)
+        changes = len(run.learner.changes)
+        lines.append(
+            f"{text}: {reached} samples, learned {run.learner.learned}, refused {run.refused}, "
+            f"{end}; {apart}; changes {changes}; finite {run.finite}"
+        )
+    return lines
+
+
+if __name__ == "__main__":
+    import sys
+
+    print("\n".join(grid(tuple(sys.argv[1:]) or EVERY_SHARE)))

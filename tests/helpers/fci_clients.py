@@ -1,0 +1,357 @@
+"""The vendor's own clients in processes of their own, and the simulated robot for them.
+
+Run as a script, this file is such a client: `fci_clients.py PROTOCOL ACTION` does one thing with
+panda-python (5) or pylibfranka (10) and prints what it saw as JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+HERE = Path(__file__).resolve()
+PACKAGES = {5: "panda_py", 10: "pylibfranka"}
+PORT = 1337  # the clients know no other
+PORT_S, READY_S, CLIENT_S = 240.0, 120.0, 120.0
+DAMPING = np.array([4.0, 4.0, 4.0, 4.0, 0.5, 0.5, 0.1])  # N m s/rad
+
+
+def demand(protocol: int) -> None:
+    """Skip the test where the client is not installed, which CI must have."""
+    import pytest
+
+    package = PACKAGES[protocol]
+    if importlib.util.find_spec(package) is None:
+        assert not os.environ.get("CI"), f"CI needs {package}"
+        pytest.skip(f"{package} is not installed")
+
+
+@contextlib.contextmanager
+def robot(protocol: int, *faults: str, seed: int = 3):
+    """A simulated robot on the port that the clients know; one at a time on a machine.
+
+    Yields a function that ends the robot and returns its summary.
+    """
+    with tempfile.TemporaryDirectory() as folder, _port_to_ourselves():
+        summary = Path(folder) / "summary.json"
+        options = [word for fault in faults for word in ("--fault", fault)]
+        command = [
+            sys.executable, "-m", "sim.fci", "--protocol", str(protocol), "--seed", str(seed),
+            "--json", str(summary), *options,
+        ]  # fmt: skip
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
+        try:
+            _wait_until_ready(process, protocol)
+
+            def end() -> dict:
+                process.terminate()
+                process.communicate(timeout=READY_S)
+                assert process.returncode == 0
+                return json.loads(summary.read_text("utf-8"))
+
+            yield end
+        finally:
+            process.kill()
+            process.communicate()
+
+
+def client(protocol: int, action: str) -> dict:
+    """What a client saw that did one thing."""
+    command = [sys.executable, str(HERE), str(protocol), action]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=CLIENT_S)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _wait_until_ready(process: subprocess.Popen, protocol: int) -> None:
+    ready = f"listening on 127.0.0.1:{PORT} protocol {protocol}"
+    for line in process.stdout:
+        if line.strip() == ready:
+            return
+    raise AssertionError(f"the simulated robot did not start: exit {process.wait()}")
+
+
+@contextlib.contextmanager
+def _port_to_ourselves():
+    """Wait until no other test run uses the port."""
+    path = Path(tempfile.gettempdir()) / "simulated-fci-port.lock"
+    end = time.monotonic() + PORT_S
+    with path.open("w") as lock:
+        while True:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            assert time.monotonic() < end, f"{path} is held by another test run"
+            time.sleep(0.2)
+        yield
+
+
+class Panda:
+    """panda-python's Robot."""
+
+    def __init__(self) -> None:
+        import panda_py
+
+        self.lib = panda_py.libfranka
+        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
+
+    def state(self):
+        return self.robot.read_once()
+
+    def millisecond(self, state) -> int:
+        return state.time.to_msec()
+
+    def ids(self, count: int) -> list[int]:
+        found: list[int] = []
+
+        def look(state) -> bool:
+            found.append(self.millisecond(state))
+            return len(found) < count
+
+        self.robot.read(look)
+        return found
+
+    def torques(self, count: int, law) -> list[int]:
+        """A torque motion: law(k, state) -> torques (7,)."""
+        found: list[int] = []
+
+        def control(state, _period):
+            found.append(self.millisecond(state))
+            tau = self.lib.Torques([float(x) for x in law(len(found), state)])
+            return self.lib.motion_finished(tau) if len(found) >= count else tau
+
+        self.robot.control(control, False, 1000.0)  # neither rate limit nor low pass
+        return found
+
+    def joints(self, count: int, law) -> None:
+        """A motion by joint positions: law(ms since, q at the start) -> positions (7,)."""
+        start: list[tuple[int, np.ndarray]] = []
+
+        def control(state, _period):
+            now = self.millisecond(state)
+            if not start:
+                start.append((now, np.array(state.q_d)))
+            k = now - start[0][0] + 1
+            x = self.lib.JointPositions([float(v) for v in law(min(k, count), start[0][1])])
+            return self.lib.motion_finished(x) if k > count else x
+
+        mode = self.lib.ControllerMode.kJointImpedance
+        self.robot.control_joint_position(control, mode, False, 1000.0)
+
+
+class FR3:
+    """pylibfranka's Robot."""
+
+    def __init__(self) -> None:
+        import pylibfranka
+
+        self.lib = pylibfranka
+        self.robot = self.lib.Robot("127.0.0.1", self.lib.RealtimeConfig.kIgnore)
+
+    def state(self):
+        return self.robot.read_once()
+
+    def millisecond(self, state) -> int:
+        return round(1000 * state.time.to_sec())
+
+    def ids(self, count: int) -> list[int]:
+        return [self.millisecond(self.state()) for _ in range(count)]
+
+    def torques(self, count: int, law) -> list[int]:
+        control, found = self.robot.start_torque_control(), []
+        for k in range(1, count + 1):
+            state, _ = control.readOnce()
+            found.append(self.millisecond(state))
+            tau = self.lib.Torques([float(x) for x in law(k, state)])
+            tau.motion_finished = k == count
+            control.writeOnce(tau)
+        return found
+
+    def joints(self, count: int, law) -> None:
+        control = self.robot.start_joint_position_control(self.lib.ControllerMode.JointImpedance)
+        start, k = None, 0
+        while k <= count:  # by the robot's time: a state that was missed shall not slow it down
+            state, _ = control.readOnce()
+            now = self.millisecond(state)
+            start = start or (now, np.array(state.q_d))
+            k = now - start[0] + 1
+            x = self.lib.JointPositions([float(v) for v in law(min(k, count), start[1])])
+            x.motion_finished = k > count
+            control.writeOnce(x)
+
+
+def swing(k: int, state) -> np.ndarray:
+    """Small torques to and fro, damped."""
+    return 0.025 * DAMPING * np.sin(k / 200) - DAMPING * np.array(state.dq)
+
+
+def hold(k: int, state) -> np.ndarray:
+    """Damping alone."""
+    return -DAMPING * np.array(state.dq)
+
+
+def step(k: int, state) -> np.ndarray:
+    """5 N m at once on joint 1."""
+    return np.array([5.0 * (k > 50), 0, 0, 0, 0, 0, 0])
+
+
+def pause(k: int, state) -> np.ndarray:
+    """A client that does not answer for 0.2 s."""
+    if k == 50:
+        time.sleep(0.2)
+    return hold(k, state)
+
+
+def arc(k: int, q: np.ndarray) -> np.ndarray:
+    """Joints 1 and 4 by 0.2 rad and back in 2 s."""
+    return q + 0.1 * (1 - np.cos(np.pi * k / 1000)) * np.array([1, 0, 0, 1, 0, 0, 0])
+
+
+def too_far(k: int, q: np.ndarray) -> np.ndarray:
+    """A first position that is not where the robot stands."""
+    return q + 0.1
+
+
+def jerky(k: int, q: np.ndarray) -> np.ndarray:
+    """Joint 7 at 0.5 rad/s all of a sudden."""
+    return q + 5e-4 * max(k - 50, 0) * np.array([0, 0, 0, 0, 0, 0, 1])
+
+
+def _failure(what) -> str:
+    try:
+        what()
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def provoke(arm, what) -> dict:
+    """An error, a motion that is refused, recovery, a motion that is not."""
+    out = {"error": _failure(what)}
+    out["mode"], out["flags"] = str(arm.state().robot_mode), str(arm.state().current_errors)
+    out["refused"] = _failure(lambda: arm.torques(100, hold))
+    arm.robot.automatic_error_recovery()
+    out["again"] = len(arm.torques(100, hold))
+    arm.ids(50)  # states that queued up during the recovery are older than its end
+    out["mode_after"] = str(arm.state().robot_mode)
+    return out
+
+
+def wait_for_stop(arm) -> dict:
+    """The user stop during a motion; a motion while it is pressed, and one when it is not."""
+    out = {"error": _failure(lambda: arm.torques(20_000, hold))}
+    out["mode"] = str(arm.state().robot_mode)
+    out["refused"] = _failure(lambda: arm.torques(100, hold))
+    end = time.monotonic() + 60.0
+    while "Stop" in str(arm.state().robot_mode) and time.monotonic() < end:
+        pass
+    out["again"] = len(arm.torques(100, hold))
+    return out
+
+
+def move_joints(arm) -> dict:
+    """Where a motion by joint positions led half way and at its end."""
+    before = np.array(arm.state().q_d)
+    arm.joints(1000, arc)
+    middle = np.array(arm.state().q_d)
+    arm.joints(2000, lambda k, q: 2 * q - arc(k, q))
+    after = np.array(arm.state().q)
+    return {"moved": (middle - before).tolist(), "back": (after - middle).tolist()}
+
+
+def settings(arm) -> dict:
+    """What the robot makes of settings, good and bad."""
+    robot = arm.robot
+    set_ee = getattr(robot, "set_ee", None) or robot.set_EE
+    shifted = [*np.eye(4).ravel()[:12], 0.0, 0.0, 0.1, 1.0]
+    ball = [1e-3, 0, 0, 0, 1e-3, 0, 0, 0, 1e-3]
+    before = arm.state()
+    set_ee(shifted)
+    robot.set_load(0.5, [0.0, 0.01, 0.05], ball)
+    robot.set_joint_impedance([1000.0] * 7)
+    robot.set_collision_behavior([30.0] * 7, [40.0] * 7, [30.0] * 6, [40.0] * 6)
+    arm.ids(5)
+    after = arm.state()
+    return {
+        "raised": float(after.O_T_EE[14] - before.O_T_EE[14]),
+        "load": [float(after.m_load), *map(float, after.F_x_Cload), *map(float, after.I_load)],
+        "bad_load": _failure(lambda: robot.set_load(-1.0, [0.0] * 3, ball)),
+        "bad_frame": _failure(lambda: set_ee([2.0, *shifted[1:]])),
+        "stiff": _failure(lambda: robot.set_joint_impedance([15000.0] * 7)),
+    }
+
+
+def model_of_panda(_arm) -> dict:
+    """Everything that the model library computes, by panda_py.Panda."""
+    import panda_py
+
+    model, frames = panda_py.Panda("127.0.0.1").get_model(), panda_py.libfranka.Frame
+    rng = np.random.default_rng(8)
+    q, dq = rng.uniform(-1, 1, 7).tolist(), rng.uniform(-1, 1, 7).tolist()
+    tool = np.eye(4)
+    tool[:3, 3] = 0.02, -0.03, 0.1
+    pose = tool.ravel("F").tolist()
+    none = np.eye(4).ravel().tolist()
+    inertia, mass, com = [1e-3, 0, 0, 0, 2e-3, 0, 0, 0, 3e-3], 0.7, [0.01, 0.02, 0.06]
+    names = [f"kJoint{k}" for k in range(1, 8)] + ["kFlange", "kEndEffector"]
+    chosen = [getattr(frames, name) for name in names]
+    return {
+        "q": q, "dq": dq, "tool": tool.tolist(), "load": [mass, com, inertia],
+        "mass": model.mass(q, inertia, mass, com),
+        "coriolis": model.coriolis(q, dq, inertia, mass, com),
+        "gravity": model.gravity(q, mass, com, [0.0, 0.0, -9.81]),
+        "poses": [model.pose(frame, q, pose, none) for frame in chosen],
+        "zero": [model.zero_jacobian(frame, q, pose, none) for frame in chosen],
+        "body": [model.body_jacobian(frame, q, pose, none) for frame in chosen],
+    }  # fmt: skip
+
+
+def model_of_fr3(arm) -> dict:
+    """Gravity and mass by the URDF that the robot sent."""
+    model, state = arm.robot.load_model(), arm.state()
+    return {
+        "q": list(map(float, state.q)),
+        "gravity": list(map(float, model.gravity(state))),
+        "mass": list(map(float, np.ravel(model.mass(state)))),
+    }
+
+
+ACTIONS = {
+    "read": lambda arm: {"ids": arm.ids(1000)},
+    "torque": lambda arm: {"ids": arm.torques(3000, swing)},
+    "step": lambda arm: provoke(arm, lambda: arm.torques(500, step)),
+    "pause": lambda arm: provoke(arm, lambda: arm.torques(500, pause)),
+    "too_far": lambda arm: provoke(arm, lambda: arm.joints(500, too_far)),
+    "jerky": lambda arm: provoke(arm, lambda: arm.joints(500, jerky)),
+    "tripped": lambda arm: provoke(arm, lambda: arm.torques(20_000, hold)),
+    "user_stop": wait_for_stop,
+    "joints": move_joints,
+    "settings": settings,
+    "panda_model": model_of_panda,
+    "fr3_model": model_of_fr3,
+}
+
+
+def main() -> None:
+    """One action of one client."""
+    kind, action = {5: Panda, 10: FR3}[int(sys.argv[1])], sys.argv[2]
+    if action == "connect":
+        print(json.dumps({"error": _failure(kind)}))
+    elif action == "panda_model":  # makes its own connection, and the robot takes one at a time
+        print(json.dumps(model_of_panda(None)))
+    else:
+        print(json.dumps(ACTIONS[action](kind())))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""Hidden-effect trials without a simulator: the drawn motion, Pinocchio's torque, noise.
+
+No controller and no steps in time, so that a trial of 20 s takes a fraction of a second. The
+arm does exactly what it was told; everything else is as in `sim.hidden`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.signal import butter, sosfilt
+
+from sim.hidden import Trial, draw, nominal_urdf
+from sim.hidden.record import Recording, write_files
+from sim.noise import NoiseLevels
+from tests.helpers.gap_effects import Array, sense
+
+NOISE_STREAM = 1 << 35
+
+
+def sensor_noise(levels: NoiseLevels, shape: tuple[int, int], seed: int) -> tuple[Array, ...]:
+    """Noise (m, n) of q, dq and tau: white, and for tau a band from 10 to 40 Hz on top."""
+    rng = np.random.default_rng([seed, NOISE_STREAM])
+    whole = np.sqrt(0.9)  # nine tenths of white noise at 1 kHz are above 50 Hz
+    q, dq, white = (
+        np.asarray(level) / whole * rng.standard_normal(shape)
+        for level in (levels.q_above_50hz, levels.dq_above_50hz, levels.tau_above_50hz)
+    )
+    power = np.square(levels.tau_10_to_40hz) - 0.06 * np.square(levels.tau_above_50hz) / 0.9
+    band = sosfilt(
+        butter(4, [10, 40], "band", fs=1000, output="sos"), rng.standard_normal(shape), 0
+    )
+    return q, dq, white + np.sqrt(np.maximum(power, 0)) * band / band.std(axis=0)
+
+
+def recorded(trial: Trial, q: Array, dq: Array, tau: Array, commands: Array | None) -> Recording:
+    """Noise-free readings (m, n) as they are recorded."""
+    more = sensor_noise(trial.noise, q.shape, trial.seed)
+    q, dq, tau = (x + e for x, e in zip((q, dq, tau), more, strict=True))
+    step = np.asarray(trial.noise.tau_step)
+    stamps = 1_000_000 * np.arange(len(q), dtype=np.int64)
+    names = trial.arm.joint_names
+    return Recording(names, stamps, q, dq, np.round(tau / step) * step, commands)
+
+
+def pinocchio_recording(trial: Trial) -> Recording:
+    """The recording of a trial, by Pinocchio alone."""
+    q, dq, tau = sense(trial.arm, trial.effects, trial.times, *trial.motion.at(trial.times))
+    return recorded(trial, q, dq, tau + trial.disturbance(), None)
+
+
+def pinocchio_trial(
+    seed: int, kind: str | None = None, effect: str | None = None
+) -> tuple[Recording, str, dict[str, Any]]:
+    """Recording, nominal URDF and truth of a seed; see `sim.hidden.draw`."""
+    trial = draw(seed, kind, effect)
+    return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth_of(trial, "pinocchio")
+
+
+def truth_of(trial: Trial, simulator: str) -> dict[str, Any]:
+    """Contents of the truth file."""
+    return {**trial.as_dict(), "simulator": simulator}
+
+
+def write_trial(
+    trial: tuple[Recording, str, dict[str, Any]], folder: Path | str
+) -> tuple[Path, Path, Path]:
+    """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths."""
+    recording, urdf, truth = trial
+    return write_files(recording, urdf, truth, Path(folder))

@@ -1,0 +1,127 @@
+"""Simulated hardware for the contract: FCI server and CAN boards, each behind its real wire."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from drivers.damiao.arm import DamiaoArm
+from drivers.fci.arm import FciArm
+from drivers.interface import JointSample
+from sim.damiao.server import Boards
+from sim.scenarios import build
+from tests.helpers.board_tools import free_port
+from tests.helpers.contract_suite import Make
+
+SERVE_CAN = (
+    "import argparse, sys; from sim.damiao.command import run; "
+    "from sim.damiao.options import add_arguments; "
+    "p = argparse.ArgumentParser(); add_arguments(p); sys.exit(run(p.parse_args()))"
+)
+
+
+class OnTime:
+    """A driver that does not pace itself, read once a period as the loop does."""
+
+    def __init__(self, driver) -> None:
+        self._driver, self._due_s = driver, 0.0
+
+    def __getattr__(self, name: str):
+        return getattr(self._driver, name)
+
+    def read(self) -> JointSample:
+        """Wait for the tick, then read."""
+        now_s = time.monotonic()
+        time.sleep(max(0.0, self._due_s - now_s))
+        self._due_s = max(self._due_s, now_s) + 1e-9 * self._driver.period_ns
+        return self._driver.read()
+
+
+@contextmanager
+def process(*command: str) -> Iterator[str]:
+    """A server in a process of its own; gives the line it says when it is ready."""
+    with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        try:
+            yield server.stdout.readline()
+        finally:
+            server.terminate()
+            try:
+                server.communicate(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                server.kill()
+
+
+@contextmanager
+def closing() -> Iterator[list]:
+    """Drivers that are closed whatever happens."""
+    arms: list = []
+    try:
+        yield arms
+    finally:
+        for arm in arms:
+            arm.stop()
+            arm.close()
+
+
+def fci(protocol: int, allow_motion: bool):
+    """The FCI server of one protocol, and drivers that may move it or not."""
+
+    @contextmanager
+    def start() -> Iterator[Make]:
+        server = process("-m", "sim.fci", "--port", "0", "--protocol", str(protocol))
+        with server as line, closing() as arms:
+            where = line.split()[2]
+
+            def make() -> FciArm:
+                for arm in arms:
+                    arm.close()  # the robot serves one client at a time
+                arms.append(FciArm(f"fci://{where}", allow_motion=allow_motion))
+                return arms[-1]
+
+            yield make
+
+    return start
+
+
+@contextmanager
+def can_multicast() -> Iterator[Make]:
+    """Boards in a process of their own, on UDP multicast."""
+    options = ["--interface", "udp_multicast", "--port", str(free_port())]
+    with process("-c", SERVE_CAN, *options) as line, closing() as arms:
+        address = line.split()[-1]
+        yield _maker(arms, address)
+
+
+@contextmanager
+def can_virtual() -> Iterator[Make]:
+    """Boards in a thread of this process, on python-can's virtual bus."""
+    import can
+
+    channel, stop = "every_driver", threading.Event()
+    bus = can.Bus(channel, interface="virtual", protocol=can.CanProtocol.CAN_FD)
+    boards = Boards(bus, build("nominal"))
+    server = threading.Thread(target=boards.serve, args=(stop,))
+    server.start()
+    try:
+        with closing() as arms:
+            yield _maker(arms, f"can://{channel}?interface=virtual&guardian=0")
+    finally:
+        stop.set()
+        server.join(10.0)
+        boards.close()
+        bus.shutdown()
+
+
+def _maker(arms: list, address: str) -> Make:
+    def make():
+        for arm in arms:
+            arm.close()
+        arms.append(OnTime(DamiaoArm(address, allow_motion=True)))
+        return arms[-1]
+
+    return make

@@ -1,0 +1,191 @@
+"""Robots for the oracle tests, and Pinocchio's answers brought into the adapter's frames."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import torch
+
+from adapter.errors import ModelWarning
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import exp_rotation, rpy_from_matrix, z_to_axis
+from adapter.model.urdf import model_from_urdf
+from adapter.physics.networks import LinkMotion
+
+SHARED = Path(__file__).parents[2].parent / "shared"
+PANDA = Path(__file__).parents[2] / "adapter" / "model" / "robots" / "panda.urdf"
+ROBOTS = ("panda", "atlas", "talos", "lwr4", "tree5", "tree17", "tree33", "tree60")
+_FILES = {
+    "atlas": "models/atlas_v5.urdf",
+    "talos": "models/talos_reduced.urdf",
+    "lwr4": "data/lwr4/kuka_lwr4.urdf",
+}
+_SPECIAL_AXES = ("1 0 0", "0 1 0", "0 0 1", "-1 0 0", "0 -1 0", "0 0 -1")
+
+
+def shared(relative: str) -> Path:
+    """A file of the shared folder; skips the test where there is none."""
+    path = SHARED / relative
+    if not path.exists():
+        pytest.skip(f"{path} is not here: the shared folder stays with the project's makers")
+    return path
+
+
+def urdf_text(name: str) -> str:
+    """The URDF of a robot of `ROBOTS`."""
+    if name.startswith("tree"):
+        links = int(name.removeprefix("tree"))
+        return random_urdf(links, seed=links)
+    path = PANDA if name == "panda" else shared(_FILES[name])
+    return path.read_text()
+
+
+def random_urdf(links: int, seed: int) -> str:
+    """A tree of `links` moving links with any axes, some fixed links with mass among them."""
+    rng = np.random.default_rng(seed)
+    parts = [_link("base", rng)]
+    names = ["base"]
+    moving = 0
+    while moving < links:
+        name = f"l{len(names)}"
+        parent = names[int(rng.integers(max(0, len(names) - 6), len(names)))]
+        fixed = bool(rng.random() < 0.25)
+        moving += not fixed
+        parts += [_link(name, rng), _joint(name, parent, fixed, rng)]
+        names.append(name)
+    return '<robot name="random">\n' + "\n".join(parts) + "\n</robot>"
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _link(name: str, rng: np.random.Generator) -> str:
+    points = rng.normal(size=(8, 3)) * 0.1  # point masses: any inertia they have is possible
+    mass = float(rng.uniform(0.2, 5.0))
+    second = mass * np.cov(points.T)
+    i = np.trace(second) * np.eye(3) - second
+    keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2]}
+    keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
+    six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
+    xyz, rpy = _text(rng.normal(size=3) * 0.1), _text(rng.uniform(-3, 3, 3))
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/>'
+        f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
+    )
+
+
+def _joint(name: str, parent: str, fixed: bool, rng: np.random.Generator) -> str:
+    special = bool(rng.random() < 0.5)
+    axis = str(rng.choice(_SPECIAL_AXES)) if special else _text(rng.normal(size=3))
+    kind = "fixed" if fixed else str(rng.choice(["revolute", "continuous"]))
+    limit = '<limit lower="-2" upper="2" velocity="3" effort="50"/>' if kind == "revolute" else ""
+    xyz = _text(rng.normal(size=3) * 0.3)
+    rpy = _text(rpy_from_matrix(exp_rotation(rng.normal(size=3))))
+    return (
+        f'<joint name="j_{name}" type="{kind}"><parent link="{parent}"/><child link="{name}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>{limit}</joint>'
+    )
+
+
+def read_quietly(text: str, floating: bool = False) -> SelfModel:
+    """The model of a URDF's text, warnings about locked joints aside."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return model_from_urdf(text, floating=floating)
+
+
+@dataclass
+class Case:
+    """A robot in random motion: joint signals, base, and what Pinocchio makes of them."""
+
+    model: SelfModel
+    q: torch.Tensor
+    dq: torch.Tensor
+    ddq: torch.Tensor
+    base: torch.Tensor | LinkMotion
+    motion: LinkMotion
+    tau: np.ndarray
+
+
+def pinocchio_case(text: str, floating: bool, samples: int = 5, seed: int = 1) -> Case:
+    """Random motion of a robot, its link motion and torques by Pinocchio, in our frames."""
+    model = read_quietly(text, floating)
+    oracle = pin_model(text, floating)
+    rng = np.random.default_rng(seed)
+    signals, motions, torques, bases = [], [], [], []
+    for _ in range(samples):
+        q, dq, ddq = rng.uniform(-3, 3, model.tree.n), *rng.normal(size=(2, model.tree.n)) * 2
+        full = _configuration(oracle, model, q, dq, ddq, rng)
+        data = oracle.createData()
+        pin.forwardKinematics(oracle, data, *full)
+        gravity = oracle.gravity.linear
+        bodies = [_body(oracle, data, model, name, gravity) for name in model.tree.joint_names]
+        if floating:
+            root = _motion(oracle, data, 1, np.eye(3), gravity)
+            bases.append(root)
+            bodies.insert(0, root)
+        signals.append((q, dq, ddq))
+        motions.append(np.stack(bodies))
+        torques.append(_torques(oracle, pin.rnea(oracle, data, *full), model))
+    motion = LinkMotion(*(torch.from_numpy(np.stack(motions)[:, :, k]) for k in range(4)))
+    if floating:
+        base: torch.Tensor | LinkMotion = LinkMotion(
+            *(torch.from_numpy(np.stack(bases)[:, k]) for k in range(4))
+        )
+    else:
+        base = torch.from_numpy(model.gravity)
+    q_t, dq_t, ddq_t = (torch.from_numpy(np.stack(x)) for x in zip(*signals, strict=True))
+    return Case(model, q_t, dq_t, ddq_t, base, motion, np.stack(torques))
+
+
+def pin_model(text: str, floating: bool = False) -> pin.Model:
+    """Pinocchio's model of a URDF."""
+    if floating:
+        return pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+    return pin.buildModelFromXML(text)
+
+
+def _configuration(oracle, model, q, dq, ddq, rng):  # type: ignore[no-untyped-def]
+    """Pinocchio's q, v, a; the base in random motion where it floats."""
+    full_q, full_v, full_a = pin.neutral(oracle), np.zeros(oracle.nv), np.zeros(oracle.nv)
+    if model.tree.floating:
+        quaternion = rng.normal(size=4)
+        full_q[:3], full_q[3:7] = rng.normal(size=3), quaternion / np.linalg.norm(quaternion)
+        full_v[:6], full_a[:6] = rng.normal(size=6), rng.normal(size=6) * 3
+    for k, name in enumerate(model.tree.joint_names):
+        joint = oracle.joints[oracle.getJointId(name)]
+        turn = [q[k]] if joint.nq == 1 else [np.cos(q[k]), np.sin(q[k])]
+        full_q[joint.idx_q : joint.idx_q + joint.nq] = turn
+        full_v[joint.idx_v], full_a[joint.idx_v] = dq[k], ddq[k]
+    return full_q, full_v, full_a
+
+
+def _body(oracle, data, model, joint, gravity):  # type: ignore[no-untyped-def]
+    turn = z_to_axis(model.axis[model.tree.joint_names.index(joint)])
+    return _motion(oracle, data, oracle.getJointId(joint), turn, gravity)
+
+
+def _motion(oracle, data, number, turn, gravity):  # type: ignore[no-untyped-def]
+    """[v w a dw] (4, 3) of a joint's frame, turned; `a` as an accelerometer reads it."""
+    twist = data.v[number]
+    accel = pin.getClassicalAcceleration(oracle, data, number, pin.LOCAL)
+    lifted = accel.linear - data.oMi[number].rotation.T @ gravity
+    return np.stack([twist.linear, twist.angular, lifted, accel.angular]) @ turn
+
+
+def _torques(oracle, tau, model):  # type: ignore[no-untyped-def]
+    places = [oracle.joints[oracle.getJointId(name)].idx_v for name in model.tree.joint_names]
+    return np.concatenate([tau[:6] if model.tree.floating else [], tau[places]])
+
+
+def relative(found: object, expected: object) -> float:
+    """Largest error over the largest expected magnitude."""
+    a, b = np.asarray(found), np.asarray(expected)
+    assert a.shape == b.shape
+    return float(np.max(np.abs(a - b)) / np.max(np.abs(b)))

@@ -1,0 +1,144 @@
+"""A tree in smooth random motion, floating in free fall or on a still base, by Pinocchio."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from adapter.learning.tree_data import BodyMotion, TreeData
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import z_to_axis
+from adapter.model.urdf import model_from_urdf
+
+FREQUENCIES_HZ = (0.15, 0.9)
+WIDEST_RAD = 0.9  # swing of a joint without narrow limits
+
+
+def joint_motion(model: SelfModel, t: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
+    """q, dq, ddq (m, n): three sines a joint, inside its limits."""
+    rng = np.random.default_rng(seed)
+    n = model.tree.n
+    lower, upper = (np.clip(x, -np.pi, np.pi) for x in (model.limits.lower, model.limits.upper))
+    middle, half = 0.5 * (lower + upper), np.minimum(0.45 * (upper - lower), WIDEST_RAD)
+    size = rng.dirichlet(np.ones(3), n) * half[:, None]
+    omega = 2 * np.pi * rng.uniform(*FREQUENCIES_HZ, (n, 3))
+    angle = omega * t[:, None, None] + rng.uniform(0, 2 * np.pi, (n, 3))
+    q = middle + (size * np.sin(angle)).sum(axis=2)
+    dq = (size * omega * np.cos(angle)).sum(axis=2)
+    return q, dq, -(size * omega**2 * np.sin(angle)).sum(axis=2)
+
+
+def in_motion(text: str, floating: bool, seconds: float, seed: int, rate_hz: float = 1e3) -> tuple:
+    """The documented model of a URDF's text and samples of it, free of noise.
+
+    In free fall the base feels no gravity, so Pinocchio's model has none; its base's acceleration
+    is the one that leaves no wrench there.
+    """
+    model = model_from_urdf(text, floating=floating)
+    args = (pin.JointModelFreeFlyer(),) if floating else ()
+    oracle = pin.buildModelFromXML(text, *args)
+    data = oracle.createData()
+    if floating:
+        oracle.gravity = pin.Motion.Zero()
+    gravity, n = oracle.gravity.linear.copy(), model.tree.n
+    dt, m = 1.0 / rate_hz, round(seconds * rate_hz)
+    q, dq, ddq = joint_motion(model, dt * np.arange(m), seed)
+    numbers = [oracle.getJointId(name) for name in model.tree.joint_names]
+    joints = [oracle.joints[k] for k in numbers]
+    turns = [z_to_axis(axis) for axis in model.axis]
+    base, links = np.zeros((m, 12)), np.zeros((m, n, 12))
+    tau = np.zeros((m, model.tree.rows))
+    places = [joint.idx_v for joint in joints]
+    full_q, full_v, full_a = pin.neutral(oracle), np.zeros(oracle.nv), np.zeros(oracle.nv)
+    speed = 0.3 * np.random.default_rng(seed + 1000).normal(size=6)
+    before = np.zeros(6)
+    for k in range(m):
+        for j, joint in enumerate(joints):
+            angle = q[k, j]
+            turn = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+            full_q[joint.idx_q : joint.idx_q + joint.nq] = turn
+        full_v[places], full_a[places] = dq[k], ddq[k]
+        if floating:
+            full_v[:6], full_a[:6] = speed, 0.0
+            wrench = pin.rnea(oracle, data, full_q, full_v, full_a)[:6].copy()
+            inertia = pin.crba(oracle, data, full_q)[:6, :6]
+            full_a[:6] = -np.linalg.solve(inertia, wrench)
+            speed = speed + dt * (1.5 * full_a[:6] - 0.5 * (before if k else full_a[:6]))
+            before = full_a[:6].copy()
+        torque = pin.rnea(oracle, data, full_q, full_v, full_a)
+        pin.forwardKinematics(oracle, data, full_q, full_v, full_a)
+        tau[k] = np.concatenate([torque[: tau.shape[1] - n], torque[places]])
+        base[k] = _row(oracle, data, 1, np.eye(3), gravity) if floating else 0.0
+        for j, number in enumerate(numbers):
+            links[k, j] = _row(oracle, data, number, turns[j], gravity)
+    if not floating:
+        base[:, 6:9] = -gravity
+    samples = TreeData(model.tree, q, dq, ddq, tau, _motion(base), _motion(links))
+    return model, samples
+
+
+def _row(oracle, data, number, turn, gravity):  # type: ignore[no-untyped-def]
+    """[v w a dw] (12,) of a joint's frame, turned to its axis; `a` with gravity."""
+    twist = data.v[number]
+    accel = pin.getClassicalAcceleration(oracle, data, number, pin.LOCAL)
+    lifted = accel.linear - data.oMi[number].rotation.T @ gravity
+    return (np.stack([twist.linear, twist.angular, lifted, accel.angular]) @ turn).ravel()
+
+
+def _motion(rows: np.ndarray) -> BodyMotion:
+    v, w, a, dw = (np.ascontiguousarray(rows[..., k : k + 3]) for k in (0, 3, 6, 9))
+    return BodyMotion(w, a, dw, v)
+
+
+def with_noise(samples: TreeData, seed: int, scale: float = 1.0) -> TreeData:
+    """Noise of usual parts on everything measured: encoder, gyro, accelerometer, torque."""
+    rng = np.random.default_rng(seed)
+
+    def noisy(x: np.ndarray, std: object) -> np.ndarray:
+        return x + scale * std * rng.normal(size=x.shape)
+
+    def moving(motion: BodyMotion) -> BodyMotion:
+        v = None if motion.v is None else noisy(motion.v, 2e-3)
+        return BodyMotion(noisy(motion.w, 2e-3), noisy(motion.a, 2e-2), noisy(motion.dw, 2e-2), v)
+
+    tau = samples.tau.copy()
+    joints = tau[:, tau.shape[1] - samples.tree.n :]
+    joints += scale * 0.01 * joints.std(axis=0) * rng.normal(size=joints.shape)
+    links = None if samples.links is None else moving(samples.links)
+    signals = noisy(samples.q, 2e-5), noisy(samples.dq, 1e-3), noisy(samples.ddq, 2e-2)
+    return TreeData(samples.tree, *signals, tau, moving(samples.base), links)
+
+
+def random_tree_text(links: int, seed: int) -> str:
+    """URDF of a tree of turning joints with random bodies, no limit wider than 2 rad."""
+    rng = np.random.default_rng(seed)
+    parts, names = [_link_text("base", rng)], ["base"]
+    for k in range(links):
+        parent = names[max(0, len(names) - 1 - int(rng.integers(0, 3)))]
+        axis, xyz = rng.normal(size=3), 0.25 * rng.normal(size=3)
+        rpy = rng.uniform(-3, 3, 3)
+        parts.append(_link_text(f"l{k}", rng))
+        parts.append(
+            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+            f'<origin xyz="{_text(xyz)}" rpy="{_text(rpy)}"/><axis xyz="{_text(axis)}"/>'
+            '<limit lower="-2" upper="2" velocity="5" effort="50"/></joint>'
+        )
+        names.append(f"l{k}")
+    return '<robot name="random">' + "".join(parts) + "</robot>"
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _link_text(name: str, rng: np.random.Generator) -> str:
+    mass = float(rng.uniform(0.5, 5.0))
+    second = mass * np.cov(0.1 * rng.normal(size=(3, 8)))  # of point masses: a possible body
+    i = np.trace(second) * np.eye(3) - second
+    keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2]}
+    keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
+    six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{_text(0.1 * rng.normal(size=3))}"/>'
+        f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
+    )

@@ -1,0 +1,60 @@
+"""Friction is looked for on every foreign log; where there is none, looking must cost nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.torque import ModelTorque
+from adapter.learning.learner import Learner
+from tests.helpers.arm_data import (
+    Motion,
+    arm,
+    learner_for,
+    panda_model,
+    pin_model,
+    record,
+    rnea,
+    rubbing,
+    states_of,
+    trajectory,
+)
+
+SECONDS = 15.0
+
+
+def learned(seed: int, effects: tuple[str, ...], friction: bool = False) -> Learner:
+    truth = rubbing(0.3, 0.05) if friction else arm()
+    learner = learner_for(effects=effects, seed=seed)
+    for state in states_of(record(truth, Motion(SECONDS, seed=seed))):
+        learner.step(state)
+    return learner
+
+
+def held_out_error(learner: Learner) -> float:
+    """Torque error on a motion that was not learned from, effects included, N m rms."""
+    q, dq, ddq = (x[::20] for x in trajectory(Motion(10.0, seed=99)))
+    model = ModelTorque(replace(panda_model(), theta=learner.theta.theta))
+    tau = model(q, dq, ddq)
+    for gain, effect in zip(learner.theta.effect_values, learner.theta.effects, strict=True):
+        tau = tau + gain * effect.column(q, dq, ddq)
+    return float(np.sqrt(np.mean((tau - rnea(pin_model(arm()), q, dq, ddq)) ** 2)))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_is_not_there_fades(seed: int) -> None:
+    plain, looking = learned(seed, ()), learned(seed, REAL_ARM_EFFECTS)
+    theta = looking.theta
+    widest = np.array([effect.prior_std for effect in theta.effects])
+    assert (theta.effect_spread < 0.02 * widest).all()
+    assert np.abs(theta.effect_values[:3]).max() < 0.02
+    assert theta.model_variance == pytest.approx(0.001**2)
+    assert held_out_error(looking) < 1.25 * held_out_error(plain)
+
+
+def test_what_is_there_stays() -> None:
+    theta = learned(0, REAL_ARM_EFFECTS, friction=True).theta
+    assert 0.2 < theta.effect_spread[1] < 0.5
+    assert np.allclose(theta.effect_values[1], 0.3, atol=0.05)
+    assert theta.model_variance > 0.001**2

@@ -1,0 +1,63 @@
+"""Our call of torch's functional ADAM against torch's optimizer."""
+
+import numpy as np
+import pytest
+import torch
+
+from adapter.learning.adam import EPS, FUSED, FlatAdam
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_are_those_of_torch_bit_for_bit(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    betas, rate = (0.97, 0.99), 3e-3
+    ours, theirs = FlatAdam(150, rate, betas), torch.zeros(150, dtype=torch.float64)
+    optimizer = torch.optim.Adam([theirs], lr=rate, betas=betas, eps=EPS, fused=True)
+    for k in range(200):
+        gradient = rng.normal(size=150) * 10.0 ** rng.uniform(-6, 6)
+        ours.gradient[:] = gradient
+        theirs.grad = torch.from_numpy(gradient)
+        if k == 100:
+            ours.rate = optimizer.param_groups[0]["lr"] = 1e-4
+        ours.step()
+        optimizer.step()
+    assert np.array_equal(ours.parameters, theirs.numpy())
+    assert ours.steps == 200
+
+
+def test_without_the_private_operator_the_numbers_are_the_same(monkeypatch) -> None:
+    """Rates that change, averages forgotten and a count put back included."""
+    rng, betas = np.random.default_rng(0), (0.97, 0.99)
+    fused = FlatAdam(40, 3e-3, betas)
+    monkeypatch.delattr(torch, FUSED)
+    plain = FlatAdam(40, 3e-3, betas)
+    monkeypatch.undo()
+    for k in range(300):
+        gradient = rng.normal(size=40) * 10.0 ** rng.uniform(-6, 6)
+        for adam in (fused, plain):
+            adam.gradient[:] = gradient
+            adam.rate = 3e-3 if k < 100 else 1e-4
+            if k == 150:
+                adam.forget(slice(10, 20))
+            if k == 200:
+                adam.steps = 20
+            adam.step()
+    for name in ("parameters", "first", "second"):
+        assert np.allclose(getattr(plain, name), getattr(fused, name), rtol=1e-10, atol=1e-14)
+    assert plain.steps == fused.steps == 120 and np.abs(plain.parameters).min() > 0.0
+
+
+def test_no_gradient_no_step() -> None:
+    adam = FlatAdam(5, 1e-2, (0.9, 0.999))
+    adam.parameters[:] = np.arange(5)
+    for _ in range(10):
+        adam.step()
+    assert np.array_equal(adam.parameters, np.arange(5))
+
+
+def test_forgetting_a_part_leaves_the_rest() -> None:
+    adam = FlatAdam(4, 1e-2, (0.9, 0.999))
+    adam.gradient[:] = 1.0
+    adam.step()
+    adam.forget(slice(2, None))
+    assert (adam.first[:2] > 0).all() and not adam.first[2:].any() and not adam.second[2:].any()

@@ -1,0 +1,198 @@
+"""A load at the hand is noticed and weighed; without one, or at rest, nothing moves."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from adapter.learning.change import ChangeDetector, ChangeSettings
+from adapter.learning.learner import Learner
+from adapter.learning.theta import ThetaSettings
+from adapter.runs.outcome import changes, collect, learned_model
+from adapter.signals.records import stamps_of
+from sim.scenarios import build
+from sim.truth import Truth
+from tests.helpers.arm_data import (
+    Motion,
+    arm,
+    learner_for,
+    model_torque,
+    panda_model,
+    record,
+    rms,
+    states_of,
+)
+
+AT_S = 20.0
+MASSES = (0.1, 0.3, 1.0)
+
+
+@cache
+def loaded_arm(mass: float) -> Truth:
+    return build("payload_at_20s", mass=mass, t_s=AT_S).truth
+
+
+def held_out_error(learner: Learner, truth: Truth, seed: int = 101) -> np.ndarray:
+    q, dq, ddq, tau = record(truth, Motion(6.0, seed), noisy=False).true
+    theta = learner.theta.theta
+    return rms(tau - model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq))
+
+
+class WithLoad:
+    """A learner that gets a load on the way, and what it looked like at four instants."""
+
+    def __init__(self, mass: float, seed: int) -> None:
+        data = record(loaded_arm(mass), Motion(AT_S + 5.2, seed))
+        self.learner = learner = learner_for(seed=seed)
+        states = states_of(data)
+        stamps = 1e-9 * stamps_of(states)
+        split = int(np.searchsorted(stamps, AT_S - 0.05))
+        for state in states[:split]:
+            learner.step(state)
+        self.frames = learner.schema.R0.copy(), learner.schema.p.copy()
+        self.theta = learner.theta.theta.copy()
+        for state in states[split:]:
+            learner.step(state)
+        rows = learner.score_trace.rows
+        self.time_s, self.error = 1e-9 * rows[:, 0], rows[:, -7:]
+
+
+@cache
+def with_load(mass: float, seed: int = 1) -> WithLoad:
+    return WithLoad(mass, seed)
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_a_load_is_noticed_once_and_soon(mass: float) -> None:
+    run = with_load(mass)
+    seen = [1e-9 * change.stamp_ns for change in run.learner.changes]
+    assert len(seen) == 1
+    assert AT_S - 0.05 < seen[0] < AT_S + 0.3
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_load_is_weighed(mass: float) -> None:
+    """Within 5 % after 5 s for 0.3 and 1 kg; 0.1 kg within its std or a fifth."""
+    run = with_load(mass)
+    theta, covariance = run.learner.theta.payload
+    slack = 0.05 * mass if mass >= 0.3 else 0.2 * mass
+    assert theta[0] == pytest.approx(mass, abs=slack)
+    assert abs(theta[0] - mass) < 4.0 * np.sqrt(covariance[0, 0]) + 0.01 * mass
+    com = [loaded_arm(mass).effects[0].number(key) for key in ("cx", "cy", "cz")]
+    assert np.abs(theta[1:4] / theta[0] - com).max() < (0.02 if mass >= 0.3 else 0.06)
+    told = changes(collect(run.learner))
+    assert len(told) == 1 and told[0]["payload"]["m"] == theta[0]
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_torque_error_is_back_within_a_second(mass: float) -> None:
+    run = with_load(mass)
+    before = (run.time_s > AT_S - 2.0) & (run.time_s < AT_S - 0.1)
+    after = (run.time_s > AT_S + 0.8) & (run.time_s < AT_S + 1.0)
+    level, now = (np.sqrt(np.mean(run.error[k] ** 2)) for k in (before, after))
+    assert now < 1.5 * level
+
+
+def test_the_model_knows_the_hand_as_well_as_its_load_is_known() -> None:
+    """Its standard deviations are those of the body with the load, not of the bare hand."""
+    learner = with_load(1.0).learner
+    theta, model = learner.theta, learned_model(collect(learner), panda_model())
+    std = np.sqrt(theta.covariance().diagonal())
+    assert np.allclose(model.theta_std[-1], std[theta.spare])
+    assert np.allclose(model.theta_std[:-1].ravel(), std[: theta.hand.start])
+    assert not np.allclose(std[theta.spare], std[theta.hand], rtol=0.02)
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_lambda_has_not_moved(mass: float) -> None:
+    run = with_load(mass)
+    R0, p = run.frames
+    assert np.abs(run.learner.schema.R0 - R0).max() < 1e-6
+    assert np.abs(run.learner.schema.p - p).max() < 1e-6
+
+
+@pytest.mark.parametrize("mass", MASSES)
+def test_the_other_links_stay_what_they_were(mass: float) -> None:
+    """What was known of the arm is known still: the error with the load on is small."""
+    run = with_load(mass)
+    truth = arm()
+    (load,) = loaded_arm(mass).effects
+    gone = truth.with_changes(effects=(replace(load, interval_s=None),))
+    error = held_out_error(run.learner, gone)
+    before = held_out_error_of(run, truth)
+    assert (error < 2.0 * before + 0.02).all()
+
+
+def held_out_error_of(run: WithLoad, truth: Truth) -> np.ndarray:
+    """With the θ from before the load, on the bare arm."""
+    q, dq, ddq, tau = record(truth, Motion(6.0, 101), noisy=False).true
+    return rms(tau - model_torque(panda_model(), run.learner.schema.lam, run.theta, q, dq, ddq))
+
+
+@pytest.mark.parametrize("seed", range(11, 14))
+def test_no_false_alarm(seed: int) -> None:
+    learner = learner_for(seed=seed)
+    for state in states_of(record(arm(), Motion(14.0, seed))):
+        learner.step(state)
+        assert not learner.change.waiting
+    assert not learner.changes and learner.theta.payload is None
+
+
+@pytest.mark.parametrize("joint", [0, 6])
+def test_directional_forgetting_does_not_wind_up(joint: int) -> None:
+    """All joints for 8 s, then one alone for 12 s while 2 s are remembered."""
+    motion = Motion(20.0, 5, alone=(joint, 8.0))
+    states = states_of(record(arm(), motion))
+    learner = learner_for(theta=ThetaSettings(forget_s=2.0))
+    stamps = 1e-9 * stamps_of(states)
+    middle = None
+    for stamp, state in zip(stamps, states, strict=True):
+        if middle is None and stamp > 8.0:
+            middle = held_out_error(learner, arm())
+        learner.step(state)
+    noise = np.sqrt(learner.theta.variance())
+    end = held_out_error(learner, arm())
+    assert np.linalg.norm(end / noise) < 1.5 * np.linalg.norm(middle / noise)
+    assert not learner.changes
+    moments = [learner.theta.joint_moments(j) for j in range(7)]
+    assert all(np.linalg.eigvalsh(a)[0] > -1e-6 * np.abs(a).max() for a in moments)
+
+
+@pytest.mark.parametrize("forget_s", [None, 2.0])
+def test_at_rest_nothing_moves(forget_s: float | None) -> None:
+    """A minute at rest; then the next motion starts where the last ended."""
+    data = record(arm(), Motion(68.0, 6, rests=((5.0, 66.0),)))
+    states = states_of(data)
+    stamps = 1e-9 * stamps_of(states)
+    assert not ((stamps > 6.1) & (stamps < 65.9)).any()
+    learner = learner_for(theta=ThetaSettings(forget_s=forget_s))
+    split = int(np.searchsorted(stamps, 30.0))
+    for state in states[:split]:
+        learner.step(state)
+    before, lam = held_out_error(learner, arm()), learner.schema.lam
+    for state in states[split:]:
+        learner.step(state)
+    after = held_out_error(learner, arm())
+    noise = np.sqrt(learner.theta.variance())
+    assert np.linalg.norm(after / noise) < 1.2 * np.linalg.norm(before / noise)
+    assert np.abs(learner.schema.lam[1:, 3:] - lam[1:, 3:]).max() < 1e-4
+    assert not learner.changes
+
+
+def test_a_second_change_is_seen_once_the_first_is_learned_and_not_before() -> None:
+    """Behind a change the error is large until the new load is learned; that is no other one."""
+    settings = ChangeSettings(fast=20, slow=200, arm_after=500, rearm_after=800, wait=30)
+    detector = ChangeDetector(3, settings)
+    rng = np.random.default_rng(3)
+
+    def look(samples: int, size: float) -> list[int]:
+        errors = size * rng.normal(size=(samples, 1, 3))
+        return [k for k, error in enumerate(errors) if detector.look(error)]
+
+    assert look(2000, 1.0) == []
+    first = look(300, 8.0)
+    assert len(first) == 1 and first[0] < 80
+    assert look(200, 1.0) == [] and look(100, 40.0) == []  # not armed again
+    assert look(4000, 1.0) == []
+    assert len(look(300, 40.0)) == 1

@@ -1,0 +1,354 @@
+"""θ learned in batch: Pinocchio's torques back, possible bodies, wrenches, noise, signals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+
+from adapter.errors import ModelError
+from adapter.learning.batch.branches import branches
+from adapter.learning.batch.prediction_errors import (
+    kinematic_errors,
+    predicted_torques,
+    relative_errors,
+    torque_errors,
+)
+from adapter.learning.batch.schema import schema_from_moments
+from adapter.learning.batch.smoothing import Measured, SmoothingSettings, smoothed_data
+from adapter.learning.batch.theta import BatchThetaSettings, learn_theta
+from adapter.learning.batch.theta_factors import row_factors, scales, system
+from adapter.learning.batch.theta_solvers import (
+    adam_theta,
+    consistent_theta,
+    least_squares_theta,
+    random_bodies,
+)
+from adapter.learning.tree_data import TreeData
+from adapter.model.inertia import is_consistent, min_eigenvalue
+from adapter.model.tree import Tree
+from adapter.physics.identifiability import base_parameters
+from adapter.physics.networks import link_motion, theta_from_log_cholesky, wrenches
+from tests.helpers.robot_models import random_urdf, read_quietly, shared
+from tests.learning.test_offline_schema import samples
+
+
+def link_wrenches(data: TreeData, lam: np.ndarray, theta: np.ndarray) -> np.ndarray:
+    """Total wrench on every body, (m, bodies, 6)."""
+    q, dq, ddq = data.joint_signals()
+    frames, bodies = torch.from_numpy(lam), torch.from_numpy(theta)
+    k = link_motion(data.tree, frames, (q, dq, ddq), data.base.torch())
+    return wrenches(data.tree, frames, bodies, q, k).numpy()
+
+
+@pytest.mark.parametrize("floating", [True, False])
+@pytest.mark.parametrize(("links", "seed"), [(5, 11), (8, 12), (12, 13)])
+def test_possible_bodies_explain_torques_to_rounding(links: int, seed: int, floating: bool) -> None:
+    text = random_urdf(links, seed)
+    model, data = samples(text, floating, 300, seed)
+    _, control = samples(text, floating, 60, seed + 100)
+    lam = schema_from_moments(data).lam
+    found = learn_theta(data, lam, seed)
+    assert found.rank == base_parameters(model.tree, model.lam, model.gravity).rank
+    assert found.min_eigenvalue > 0.0 and is_consistent(found.theta)
+    error = torque_errors(control, lam, found.theta)
+    assert error.median < 1e-9 and error.p99 < 1e-6
+    names = [branch.name for branch in branches(model.tree)]
+    assert [s.name for s in found.stages][: len(names)] == names
+    for stage, branch in zip(found.stages, branches(model.tree), strict=False):
+        if floating:
+            assert stage.rank == 7 * len(branch.joints) < stage.parameters
+
+
+def test_least_squares_stays_at_the_prior_where_nothing_shows() -> None:
+    text = random_urdf(6, 14)
+    model, data = samples(text, True, 200, 14)
+    prior = model.theta + np.random.default_rng(0).normal(size=model.theta.shape)
+    settings = BatchThetaSettings(solver="least squares", prior=prior, rounds=0)
+    found = learn_theta(data, model.lam, 0, settings)
+    assert torque_errors(data, model.lam, found.theta).p99 < 1e-8
+    base = base_parameters(model.tree, model.lam, model.gravity)
+    assert base.distance(found.theta, model.theta) < 1e-8 < base.distance(prior, model.theta)
+    rows = row_factors(data, model.lam)
+    r, b = system(rows, scales(rows), tuple(range(7)))
+    exact = least_squares_theta(r, b, model.theta)  # a prior that fits is left alone
+    np.testing.assert_allclose(exact.theta, model.theta, atol=1e-9)
+    same = learn_theta(data, model.lam, 0, replace(settings, prior=model.theta))
+    np.testing.assert_allclose(same.theta, model.theta, atol=1e-8)
+
+
+@pytest.mark.parametrize("supervision", ["wrenches", "both"])
+@pytest.mark.parametrize("floating", [True, False])
+def test_wrenches_show_what_torques_do_not(supervision: str, floating: bool) -> None:
+    """Eq. 17: with every link's wrench known, no mass is hidden on a moving base."""
+    text = random_urdf(6, 15)
+    model, data = samples(text, floating, 150, 15)
+    measured = link_wrenches(data, model.lam, model.theta)
+    first = int(floating)
+    np.testing.assert_allclose(measured[:, first:, 5], data.tau[:, 6 * first :], atol=1e-9)
+    settings = BatchThetaSettings(supervision=supervision, solver="least squares", rounds=0)
+    found = learn_theta(data, model.lam, 0, settings, measured)
+    assert found.rank > base_parameters(model.tree, model.lam, model.gravity).rank
+    if floating:
+        assert found.rank == 10 * model.tree.bodies
+        np.testing.assert_allclose(found.theta, model.theta, atol=1e-8)
+    possible = learn_theta(
+        data, model.lam, 0, BatchThetaSettings(supervision=supervision, rounds=0), measured
+    )
+    np.testing.assert_allclose(link_wrenches(data, model.lam, possible.theta), measured, atol=1e-6)
+
+
+def test_rows_weigh_and_sum_as_the_samples_do() -> None:
+    """|Y θ - τ| by the factors is that of the samples, for any θ."""
+    model, data = samples(random_urdf(5, 16), True, 90, 16)
+    rows = row_factors(data, model.lam)
+    theta = theta_from_log_cholesky(random_bodies(6, np.random.default_rng(1)))
+    gap = predicted_torques(data, model.lam, theta) - data.tau
+    joints = [row.residual(theta) for row in rows if row.kind == "torque"]
+    np.testing.assert_allclose(joints, np.sqrt(np.mean(gap[:, 6:] ** 2, axis=0)), rtol=1e-9)
+    (force,) = [row for row in rows if row.kind == "force"]
+    assert force.residual(theta) == pytest.approx(np.sqrt(np.mean(gap[:, :3] ** 2)))
+    std = np.arange(1.0, 1.0 + len(rows))
+    r, b = system(rows, std, tuple(range(6)))
+    weighted = sum(
+        (row.residual(theta) / s) ** 2 * row.count for row, s in zip(rows, std, strict=True)
+    )
+    assert np.sum((r @ theta.ravel() - b) ** 2) == pytest.approx(weighted)
+
+
+@pytest.mark.parametrize("solver", ["least squares", "consistent"])
+def test_rows_are_weighed_by_what_is_left_of_them(solver: str) -> None:
+    """A hundredfold noise on every other joint: the weights say so, and good joints stay good."""
+    model, data = samples(random_urdf(5, 26), True, 400, 26)
+    noise = np.array([1e-3, 1e-1, 1e-3, 1e-1, 1e-3])
+    tau = data.tau.copy()
+    tau[:, 6:] += noise * np.random.default_rng(2).normal(size=(400, 5))
+    noisy = replace(data, tau=tau)
+    found = learn_theta(noisy, model.lam, 0, BatchThetaSettings(solver=solver, rounds=3))
+    std = np.array([s for name, s in found.std.items() if name.startswith("torque")])
+    assert (0.8 * noise < std).all() and (std < 1.2 * noise).all()
+    error = predicted_torques(data, model.lam, found.theta) - data.tau
+    assert np.sqrt(np.mean(error[:, 6:][:, ::2] ** 2, axis=0)).max() < 1e-3
+    by_size = learn_theta(noisy, model.lam, 0, BatchThetaSettings(solver=solver, rounds=0))
+    worse = predicted_torques(data, model.lam, by_size.theta) - data.tau
+    assert np.abs(error[:, 6::2]).mean() < 0.8 * np.abs(worse[:, 6::2]).mean()
+
+
+@pytest.mark.parametrize("seed", [17, 18])
+def test_no_descent_gets_below_the_conic_solution(seed: int) -> None:
+    """Noise puts bodies at the edge; scipy's Gauss-Newton and ADAM on log-Cholesky vectors, from
+    random bodies, end there too or above."""
+    model, data = samples(random_urdf(4, seed), True, 60, seed)
+    rng = np.random.default_rng(seed)
+    tau = data.tau + 5.0 * rng.normal(size=data.tau.shape)
+    rows = row_factors(replace(data, tau=tau), model.lam)
+    r, b = system(rows, scales(rows), tuple(range(5)))
+    found = consistent_theta(r, b)
+    assert min_eigenvalue(found.theta).min() > 0.0
+    assert least_squares_theta(r, b, found.theta).cost < 0.999 * found.cost  # the edge matters
+
+    def left(x: np.ndarray) -> np.ndarray:
+        return r @ theta_from_log_cholesky(x.reshape(5, 10)).ravel() - b
+
+    start = random_bodies(5, np.random.default_rng(4))
+    best = min(
+        least_squares(left, x.ravel(), max_nfev=200).cost
+        for x in (start, random_bodies(5, np.random.default_rng(5)))
+    )
+    assert found.cost < 1.0001 * best and best < 1.05 * found.cost
+    slow = adam_theta(r, b, start, steps=1500)
+    assert is_consistent(slow.theta) and slow.cost > 0.9999 * found.cost
+    first = 0.5 * float(left(start.ravel()) @ left(start.ravel()))
+    assert slow.cost - found.cost < 0.1 * (first - found.cost)
+
+
+@pytest.mark.parametrize("links", [5, 9])
+def test_exact_data_give_exact_bodies_and_leave_them_room(links: int) -> None:
+    """Of a tree's samples with true frames: nothing is lost, also where one joint rests."""
+    for seed in range(3):
+        model, data = samples(random_urdf(links, seed), True, 100, seed)
+        for still in (False, True):
+            known = data
+            if still:
+                at_rest = [x.copy() for x in (data.q, data.dq, data.ddq)]
+                at_rest[0][:, 2], at_rest[1][:, 2], at_rest[2][:, 2] = 0.3, 0.0, 0.0
+                q, dq, ddq = at_rest
+                known = replace(data, q=q, dq=dq, ddq=ddq, links=None)
+                known = replace(known, tau=predicted_torques(known, model.lam, model.theta))
+            found = learn_theta(known, model.lam)
+            gap = predicted_torques(known, model.lam, found.theta) - known.tau
+            assert np.abs(gap).max() < 1e-9 * np.abs(known.tau).max()
+            assert found.min_eigenvalue > 1e-7
+
+
+def test_impossible_least_squares_are_kept_out() -> None:
+    """Noise makes least squares leave what can exist; possible bodies fit as well as they can."""
+    model, data = samples(random_urdf(6, 18), True, 60, 18)
+    rng = np.random.default_rng(3)
+    noisy = replace(data, tau=data.tau + 5.0 * rng.normal(size=data.tau.shape))
+    free = learn_theta(noisy, model.lam, 0, BatchThetaSettings(solver="least squares"))
+    held = learn_theta(noisy, model.lam, 0)
+    assert min_eigenvalue(free.theta).min() < 0.0 < held.min_eigenvalue
+    truth = [
+        np.sqrt(np.mean((predicted_torques(data, model.lam, x) - data.tau) ** 2))
+        for x in (held.theta, free.theta)
+    ]
+    assert truth[0] < truth[1]  # what is known to be possible keeps noise out
+
+
+def test_a_solver_that_stops_early_is_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its bodies are possible all the same."""
+    rng = np.random.default_rng(6)
+    r, b = rng.normal(size=(30, 10)), rng.normal(size=30)
+    assert consistent_theta(r, b).converged
+    monkeypatch.setattr("adapter.learning.batch.theta_solvers.SOLVED", ())
+    found = consistent_theta(r, b)
+    assert not found.converged and is_consistent(found.theta)
+
+
+def test_atlas_from_one_percent_of_samples() -> None:
+    text = shared("models/atlas_v5.urdf").read_text()
+    _, data = samples(text, True, 300, 19)
+    _, control = samples(text, True, 40, 20)
+    lam = schema_from_moments(data).lam
+    largest = kinematic_errors(control, lam).largest
+    assert max(largest.values()) < 1e-6, largest
+    found = learn_theta(data, lam, 5)
+    error = torque_errors(control, lam, found.theta)
+    assert error.median < 1e-6 and error.p99 < 1e-3
+    assert found.rank == 220 and found.min_eigenvalue > 0.0 and found.converged
+    ranks = {s.name: (s.rank, s.parameters) for s in found.stages}
+    assert ranks["right leg"] == ranks["left leg"] == (42, 60)
+    assert ranks["upper body"] == (126, 180)
+    assert ranks["whole tree"] == (220, 310)
+
+
+def test_relative_error_is_that_of_the_paper() -> None:
+    measured = np.array([[2.0, -1.0, 0.05, 1.0]])
+    predicted = np.array([[1.0, -2.0, 0.0, -1.0]])
+    np.testing.assert_allclose(relative_errors(measured, predicted), [[0.5, 0.5, np.nan, 2.0]])
+    with pytest.raises(ModelError, match="not finite"):
+        relative_errors(measured, predicted * np.nan)
+    with pytest.raises(ModelError, match="like tables"):
+        relative_errors(measured, predicted[:, :2])
+
+
+def test_errors_summed_up_are_those_of_the_samples() -> None:
+    model, data = samples(random_urdf(5, 27), True, 40, 27)
+    lam, theta = model.lam + 0.01, 1.1 * model.theta
+    k = link_motion(data.tree, torch.from_numpy(lam), data.joint_signals(), data.base.torch())
+    found = kinematic_errors(data, lam)
+    for name, by_link in found.largest_by_link.items():
+        gap = np.abs(getattr(k, name)[:, 1:].numpy() - getattr(data.links, name))
+        np.testing.assert_allclose(by_link, gap.max(axis=(0, 2)), rtol=1e-9)
+        assert found.largest[name] == by_link.max()
+    error = torque_errors(data, lam, theta)
+    tau = predicted_torques(data, lam, theta)[:, 6:]
+    every = np.sort(relative_errors(data.tau[:, 6:], tau).ravel())
+    every = every[np.isfinite(every)]
+    assert error.median == pytest.approx(np.quantile(every, 0.5))
+    assert error.p99 == pytest.approx(np.quantile(every, 0.99)) and error.p99 > 2 * error.median
+    np.testing.assert_allclose(error.rmse, np.sqrt(np.mean((tau - data.tau[:, 6:]) ** 2, axis=0)))
+
+
+def arm_signals(model, rng, seconds: float):  # type: ignore[no-untyped-def]
+    """Smooth motion of a fixed-base robot at 1 kHz, torques and link motion by the networks."""
+    t = np.arange(0.0, seconds, 1e-3)
+    speed = 2.0 * np.pi * rng.uniform(0.2, 1.0, (3, 1, model.tree.n))
+    phase = rng.uniform(0.0, 2.0 * np.pi, speed.shape)
+    size = rng.uniform(0.2, 0.6, speed.shape)
+    angle = speed * t[:, None] + phase
+    q = (size * np.sin(angle)).sum(axis=0)
+    dq = (size * speed * np.cos(angle)).sum(axis=0)
+    ddq = -(size * speed**2 * np.sin(angle)).sum(axis=0)
+    lam, gravity = torch.from_numpy(model.lam), torch.from_numpy(model.gravity)
+    joints = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
+    k = link_motion(model.tree, lam, joints, gravity)
+    tau = wrenches(model.tree, lam, torch.from_numpy(model.theta), torch.from_numpy(q), k)
+    return q, dq, ddq, tau[..., 5].numpy(), k
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
+    """Control torque error of learned λ and θ against weighted least squares with the true λ."""
+    model, _ = samples(random_urdf(5, seed), False, 2, seed)
+    rng = np.random.default_rng(seed)
+    clean, parts = [], []
+    for _ in range(3):
+        q, dq, ddq, tau, k = arm_signals(model, rng, 6.0)
+        noise = {"q": 2e-5, "dq": 2e-3, "tau": 0.1, "link_w": 2e-3, "link_a": 0.02}
+        true = {"q": q, "dq": dq, "tau": tau, "link_w": k.w.numpy(), "link_a": k.a.numpy()}
+        read = {name: x + noise[name] * rng.normal(size=x.shape) for name, x in true.items()}
+        parts.append(smoothed_data(model.tree, Measured(**read), gravity=model.gravity))
+        exact = smoothed_data(model.tree, Measured(**true), gravity=model.gravity)
+        cut = slice(200, -200)
+        assert np.abs(exact.ddq - ddq[cut]).max() < 2e-2 * np.abs(ddq).max()
+        assert (exact.base.a == -model.gravity).all()  # what an accelerometer at rest reads
+        clean.append(exact)
+    learn, control = parts[0].take(slice(None, None, 3)), clean[2]
+    schema = schema_from_moments(learn)
+    found = learn_theta(learn, schema.lam, 0)
+    best = learn_theta(learn, model.lam, 0, BatchThetaSettings(solver="least squares"))
+    ours = torque_errors(control, schema.lam, found.theta).rmse
+    theirs = torque_errors(control, model.lam, best.theta).rmse
+    assert np.linalg.norm(ours) <= 1.1 * np.linalg.norm(theirs)
+    assert found.min_eigenvalue > 0.0
+
+
+def test_bad_input_is_named() -> None:
+    model, data = samples(random_urdf(5, 23), True, 30, 23)
+    with pytest.raises(ModelError, match=r"torques.*wrenches.*both"):
+        learn_theta(data, model.lam, 0, BatchThetaSettings(supervision="forces"))
+    with pytest.raises(ModelError, match="needs wrenches"):
+        learn_theta(data, model.lam, 0, BatchThetaSettings(supervision="both"))
+    with pytest.raises(ModelError, match="least squares"):
+        BatchThetaSettings(solver="magic")
+    with pytest.raises(ModelError, match="not finite"):
+        row_factors(replace(data, tau=data.tau * np.nan), model.lam)
+    with pytest.raises(ModelError, match="std"):
+        learn_theta(data, model.lam, 0, BatchThetaSettings(std=(1.0,)))
+    with pytest.raises(ModelError, match="gravity"):
+        fixed = Measured(data.q, data.dq, data.tau[:, 6:])
+        tree = replace(data.tree, floating=False)
+        smoothed_data(tree, fixed, SmoothingSettings(cut_s=0.0, order=1))
+
+
+@pytest.mark.parametrize(("robot", "joints"), [("atlas", 30), ("talos", 32)])
+def test_branches_of_humanoids(robot: str, joints: int) -> None:
+    path = {"atlas": "models/atlas_v5.urdf", "talos": "models/talos_reduced.urdf"}[robot]
+    tree = read_quietly(shared(path).read_text(), True).tree
+    found = {branch.name: branch for branch in branches(tree)}
+    assert set(found) == {"right leg", "left leg", "upper body"}
+    assert len(found["right leg"].joints) == len(found["left leg"].joints) == 6
+    assert len(found["upper body"].joints) == joints - 12
+    assert sorted(j for b in found.values() for j in b.joints) == list(range(joints))
+    for side in ("right", "left"):
+        names = " ".join(tree.joint_names[j] for j in found[f"{side} leg"].joints)
+        assert "leg" in names and (f"{side}_" in names or f"{side[0]}_leg" in names)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_branches_of_any_tree_are_trees_of_their_own(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    parent = tuple(int(rng.integers(-1, j)) if j % 5 else -1 for j in range(17))
+    tree = Tree(parent, bool(seed % 2))
+    found = branches(tree)
+    assert len(found) == parent.count(-1)
+    assert [b.name for b in found] == [f"branch {k + 1}" for k in range(len(found))]
+    assert sorted(j for b in found for j in b.joints) == list(range(17))
+    for branch in found:
+        assert not branch.tree.floating
+        for k, j in enumerate(branch.joints):
+            below = branch.tree.parent[k]
+            assert parent[j] == (-1 if below == -1 else branch.joints[below])
+            assert branch.tree.link_names[k] == tree.link_names[j]
+
+
+def test_one_branch_for_an_arm() -> None:
+    tree = read_quietly(random_urdf(6, 3)).tree
+    chain = Tree((-1, 0, 1, 2), joint_names=tree.joint_names[:4])
+    (only,) = branches(chain)
+    assert only.joints == (0, 1, 2, 3) and only.tree.parent == chain.parent

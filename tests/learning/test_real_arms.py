@@ -1,0 +1,91 @@
+"""Logs of real arms: a Panda (Gaz et al. 2019) and a KUKA LWR4; the data are not the project's."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from adapter.cli import main
+from adapter.model.robots import documented
+from drivers.files.mcap import McapWriter, read_log
+
+SHARED = Path(__file__).parents[2].parent / "shared"
+pytestmark = pytest.mark.skipif(
+    not SHARED.is_dir(), reason="the folder of real logs is not beside the project"
+)
+# Torque RMSE of an identification tool's weighted least squares on the same log, N m.
+TOOL = np.array([0.204, 0.251, 0.235, 0.201, 0.076, 0.041, 0.056])
+SPLIT_S = 14.0
+
+
+def give(*arguments: object) -> None:
+    assert main([str(argument) for argument in arguments]) == 0
+
+
+@pytest.fixture(scope="module")
+def panda_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Panda's log, imported as a user would."""
+    path = tmp_path_factory.mktemp("panda") / "panda.mcap"
+    start = SHARED / "data" / "panda_gaz2019" / "exciting_traj_"
+    files = {"time": "time", "q": "positions", "dq": "velocity", "tau": "torques"}
+    sources = [f"{signal}={start}{name}.txt" for signal, name in files.items()]
+    give("import", *sources, "--flat", "--robot", "panda", "--to", path)
+    return path
+
+
+def replayed(path: Path, folder: Path, *options: object) -> dict[str, Any]:
+    out = folder / "o.json"
+    common = ("--quiet", "--no-report", "--out", folder, "--json", out)
+    give("replay", path, *common, *options)
+    return json.loads(out.read_text())
+
+
+def test_panda_in_one_pass(panda_log: Path, tmp_path: Path) -> None:
+    figures = replayed(panda_log, tmp_path, "--validate-from", SPLIT_S)
+    assert figures["lambda"]["converged_s"] < 3.0
+    assert figures["lambda"]["source"] == "reproduces the documentation"
+    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
+    assert (error <= 0.92 * TOOL).all(), error / TOOL
+    assert figures["theta"]["changes"] == []  # bursts where friction reverses are no loads
+    assert figures["refused"]["repeated"] > 700
+    friction = np.array(figures["theta"]["effects"]["coulomb_friction"])
+    assert (friction > 0.1).all() and (friction < 0.6).all()
+
+
+def test_panda_after_ten_seconds(panda_log: Path, tmp_path: Path) -> None:
+    log = read_log(panda_log)
+    seconds = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    names = documented("panda").tree.joint_names
+    for name, part in (("first", seconds < 10.0), ("last", seconds >= SPLIT_S)):
+        with McapWriter(tmp_path / f"{name}.mcap", names) as writer:
+            for i in np.flatnonzero(part):
+                writer.write_joint_state(int(log.stamp_ns[i]), log.q[i], log.dq[i], log.tau[i])
+    options = ("--validate", tmp_path / "last.mcap")
+    figures = replayed(tmp_path / "first.mcap", tmp_path, *options)
+    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
+    assert (error <= 1.0 * TOOL).all(), error / TOOL
+
+
+def test_panda_after_ten_seconds_on_all_the_rest(panda_log: Path, tmp_path: Path) -> None:
+    """The rest has the largest swing of joint 6, which nothing before it shows."""
+    figures = replayed(panda_log, tmp_path, "--validate-from", 10.0)
+    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
+    assert (error <= 1.0 * TOOL).all(), error / TOOL
+
+
+def test_panda_in_batches(panda_log: Path, tmp_path: Path) -> None:
+    figures = replayed(panda_log, tmp_path, "--validate-from", SPLIT_S, "--every", 20)
+    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
+    assert (error <= 0.92 * TOOL).all(), error / TOOL
+
+
+def test_kuka(tmp_path: Path) -> None:
+    folder = SHARED / "data" / "lwr4"
+    urdf, path = folder / "kuka_lwr4.urdf", tmp_path / "kuka.mcap"
+    give("import", folder / "measurements_1.npz", "--robot", urdf, "--to", path)
+    figures = replayed(path, tmp_path, "--robot", urdf, "--validate-from", 18.0)
+    assert figures["lambda"]["converged_s"] < 3.0
+    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
+    assert (error < 0.5).all(), error  # N m, of torques of up to 60

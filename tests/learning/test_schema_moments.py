@@ -1,0 +1,311 @@
+"""Cost, gradient and curvature of λ from second moments, against sums over samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from adapter.learning.schema import RestingBase, Schema, SchemaSettings
+from adapter.learning.schema_kernels import (
+    N_SIGNALS,
+    accumulate,
+    channel_cost,
+    signals,
+    without_noise,
+)
+from adapter.learning.tree_data import BodyMotion, TreeData
+from adapter.model.spatial import exp_rotation, matrix_from_zxz
+from adapter.model.tree import Tree
+from adapter.physics.kernels import base_at_rest
+from adapter.physics.networks import joint_rotation, skew, turn_z
+from tests.helpers.tree_motion import in_motion, random_tree_text
+
+CHANNELS = range(3)
+SEEDS = range(4)
+
+
+class Data:
+    """Random motion of a parent and a child that don't belong together, and their moments."""
+
+    def __init__(self, seed: int, samples: int = 40, keep: float = 1.0) -> None:
+        rng = np.random.default_rng(seed)
+        self.q, self.dq = rng.normal(size=(2, samples)) * 2.0
+        self.parent, self.child = rng.normal(size=(2, samples, 12))
+        self.R = exp_rotation(rng.normal(size=3))
+        self.p = rng.normal(size=3) * 0.5
+        self.M = np.zeros((3, 15, 15))
+        self.s = np.full((samples, 3, 15), np.nan)
+        for m in range(samples):
+            signals(self.q[m], self.dq[m], self.parent[m], self.child[m], self.s[m])
+            accumulate(self.s[m], keep, self.M)
+
+    def residuals(self, ch: int, R: torch.Tensor, p: torch.Tensor) -> torch.Tensor:
+        """y - R0^T z (m, 3), straight from eqs. 8a to 8c."""
+        v, w, a, dw = (torch.from_numpy(self.parent[:, k : k + 3]) for k in (0, 3, 6, 9))
+        cross = torch.linalg.cross
+        P = p.expand_as(w)
+        own = torch.from_numpy(self.child[:, (3, 0, 6)[ch] : (6, 3, 9)[ch]])
+        if ch == 0:
+            z = w
+            own = own - torch.from_numpy(self.dq)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+        elif ch == 1:
+            z = v + cross(w, P)
+        else:
+            z = a + cross(dw, P) + cross(w, cross(w, P))
+        c, s = np.cos(self.q), np.sin(self.q)
+        turn = np.zeros((len(c), 3, 3))
+        turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c
+        turn[:, 2, 2] = 1.0
+        y = torch.einsum("mab,mb->ma", torch.from_numpy(turn), own)
+        return y - z @ R
+
+    def moved(self, ch: int, x: torch.Tensor) -> torch.Tensor:
+        """Residuals (3 m,) after a turn and shift x (6,) of the frame."""
+        a, b, c = x[:3]
+        zero = torch.zeros_like(a)
+        turn = torch.linalg.matrix_exp(
+            torch.stack([zero, -c, b, c, zero, -a, -b, a, zero]).reshape(3, 3)
+        )
+        R, p = torch.from_numpy(self.R) @ turn, torch.from_numpy(self.p) + x[3:]
+        return self.residuals(ch, R, p).ravel()
+
+    def cost(self, ch: int, R=None, p=None, curved: bool = True):
+        """Cost, gradient and curvature of the kernel."""
+        g, H = np.zeros(6), np.zeros((6 if curved else 0, 6))
+        R = np.ascontiguousarray(self.R if R is None else R)
+        return channel_cost(self.M, ch, R, self.p if p is None else p, g, H), g, H
+
+
+@pytest.mark.parametrize("ch", CHANNELS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cost_is_the_summed_squared_residual(ch: int, seed: int) -> None:
+    data = Data(seed)
+    expected = float((data.moved(ch, torch.zeros(6).double()) ** 2).sum())
+    assert data.cost(ch)[0] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("ch", CHANNELS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_gradient_is_autograds(ch: int, seed: int) -> None:
+    data = Data(seed)
+    x = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    (0.5 * (data.moved(ch, x) ** 2).sum()).backward()
+    expected = x.grad.numpy()
+    assert np.abs(data.cost(ch)[1] - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("ch", CHANNELS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_gradient_is_the_slope_of_the_cost(ch: int, seed: int) -> None:
+    data, step = Data(seed), 1e-5
+    _, g, _ = data.cost(ch)
+    for k in range(6):
+        x = step * np.eye(6)[k]
+        up, down = (
+            data.cost(ch, data.R @ exp_rotation(sign * x[:3]), data.p + sign * x[3:])[0]
+            for sign in (1.0, -1.0)
+        )
+        assert g[k] == pytest.approx(0.25 * (up - down) / step, rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("ch", CHANNELS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_curvature_is_gauss_newtons(ch: int, seed: int) -> None:
+    data = Data(seed)
+    jacobian = torch.autograd.functional.jacobian(
+        lambda x: data.moved(ch, x), torch.zeros(6, dtype=torch.float64)
+    ).numpy()
+    expected = jacobian.T @ jacobian
+    H = data.cost(ch)[2]
+    assert np.abs(H - expected).max() < 1e-10 * np.abs(expected).max()
+    assert np.allclose(H, H.T, rtol=0, atol=1e-12 * np.abs(H).max())
+
+
+@pytest.mark.parametrize("ch", CHANNELS)
+def test_gradient_and_curvature_are_added_to_what_is_there(ch: int) -> None:
+    data = Data(0)
+    _, g, H = data.cost(ch)
+    more_g, more_H = np.ones(6), np.ones((6, 6))
+    channel_cost(data.M, ch, data.R, data.p, more_g, more_H)
+    assert np.allclose(more_g, 1.0 + g, rtol=1e-12, atol=1e-9)
+    assert np.allclose(more_H, 1.0 + H, rtol=1e-12, atol=1e-9)
+
+
+def test_without_curvature_cost_and_gradient_are_the_same() -> None:
+    data = Data(1)
+    c, g, _ = data.cost(1, curved=False)
+    full = data.cost(1)
+    assert c == full[0] and np.array_equal(g, full[1])
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_moments_are_sums_over_samples(seed: int) -> None:
+    data = Data(seed)
+    for ch, width in enumerate(N_SIGNALS):
+        k = 3 + width
+        s = data.s[:, ch, :k]
+        assert np.isfinite(s).all()
+        assert np.allclose(data.M[ch, :k, :k], s.T @ s, rtol=1e-12, atol=1e-12)
+        assert (data.M[ch, k:] == 0.0).all() and (data.M[ch, :, k:] == 0.0).all()
+
+
+def test_forgotten_moments_are_weighted_sums() -> None:
+    keep = 0.9
+    data = Data(5, keep=keep)
+    weight = keep ** np.arange(len(data.q) - 1, -1, -1.0)
+    for ch, width in enumerate(N_SIGNALS):
+        s = data.s[:, ch, : 3 + width]
+        expected = (s * weight[:, None]).T @ s
+        assert np.allclose(data.M[ch, : 3 + width, : 3 + width], expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cost_of_the_true_frame_is_zero(seed: int) -> None:
+    """Motion made by eqs. 8a to 8c with numpy alone, for angles of the paper's z-x-z triple."""
+    rng = np.random.default_rng(seed)
+    lam = rng.normal(size=6)
+    R0, p = matrix_from_zxz(lam[:3]), lam[3:]
+    assert np.allclose(R0, joint_rotation(torch.from_numpy(lam)).numpy(), atol=1e-14)
+    M, s = np.zeros((3, 15, 15)), np.zeros((3, 15))
+    for _ in range(30):
+        q, dq = rng.normal(size=2)
+        up = rng.normal(size=12)
+        v, w, a, dw = up.reshape(4, 3)
+        c, t = np.cos(q), np.sin(q)
+        R = R0 @ np.array([[c, -t, 0.0], [t, c, 0.0], [0.0, 0.0, 1.0]])
+        acceleration = a + np.cross(dw, p) + np.cross(w, np.cross(w, p))
+        own = np.concatenate(
+            [R.T @ (v + np.cross(w, p)), R.T @ w + [0, 0, dq], R.T @ acceleration, np.zeros(3)]
+        )
+        signals(q, dq, up, own, s)
+        accumulate(s, 1.0, M)
+    for ch in CHANNELS:
+        g, H = np.zeros(6), np.zeros((6, 6))
+        power = np.trace(M[ch, :3, :3])
+        cost = channel_cost(M, ch, R0, p, g, H)
+        assert abs(cost) < 1e-12 * power
+        assert np.abs(g).max() < 1e-12 * power
+
+
+def one_link(up, q, dq, ddq, schema, j, turn, shift):  # type: ignore[no-untyped-def]
+    """Motion [v w a] (m, 9) of link j from its parent's row (m, 12), its frame turned, shifted."""
+    R = torch.from_numpy(schema.R0[j].copy()) @ torch.linalg.matrix_exp(skew(turn))
+    p = (torch.from_numpy(schema.p[j].copy()) + shift).expand(len(q), 3)
+    v, w, a, dw = up[:, :3], up[:, 3:6], up[:, 6:9], up[:, 9:]
+    cross = torch.linalg.cross
+    moved = v + cross(w, p), w, a + cross(dw, p) + cross(w, cross(w, p))
+    into = [turn_z(-q, x @ R) for x in moved]
+    into[1] = into[1] + torch.stack([0 * dq, 0 * dq, dq], dim=1)
+    return torch.cat(into, dim=1)
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("floating", [True, False])
+@pytest.mark.parametrize("parents", [(-1, -1, 0, 0, 2), (-1, 0, 1, 1, -1, 4)])
+def test_gradient_of_a_tree_is_autograds(parents, floating: bool, velocities: bool) -> None:
+    """The profiled cost of each joint's channels, by turns about and shifts of its frame."""
+    rng, tree, m = np.random.default_rng(len(parents)), Tree(parents, floating), 60
+    q, dq, ddq = rng.normal(size=(3, m, tree.n))
+    links, base = rng.normal(size=(m, tree.n, 12)), rng.normal(size=(m, 12))
+    if not floating:
+        base[:] = base_at_rest(np.array([0.1, -0.2, -9.8]))
+    if not velocities:
+        links[..., :3], base[:, :3] = 0.0, 0.0
+    schema = Schema(tree, None if floating else RestingBase(-base[0], base[0]), SchemaSettings())
+    zero = np.zeros((m, tree.rows))
+    bodies = [BodyMotion(x[..., 3:6], x[..., 6:9], x[..., 9:], x[..., :3]) for x in (base, links)]
+    states = TreeData(tree, q, dq, ddq, zero, *bodies).states()
+    for part in (states[:1], states[1:20], states[20:]):
+        schema.absorb(part)
+    schema.updates = 1  # the gradient alone; how far steps may go is another matter
+    schema.compute_gradient()
+    turn = torch.zeros(tree.n, 3, dtype=torch.float64, requires_grad=True)
+    shift = torch.zeros(tree.n, 3, dtype=torch.float64, requires_grad=True)
+    cost = torch.zeros((), dtype=torch.float64)
+    signals = [torch.from_numpy(x) for x in (q, dq, ddq)]
+    for j, i in enumerate(tree.parent):
+        up = torch.from_numpy(base if i < 0 else links[:, i])
+        hat = one_link(up, *(s[:, j] for s in signals), schema, j, turn[j], shift[j])
+        seen = torch.from_numpy(links[:, j])
+        for channel in (0, 1, 2) if velocities else (1, 2):  # v, w, a
+            part = slice(3 * channel, 3 * channel + 3)
+            square = ((hat[:, part] - seen[:, part]) ** 2).sum()
+            own = seen[:, part] - torch.eye(3)[2] * signals[1][:, j, None] * (channel == 1)
+            count = 3.0 * m
+            loose = count * 1e-8 + 1e-6 * float((own**2).sum())  # floors of the weights
+            cost = cost + 0.5 * square * (count / (square.detach() + loose))
+    gradients = torch.autograd.grad(cost / m, (turn, shift))
+    expected = np.concatenate([g.numpy() for g in gradients], axis=1)
+    assert np.abs(schema.gradient - expected).max() < 1e-9 * np.abs(expected).max()
+
+
+NOISE = {"v": 6e-3, "w": 1e-3, "a": 8e-2, "dw": 2e-1}
+
+
+@pytest.mark.parametrize("channel", NOISE)
+@pytest.mark.parametrize("floating", [True, False])
+def test_each_channels_own_noise_is_found_and_taken_out(channel: str, floating: bool) -> None:
+    """One channel is five times as noisy as usual; the others are told to be what they are."""
+    model, data = in_motion(random_tree_text(4, 5), floating, 2.0, 5)
+    rng, levels = np.random.default_rng(2), {**NOISE, channel: 5 * NOISE[channel]}
+
+    def noisy(motion: BodyMotion) -> BodyMotion:
+        parts = {k: getattr(motion, k) for k in levels}
+        return BodyMotion(**{k: x + levels[k] * rng.normal(size=x.shape) for k, x in parts.items()})
+
+    rest = None if floating else RestingBase(*[base_at_rest(model.gravity)] * 2)
+    base = noisy(data.base) if floating else data.base
+    blurred = replace(data, base=base, links=noisy(data.links))
+    exact, schema = (Schema(model.tree, rest, SchemaSettings()) for _ in range(2))
+    for one, samples in ((exact, data), (schema, blurred)):
+        one.set_lam(model.lam)
+        one.absorb(samples.states())
+    found = schema.noise_variance()
+    true = np.array([levels[k] for k in ("v", "w", "a", "dw")]) ** 2
+    bodies = found if floating else found[1:]
+    inner = sorted({i + 1 for i in model.tree.parent if i >= 0 or floating})
+    assert (bodies < 1.3 * true).all() and (found[inner] > 0.75 * true).all()
+    if not floating:
+        assert not found[0].any()
+    clean = np.empty_like(schema.moments.M)
+    without_noise(schema._parent, schema.moments.M, schema.moments.counts, found, clean)
+    for part, number in ((slice(3, 6), 0), (slice(3, 6), 1), (slice(6, 9), 1), (slice(3, 6), 2)):
+        for j, i in enumerate(model.tree.parent):
+            if i < 0 and not floating:
+                continue
+            level = {0: 1, 1: 0 if part.start == 3 else 1, 2: 2}[number]
+            ours, theirs = (M[j, number, part, part].trace() for M in (clean, exact.moments.M))
+            raw = schema.moments.M[j, number, part, part].trace()
+            noise = 3 * schema.count * true[level]
+            spread = 8.0 * np.sqrt(theirs * true[level]) + 0.2 * noise  # of motion times noise
+            assert abs(ours - theirs) < spread
+            assert raw - ours == pytest.approx(3 * schema.count * found[i + 1, level])
+
+
+def test_noise_without_velocities_leaves_accelerations_and_products_of_w() -> None:
+    """Where no velocity is measured, a frame's place shows in dw and products of w: noise out."""
+    model, data = in_motion(random_tree_text(4, 5), True, 2.0, 5)
+    rng = np.random.default_rng(4)
+    levels = {"w": 2e-2, "a": 8e-2, "dw": 2e-1}
+
+    def bare(motion: BodyMotion, scale: float) -> BodyMotion:
+        parts = {k: getattr(motion, k) for k in levels}
+        noisy = {k: x + scale * levels[k] * rng.normal(size=x.shape) for k, x in parts.items()}
+        return BodyMotion(**noisy)
+
+    exact, schema = (Schema(model.tree, None, SchemaSettings()) for _ in range(2))
+    for one, scale in ((exact, 0.0), (schema, 1.0)):
+        one.set_lam(model.lam)
+        blurred = replace(data, base=bare(data.base, scale), links=bare(data.links, scale))
+        one.absorb(blurred.states())
+    clean = np.empty_like(schema.moments.M)
+    found = schema.noise_variance()
+    without_noise(schema._parent, schema.moments.M, schema.moments.counts, found, clean)
+    assert not clean[:, 1].any()
+    for j in range(model.tree.n):
+        for k in (*range(6, 9), *range(9, 15)):
+            raw, ours, theirs = (x[j, 2, k, k] for x in (schema.moments.M, clean, exact.moments.M))
+            assert raw > ours
+            excess = raw - theirs
+            assert abs(ours - theirs) < 0.5 * abs(excess) + 0.05 * theirs

@@ -1,0 +1,256 @@
+"""URDF in and out, judged by Pinocchio; what can't be read is refused in one sentence."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.effects.export import to_urdf
+from adapter.errors import ModelError, ModelWarning
+from adapter.model.model_file import save_model
+from adapter.model.robots import documented, names
+from adapter.model.self_model import SelfModel, Tool
+from adapter.model.urdf import model_from_urdf, read_urdf
+from tests.helpers.robot_models import (
+    PANDA,
+    ROBOTS,
+    pin_model,
+    pinocchio_case,
+    read_quietly,
+    relative,
+    shared,
+    urdf_text,
+)
+
+
+@pytest.mark.parametrize("floating", [False, True], ids=["fixed", "floating"])
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_round_trip_keeps_pinocchios_torques_and_frames(robot: str, floating: bool) -> None:
+    text = urdf_text(robot)
+    model = read_quietly(text, floating)
+    written = to_urdf(model)
+    again = read_quietly(written, floating)
+    np.testing.assert_allclose(again.theta, model.theta, atol=1e-12)
+    np.testing.assert_allclose(again.axis, model.axis, atol=1e-15)
+    before = pinocchio_case(text, floating)
+    after = pinocchio_case(written, floating)
+    assert relative(after.tau, before.tau) < 1e-9
+    _same_frames(pin_model(text), pin_model(written))
+
+
+def _same_frames(before: pin.Model, after: pin.Model) -> None:
+    """Every link, moving or not, is where it was, at a random posture."""
+    places = []
+    names_kept = [frame.name for frame in before.frames if after.existFrame(frame.name)]
+    assert len(names_kept) == before.nframes
+    for oracle in (before, after):
+        data, q = oracle.createData(), pin.neutral(oracle)
+        rng = np.random.default_rng(0)
+        for name in sorted(oracle.names):
+            joint = oracle.joints[oracle.getJointId(name)]
+            angle = rng.uniform(-2, 2)
+            q[joint.idx_q : joint.idx_q + joint.nq] = (
+                []
+                if joint.nq == 0
+                else [angle]
+                if joint.nq == 1
+                else [np.cos(angle), np.sin(angle)]
+            )
+        pin.framesForwardKinematics(oracle, data, q)
+        places.append([data.oMf[oracle.getFrameId(name)].homogeneous for name in names_kept])
+    np.testing.assert_allclose(places[0], places[1], atol=1e-10)
+
+
+def test_our_panda_is_the_documented_one() -> None:
+    reference = read_urdf(shared("models/panda_gaz2019.urdf"))
+    ours = documented("panda")
+    for key in ("lam", "theta", "base_theta", "axis"):
+        np.testing.assert_array_equal(getattr(ours, key), getattr(reference, key))
+    for key in ("lower", "upper", "velocity", "effort"):
+        np.testing.assert_array_equal(getattr(ours.limits, key), getattr(reference.limits, key))
+    assert ours.tree.parent == (-1, 0, 1, 2, 3, 4, 5)
+    assert [frame.name for frame in ours.frames] == ["panda_link8"]
+    assert ours.lambda_source == "documentation"
+
+
+def test_fixed_links_are_merged() -> None:
+    """The hand's 0.73 kg count with link 7; its frame is remembered."""
+    bare = documented("panda")
+    held = documented(shared("models/panda_gaz2019_hand.urdf"))
+    assert held.theta[6, 0] == pytest.approx(bare.theta[6, 0] + 0.73)
+    hand = {frame.name: frame for frame in held.frames}["panda_hand"]
+    assert hand.parent == "panda_link7"
+    np.testing.assert_allclose(hand.position, [0, 0, 0.107])
+
+
+def test_humanoids() -> None:
+    atlas = documented(shared("models/atlas_v5.urdf"), floating=True)
+    assert (atlas.tree.n, atlas.tree.bodies, atlas.tree.rows) == (30, 31, 36)
+    assert atlas.theta[:, 0].sum() == pytest.approx(174.05, abs=0.01)
+    assert documented(shared("models/talos_reduced.urdf")).tree.n == 32
+
+
+def test_pybullets_panda_has_its_fingers_locked() -> None:
+    data = pytest.importorskip("pybullet_data")
+    path = Path(data.getDataPath()) / "franka_panda" / "panda.urdf"
+    with pytest.warns(ModelWarning) as caught:
+        model = read_urdf(path)
+    said = [str(w.message) for w in caught]
+    assert len(said) == 2 and all("prismatic" in s and "locked at zero" in s for s in said)
+    assert "panda_finger_joint1" in said[0] and "panda_finger_joint2" in said[1]
+    assert model.tree.joint_names == tuple(f"panda_joint{k}" for k in range(1, 8))
+    assert model.theta[6, 0] == pytest.approx(0.2 + 0.81 + 0.1 + 0.1)
+    with pytest.raises(ModelError, match=r"panda_finger_joint1.*is prismatic.*panda_joint1"):
+        read_urdf(path, joints=["panda_joint1", "panda_finger_joint1"])
+
+
+def test_joints_not_asked_for_are_locked() -> None:
+    wanted = [f"panda_joint{k}" for k in (2, 4)]
+    with pytest.warns(ModelWarning, match="panda_joint7.*locked at zero"):
+        model = documented("panda", joints=wanted)
+    assert model.tree.joint_names == tuple(wanted)
+    whole = documented("panda")
+    total = whole.theta[:, 0].sum() + whole.base_theta[0]
+    assert model.theta[:, 0].sum() + model.base_theta[0] == pytest.approx(total)
+
+
+def test_mimic_joints_are_locked() -> None:
+    text = PANDA.read_text().replace(
+        '<joint name="panda_joint7" type="revolute">',
+        '<joint name="panda_joint7" type="revolute"><mimic joint="panda_joint6"/>',
+    )
+    with pytest.warns(ModelWarning, match="panda_joint7.*mimics another; locked at zero"):
+        assert model_from_urdf(text).tree.n == 6
+
+
+def test_a_tool_is_kept_apart_and_counts_in_the_torques() -> None:
+    tool = Tool(0.8, np.array([0.01, 0.0, 0.05]), np.diag([1e-3, 2e-3, 2.5e-3]))
+    model = replace(documented("panda"), tool=tool)
+    assert model.theta_with_tool()[6, 0] == pytest.approx(model.theta[6, 0] + 0.8)
+    np.testing.assert_array_equal(model.theta_with_tool()[:6], model.theta[:6])
+    merged = model_from_urdf(to_urdf(model))
+    np.testing.assert_allclose(merged.theta, model.theta_with_tool(), atol=1e-12)
+
+
+def test_an_impossible_body_is_not_exported() -> None:
+    model = documented("panda")
+    theta = model.theta.copy()
+    theta[3, 4] = 1.0  # XX far above YY + ZZ
+    with pytest.raises(ModelError, match=r"'panda_link4'.*impossible.*eigenvalue of -0\."):
+        to_urdf(replace(model, theta=theta))
+    theta[3] = 0.0
+    with pytest.raises(ModelError, match=r"'panda_link4'.*eigenvalue of 0"):
+        to_urdf(replace(model, theta=theta))
+
+
+def test_with_base_is_there_and_back() -> None:
+    model = documented("panda")
+    floating = model.with_base(floating=True)
+    np.testing.assert_array_equal(floating.theta, documented("panda", floating=True).theta)
+    back = floating.with_base(floating=False)
+    np.testing.assert_array_equal(back.theta, model.theta)
+    np.testing.assert_array_equal(back.base_theta, model.base_theta)
+
+
+MASS = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+LINK = "<link name='{}'>" + MASS + "</inertial></link>"
+JOINT = "<joint name='{}' type='{}'><parent link='{}'/><child link='{}'/>{}</joint>"
+
+
+def robot(*parts: str) -> str:
+    """A URDF of links a, b, c and the given parts."""
+    return "<robot name='r'>" + "".join(LINK.format(x) for x in "abc") + "".join(parts) + "</robot>"
+
+
+AB = JOINT.format("ab", "revolute", "a", "b", "")
+BC = JOINT.format("bc", "revolute", "b", "c", "")
+BAD = {
+    "prismatic": (robot(AB, JOINT.format("bc", "prismatic", "b", "c", "")), r"'bc'.*prismatic.*ab"),
+    "two roots": (robot(AB), r"2 root links \(a, c\)"),
+    "two parents": (
+        robot(AB, BC, JOINT.format("ac", "fixed", "a", "c", "")),
+        r"'c'.*'bc' and 'ac'",
+    ),
+    "circle": (
+        robot(BC, JOINT.format("cb", "fixed", "c", "b", "")),
+        r"links .* form a loop",
+    ),
+    "massless": (
+        robot(AB, BC, "<link name='d'/>", JOINT.format("cd", "revolute", "c", "d", "")),
+        r"moving link 'd' has no mass.*leave joint 'cd' out",
+    ),
+    "no name": (robot(AB, BC).replace("link name='a'", "link"), r"a <link> has no 'name'"),
+    "no type": (
+        robot(AB, BC).replace("name='bc' type='revolute'", "name='bc'"),
+        r"'bc' has no 'type'",
+    ),
+    "no child": (robot(AB, BC).replace("<child link='c'/>", ""), r"'bc' has no <child"),
+    "no mass value": (
+        robot(AB, BC).replace('mass value="1"', "mass"),
+        r"'a' has no 'value'.*<mass>",
+    ),
+    "no ixz": (robot(AB, BC).replace('ixz="0"', ""), r"'a' has no 'ixz'.*<inertia>"),
+    "no inertia": (
+        robot(AB, BC).replace(MASS, '<inertial><mass value="1"/>'),
+        r"without <inertia>",
+    ),
+    "negative": (
+        robot(AB, BC).replace('mass value="1"', 'mass value="-1"'),
+        r"negative mass of -1",
+    ),
+    "unknown link": (
+        robot(AB, BC).replace("child link='c'", "child link='z'"),
+        r"'z'.*have.*a, b, c",
+    ),
+    "unknown type": (
+        robot(AB, BC).replace("revolute", "spherical"),
+        r"'spherical'; have: revolute",
+    ),
+    "words": (robot(AB, BC).replace('ixx="1"', 'ixx="one"'), r"must hold numbers, got 'one'"),
+    "nan": (robot(AB, BC).replace('ixx="1"', 'ixx="nan"'), r"finite"),
+    "no axis": (
+        robot(AB, BC.replace("</joint>", "<axis xyz='0 0 0'/></joint>")),
+        r"'bc'.*length zero",
+    ),
+    "twice": (robot(AB, BC, LINK.format("a")), r"link 'a' appears twice"),
+    "not xml": ("<robot name='r'><link", r"not XML.*line 1"),
+    "sdf": ("<sdf/>", r"<sdf>, a URDF has <robot>"),
+    "empty": ("", r"not XML"),
+    "no joints": ("<robot name='r'><link name='a'/></robot>", r"no joint is left to move"),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_bad_files_are_refused_with_the_place_and_the_choices(fault: str, tmp_path: Path) -> None:
+    text, message = BAD[fault]
+    path = tmp_path / "bad.urdf"
+    path.write_text(text)
+    joints = ["ab", "bc"] if fault == "prismatic" else None
+    with pytest.raises(ModelError, match=message) as caught, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_urdf(path, joints=joints)
+    assert "bad.urdf" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_joint_that_is_not_there_is_named_with_the_choices() -> None:
+    with pytest.raises(ModelError, match=r"'panda_joint9'.*not there.*panda_joint1, panda_joint2"):
+        documented("panda", joints=["panda_joint9"])
+
+
+def test_robots_by_name_and_by_file(tmp_path: Path) -> None:
+    assert "panda" in names()
+    with pytest.raises(ModelError, match=r"no robot 'pnada'; have: panda, a \.urdf file"):
+        documented("pnada")
+    with pytest.raises(ModelError, match=r"gone\.urdf"):
+        documented(tmp_path / "gone.urdf")
+    with pytest.raises(ModelError, match=r"gone\.json"):
+        documented(tmp_path / "gone.json")
+    model = documented("panda", gravity=[9.81, 0, 0])
+    path = save_model(model, tmp_path / "wall.json")
+    back = documented(path)
+    assert isinstance(back, SelfModel) and back.gravity.tolist() == [9.81, 0, 0]

@@ -1,0 +1,259 @@
+"""The live process: nothing gets lost, whatever fails."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.realtime.clock import sleep_until
+from adapter.realtime.jobs import DisplayJob, Jobs
+from adapter.realtime.loop import run_live
+from adapter.realtime.session import Session, run_lockstep
+from adapter.realtime.worker import WorkerError
+from drivers.files.mcap import read_estimates, read_log
+from drivers.interface import DriverError
+from tests.helpers import live_tools as tools
+
+pytestmark = pytest.mark.alone
+
+SCRIPT = """
+import sys
+import time
+from pathlib import Path
+from tests.helpers import live_tools as tools
+from adapter.realtime.jobs import Jobs
+from adapter.realtime.loop import run_live
+
+if __name__ == "__main__":
+    front_end, controller = tools.parts()
+    result = run_live(
+        tools.simulated_arm(), front_end, controller=controller,
+        jobs=Jobs(learner=tools.learner_job(), recording=tools.recording_job(Path(sys.argv[1]))),
+        options=tools.live_options(None),
+        say=lambda line: print(line, flush=True),
+    )
+    print("RESULT", result.ended, result.samples, result.recorded, result.passed_on,
+          result.collected[0], flush=True)
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_leftovers():
+    before = tools.shared_memory()
+    yield
+    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+
+
+def _save(learner) -> None:
+    Path(os.environ["TEST_CHECKPOINT"]).write_text(str(learner.count))
+
+
+def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch):
+    monkeypatch.setenv("TEST_CHECKPOINT", str(tmp_path / "checkpoint"))
+    front_end, controller = tools.parts()
+    path = tmp_path / "a.mcap"
+    result = run_live(
+        tools.simulated_arm(),
+        front_end,
+        controller=controller,
+        jobs=Jobs(learner=tools.learner_job(save=_save), recording=tools.recording_job(path)),
+        options=tools.live_options(2.0),
+    )
+    print("\n".join(result.timing.lines()))
+    assert (result.ended, result.fault, result.troubles) == ("duration", None, [])
+    assert result.samples == result.recorded >= 3000
+    assert (result.unlearned, result.unrecorded) == (0, 0)
+    assert [g.what for g in result.grants] == ["collector", "memory", "core", "priority"]
+
+    again, learner = tools.simulated_arm(), tools.Digest()
+    front_end, controller = tools.parts()
+    lockstep = run_lockstep(again, front_end, learner, controller, 2.0)
+    assert result.collected == learner.summary()
+    assert result.collected[:2] == (result.passed_on, True)
+    assert (lockstep.samples, lockstep.ended) == (result.samples, "duration")
+    assert lockstep.tracking == result.tracking
+
+    log = read_log(path)
+    assert len(log) == result.samples and not log.truncated and log.metadata["note"] == "test"
+    assert log.commands is not None and len(log.commands.stamp_ns) == result.samples
+    estimates = list(read_estimates(path))
+    assert len(estimates) > 10 and estimates[-1]["learned"] == result.passed_on
+    assert (tmp_path / "checkpoint").read_text() == str(result.passed_on)
+
+
+@pytest.mark.parametrize("fault", [{"fail_read": 700}, {"fail_command": 700}])
+def test_a_driver_that_fails_is_stopped_and_all_is_kept(tmp_path, fault):
+    arm, path = tools.Swinging(**fault), tmp_path / "a.mcap"
+    front_end, controller = tools.parts()
+    result = run_live(
+        arm,
+        front_end,
+        controller=controller,
+        jobs=Jobs(learner=tools.learner_job(), recording=tools.recording_job(path)),
+        options=tools.live_options(30.0),
+    )
+    assert result.ended == "driver_error"
+    assert result.fault in ("the cable came off", "the arm refused")
+    assert arm.stops == 1 and arm.closes == 1
+    assert result.samples == result.recorded == len(read_log(path)) == arm.reads
+    assert result.collected[:2] == (result.passed_on, True) and result.passed_on > 300
+
+
+@pytest.mark.parametrize("kind", [tools.Digest, tools.Dying])
+def test_a_display_sees_the_run_to_its_end(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
+    result = run_live(
+        tools.Swinging(),
+        tools.parts()[0],
+        jobs=Jobs(learner=tools.learner_job(kind), display=DisplayJob(tools.Diary, period_s=0.05)),
+        options=tools.live_options(1.0),
+    )
+    lines = [line.split() for line in (tmp_path / "diary").read_text().splitlines()]
+    assert [line[3] for line in lines[:-1]] == ["False"] * (len(lines) - 1) and len(lines) > 5
+    assert lines[-1][1:] == ["0", lines[-1][2], "True"]
+    if kind is tools.Digest:
+        assert int(lines[-1][0]) == result.passed_on
+
+
+def test_passive_only_listens_and_needs_no_workers():
+    arm = tools.Swinging()
+    result = run_live(arm, tools.parts()[0], options=tools.live_options(0.3))
+    assert (result.ended, arm.commands, result.tracking) == ("duration", 0, None)
+    assert result.samples == 301 and result.recorded is None and result.collected is None
+
+
+class Paced(tools.Swinging):
+    """An arm that sets the rhythm itself; a sample is a millisecond old when it is given out."""
+
+    paced = True
+
+    def read(self):
+        sample = super().read()
+        self.arrived_ns = time.monotonic_ns()
+        sleep_until(self.arrived_ns + 1_000_000)
+        self.intake.received += 1
+        self.intake.used += 1
+        return sample
+
+
+def test_every_sample_is_accounted_for_and_its_age_is_told():
+    arm = Paced()
+    result = run_live(arm, tools.parts()[0], options=tools.live_options(0.5))
+    assert result.samples + result.set_aside == result.intake.received == arm.reads
+    assert result.intake == arm.intake and result.intake is not arm.intake
+    assert result.timing.age_us["p50"] >= 1000.0
+    assert any("age of a sample" in line for line in result.timing.lines())
+    unpaced = run_live(tools.Swinging(), tools.parts()[0], options=tools.live_options(0.2))
+    assert unpaced.timing.age_us["p50"] is None and unpaced.set_aside == 0
+
+
+class Waking(tools.Swinging):
+    """An arm whose torques are there 20 ms after it was first read, and which never waits."""
+
+    def read(self):
+        sample = super().read()
+        self.arrived_ns = time.monotonic_ns()
+        self._first_ns = min(getattr(self, "_first_ns", self.arrived_ns), self.arrived_ns)
+        if self.arrived_ns - self._first_ns < 20_000_000:
+            return replace(sample, tau=np.full(7, np.nan))
+        return sample
+
+
+def test_a_motion_starts_with_the_first_whole_sample():
+    """As of a CAN arm, whose next replies need a tick: reading faster finds nothing new."""
+    arm = Waking()
+    front_end, controller = tools.parts()
+    arm.connect()
+    session = Session(arm, front_end, controller, lambda record: None, lambda *kept: None, 1.0)
+    sample = session.get_ready(controller.prepare)
+    assert np.isfinite(sample.tau).all()
+    assert 0 < session.set_aside < 30
+
+
+@pytest.mark.parametrize(("kind", "said"), [(tools.Dying, "exit code 3"), (tools.Failing, "a bug")])
+def test_a_learner_that_dies_does_not_stop_the_arm(tmp_path, kind, said):
+    lines: list[str] = []
+    arm, path = tools.Swinging(), tmp_path / "a.mcap"
+    result = run_live(
+        arm,
+        tools.parts()[0],
+        jobs=Jobs(learner=tools.learner_job(kind), recording=tools.recording_job(path)),
+        options=tools.live_options(2.0),
+        say=lines.append,
+    )
+    assert result.ended == "duration" and result.samples == 2001
+    assert result.collected is None and result.unlearned > 0
+    assert len(result.troubles) == 1 and said in result.troubles[0]
+    assert "the arm goes on" in result.troubles[0] and result.troubles[0] in lines
+    assert len(read_log(path)) == result.samples
+
+
+def _no_learner():
+    raise RuntimeError("no such model")
+
+
+def test_what_cannot_start_says_so_and_leaves_nothing(tmp_path):
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    arm = tools.Swinging()
+    with pytest.raises(DriverError, match="exists"):
+        run_live(
+            arm,
+            tools.parts()[0],
+            jobs=Jobs(recording=tools.recording_job(path)),
+        )
+    assert path.read_bytes() == b"precious"
+    job = tools.LearnerJob(_no_learner, tools.Digest.summary)
+    with pytest.raises(WorkerError, match="no such model"):
+        run_live(
+            arm,
+            tools.parts()[0],
+            jobs=Jobs(learner=job),
+            options=tools.live_options(1.0),
+        )
+    arm.can_move = False
+    with pytest.raises(DriverError, match="passive"):
+        run_live(arm, tools.parts()[0], controller=tools.parts()[1])
+
+
+@pytest.fixture
+def running(tmp_path):
+    script, path = tmp_path / "live.py", tmp_path / "a.mcap"
+    script.write_text(SCRIPT)
+    folders = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders)}
+    process = subprocess.Popen(
+        [sys.executable, str(script), str(path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+    assert tools.wait_for(lambda: path.exists() and path.stat().st_size > 60_000, 120.0)
+    yield process, path
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+def test_after_kill_9_the_workers_close_the_recording_and_go(running):
+    process, path = running
+    process.kill()
+    process.wait()
+    assert tools.wait_for(lambda: not _truncated(path))
+    assert len(read_log(path)) > 100  # what 60 kB held at the least
+
+
+def _truncated(path: Path) -> bool:
+    try:
+        return read_log(path).truncated
+    except DriverError:
+        return True

@@ -1,0 +1,159 @@
+"""A disk that is full, slow or loses its writer: the arm goes on, what was written stays."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.realtime.jobs import Jobs
+from adapter.realtime.loop import run_live
+from adapter.runs.live import describe_estimate
+from drivers.files.mcap import read_log
+from tests.helpers import live_tools as tools
+
+pytestmark = pytest.mark.alone
+
+ROOM = 200_000  # bytes, for a second or so of samples
+RUN_S = 4.0
+
+
+@pytest.fixture(autouse=True)
+def no_leftovers(tmp_path, monkeypatch):
+    monkeypatch.setenv("TEST_GRAVES", str(tmp_path))
+    before = tools.shared_memory()
+    yield
+    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+
+
+class Shaky(tools.Swinging):
+    """An arm whose readings do not compress."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._rng = np.random.default_rng(3)
+
+    def read(self):
+        sample = super().read()
+        return replace(sample, q=sample.q + 1e-6 * self._rng.random(7))
+
+
+def _run(path: Path, describe=describe_estimate, ring_s: float = 5.0, duration_s: float = RUN_S):
+    arm = Shaky()
+    result = run_live(
+        arm,
+        tools.parts()[0],
+        jobs=Jobs(
+            learner=tools.learner_job(),
+            recording=replace(tools.recording_job(path), describe=describe),
+        ),
+        options=tools.live_options(duration_s, ring_s),
+    )
+    assert (result.ended, result.fault) == ("duration", None) and arm.stops == 1
+    assert result.samples == round(1e3 * duration_s) + 1
+    assert result.samples == result.recorded + result.unrecorded
+    assert result.collected[:2] == (result.passed_on, True)
+    return result
+
+
+def _stamps(path: Path) -> list[int]:
+    return read_log(path).stamp_ns.tolist()
+
+
+def _check_full(result, path: Path) -> None:
+    assert len(result.troubles) == 1 and "nothing more is recorded" in result.troubles[0]
+    assert f"{path}: cannot be written" in result.troubles[0]
+    assert "what was recorded before stays readable" in result.troubles[0]
+    stamps = _stamps(path)
+    assert stamps == [1_000_000 * k for k in range(1, len(stamps) + 1)]
+    assert 0 < result.recorded <= len(stamps) and result.unrecorded > 500
+    assert result.restarts == 0 and not list(path.parent.glob("*.part2*"))
+
+
+def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={ROOM}", "tmpfs", str(disk)]
+    try:
+        done = subprocess.run(mount, capture_output=True, text=True)
+    except FileNotFoundError:
+        pytest.skip("no mount program here")
+    if done.returncode:
+        pytest.skip(f"no small disk to be had: {done.stderr.strip()}")
+    try:
+        path = disk / "a.mcap"
+        result = _run(path)
+        assert "No space left on device" in result.troubles[0]
+        _check_full(result, path)
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def _little_room(snapshot):
+    """From the first estimate on, this process may write files of so many bytes."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, resource.RLIM_INFINITY))
+    return describe_estimate(snapshot)
+
+
+def test_a_file_that_may_not_grow_stops_the_recording_and_nothing_else(tmp_path):
+    path = tmp_path / "a.mcap"
+    _check_full(_run(path, _little_room), path)
+    assert path.stat().st_size <= ROOM
+
+
+def _stop_once(snapshot):
+    """Hangs once, as a write to a disk does that has other work."""
+    if snapshot.learned > 300:
+        place = Path(os.environ["TEST_GRAVES"]) / "hanging"
+        if not place.exists():
+            place.write_text(str(os.getpid()))
+            os.kill(os.getpid(), signal.SIGSTOP)
+    return describe_estimate(snapshot)
+
+
+@pytest.mark.parametrize(("hangs_s", "ring_s"), [(1.0, 5.0), (2.0, 1.0)])
+def test_a_slow_disk_costs_what_the_ring_cannot_hold(tmp_path, hangs_s, ring_s):
+    place, path = tmp_path / "hanging", tmp_path / "a.mcap"
+
+    def wake() -> None:
+        assert tools.wait_for(lambda: place.exists() and place.read_text(), 120.0)
+        time.sleep(hangs_s)
+        os.kill(int(place.read_text()), signal.SIGCONT)
+
+    waker = threading.Thread(target=wake)
+    waker.start()
+    result = _run(path, _stop_once, ring_s)
+    waker.join()
+    stamps = _stamps(path)
+    assert result.troubles == [] and len(stamps) == result.recorded
+    assert (np.diff(stamps) > 0).all()
+    if ring_s > hangs_s:
+        assert result.unrecorded == 0
+    else:
+        assert 300 < result.unrecorded < 2500
+
+
+def _die_once(snapshot):
+    if snapshot.learned > 500:
+        tools.die_once("recorder")
+    return describe_estimate(snapshot)
+
+
+def test_a_killed_recorder_is_followed_by_one_with_a_file_of_its_own(tmp_path):
+    path = tmp_path / "a.mcap"
+    result = _run(path, _die_once)
+    assert result.restarts == 1 and result.unrecorded == 0
+    assert len(result.troubles) == 1 and "exit code -9" in result.troubles[0]
+    first, second = _stamps(path), _stamps(tmp_path / "a.part2.mcap")
+    assert read_log(path).truncated and not read_log(tmp_path / "a.part2.mcap").truncated
+    assert len(first) > 0 and second[-1] == 1_000_000 * result.samples
+    assert 0 <= first[-1] + 1_000_000 - second[0] < 500_000_000  # was not handed over yet
+    assert sorted({*first, *second}) == [1_000_000 * k for k in range(1, result.samples + 1)]

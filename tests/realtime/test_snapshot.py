@@ -1,0 +1,124 @@
+"""The published estimate: never torn, clear when absent, no leftovers."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.model.self_model import LAMBDA_MEASURED
+from adapter.realtime import SnapshotError, SnapshotReader, SnapshotWriter
+from adapter.realtime.snapshot import PID, nothing_known
+
+JOINTS = ("a", "b", "c")
+
+
+@pytest.fixture
+def board():
+    writer = SnapshotWriter.create(
+        JOINTS, ("viscous_friction",), name=f"adapter-test-{os.getpid()}"
+    )
+    yield writer
+    writer.close()
+    writer.unlink()
+
+
+def _of(number: float):
+    parts = nothing_known(3, 3, 1)
+    filled = {
+        key: np.full(getattr(parts, key).shape, number)
+        for key in ("lam", "lam_std", "theta", "theta_std", "effects", "effects_std")
+    }
+    return replace(parts, **filled, stamp_ns=int(number), learned=int(number))
+
+
+def test_what_is_published_is_read(board):
+    with SnapshotReader(board.name) as reader:
+        before = reader.read()
+        assert before.version == 0 and np.isnan(before.lam).all() and not before.lam_converged
+        wanted = replace(_of(7.0), lam_converged=True, lambda_source=LAMBDA_MEASURED)
+        board.publish(wanted)
+        found = reader.read()
+    assert reader.joint_names == JOINTS and reader.effect_names == ("viscous_friction",)
+    assert found.version == 1 and found.stamp_ns == found.learned == 7
+    assert found.lam_converged and not found.theta_converged
+    assert found.lambda_source == LAMBDA_MEASURED and found.age_s >= 0.0
+    for key in ("lam", "lam_std", "theta", "theta_std", "effects", "effects_std"):
+        np.testing.assert_array_equal(getattr(found, key), getattr(wanted, key))
+
+
+def test_what_does_not_fit_is_refused(board):
+    with pytest.raises(ValueError, match="lam must have shape"):
+        board.publish(replace(_of(1.0), lam=np.zeros((2, 6))))
+    with pytest.raises(ValueError, match="have: documentation"):
+        board.publish(replace(_of(1.0), lambda_source="guess"))
+
+
+def test_absent_and_closed_are_said_clearly(board):
+    with pytest.raises(SnapshotError, match="no estimate is published as 'nobody'"):
+        SnapshotReader("nobody")
+    reader = SnapshotReader(board.name)
+    reader.close()
+    with pytest.raises(SnapshotError, match="was closed"):
+        reader.read()
+
+
+def test_a_name_in_use_is_refused_and_a_leftover_replaced(board):
+    with pytest.raises(SnapshotError, match=f"in use by process {os.getpid()}"):
+        SnapshotWriter.create(JOINTS, name=board.name)
+    board._header[PID] = 2**22 + 1  # of no process
+    fresh = SnapshotWriter.create(JOINTS, name=board.name)
+    assert fresh.effect_names == ()
+    fresh.close()
+
+
+def _hammer(name: str, stop) -> None:
+    writer = SnapshotWriter.attach(name)
+    number = 0
+    while not stop.is_set():
+        for _ in range(200):
+            number += 1
+            writer.publish(_of(float(number)))
+    writer.close()
+
+
+def test_a_hammering_writer_is_never_read_torn(board):
+    context = multiprocessing.get_context("spawn")
+    stop = context.Event()
+    process = context.Process(target=_hammer, args=(board.name, stop))
+    process.start()
+    versions = []
+    with SnapshotReader(board.name) as reader:
+        while reader.read().version == 0:
+            pass
+        for _ in range(20_000):
+            found = reader.read()
+            values = np.concatenate(
+                [v.ravel() for v in (found.lam, found.theta_std, found.effects, found.effects_std)]
+            )
+            assert (values == found.version).all() and found.stamp_ns == found.version
+            versions.append(found.version)
+    stop.set()
+    process.join(30)
+    assert process.exitcode == 0
+    assert (np.diff(versions) >= 0).all() and versions[-1] > versions[0]
+
+
+def test_a_foreign_reader_leaves_the_memory_and_stderr_alone(board):
+    code = (
+        "from adapter.realtime import SnapshotReader; import sys;"
+        "print(SnapshotReader(sys.argv[1]).read().version)"
+    )
+    board.publish(_of(1.0))
+    done = subprocess.run(
+        [sys.executable, "-c", code, board.name], capture_output=True, text=True, timeout=120
+    )
+    assert (done.stdout, done.stderr) == ("1\n", "")
+    if Path("/dev/shm").is_dir():
+        assert Path("/dev/shm", board.name).exists()

@@ -1,0 +1,271 @@
+"""What is said and shown about the gap: right words for each outcome, a page that stands alone."""
+
+from __future__ import annotations
+
+import html
+import io
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from adapter.effects.catalogue import CATALOGUE
+from adapter.gap.result import GapResult
+from adapter.gap.words import (
+    as_json,
+    console_summary,
+    headline,
+    leftover_sentence,
+    rivals,
+    sentence,
+)
+from adapter.report.gap_page import render_gap_page, write_gap_page
+from adapter.report.gap_signatures import shown_joints
+from adapter.runs.run_folder import RunFolderError
+from tests.helpers import gap_results as made_up
+from tests.helpers.browser import Links, screenshot
+
+MOST_BYTES = 2_000_000
+KINDS = ["one_finding", "pair", "unexplained", "nothing", "problem", "two_joints", "many"]
+SECTIONS = {
+    "one_finding": "findings gap signatures confusion next correction notes provenance",
+    "pair": "findings gap signatures confusion next correction notes provenance",
+    "unexplained": "unexplained gap signatures next correction notes provenance",
+    "nothing": "gap signatures provenance",
+    "problem": "next provenance",
+    "two_joints": "findings gap signatures confusion provenance",
+    "many": "findings unexplained gap signatures confusion next correction notes provenance",
+}
+SAID = {
+    "one_finding": "joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; "
+    "torque error 1.92 -> 0.02 N m",
+    "pair": "joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; "
+    "from 12.3 s on the flange carries 1.020 ± 0.010 kg; torque error 1.92 -> 0.02 N m",
+    "unexplained": "joint 3: 0.30 N m that follow dq3 and q1 are not explained by any effect of "
+    "the catalogue",
+    "nothing": "the model explains this recording down to its noise",
+    "problem": "joints 1 to 7 hardly move; move each over 0.5 rad and more than 0.2 rad/s.",
+    "two_joints": "the torque of all joints comes 2.10 ± 0.10 ms after the position; "
+    "torque error of joint 1 0.90 -> 0.03 N m",
+    "many": "joints 1 to 7 lack Coulomb friction (0.27, 0.20, 0.14, 0.45, 0.30, 0.15 and "
+    "0.25 N m); joints 1, 2 and 4 lack viscous friction (0.10, 0.20 and 0.40 N m s/rad); "
+    "the torque sensor of joint 2 reads 0.310 ± 0.020 N m too little; 2 more findings; "
+    "torque error of joint 2 0.77 -> 0.29 N m; joints 3 and 6: 0.30 and 0.60 N m are not "
+    "explained by any effect of the catalogue",
+}
+
+
+def result_of(kind: str) -> GapResult:
+    make: Callable[[], GapResult] = getattr(made_up, kind)
+    return make()
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    return {kind: render_gap_page(result_of(kind)) for kind in KINDS}
+
+
+def text_of(page: str) -> str:
+    """What a reader sees, with plain spaces."""
+    text = re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.S)
+    return re.sub(r"\s+", " ", html.unescape(text))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_headline(kind: str) -> None:
+    result = result_of(kind)
+    assert headline(result) == SAID[kind]
+    assert as_json(result)["headline"] == SAID[kind]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_page_has_its_sections_and_stands_alone(kind: str, pages: dict[str, str]) -> None:
+    page = pages[kind]
+    assert re.findall(r'<(?:section|footer) id="(\w+)"', page) == SECTIONS[kind].split()
+    assert len(page.encode()) < MOST_BYTES
+    assert page.startswith("<!doctype html>")
+    links = Links()
+    links.feed(page)
+    assert [link for link in links.found if not link.startswith("#")] == []
+    assert not re.search(r"https?:|url\((?!#)|@import", page)
+    assert "default-src 'none'" in page
+    assert len(links.ids) == len(set(links.ids))
+    assert not re.search(r"\b(None|nan|null|inf|Undefined)\b", text_of(page))
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "dark"),
+    [
+        ("one_finding", (1300, 1500), False),
+        ("pair", (1300, 1500), True),
+        ("many", (500, 1500), True),
+        ("unexplained", (390, 1500), False),
+        ("nothing", (1300, 1000), False),
+        ("problem", (900, 500), True),
+        ("two_joints", (1300, 1000), False),
+    ],
+)
+def test_a_browser_shows_it_without_complaint(
+    kind: str, size: tuple[int, int], dark: bool, pages: dict[str, str], tmp_path: Path
+) -> None:
+    picture, complaints = screenshot(pages[kind], tmp_path, size, dark)
+    assert complaints == []
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 20_000  # more than an empty page
+
+
+def test_page_tells_the_finding(pages: dict[str, str]) -> None:
+    text = text_of(pages["one_finding"])
+    for said in (
+        "Joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; torque error 1.92 → 0.02 N m.",
+        "Fc = 2.000 ± 0.030 N m", "> 99.9 %", "load-dependent friction 97 %", "96.0",
+        "repeat the motion with a ladder of loads", "Forward simulation", "Against velocity",
+        "Against position", "Against load", "Against acceleration", "Over time",
+        "Not a finding", "+0.05 kg", "12 samples are repeated", "nominal+coulomb_friction.json",
+    ):  # fmt: skip
+        assert said in text, said
+    assert pages["one_finding"].count("<svg") == 2 + 4 + 2
+
+
+def test_page_tells_what_stays_unexplained(pages: dict[str, str]) -> None:
+    text = text_of(pages["unexplained"])
+    assert "that follow the velocity of joint 3 (dq3) and the position of joint 1 (q1)" in text
+    assert "15 times its noise" in text
+    assert "Left on joint 3" in text
+    assert "none was written" in text
+
+
+def test_signatures_are_of_the_worst_joints() -> None:
+    assert shown_joints(result_of("one_finding")) == [3]
+    assert shown_joints(result_of("pair")) == [3, 1]  # the payload acts most on joint 2
+    assert shown_joints(result_of("unexplained")) == [2]
+    assert len(shown_joints(result_of("many"))) == 3
+    assert shown_joints(result_of("problem")) == []
+
+
+def test_a_problem_with_curves_still_has_a_page() -> None:
+    result = replace(result_of("problem"), curves=(made_up.curves(),))
+    assert "Against velocity" in render_gap_page(result)
+
+
+def test_unknown_rollouts_are_dashes_or_left_out(pages: dict[str, str]) -> None:
+    assert "rollout" not in text_of(pages["two_joints"])
+    one = result_of("one_finding")
+    failed = replace(one.after, rollout_rmse_rad=np.full(7, np.nan), rollout_rmse_rad_s=None)
+    text = text_of(render_gap_page(replace(one, after=failed)))
+    assert "80.00 – " in text
+    assert "80 → – mrad" in text
+
+
+def test_a_correction_without_prior_is_no_division() -> None:
+    result = replace(result_of("one_finding"), corrections_prior=np.zeros((7, 10)))
+    assert 'id="correction"' not in render_gap_page(result)
+
+
+def test_every_effect_has_its_phrase() -> None:
+    for name, effect in CATALOGUE.items():
+        values = {p.key: [0.1] * p.count if p.count > 1 else 0.1 for p in effect.parameters}
+        std = {p.key: [0.01] * p.count if p.count > 1 else 0.01 for p in effect.parameters}
+        joints = (2,) if effect.scope in ("joint", "link") else ()
+        for sign in (1.0, -1.0):
+            signed = {k: sign * np.array(v) for k, v in values.items()}
+            signed = {k: v.tolist() if v.ndim else float(v) for k, v in signed.items()}
+            said = sentence(made_up.finding(name, joints, signed, std))
+            assert not re.search(r"[{}]|nan|None", said), said
+        made_up_page = replace(
+            result_of("one_finding"), findings=(made_up.finding(name, joints, values, std),)
+        )
+        assert headline(made_up_page)
+
+
+@pytest.mark.parametrize(
+    ("effect", "joints", "values", "std", "said"),
+    [
+        ("torque_gain", (2,), {"g": 0.05}, {"g": 0.002},
+         "the torque sensor of joint 2 reads 5.00 ± 0.20 % too much"),
+        ("encoder_offset", (3,), {"o": -0.0123}, {"o": 0.0002},
+         "the encoder of joint 3 reads 12.30 ± 0.20 mrad too little"),
+        ("joint_elasticity", (2,), {"k": 12345.0}, {"k": 340.0},
+         "joint 2 is elastic, with a stiffness of 12340 ± 340 N m/rad"),
+        ("torque_ripple", (5,), {"a": 0.31, "n": 3, "phase": 0.2}, {"a": 0.01, "phase": 0.03},
+         "joint 5 has a torque ripple of 0.310 ± 0.010 N m, 3 per turn"),
+        ("base_tilt", (), {"rx": 0.03, "ry": 0.04}, {"rx": 0.001, "ry": 0.001},
+         "the base is tilted by 2.865 ± 0.057°"),
+        ("payload", (), {"m": -0.4, "cx": 0.0, "cy": 0.0, "cz": 0.1}, {"m": None},
+         "the flange carries 0.400 kg less than the model says"),
+        ("coulomb_friction", (4,), {"Fc": -0.3}, {"Fc": 0.02},
+         "joint 4 has 0.300 ± 0.020 N m less Coulomb friction than the model says"),
+    ],
+)  # fmt: skip
+def test_sentence(effect, joints, values, std, said) -> None:
+    assert sentence(made_up.finding(effect, joints, values, std)) == said
+
+
+def test_when() -> None:
+    wrench = result_of("many").findings[-1]
+    assert sentence(wrench).startswith("from 3.1 to 4.6 s something pushes the flange with 5.20 ±")
+    early = replace(made_up.COULOMB, interval_s=(0.0, 4.0), lasting=False)
+    assert sentence(early).startswith("until 4 s joint 4 lacks")
+
+
+def test_rivals() -> None:
+    assert rivals(made_up.COULOMB) == (
+        "could also be load-dependent friction, which explains 97 % of it here; "
+        "to split: repeat the motion with a ladder of loads at the flange, at the same speed: "
+        "the Coulomb friction stays, the load-dependent friction grows with the load"
+    )
+    assert "explains all of it" in rivals(made_up.PAYLOAD)
+    assert rivals(replace(made_up.COULOMB, overlaps={})) == ""
+
+
+def test_what_follows_nothing_is_said_so() -> None:
+    left = replace(result_of("unexplained").unexplained[0], depends_on=())
+    assert "that follow no signal are not explained" in leftover_sentence(left)
+    result = replace(result_of("unexplained"), unexplained=(left,))
+    assert "time, s" in text_of(render_gap_page(result))
+
+
+def test_nothing_found_is_not_called_noise_where_more_is_left() -> None:
+    high = made_up.errors([0.1] * 7)
+    result = replace(result_of("nothing"), before=high, after=high)
+    assert "to within 5 times the noise" in headline(result)
+    corrected = replace(result_of("nothing"), before=high)
+    assert "once its inertias are corrected" in headline(corrected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_console_summary(kind: str) -> None:
+    result = replace(result_of(kind), notes=("[bold] is not markup here",))
+    console = Console(width=400, record=True, file=io.StringIO())
+    for line in console_summary(result):
+        console.print(line, highlight=False)
+    shown = console.export_text()
+    assert SAID[kind] in shown
+    assert "[bold] is not markup here" in shown
+    if result.problem is None:
+        assert "torque error before" in shown
+    assert "nan" not in shown
+
+
+def test_names_are_escaped() -> None:
+    evil = "<b>\"&'$x_{1}$"
+    result = replace(
+        result_of("one_finding"), model_name=evil, joint_names=(evil,) * 7, recordings=(evil,),
+        notes=(evil,), what_next=(evil,), model_out=evil,
+    )  # fmt: skip
+    page = render_gap_page(result)
+    assert '<b>"' not in page
+    assert "<b>&#34;" not in page
+
+
+def test_it_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = write_gap_page(result_of("nothing"), tmp_path / "new" / "gap.html")
+    assert path.read_text("utf-8").endswith("</html>")
+    assert [p.name for p in path.parent.iterdir()] == ["gap.html"]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        write_gap_page(result_of("nothing"), tmp_path / "file" / "gap.html")

@@ -1,0 +1,275 @@
+"""The run folder and its report: whole, self-contained, honest about what is missing."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.control.controller import ExcitationController
+from adapter.control.excitation import ExcitationSettings
+from adapter.control.limits import MotionLimits
+from adapter.learning.learner import LearnerSettings
+from adapter.model.robots import documented
+from adapter.realtime.session import run_lockstep
+from adapter.report import render, write_report
+from adapter.report.schema_panels import rotation_path
+from adapter.report.style import thin
+from adapter.report.words import headline
+from adapter.runs.outcome import collect
+from adapter.runs.pipeline import Pipeline, PipelineSettings
+from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data, save_run
+from adapter.runs.score import Course, figures, reference_from
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+from tests.helpers.browser import Links, screenshot
+
+PERCENTILES = {"p50": 90.0, "p99": 140.0, "p99.9": 200.0, "max": 900.0}
+SECTIONS = "schema skeleton dynamics prequential fit joints identifiability samples provenance"
+MOST_BYTES = 2_000_000
+
+
+def a_run(duration_s: float, **more) -> RunData:
+    """A few seconds of the simulated arm, learned in lockstep."""
+    robot = documented("panda")
+    settings = PipelineSettings(learner=LearnerSettings(effects=("viscous_friction",)))
+    pipeline = Pipeline(robot, settings)
+    controller = ExcitationController(MotionLimits.of(robot), ExcitationSettings(seed=5))
+    arm = PyBulletArm(build("nominal", 5).plant())
+    run = run_lockstep(arm, pipeline.front_end, pipeline.learner, controller, duration_s)
+    outcome, front_end = collect(pipeline.learner), pipeline.front_end
+    reference = reference_from(None, robot)
+    times = {"delay_s": front_end.delay_s, "first_moving_ns": front_end.first_moving_ns}
+    numbers = figures(
+        outcome,
+        robot,
+        reference,
+        Course(run.samples, front_end.refused, **times),
+        **more,
+    )
+    return run_data(
+        outcome, robot, numbers, reference, **times, program="0.1.0", documented="panda"
+    )
+
+
+@pytest.fixture(scope="module")
+def data() -> RunData:
+    return a_run(5.0)
+
+
+@pytest.fixture(scope="module")
+def page(data: RunData) -> str:
+    return render(data)
+
+
+def with_figures(data: RunData, **more) -> RunData:
+    return replace(data, figures={**data.figures, **more})
+
+
+def test_page_has_all_sections_and_is_small(page: str) -> None:
+    for section in SECTIONS.split():
+        assert f'id="{section}"' in page, section
+    assert len(page.encode()) < MOST_BYTES
+    # 4 of λ, 3 views, 3 + 1 of θ, 2 prequential, 7 joints
+    assert page.count("<svg") == 20
+    assert "36 of 42 directions" in page
+    assert "43 combinations of 70 parameters" in page
+
+
+def test_page_fetches_nothing(page: str) -> None:
+    links = Links()
+    links.feed(page)
+    assert [link for link in links.found if not link.startswith("#")] == []
+    assert not re.search(r"https?:|url\((?!#)|@import", page)
+    assert "default-src 'none'" in page
+    assert len(links.ids) == len(set(links.ids))
+    for target in re.findall(r'(?:href="|url\()#([\w-]+)', page):
+        assert target in links.ids
+
+
+def test_nothing_missing_is_shown_as_null(page: str) -> None:
+    text = re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.S)
+    assert not re.search(r"\b(None|nan|null|Undefined)\b", text)
+    for absent in ("timing", "changes", "tracking", "warnings"):
+        assert f'id="{absent}"' not in page
+    assert "eadlines" not in page
+
+
+def test_lambda_says_where_it_comes_from(data: RunData, page: str) -> None:
+    assert page.count("reproduces the documentation") >= 5
+    measured = with_figures(data, **{"lambda": {**data.figures["lambda"], "source": "measured"}})
+    measured = replace(measured, model=replace(data.model, lambda_source="measured"))
+    text = render(measured)
+    assert "reproduces the documentation" not in text
+    assert text.count("measured") >= 5
+
+
+def test_optional_parts_appear_when_the_run_has_them(data: RunData) -> None:
+    change = {
+        "stamp_s": data.start_s + 3.0,
+        "payload": {"m": 0.3, "m_std": 0.002, "cx": 0.02, "cy": 0.0, "cz": 0.15},
+    }
+    error = {"samples": 1000, "rms_rad": [0.01] * 7, "max_rad": [0.03] * 7}
+    text = render(
+        with_figures(
+            data,
+            theta={
+                **data.figures["theta"],
+                "changes": [change],
+                "validation_torque_rmse_nm": [0.1] * 7,
+            },
+            tick_us=PERCENTILES,
+            timing={
+                "tick_us": PERCENTILES,
+                "lateness_us": PERCENTILES,
+                "loop_us": dict.fromkeys(PERCENTILES),
+                "histograms": {"tick_us": {"edges_us": [80, 90, 100], "counts": [3, 900]}},
+            },
+            tracking={"feedback": error, "feedforward": error, "saturated": 0},
+            warnings=["a <b>warning</b>"],
+            granted=["memory locked"],
+            refused={"repeated": 12, "never_heard_of": 3},
+            gaps=[[0, 0.05]],
+            fault="the arm went away",
+        )
+    )
+    for shown in (
+        'id="changes"', 'id="tracking"', 'id="timing"', 'id="refused"', 'id="warnings"',
+        "0.3000 ± 0.0020", "Begin of the tick after its deadline", "900", "memory locked",
+        "never heard of", "1 gap in", "On data held out", "0 deadlines missed",
+        "a &lt;b&gt;warning&lt;/b&gt;", "the arm went away", "ticks per bin",
+    ):  # fmt: skip
+        assert shown in text, shown
+    assert "Compute of the whole tick" not in text
+
+
+def test_names_are_escaped(data: RunData) -> None:
+    evil = "<b>\"&'$x_{1}$"
+    tree = replace(data.documented.tree, joint_names=tuple(f"{evil}{j}" for j in range(7)))
+    robot = replace(data.documented, name=evil, tree=tree, frames=())
+    model = replace(data.model, name=evil, tree=tree, frames=(), provenance={"command": evil})
+    text = render(replace(data, documented=robot, model=model))
+    assert "<b>&#34;" not in text
+    assert '<b>"' not in text
+    assert "&lt;b&gt;" in text
+
+
+def test_an_arm_that_never_moved_has_a_report(data: RunData) -> None:
+    n = data.n
+    schema = {**data.figures["lambda"], "converged_s": None}
+    theta = {**data.figures["theta"], "started_s": None, "converged_s": None, "torque_rmse_nm": []}
+    still = replace(
+        with_figures(data, **{"lambda": schema, "theta": theta, "learned": 0}),
+        schema_trace=data.schema_trace[:0],
+        theta_trace=data.theta_trace[:0],
+        score_trace=data.score_trace[:0],
+        fit=np.zeros((0, n)),
+        batch=np.zeros((0, n)),
+        first_moving_ns=None,
+    )
+    text = render(still)
+    assert "θ was not learned" in text
+    assert "not reached" in text
+    assert 'id="fit"' not in text
+
+
+def test_without_a_reference_no_errors_are_drawn(data: RunData) -> None:
+    text = render(replace(data, reference=None))
+    assert "Orientation of the joint frames" in text
+    assert "Orientation error" not in text
+
+
+def test_headline(data: RunData) -> None:
+    said = headline(data.figures)
+    assert re.match(r"λ reproduces the documentation [\d.]+\u202fs after the first motion; ", said)
+    assert "torque explained to" in said
+    assert "samples learned" in said
+    truth = {**data.figures["lambda"], "source": "measured", "reference": "a/truth.json"}
+    said = headline({**data.figures, "lambda": {**truth, "converged_s": None}})
+    assert said.startswith(
+        "λ, measured, did not stay within 0.01\u202frad and 5\u202fmm of the given"
+    )
+
+
+def test_run_folder_round_trip(data: RunData, page: str, tmp_path: Path) -> None:
+    folder = save_run(tmp_path / "runs" / "a", data)
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"model.json", "documented.json", "figures.json", "traces.npz"}
+    back = load_run(folder)
+    for key in ("schema_trace", "score_trace", "fit", "batch", "lam_shown", "reference"):
+        np.testing.assert_array_equal(getattr(back, key), getattr(data, key))
+    assert back.figures == json.loads(json.dumps(data.figures))
+    assert (back.delay_s, back.first_moving_ns) == (data.delay_s, data.first_moving_ns)
+    assert back.model.provenance["program"] == "0.1.0"
+    np.testing.assert_array_equal(back.model.theta, data.model.theta)
+    written = write_report(folder / "report.html", back).read_text("utf-8")
+    assert without_ids(written) == without_ids(page)
+
+
+def without_ids(text: str) -> str:
+    return re.sub(r"f\d+-\w+", "", text)
+
+
+def test_what_is_not_finite_is_saved_as_unknown(data: RunData, tmp_path: Path) -> None:
+    folder = save_run(tmp_path, with_figures(data, odd=[np.float64("nan"), np.int64(3)]))
+    assert load_run(folder).figures["odd"] == [None, 3]
+
+
+def test_folder_errors_name_the_file(data: RunData, tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match="no such run folder"):
+        load_run(tmp_path / "nowhere")
+    folder = save_run(tmp_path / "a", data)
+    (folder / "traces.npz").write_bytes((folder / "traces.npz").read_bytes()[:1000])
+    with pytest.raises(RunFolderError, match=r"traces\.npz: cannot be read"):
+        load_run(folder)
+    np.savez(folder / "traces.npz", version=99)
+    with pytest.raises(RunFolderError, match="version 99 of the traces; have: 1"):
+        load_run(folder)
+    np.savez(folder / "traces.npz", version=np.array([{}], dtype=object))
+    with pytest.raises(RunFolderError, match=r"traces\.npz: cannot be read"):
+        load_run(folder)
+    save_run(folder, data)
+    (folder / "figures.json").write_text("{")
+    with pytest.raises(RunFolderError, match=r"figures\.json: cannot be read"):
+        load_run(folder)
+    (folder / "figures.json").write_text("{}")
+    with pytest.raises(RunFolderError, match="the figures lack 'samples'"):
+        load_run(folder)
+    (folder / "model.json").unlink()
+    with pytest.raises(RunFolderError, match=r"lacks model\.json; a run has"):
+        load_run(folder)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        save_run(tmp_path / "file", data)
+    with pytest.raises(RunFolderError, match="cannot be written"):
+        write_report(tmp_path / "file" / "report.html", data)
+
+
+def test_thin_keeps_peaks() -> None:
+    t = np.arange(10_000.0)
+    y = np.zeros_like(t)
+    y[[1234, 7777]] = 5.0, -3.0
+    few, values = thin(t, y, 100)
+    assert len(few) <= 102
+    assert values.max() == 5.0
+    assert values.min() == -3.0
+    assert (np.diff(few) > 0).all()
+
+
+def test_rotation_path_has_no_jump_at_half_a_turn() -> None:
+    lam = np.zeros((50, 1, 6))
+    lam[:, 0, 1] = np.linspace(2.5, 3.8, 50)  # about x, through π
+    path = rotation_path(lam)
+    assert np.abs(np.diff(path[:, 0, 0])).max() < 0.05
+    assert path[-1, 0, 0] == pytest.approx(3.8)
+
+
+def test_a_browser_shows_it_without_complaint(page: str, tmp_path: Path) -> None:
+    picture, complaints = screenshot(page, tmp_path)
+    assert complaints == []
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > 50_000  # more than an empty page

@@ -1,0 +1,262 @@
+"""Replay: the same bits every time and as the pipeline, batches that agree, names that match."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from adapter.errors import SettingsError
+from adapter.learning.learner import Learner, LearnerSettings
+from adapter.model.spatial import log_rotation, matrix_from_zxz
+from adapter.runs.pipeline import Pipeline, PipelineSettings
+from adapter.runs.replay import MOST_PER_UPDATE, Replay, ReplayOptions, replay
+from adapter.runs.score import theta_score
+from adapter.signals.matching import matching
+from drivers.files.mcap import Log, McapWriter, read_log
+from drivers.interface import DriverError
+from sim.scenarios import build
+from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
+
+N = 7
+
+
+def data(links: bool = False, seconds: float = 2.5) -> ArmData:
+    truth = bent() if links else arm()
+    found = record(truth, Motion(12.0 if not links else 4.0, 21), links=links)
+    return found.part(seconds)
+
+
+@cache
+def bent():
+    return build("bent_link", 2).truth
+
+
+def settings(**learner) -> PipelineSettings:
+    return PipelineSettings(learner=LearnerSettings(seed=3, **learner))
+
+
+def state_bytes(learner: Learner) -> bytes:
+    """Everything that a learner knows."""
+    schema, theta = learner.schema, learner.theta
+    parts = [schema.R0, schema.p, schema.information, theta.x, theta.mean]
+    parts += [*schema.moments, *theta.moments]
+    return b"".join(np.ascontiguousarray(x).tobytes() for x in parts)
+
+
+@cache
+def exact(links: bool = False, seconds: float = 2.5) -> Replay:
+    log = matching(data(links, seconds).log(), panda_model())
+    return replay(log, panda_model(), settings())
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_exact_replay_repeats_bit_for_bit(links: bool) -> None:
+    again = replay(matching(data(links).log(), panda_model()), panda_model(), settings())
+    assert state_bytes(again.pipeline.learner) == state_bytes(exact(links).pipeline.learner)
+    for name in ("lam", "theta", "lam_covariance", "schema_trace", "score_trace"):
+        a, b = getattr(again.outcome, name), getattr(exact(links).outcome, name)
+        assert a.tobytes() == b.tobytes(), name
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_exact_replay_is_the_pipeline_sample_by_sample(links: bool) -> None:
+    pipeline = Pipeline(panda_model(), settings())
+    passed = sum(pipeline.step(sample) for sample in data(links).samples())
+    found = exact(links)
+    assert state_bytes(pipeline.learner) == state_bytes(found.pipeline.learner)
+    assert pipeline.front_end.refused == found.pipeline.front_end.refused
+    assert passed == found.outcome.learned
+    assert found.samples == len(data(links)) == len(found.tick_ns)
+    assert (found.tick_ns > 0).all()
+    assert found.span_s == pytest.approx(2.499)
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_a_file_replays_as_what_was_recorded(tmp_path, links: bool) -> None:
+    path = tmp_path / "run.mcap"
+    source = data(links)
+    names = source.truth.link_names if links else ()
+    with McapWriter(path, source.truth.joint_names, names) as writer:
+        for sample in source.samples():
+            writer.write(sample)
+    found = replay(matching(read_log(path), panda_model()), panda_model(), settings())
+    assert state_bytes(found.pipeline.learner) == state_bytes(exact(links).pipeline.learner)
+
+
+@cache
+def batch(every: int = 10) -> Replay:
+    log = matching(data(seconds=12.0).log(), panda_model())
+    return replay(log, panda_model(), settings(), ReplayOptions(every=every))
+
+
+def test_batches_repeat_bit_for_bit() -> None:
+    log = matching(data().log(), panda_model())
+    one, two = (replay(log, panda_model(), settings(), ReplayOptions(every=10)) for _ in range(2))
+    assert state_bytes(one.pipeline.learner) == state_bytes(two.pipeline.learner)
+
+
+@pytest.mark.parametrize("every", [10, 30])
+def test_batches_agree_within_the_std(every: int) -> None:
+    ours, theirs = batch(every), exact(seconds=12.0)
+    a, b = ours.outcome, theirs.outcome
+    assert a.learned == b.learned and ours.samples == theirs.samples
+    assert a.lam_rank == b.lam_rank and a.lam_converged
+    turn = log_rotation(matrix_from_zxz(a.lam[:, :3]) @ matrix_from_zxz(b.lam[:, :3]).mT)
+    difference = np.concatenate([turn, a.lam[:, 3:] - b.lam[:, 3:]], axis=1)
+    shown = np.einsum("jab,jb->ja", b.lam_identifiable, difference)
+    std = np.sqrt(np.einsum("jaa->ja", b.lam_covariance))
+    assert (np.abs(shown) <= std + 1e-6).all()
+    k = 10 * N
+    std = np.sqrt(np.diag(b.covariance)[:k]).reshape(N, 10)
+    assert (np.abs(a.theta - b.theta) < std).all()
+
+
+def converged_s(found: Replay) -> float:
+    """When θ's torque error was that of batch least squares, for good."""
+    moving_ns = found.pipeline.front_end.first_moving_ns
+    assert moving_ns is not None
+    return theta_score(found.outcome, panda_model(), 1e-9 * moving_ns)["converged_s"]
+
+
+@pytest.mark.parametrize("every", [10, 30])
+def test_batches_converge_as_early_and_with_fewer_steps(every: int) -> None:
+    ours, theirs = batch(every), exact(seconds=12.0)
+    assert converged_s(ours) < converged_s(theirs) + 0.5
+    theta = ours.pipeline.learner.theta
+    assert (theta.variance() < 1.001 * theta.variance(theta.least_squares())).all()
+    assert ours.pipeline.learner.adam.steps < 0.8 * theirs.pipeline.learner.adam.steps
+
+
+def test_measured_motion_in_batches() -> None:
+    source = data(links=True, seconds=4.0)
+    log = matching(source.log(), panda_model())
+    a = replay(log, panda_model(), settings(), ReplayOptions(every=10)).outcome
+    b = exact(links=True, seconds=4.0).outcome
+    assert a.lam_measured and b.lam_measured
+    std = np.sqrt(np.einsum("jaa->ja", b.lam_covariance))
+    turn = log_rotation(matrix_from_zxz(a.lam[:, :3]) @ matrix_from_zxz(b.lam[:, :3]).mT)
+    difference = np.concatenate([turn, a.lam[:, 3:] - b.lam[:, 3:]], axis=1)
+    shown = np.einsum("jab,jb->ja", b.lam_identifiable, difference)
+    assert (np.abs(shown[2:]) <= std[2:] + 1e-6).all()
+
+
+@pytest.mark.parametrize("every", [0, -3, MOST_PER_UPDATE + 1])
+def test_every_is_checked(every: int) -> None:
+    with pytest.raises(SettingsError, match=f"1 to {MOST_PER_UPDATE} samples, got {every}"):
+        replay(data().log(), panda_model(), settings(), ReplayOptions(every=every))
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_until_s_learns_from_nothing_later(every: int) -> None:
+    log = data().log()
+    whole = replay(log, panda_model(), settings(), ReplayOptions(every=every, until_s=1.5))
+    part = replay(data(seconds=1.5).log(), panda_model(), settings(), ReplayOptions(every=every))
+    assert whole.samples == part.samples == 1500
+    assert state_bytes(whole.pipeline.learner) == state_bytes(part.pipeline.learner)
+
+
+def test_until_s_of_nothing_is_refused() -> None:
+    with pytest.raises(DriverError, match=r"arm_data\.mcap: no samples to learn from"):
+        replay(data().log(), panda_model(), settings(), ReplayOptions(until_s=0.0))
+
+
+def test_an_empty_recording_is_refused() -> None:
+    with pytest.raises(DriverError, match="no samples"):
+        replay(empty(), panda_model(), settings())
+    with pytest.raises(DriverError, match="no samples"):
+        replay(empty(), panda_model(), settings(), ReplayOptions(until_s=1.0))
+
+
+def empty() -> Log:
+    log = data().log()
+    nothing = log.q[:0]
+    return replace(log, stamp_ns=log.stamp_ns[:0], q=nothing, dq=nothing, tau=nothing)
+
+
+def test_progress_is_told() -> None:
+    for every in (1, 10):
+        told: list[int] = []
+        options = ReplayOptions(every, progress=told.append)
+        replay(data().log(), panda_model(), settings(), options)
+        assert told == sorted(told) and told[-1] < 2500
+
+
+def renamed(log: Log, names: tuple[str, ...], **more) -> Log:
+    return replace(log, joint_names=names, **more)
+
+
+def test_names_in_another_order_are_put_in_order() -> None:
+    log = data().log()
+    order = [3, 0, 6, 1, 5, 2, 4]
+    names = tuple(log.joint_names[k] for k in order)
+    mixed = renamed(log, names, q=log.q[:, order], dq=log.dq[:, order], tau=log.tau[:, order])
+    found = matching(mixed, panda_model())
+    assert found.joint_names == panda_model().tree.joint_names
+    assert np.array_equal(found.q, log.q) and np.array_equal(found.tau, log.tau)
+    assert not found.warnings
+
+
+def test_another_prefix_means_the_same_joints_with_a_warning() -> None:
+    log = data().log()
+    names = tuple(f"fer_joint{k + 1}" for k in range(N))[::-1]
+    found = matching(renamed(log, names, q=log.q[:, ::-1]), panda_model())
+    assert np.array_equal(found.q, log.q)
+    assert len(found.warnings) == 1 and "matched by their numbers" in found.warnings[0]
+
+
+def test_the_warning_pairs_the_names_that_were_matched() -> None:
+    names = tuple(f"fer_joint{k}" for k in (2, 1, 3, 4, 5, 6, 7))
+    found = matching(renamed(data().log(), names), panda_model())
+    assert "fer_joint1 = panda_joint1" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("a", "b", "c", "d", "e", "f", "g"),
+        ("j1", "j2", "j3", "j4", "j5", "j6", "k6"),
+        ("x0", "x1", "x2", "x3", "x4", "x5", "x6"),
+    ],
+)
+def test_names_that_say_nothing_are_refused(names: tuple[str, ...]) -> None:
+    with pytest.raises(DriverError) as refused:
+        matching(renamed(data().log(), names), panda_model())
+    assert "arm_data.mcap: has no joint" in str(refused.value)
+    assert names[0] in str(refused.value) and "panda_joint7" in str(refused.value)
+
+
+def test_a_missing_joint_is_named() -> None:
+    log = data().log()
+    names = (*log.joint_names[:4], "gripper", *log.joint_names[5:])
+    with pytest.raises(DriverError, match=r"has no joint panda_joint5; it has .*gripper.*; panda"):
+        matching(renamed(log, names), panda_model())
+
+
+def test_extra_joints_are_ignored_with_a_warning() -> None:
+    log = data().log()
+    wide = {k: np.c_[np.ones(len(log)), getattr(log, k)] for k in ("q", "dq", "tau")}
+    found = matching(renamed(log, ("finger", *log.joint_names), **wide), panda_model())
+    assert np.array_equal(found.q, log.q)
+    assert len(found.warnings) == 1 and "ignored: finger" in found.warnings[0]
+
+
+def test_motion_of_some_links_is_not_enough() -> None:
+    log = data(links=True).log()
+    part = replace(
+        log, link_names=log.link_names[:5], twists=log.twists[:, :5], accels=log.accels[:, :5]
+    )
+    found = matching(part, panda_model())
+    assert any("motion of not all links" in w for w in found.warnings)
+    assert not found.link_names and found.twists.shape[1] == 0
+    outcome = replay(found, panda_model(), settings()).outcome
+    assert not outcome.lam_measured and np.isfinite(outcome.lam).all()
+
+
+def test_links_in_another_order_are_put_in_order() -> None:
+    log = data(links=True).log()
+    mixed = replace(
+        log, link_names=log.link_names[::-1], twists=log.twists[:, ::-1], accels=log.accels[:, ::-1]
+    )
+    found = matching(mixed, panda_model())
+    assert np.array_equal(found.twists, log.twists) and np.array_equal(found.accels, log.accels)

@@ -1,0 +1,142 @@
+"""The front end in tables and single steps, on damaged recordings and random nonsense."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from adapter.model.self_model import Limits
+from adapter.signals.front_end import FrontEnd
+from adapter.signals.records import LinkMotionKind, StateLayout, stamps_of
+from drivers.interface import JointSample
+from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
+
+N = 7
+MS = 1_000_000
+LAYOUT = StateLayout(N)
+SIGNALS = slice(LAYOUT.q.start, LAYOUT.tau.stop)
+
+
+def moving(links: bool = False) -> ArmData:
+    return record(arm(), Motion(3.0, seed=1), links=links)
+
+
+def run(samples: list[JointSample], known: bool = True) -> tuple[np.ndarray, FrontEnd]:
+    """What comes out sample by sample, of an arm with or without documented limits."""
+    model = panda_model()
+    front_end = FrontEnd(model if known else replace(model, limits=Limits.unknown(N)))
+    rows = []
+    for sample in samples:
+        state = front_end.step(sample)
+        if state is not None:
+            rows.append(state.copy())
+    assert len(samples) == len(rows) + sum(front_end.refused.values())
+    return np.array(rows).reshape(-1, LAYOUT.size), front_end
+
+
+def damaged(links: bool) -> ArmData:
+    """All that can happen, in three seconds."""
+    data = moving(links)
+    q, dq, tau, stamps = (np.array(x) for x in (data.q, data.dq, data.tau, data.stamp_ns))
+    q[700, 2], dq[800, 1], tau[801, 0] = np.nan, np.inf, 1e9
+    q[900:930], dq[900:930], tau[900:930] = q[899], dq[899], tau[899]
+    stamps[1200] -= 5 * MS
+    stamps[1500:] += 50 * MS
+    tau[2200, 5] = 12.0
+    twists = None if data.twists is None else data.twists.copy()
+    if twists is not None:
+        twists[1300, 4] = np.nan  # one link unheard of
+        twists[2600] = np.nan
+    return replace(data, q=q, dq=dq, tau=tau, stamp_ns=stamps, twists=twists)
+
+
+def tables(data: ArmData, front_end: FrontEnd, cuts: list[int]) -> np.ndarray:
+    """`step_table` on consecutive pieces."""
+    names = ("stamp_ns", "q", "dq", "tau", "twists", "accels")
+    columns = [getattr(data, name) for name in names]
+    edges = [0, *cuts, len(data)]
+    pieces = [
+        front_end.step_table(*(None if c is None else c[i:j] for c in columns))
+        for i, j in pairwise(edges)
+    ]
+    return np.concatenate(pieces)
+
+
+@pytest.mark.parametrize("links", [False, True])
+@pytest.mark.parametrize("cuts", [[], [500, 905, 1501]])
+def test_tables_equal_single_steps_bit_for_bit(links: bool, cuts: list[int]) -> None:
+    data = damaged(links)
+    single, one = run(data.samples())
+    table = FrontEnd(panda_model())
+    states = tables(data, table, cuts)
+    assert states.tobytes() == single.tobytes()
+    assert table.refused == one.refused
+    assert table.first_moving_ns == one.first_moving_ns
+
+
+@pytest.mark.parametrize("links", [False, True])
+def test_a_table_that_teaches_nothing_is_empty(links: bool) -> None:
+    data = moving(links).part(0.1)
+    states = tables(data, FrontEnd(panda_model()), [])
+    assert states.shape == (0, LAYOUT.size)
+
+
+@pytest.mark.parametrize("cuts", [[], [931]])
+def test_tables_tell_the_same_gaps(cuts: list[int]) -> None:
+    data = damaged(links=False)
+    _, one = run(data.samples())
+    table = FrontEnd(panda_model())
+    tables(data, table, cuts)
+    assert one.gaps == [(899 * MS, pytest.approx(0.031)), (1499 * MS, pytest.approx(0.051))]
+    assert table.gaps == one.gaps
+    assert table.messages == one.messages
+
+
+READINGS = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, 57.0]),
+)
+
+
+@settings(
+    max_examples=100,
+    deadline=None,
+    derandomize=True,
+    phases=[Phase.explicit, Phase.generate],  # shrinking 300 samples takes minutes
+    suppress_health_check=list(HealthCheck),
+)
+@given(
+    hits=st.lists(
+        st.tuples(
+            st.integers(0, 299),
+            st.sampled_from(["q", "dq", "tau", "twist", "accel"]),
+            st.integers(0, N - 1),
+            READINGS,
+        ),
+        max_size=25,
+    ),
+    stamps=st.lists(st.tuples(st.integers(0, 299), st.integers(-(2**40), 2**40)), max_size=4),
+    known=st.booleans(),
+)
+def test_nothing_that_is_no_number_ever_leaves(hits, stamps, known) -> None:
+    samples = moving(links=True).samples()[1000:1300]
+    for k, signal, j, value in hits:
+        sample = samples[k]
+        if signal in ("q", "dq", "tau"):
+            row = getattr(sample, signal).copy()
+            row[j] = value
+            samples[k] = replace(sample, **{signal: row})
+        else:
+            motion = getattr(sample.links, signal).copy()
+            motion[j, 2] = value
+            samples[k] = replace(sample, links=replace(sample.links, **{signal: motion}))
+    for k, shift in stamps:
+        samples[k] = replace(samples[k], stamp_ns=samples[k].stamp_ns + shift)
+    states, _ = run(samples, known)
+    assert np.isfinite(states[:, SIGNALS]).all()
+    learned = states[states[:, 1] != LinkMotionKind.NONE]
+    assert np.isfinite(learned[:, 2:]).all()
+    assert (np.diff(stamps_of(states)) > 0).all()

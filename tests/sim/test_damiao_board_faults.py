@@ -1,0 +1,324 @@
+"""Faults of simulated boards strike as told, as often as told, and alike with the same seed."""
+
+from __future__ import annotations
+
+import errno
+
+import can
+import numpy as np
+import pytest
+
+from sim.damiao.faults import NAMES, Faults
+from sim.damiao.host import FailingBus
+from sim.damiao.server import Boards
+from sim.scenarios import build
+from tests.helpers.board_tools import (
+    CLEAR,
+    ENABLE,
+    IDS,
+    NOTHING,
+    PANDA,
+    STATUS_OF,
+    Rig,
+    frame,
+    parse,
+    refresh,
+    rig,
+)
+
+pytestmark = pytest.mark.alone
+
+READY = build("nominal").truth.ready
+TICKS = 400
+SHARE = 0.1
+EXPECTED = SHARE * 7 * TICKS  # 280, standard deviation 16
+
+
+def run(bench: Rig, ticks: int = TICKS) -> list[list[can.Message]]:
+    bench.enable()
+    return [bench.tick(bench.hold(READY)) for _ in range(ticks)]
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("fire", "no fault 'fire'; have: drop, deaf"),
+        ("", "no fault ''; have:"),
+        ("drop=1.5", "a share of frames"),
+        ("drop=-1", r"write drop\[=VALUE\]\[@SECONDS\]"),
+        ("drop=0.1@", r"write drop\[=VALUE\]\[@SECONDS\]"),
+        ("silent=8", "number of a motor, from 1 to 7"),
+        ("stuck=1.5", "number of a motor, from 1 to 7"),
+        ("late=nan", r"write late\[=VALUE\]"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_choices(text, says) -> None:
+    with pytest.raises(ValueError, match=says):
+        Faults([text])
+
+
+def test_every_fault_has_a_default_and_a_start() -> None:
+    faults = Faults([f"{name}@2.5" for name in NAMES])
+    assert [fault.name for fault in faults.faults] == list(NAMES)
+    assert all(fault.at_s == 2.5 for fault in faults.faults)
+
+
+def test_without_faults_every_command_has_one_reply_in_order() -> None:
+    with rig() as bench:
+        for messages in run(bench):
+            assert [m.arbitration_id - 0x10 for m in messages] == list(IDS)
+
+
+def test_dropped_replies_are_missing() -> None:
+    with rig(faults=[f"drop={SHARE}"]) as bench:
+        got = sum(len(messages) for messages in run(bench))
+        dropped = bench.faults.counts["drop"]
+    assert 200 < dropped < 360
+    assert got >= 7 * TICKS - dropped  # some of those that enabled the motors may be among them
+    assert got <= 7 * TICKS - dropped + 7
+
+
+def test_unheard_commands_have_neither_reply_nor_effect() -> None:
+    with rig(faults=["deaf=1.0@0.05"]) as bench:
+        messages = run(bench, 100)
+        bench.pass_ms(1.0)
+        commands = bench.boards.frames["commands"]
+    assert 40 * 7 <= commands <= 50 * 7
+    assert sum(len(some) for some in messages[55:]) == 0
+
+
+def test_late_replies_come_3_ms_after_the_others() -> None:
+    with rig(faults=[f"late={SHARE}"]) as bench:
+        rows = run(bench)
+        bench.pass_ms(10.0)
+        rows.append(bench.messages())
+        late = bench.faults.counts["late"]
+    assert 200 < late < 360
+    total = sum(len(row) for row in rows)
+    assert 7 * TICKS <= total <= 7 * TICKS + 7
+    assert any(len(row) > 7 for row in rows)
+    assert any(len(row) < 7 for row in rows)
+
+
+def test_repeated_replies_are_the_same_frame_twice() -> None:
+    with rig(faults=[f"repeat={SHARE}"]) as bench:
+        rows = run(bench)
+        repeated = bench.faults.counts["repeat"]
+    twice = 0
+    for row in rows:
+        seen = [(m.arbitration_id, bytes(m.data)) for m in row]
+        twice += len(seen) - len(set(seen))
+    assert 200 < repeated < 360
+    assert repeated - 7 <= twice <= repeated
+
+
+def test_reordered_replies_come_after_the_next_one() -> None:
+    """On a bus that keeps its order; on a line the lowest id goes first, whatever came first."""
+    with (
+        can.Bus(interface="virtual", channel="reorder") as near,
+        can.Bus(interface="virtual", channel="reorder") as far,
+    ):
+        clock = [0]
+        boards = Boards(far, build("nominal"), faults=[f"reorder={SHARE}"], now_ns=lambda: clock[0])
+        order = []
+        for k in range(TICKS):
+            clock[0] = k * 1_000_000
+            for motor in IDS:
+                near.send(frame(0x7FF, refresh(motor)))
+            boards.service()
+            while (message := near.recv(0.0)) is not None:
+                order.append(message.arbitration_id - 0x10)
+        held = boards.faults.counts["reorder"]
+        boards.close()
+    assert 200 < held < 360
+    assert len(order) >= 7 * TICKS - 3
+    steps = (np.diff(order) % 7 != 1).sum()
+    assert steps > held
+
+
+def test_corrupt_replies_have_one_bit_flipped_or_are_short() -> None:
+    with rig(faults=[f"corrupt={SHARE}"]) as bench, rig() as clean:
+        spoilt, good = run(bench), run(clean)
+        struck = bench.faults.counts["corrupt"]
+    short = flipped = 0
+    for row, healthy in zip(spoilt, good, strict=True):
+        assert len(row) == 7
+        for message, wanted in zip(row, healthy, strict=True):
+            if len(message.data) < 8:
+                short += 1
+                assert message.dlc == len(message.data)
+                assert wanted.data.startswith(message.data)
+            elif message.data != wanted.data:
+                flipped += 1
+                bits = int.from_bytes(message.data, "big") ^ int.from_bytes(wanted.data, "big")
+                assert bits.bit_count() == 1
+    assert 200 < struck < 360
+    assert struck - 7 <= short + flipped <= struck
+    assert min(short, flipped) > 80
+
+
+def test_a_silent_motor_says_nothing_from_its_time_on() -> None:
+    with rig(faults=["silent=3@0.05"]) as bench:
+        rows = run(bench, 100)
+    heard = [[m.arbitration_id - 0x10 for m in row] for row in rows]
+    assert heard[40] == list(IDS)
+    assert heard[60] == [1, 2, 4, 5, 6, 7]
+
+
+def test_a_stuck_encoder_stands_still_while_the_arm_moves() -> None:
+    with rig(faults=["stuck=4@0.02"]) as bench:
+        bench.enable()
+        told = [parse(bench.tick([NOTHING] * 7)[3], PANDA[3]) for _ in range(100)]
+        moved = abs(bench.boards.world.state()[1][3] - READY[3])
+    assert moved > 0.05
+    late = told[30:]
+    assert {one.q for one in late} == {late[0].q}
+    assert all(abs(one.dq) < 0.02 for one in late)
+    assert all(one.status == 1 for one in late)
+
+
+def test_an_encoder_jumps_by_a_tenth_and_stays_there() -> None:
+    with rig(faults=["jump=2@0.1"]) as bench:
+        rows = run(bench, 200)
+        true = bench.boards.world.state()[1][1]
+    told = [parse(row[1], PANDA[1]).q for row in rows]
+    step = np.abs(np.diff(told))
+    assert step.max() == pytest.approx(0.1, abs=5e-3)
+    assert (step > 0.05).sum() == 1
+    assert told[-1] - true == pytest.approx(0.1, abs=5e-3)
+
+
+def test_spikes_last_one_reply() -> None:
+    with rig(faults=["spike=0.01"]) as bench:
+        rows = run(bench)
+        struck = bench.faults.counts["spike"]
+    told = np.array([[parse(m, PANDA[j]).q for j, m in enumerate(row)] for row in rows])
+    off = np.abs(told - READY) > 0.3
+    assert 10 < struck < 60
+    assert struck - 2 <= off.sum() <= struck
+
+
+@pytest.mark.parametrize("name", list(STATUS_OF))
+def test_electrical_faults_show_in_the_status_and_stay(name) -> None:
+    with rig(faults=[f"{name}=6@0.03"]) as bench:
+        rows = run(bench, 60)
+        told = [parse(row[5], PANDA[5]) for row in rows]
+        assert told[20].status == 1
+        assert told[-1].status == STATUS_OF[name]
+        assert abs(told[-1].tau) < 0.02
+        others = [m.data[0] >> 4 for m in rows[-1] if m.arbitration_id != 0x16]
+        assert others == [1] * 6
+        assert parse(bench.ask(6, CLEAR)[0], PANDA[5]).status == STATUS_OF[name]  # the cause stays
+
+
+def test_a_hot_motor_lets_go_and_reports_its_temperature() -> None:
+    with rig(faults=["overtemp=2@0.03"]) as bench:
+        rows = run(bench, 80)
+        told = parse(rows[-1][1], PANDA[1])
+        far = abs(bench.boards.world.state()[1][1] - READY[1])
+    assert told.status == 0xC
+    assert told.rotor > 100
+    assert far > 0.001
+
+
+def test_bus_off_is_announced_and_ends() -> None:
+    with rig(faults=["bus_off=0.1@0.05"]) as bench:
+        rows = run(bench, 250)
+        unheard = bench.boards.frames["while bus off"]
+    errors = [m for row in rows for m in row if m.is_error_frame]
+    assert [m.arbitration_id for m in errors] == [0x40]
+    assert 600 <= unheard <= 800
+    assert all(not row for row in rows[60:140])
+    assert [m.arbitration_id - 0x10 for m in rows[-1]] == list(IDS)
+
+
+def test_error_frames_come_besides_the_replies() -> None:
+    with rig(faults=[f"error_frames={SHARE}"]) as bench:
+        rows = run(bench)
+        struck = bench.faults.counts["error_frames"]
+    errors = sum(m.is_error_frame for row in rows for m in row)
+    replies = sum(not m.is_error_frame for row in rows for m in row)
+    assert 200 < struck < 360
+    assert struck - 7 <= errors <= struck
+    assert replies == 7 * TICKS
+
+
+def test_a_host_without_buffers_cannot_send_on_a_line() -> None:
+    failed = 0
+    with rig(faults=[f"enobufs={SHARE}"]) as bench:
+        for k in range(7 * TICKS):
+            try:
+                bench.send(1 + k % 7, NOTHING)
+            except can.CanOperationError as error:
+                assert error.error_code == errno.ENOBUFS
+                failed += 1
+            bench.pass_ms(0.2)
+        assert bench.boards.frames["commands"] == 7 * TICKS - failed
+    assert 200 < failed < 360
+
+
+def test_a_line_whose_queue_is_full_refuses() -> None:
+    with rig() as bench:
+        with pytest.raises(can.CanOperationError, match="No buffer space"):
+            for _ in range(1000):
+                bench.send(1, NOTHING)
+        bench.pass_ms(20.0)
+        assert len(bench.messages()) == bench.boards.frames["commands"] > 10
+
+
+def test_any_bus_can_be_wrapped_to_fail() -> None:
+    with can.Bus(interface="virtual", channel="full") as far:
+        bus = FailingBus(
+            can.Bus(interface="virtual", channel="full"), Faults([f"enobufs={SHARE}"], 3)
+        )
+        failed = 0
+        for _ in range(1000):
+            try:
+                bus.send(frame(1, ENABLE))
+            except can.CanOperationError:
+                failed += 1
+        arrived = 0
+        while far.recv(0.0) is not None:
+            arrived += 1
+        far.send(frame(0x11, NOTHING))
+        assert bus.recv(0.0) is not None
+        bus.shutdown()
+    assert arrived == 1000 - failed
+    assert 50 < failed < 160
+
+
+def test_bytes_that_are_no_frame_are_counted_and_passed_over() -> None:
+    class Noisy:
+        """A bus that fails to receive a few times; its frames are real."""
+
+        def __init__(self, bus) -> None:
+            self.bus, self.left = bus, 3
+
+        def recv(self, timeout):
+            if self.left:
+                self.left -= 1
+                raise can.CanOperationError("could not unpack received message")
+            return self.bus.recv(timeout)
+
+        def send(self, message):
+            self.bus.send(message)
+
+    with (
+        can.Bus(interface="virtual", channel="noisy") as near,
+        can.Bus(interface="virtual", channel="noisy") as far,
+    ):
+        boards = Boards(Noisy(far), build("nominal"))
+        near.send(frame(0x7FF, refresh(1)))
+        assert boards.service() == 1
+        assert boards.frames["unreadable"] == 3
+        assert near.recv(0.0) is not None
+        boards.close()
+
+
+def test_same_seed_same_faults_another_seed_others() -> None:
+    def replies(seed):
+        with rig(faults=["drop=0.2", "repeat=0.1"], seed=seed) as bench:
+            return [[m.arbitration_id for m in row] for row in run(bench, 60)]
+
+    assert replies(1) == replies(1)
+    assert replies(1) != replies(2)

@@ -1,0 +1,327 @@
+"""Simulated joint boards against closed forms: motion, motor law, quantisation, wire times."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sim.damiao.bit_times import fd_bits, frame_ns
+from sim.engine import Engine
+from sim.scenarios import build
+from tests.helpers.board_tools import (
+    IDS,
+    MS_NS,
+    NOTHING,
+    PANDA,
+    frame,
+    mit,
+    parse,
+    read_register,
+    refresh,
+    rig,
+)
+
+READY = build("nominal").truth.ready
+OPENARM = ((12.5, 45.0, 54.0),) * 2 + ((12.5, 10.0, 28.0),) * 2 + ((12.5, 30.0, 10.0),) * 3
+
+
+def integrate(truth, law, times, q0=READY, dq0=None):
+    """q, dq (m, n) under torques law(t, q, dq), by an integrator that is not ours."""
+    engine = Engine(truth)
+
+    def rate(t, y):
+        q, dq = y[:7], y[7:]
+        return np.concatenate((dq, engine.acceleration(q, dq, law(t, q, dq))))
+
+    start = np.concatenate((q0, np.zeros(7) if dq0 is None else dq0))
+    found = solve_ivp(rate, (times[0], times[-1]), start, t_eval=times, rtol=1e-9, atol=1e-10)
+    engine.close()
+    return found.y[:7].T, found.y[7:].T
+
+
+@pytest.mark.parametrize(("scenario", "most"), [("nominal", 1e-5), ("friction", 1e-4)])
+def test_a_limp_arm_falls_as_the_equations_of_motion_say(scenario, most) -> None:
+    with rig(scenario, stand=False) as bench:
+        world, start_ns = bench.boards.world, bench.line.start_ns
+        bench.line.advance_to(start_ns)
+        bench.boards.service()
+        times, found = [0.0], [READY]
+        for _ in range(150):  # before it touches an end stop
+            bench.pass_ms()
+            bench.boards.service()
+            end_ns, q, dq = world.state()
+            times.append((end_ns - start_ns) * 1e-9)
+            found.append(q)
+        truth = bench.scenario.truth
+    times, found = np.array(times), np.array(found)
+    expected, speeds = integrate(truth, lambda t, q, dq: np.zeros(7), times)
+    assert np.abs(expected[-1] - READY).max() > 0.3  # it does fall
+    assert np.abs(found - expected).max() < most
+    assert np.abs(dq - speeds[-1]).max() < 1e-3
+
+
+def test_the_law_holds_and_swings_as_spring_and_damper_do() -> None:
+    """A step of 0.1 rad in the wanted angles, speed wanted, feed-forward on top."""
+    wanted = READY + 0.1
+    gains = np.array([400.0] * 4 + [40.0] * 3), np.array([5.0] * 4 + [0.5] * 3)
+    with rig() as bench:
+        bench.enable()
+        commands = [
+            mit(PANDA[j], q=wanted[j], dq=0.2, kp=gains[0][j], kd=gains[1][j]) for j in range(7)
+        ]
+        for motor, data in zip(IDS, commands, strict=True):
+            bench.send(motor, data)
+        bench.pass_ms(1.0)
+        assert not bench.boards.world.held
+        world, times, found, torques = bench.boards.world, [], [], []
+        start_ns = None
+        for _ in range(300):
+            bench.pass_ms(1.0)
+            bench.boards.service()
+            end_ns, q, dq = world.state()
+            if not times:
+                start_ns, q0, dq0 = end_ns, q.copy(), dq.copy()
+            times.append((end_ns - start_ns) * 1e-9)
+            found.append(q)
+            torques.append([world.at(end_ns, j)[2] for j in range(7)])
+        sent = [m.command for m in bench.boards.motors]
+        truth = bench.scenario.truth
+    q_des, dq_des, kp, kd, ff = (np.array(column) for column in zip(*sent, strict=True))
+
+    def law(t, q, dq):
+        return kp * (q_des - q) + kd * (dq_des - dq) + ff
+
+    expected, speeds = integrate(truth, law, np.array(times), q0, dq0)
+    assert np.abs(np.array(found) - expected).max() < 2e-4
+    assert np.abs(expected - q0).max() > 0.1
+    for tau, q, dq in zip(torques, expected, speeds, strict=True):
+        assert np.abs(tau - law(0.0, q, dq)).max() < 0.15  # of up to 40 N m
+
+
+def test_full_damping_sinks_and_does_not_ring_on_the_lightest_joint() -> None:
+    """kd = 5 N m s/rad on 0.005 kg m²: a law that lagged by a tick would blow up."""
+    with rig() as bench:
+        bench.enable()
+        commands = [mit(PANDA[j], kd=5.0) for j in range(7)]
+        times, found, speeds = [], [], []
+        for _ in range(100):
+            bench.tick(commands)
+            end_ns, q, dq = bench.boards.world.state()
+            if not bench.boards.world.held:
+                times.append(end_ns * 1e-9)
+                found.append(q)
+                speeds.append(dq)
+        sent = [m.command for m in bench.boards.motors]
+        truth = bench.scenario.truth
+    _, dq_des, _, kd, ff = (np.array(column) for column in zip(*sent, strict=True))
+
+    def law(t, q, dq):
+        return kd * (dq_des - dq) + ff
+
+    # From the third tick on: before it not all commands were in force.
+    times, found, speeds = np.array(times[3:]), np.array(found[3:]), np.array(speeds[3:])
+    expected, fast = integrate(truth, law, times - times[0], found[0], speeds[0])
+    assert np.abs(found - expected).max() < 2e-4
+    assert np.abs(speeds - fast).max() < 5e-3
+    assert np.abs(speeds).max() > 1.0
+
+
+def test_torque_ends_at_the_motors_scale() -> None:
+    """An OpenArm's 10 N m motor asked for 50 rad/s·5 + ... gives 10 N m and says so."""
+    with rig(motors="openarm", scale=OPENARM, q0=READY) as bench:
+        bench.enable()
+        commands = bench.hold(READY)
+        commands[6] = mit(OPENARM[6], q=12.5, kp=500.0)
+        for _ in range(5):
+            bench.tick(commands)
+        state = bench.state(7)
+        end_ns, *_ = bench.boards.world.state()
+        told = bench.boards.world.at(end_ns, 6)[2]
+    assert told == 10.0
+    assert state.tau == pytest.approx(10.0, abs=20 / 4095)
+
+
+def test_replies_are_the_true_state_within_one_code() -> None:
+    """Every reply in a lively motion, against the world at the instant the command arrived."""
+    rng = np.random.default_rng(3)
+    seen = 0
+    with rig() as bench:
+        bench.enable()
+        for k in range(120):
+            q = READY + 0.1 * np.sin(0.05 * k + np.arange(7))
+            commands = bench.hold(q, kp=200.0, kd=2.0, tau=rng.uniform(-1, 1, 7))
+            truth = {}
+            for motor, data in zip(IDS, commands, strict=True):
+                begun = bench.line.now_ns()
+                took = frame_ns(frame(motor, data), 1_000_000, 5_000_000)
+                bench.send(motor, data)
+                bench.line.advance_to(begun + took)  # the command is complete, measured now
+                assert bench.line.now_ns() == begun + took
+                truth[motor] = bench.boards.world.at(begun + took, motor - 1)
+                bench.line.advance_to(begun + took + 70_000)
+                (message,) = bench.messages()
+                told, scale = parse(message, PANDA[motor - 1]), PANDA[motor - 1]
+                steps = np.array(scale) * 2 / [65535, 4095, 4095]
+                error = np.array(truth[motor]) - (told.q, told.dq, told.tau)
+                assert (error >= -1e-9).all()  # truncated, never rounded up
+                assert (error <= steps + 1e-9).all()
+                seen += 1
+            bench.line.advance_to(bench.line.next_whole_ns(MS_NS))
+    assert seen == 840
+
+
+def test_an_instant_inside_a_tick_lies_on_the_motion() -> None:
+    with rig(stand=False) as bench:
+        bench.boards.service()
+        bench.pass_ms(100.0)
+        bench.boards.service()
+        world, truth = bench.boards.world, bench.scenario.truth
+        end_ns, q1, dq1 = world.state()
+        first_ns = end_ns - MS_NS
+        q0 = np.array([world.at(first_ns, j)[0] for j in range(7)])
+        dq0 = np.array([world.at(first_ns, j)[1] for j in range(7)])
+        parts = np.linspace(0.0, 1.0, 11)
+        inside = np.array(
+            [[world.at(first_ns + round(x * MS_NS), j)[:2] for j in range(7)] for x in parts]
+        )
+    q, dq = integrate(truth, lambda t, q, dq: np.zeros(7), parts * 1e-3, q0, dq0)
+    assert np.abs(dq0).max() > 0.5
+    assert np.abs(inside[:, :, 0] - q).max() < 1e-7
+    assert np.abs(inside[:, :, 1] - dq).max() < 1e-4
+    np.testing.assert_allclose(inside[-1, :, 0], q1, atol=1e-12)
+    np.testing.assert_allclose(inside[-1, :, 1], dq1, atol=1e-9)
+
+
+def test_a_joint_stops_at_the_end_of_its_range() -> None:
+    with rig(stand=False) as bench:
+        bench.boards.service()
+        for _ in range(40):
+            bench.pass_ms(100.0)
+            bench.boards.service()
+        limits, (_, q, _) = bench.scenario.truth.limits, bench.boards.world.state()
+        report = bench.boards.report()
+    assert report["stop_ticks"] > 0
+    assert (q > limits.lower - 0.2).all()
+    assert (q < limits.upper + 0.2).all()
+
+
+def test_rotor_warms_as_an_exponential_of_its_load() -> None:
+    """Half the rated torque for a minute: 15 K (1 - exp(-60/300))."""
+    with rig() as bench:
+        bench.boards.motors[6].fail(0xE)  # a motor that drives nothing stays cool
+        motor = bench.boards.motors[4]
+        for _ in range(3000):
+            motor.warm_up(4.0, 0.02)
+        assert motor.rotor_c == pytest.approx(25 + 15 * (1 - np.exp(-0.2)), abs=0.02)
+        for _ in range(100_000):
+            motor.warm_up(12.5, 0.02)
+        assert motor.status == 0xC  # 146 K of rise are too much
+
+
+CYCLE_US = {  # typical, least, most of the reference page's table, 7 commands and 7 replies
+    True: (713, 678, 781),
+    False: (1668, 1554, 1890),
+}
+
+
+@pytest.mark.parametrize("fd", [True, False])
+def test_a_cycle_of_fourteen_frames_takes_what_the_reference_says(fd) -> None:
+    """Torque-only commands and replies of an arm at random places."""
+    rng, cycles = np.random.default_rng(8), []
+    typical, least, most = CYCLE_US[fd]
+    for _ in range(300):
+        total = 0
+        for motor in IDS:
+            scale = PANDA[motor - 1]
+            data = mit(scale, tau=rng.uniform(-0.4, 0.4) * scale[2])
+            reply = bytes([0x10 | motor, *rng.integers(0, 256, 5).tolist(), 30, 33])
+            for message in (frame(motor, data, fd), frame(motor + 16, reply, fd)):
+                total += frame_ns(message, 1_000_000, 5_000_000)
+        cycles.append(total / 1000)
+    assert least <= min(cycles)
+    assert max(cycles) <= most
+    assert np.mean(cycles) == pytest.approx(typical, rel=0.01)
+
+
+def spelled_out(identifier: int, data: bytes) -> tuple[str, str]:
+    """The stuffed bits of a classic frame and of an FD frame's stuffed part, one by one."""
+    payload = "".join(f"{byte:08b}" for byte in data)
+    classic = f"0{identifier:011b}000{len(data):04b}{payload}"
+    # Remainder of the polynomial x^15+x^14+x^10+x^8+x^7+x^4+x^3+1.
+    remainder = int(classic + "0" * 15, 2)
+    for shift in range(len(classic) - 1, -1, -1):
+        if remainder >> (shift + 15) & 1:
+            remainder ^= 0b1100010110011001 << shift
+    return stuffing(f"{classic}{remainder:015b}"), stuffing(
+        f"0{identifier:011b}001010{len(data):04b}{payload}"
+    )
+
+
+def stuffing(bits: str) -> str:
+    out, run = "", ""
+    for bit in bits:
+        run = run + bit if run.endswith(bit) else bit
+        out += bit
+        if len(run) == 5:
+            run = "0" if bit == "1" else "1"
+            out += run
+    return out
+
+
+def test_bits_are_those_of_frames_spelled_out() -> None:
+    rng = np.random.default_rng(2)
+    payloads = [bytes(8), bytes([0xFF] * 8), bytes([0x55] * 8), NOTHING]
+    payloads += [rng.integers(0, 256, size).astype(np.uint8).tobytes() for size in [8] * 300]
+    for data in payloads:
+        identifier = int(rng.integers(0x800))
+        classic, fd = spelled_out(identifier, data)
+        said = frame_ns(frame(identifier, data, fd=False), 1_000_000, 1)
+        assert said == (len(classic) + 13) * 1000  # delimiters, acknowledge, end, gap
+        slow, fast = fd_bits(identifier, data, True)
+        # 27 bits of checksum with fixed stuffing, then delimiters, acknowledge, end and gap; a
+        # stuff bit due right at the end of the data is the fixed one.
+        whole = len(fd) - (fd[-6:] in ("000001", "111110")) + 27 + 13
+        assert slow + fast == whole
+        assert 29 <= slow <= 32
+        assert fd_bits(identifier, data, False) == (whole, 0)
+
+
+def test_replies_queue_behind_commands_up_to_the_end_of_the_cycle() -> None:
+    with rig() as bench:
+        bench.enable()
+        bench.line.advance_to(bench.line.next_whole_ns(MS_NS))
+        begun_s = bench.line.now_ns() * 1e-9
+        messages = bench.tick([NOTHING] * 7)
+    assert [m.arbitration_id for m in messages] == [0x10 + motor for motor in IDS]
+    after_us = [(m.timestamp - begun_s) * 1e6 for m in messages]
+    assert 678 <= after_us[-1] <= 781
+    assert 350 <= after_us[0] <= 450  # seven commands and one reply
+    assert np.diff(after_us) == pytest.approx([51] * 6, abs=3)
+
+
+def test_lines_are_alike_bit_by_bit_when_run_twice() -> None:
+    def run():
+        with rig("friction", faults=["drop=0.1", "late=0.1", "corrupt=0.1"], seed=5) as bench:
+            bench.enable()
+            out = []
+            for _ in range(100):
+                out += [
+                    (m.arbitration_id, bytes(m.data), m.timestamp)
+                    for m in bench.tick(bench.hold(READY))
+                ]
+        return out
+
+    first = run()
+    assert len(first) > 500
+    assert first == run()
+
+
+def test_a_register_read_costs_no_motion_and_the_stand_none_either() -> None:
+    with rig() as bench:
+        before = bench.boards.world.state()[1]
+        for motor in IDS:
+            bench.ask(0x7FF, read_register(motor, 21))
+            bench.ask(0x7FF, refresh(motor))
+        bench.pass_ms(500.0)
+        assert (bench.boards.world.state()[1] == before).all()

@@ -1,0 +1,145 @@
+"""Trees in free fall against Pinocchio, and ATLAS's facts against the file they come from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.model.spatial import matrix_from_zxz
+from sim.falls.babbling import Babbling
+from sim.falls.fall import FallRecord, babble
+from sim.falls.links import LinkTables, link_tables
+from sim.falls.tree_truth import TreeTruth, atlas, random_tree
+from sim.truth import body_of
+from tests.helpers.robot_models import read_quietly, shared
+
+EXACT = 1e-8
+PINOCCHIO_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # XX XY YY XZ YZ ZZ
+
+
+def tree_of(name: str) -> TreeTruth:
+    return atlas() if name == "atlas" else random_tree(int(name), seed=int(name))
+
+
+def pinocchio_of(truth: TreeTruth) -> tuple[pin.Model, list[int]]:
+    """A model built joint by joint from the truth's numbers, and the number of each body in it."""
+    model = pin.Model()
+    model.gravity.linear = truth.gravity
+    numbers = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root")]
+    for j, i in enumerate(truth.parent):
+        place = pin.SE3(truth.R[j], truth.p[j])
+        numbers.append(model.addJoint(numbers[i + 1], pin.JointModelRZ(), place, f"j{j}"))
+    for number, theta in zip(numbers, truth.theta, strict=True):
+        body = pin.Inertia.FromDynamicParameters(theta[PINOCCHIO_ORDER])
+        model.appendBodyToJoint(number, body, pin.SE3.Identity())
+    return model, numbers
+
+
+def answers(truth: TreeTruth, record: FallRecord, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Base wrench, joint torques, motion (rows, n, 4, 3) of the links and largest force, by rows.
+
+    The record's accelerations are already without gravity, so Pinocchio works without it too; the
+    base's orientation then is of no account.
+    """
+    model, numbers = pinocchio_of(truth)
+    model.gravity.linear = np.zeros(3)
+    data = model.createData()
+    places = [model.joints[k].idx_v for k in numbers[1:]]
+    wrenches, torques, motions, forces = [], [], [], []
+    for k in rows:
+        q, v, a = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
+        q[[x + 1 for x in places]] = record.q[k]
+        v[places], a[places] = record.dq[k], record.ddq[k]
+        v[:6] = *record.base_v[k], *record.base_w[k]
+        spatial = record.base_a[k] - np.cross(record.base_w[k], record.base_v[k])
+        a[:6] = *spatial, *record.base_dw[k]
+        tau = pin.rnea(model, data, q, v, a)
+        wrenches.append(tau[:6].copy())
+        torques.append(tau[places])
+        forces.append(max(np.linalg.norm(data.f[i].linear) for i in numbers[1:]))
+        pin.forwardKinematics(model, data, q, v, a)
+        motions.append([_motion(model, data, i) for i in numbers[1:]])
+    return np.array(wrenches), np.array(torques), np.array(motions), np.array(forces)
+
+
+def _motion(model: pin.Model, data: pin.Data, number: int) -> np.ndarray:
+    twist = data.v[number]
+    accel = pin.getClassicalAcceleration(model, data, number, pin.LOCAL)
+    return np.stack([twist.linear, twist.angular, accel.linear, accel.angular])
+
+
+def links_of(truth: TreeTruth, x: FallRecord) -> LinkTables:
+    return link_tables(truth, x.q, x.dq, x.ddq, (x.base_v, x.base_w, x.base_a, x.base_dw))
+
+
+@pytest.mark.parametrize("name", ["atlas", "5", "33"])
+def test_every_sample_satisfies_the_equations_of_motion(name: str) -> None:
+    truth = tree_of(name)
+    record = babble(truth, 1.5, np.random.default_rng(1))
+    rows = np.r_[0:10, 10:1500:50]
+    wrench, tau, motion, force = answers(truth, record, rows)
+    assert np.abs(tau - record.tau[rows]).max() < EXACT * np.median(np.abs(tau))
+    assert np.abs(wrench).max() < EXACT * np.median(force)
+    links = links_of(truth, record)
+    ours = np.stack([links.v, links.w, links.a, links.dw], axis=2)[rows]
+    assert np.abs(ours - motion).max() < 1e-11 * np.abs(motion).max()
+    assert np.ptp(record.base_w, axis=0).min() > 0.1  # the base answers the limbs
+
+
+def test_a_full_fall_of_atlas_stays_exact_and_uses_the_joints() -> None:
+    truth = atlas()
+    record = babble(truth, 10.0, np.random.default_rng(2))
+    rows = np.arange(0, 10_000, 250)
+    wrench, tau, _, force = answers(truth, record, rows)
+    assert np.abs(tau - record.tau[rows]).max() < EXACT * np.median(np.abs(tau))
+    assert np.abs(wrench).max() < EXACT * np.median(force)
+    limits = truth.limits
+    assert np.all((record.q > limits.lower) & (record.q < limits.upper))
+    assert np.all(np.abs(record.tau) < limits.effort)
+    used = np.ptp(record.q, axis=0) / (limits.upper - limits.lower)
+    assert np.median(used) > 0.7 and used.min() > 0.3
+    assert 2.0 < np.abs(record.dq).max() < 1.1 * Babbling().top_speed
+    # In free fall no force acts on the whole: the centre of mass keeps falling from rest.
+    assert abs(np.linalg.norm(record.base_v[-1]) - 9.81 * 10) < 10
+
+
+def test_atlas_is_the_robot_of_its_source() -> None:
+    truth = atlas()
+    model = read_quietly(shared("models/atlas_v5.urdf").read_text(), floating=True)
+    assert (truth.n, truth.base_name) == (30, model.tree.base_name)
+    assert truth.mass == pytest.approx(174.05, abs=1e-3)
+    names = model.tree.joint_names
+    order = np.array([names.index(name) for name in truth.joint_names])
+    assert tuple(np.asarray(model.tree.link_names)[order]) == truth.link_names
+    for j, i in enumerate(truth.parent):
+        theirs = model.tree.parent[order[j]]
+        assert truth.link_names[i] == model.tree.link_names[theirs] if i >= 0 else theirs == -1
+    np.testing.assert_allclose(truth.R, matrix_from_zxz(model.lam[order, :3]), atol=1e-12)
+    np.testing.assert_allclose(matrix_from_zxz(truth.lam[:, :3]), truth.R, atol=1e-15)
+    np.testing.assert_allclose(truth.p, model.lam[order, 3:], atol=1e-12)
+    np.testing.assert_allclose(truth.theta, model.theta[np.r_[0, order + 1]], atol=1e-12)
+    for key in ("lower", "upper", "velocity", "effort"):
+        theirs = getattr(model.limits, key)[order]
+        np.testing.assert_array_equal(getattr(truth.limits, key), theirs)
+
+
+@pytest.mark.parametrize("name", ["atlas", "5", "60"])
+def test_every_body_is_one_that_can_exist(name: str) -> None:
+    for theta in tree_of(name).theta:
+        m, _, inertia = body_of(theta)
+        small, middle, large = np.linalg.eigvalsh(inertia)
+        assert m > 0 and small > 0 and large < small + middle
+
+
+def test_trees_that_are_none_are_refused() -> None:
+    for links in (4, 61):
+        with pytest.raises(ValueError, match="5 to 60"):
+            random_tree(links, seed=0)
+    good = random_tree(5, seed=0)
+    with pytest.raises(ValueError, match="have: -1"):
+        replace(good, parent=(0, *good.parent[1:]))
+    with pytest.raises(ValueError, match="5 joints"):
+        replace(good, theta=good.theta[1:])

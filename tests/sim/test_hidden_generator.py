@@ -1,0 +1,259 @@
+"""The generator of hidden-effect trials: seeds, shares, sizes, no leaks, three simulators agree."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adapter.model.model_file import save_model
+from adapter.model.robots import documented
+from adapter.model.urdf import read_urdf
+from drivers.files.mcap import read_log
+from sim.hidden import SHARES, draw, unseal
+from sim.hidden.record import pybullet_recording, simulate, write
+from sim.hidden.sizes import CATALOGUE, OUTSIDE, WRIST, WRIST_SHARE, draw_effect
+from tests.benchmarks.gap_trials import run_trial
+from tests.helpers import gap_mujoco
+from tests.helpers.gap_effects import predict, sense, slope
+from tests.helpers.gap_judges import torque_judge
+from tests.helpers.gap_oracle import Oracle, detectability, rms, second, slow
+from tests.helpers.gap_scorer import score_trial, summary, table, wilson
+from tests.helpers.gap_tools import pinocchio_recording, pinocchio_trial, write_trial
+
+SEEDS = range(150)
+RANGES = {  # as the issue states them
+    ("coulomb_friction", "Fc"): (0.3, 2.0),
+    ("viscous_friction", "Fv"): (0.1, 1.0),
+    ("payload", "m"): (0.3, 3.0),
+    ("torque_gain", "g"): (0.03, 0.1),
+    ("torque_ripple", "a"): (0.1, 0.5),
+    ("joint_elasticity", "k"): (3000.0, 20000.0),
+    ("signal_delay", "d"): (0.001, 0.005),
+    ("motor_inertia", "B"): (0.05, 0.3),
+    ("encoder_offset", "o"): (0.005, 0.02),
+    ("torque_offset", "o"): (0.2, 1.0),
+    ("joint_spring", "k"): (0.2, 2.0),
+}
+TORQUES = {"Fc", "Fv", "a", "B", "o", "k"}
+NOT_TORQUES = {"encoder_offset", "joint_elasticity"}
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return [draw(seed) for seed in SEEDS]
+
+
+def test_a_seed_decides_everything():
+    first, again, other = (pinocchio_trial(seed, "single") for seed in (5, 5, 6))
+    assert first[1:] == again[1:]
+    assert all(
+        np.array_equal(getattr(first[0], key), getattr(again[0], key))
+        for key in ("stamp_ns", "q", "dq", "tau")
+    )
+    assert first[2] != other[2]
+
+
+def test_kinds_come_in_their_shares(trials):
+    counts = Counter(trial.kind for trial in trials)
+    for kind, share in zip(("null", "single", "pair", "outside"), SHARES, strict=True):
+        low, high = wilson(counts[kind], len(trials))
+        assert low - 0.02 < share < high + 0.02
+    assert all(
+        len(t.effects) == {"null": 0, "single": 1, "pair": 2, "outside": 1}[t.kind] for t in trials
+    )
+
+
+@pytest.mark.parametrize("name", [*CATALOGUE, *OUTSIDE])
+def test_effects_are_drawn_at_the_sizes_asked_for(name, trials):
+    rng, arm = np.random.default_rng(7), trials[0].arm
+    drawn = [draw_effect(rng, name, arm) for _ in range(60)]
+    for effect in drawn:
+        for key in (key for key in effect.parameters if (name, key) in RANGES):
+            low, high = RANGES[name, key]
+            torque = key in TORQUES and name not in NOT_TORQUES
+            wrist = bool(effect.joints) and effect.joints[0] >= WRIST
+            share = WRIST_SHARE if torque and wrist else 1.0
+            assert share * low <= abs(effect.number(key)) <= share * high
+        if effect.interval_s is not None:
+            assert 5.0 <= effect.start_s <= 15.0
+        if name == "base_tilt":
+            size = np.hypot(effect.number("rx"), effect.number("ry"))
+            assert np.radians(0.5) <= size <= np.radians(3.0)
+        if name == "external_wrench":
+            force = np.linalg.norm([effect.number(key) for key in ("fx", "fy", "fz")])
+            assert 5.0 <= force <= 30.0 and 1.0 <= effect.end_s - effect.start_s <= 3.0
+
+
+def test_many_different_effects_are_hidden(trials):
+    names = {effect.name for trial in trials for effect in trial.effects}
+    assert len(names & set(CATALOGUE)) > 15 and len(names & set(OUTSIDE)) > 3
+
+
+def test_model_error_is_two_percent_and_motion_keeps_the_limits(trials):
+    size = np.abs(trials[0].nominal.theta)
+    errors = np.array([(t.arm.theta - t.nominal.theta)[size > 0] for t in trials])
+    assert np.isclose(np.sqrt(np.mean((errors / size[size > 0]) ** 2)), 0.02, rtol=0.15)
+    for trial in trials[:40]:
+        q, dq, ddq = trial.motion.at(trial.times[::20])
+        limits = trial.arm.limits
+        assert np.all((q > limits.lower) & (q < limits.upper))
+        assert np.all(np.abs(dq) < limits.velocity) and np.all(np.abs(ddq) < limits.acceleration)
+        assert np.allclose(q[0], trial.motion.middle) and np.allclose(dq[0], 0)
+
+
+def test_recording_tells_nothing_but_what_was_measured(tmp_path):
+    trial = next(t for t in map(draw, SEEDS) if t.kind == "single" and t.commands)
+    recording = replace(pinocchio_recording(trial), commands=np.zeros((20000, 7)))
+    log, model, truth = write(trial, tmp_path, recording, "pinocchio")
+    data = log.read_bytes() + model.read_bytes()
+    read = read_log(log)
+    assert read.attachments == {} and set(read.metadata) == {"joint_names", "link_names"}
+    assert read.commands is not None and set(read.topics) == {"/joint_states", "/joint_commands"}
+    assert not any(name.encode() in data for name in (*CATALOGUE, *OUTSIDE, "truth", "seed"))
+    nominal = read_urdf(model)
+    assert np.allclose(nominal.theta, trial.nominal.theta, atol=1e-12)
+    assert not np.allclose(nominal.theta, trial.arm.theta, rtol=1e-3)
+    assert unseal(truth)["effects"] == [e.as_dict() for e in trial.effects]
+    broken = json.loads(truth.read_text())
+    broken["truth"]["seed"] += 1
+    truth.write_text(json.dumps(broken))
+    with pytest.raises(ValueError, match="changed"):
+        unseal(truth)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "tolerance"),
+    [
+        ("coulomb_friction", 24, 0.15),  # a joint that sticks takes any torque up to Fc
+        ("motor_inertia", 12, 0.02),
+        ("encoder_offset", 15, 0.02),
+        ("external_wrench", 16, 0.02),
+        ("payload", 17, 0.02),
+    ],
+)
+def test_simulators_agree_on_the_signature_of_an_effect(name, seed, tolerance):
+    """Torque beside that of the arm without the effect, on the motion that was read."""
+    trial = replace(draw(seed, "single", name), seconds=5.0)
+    (effect,) = trial.effects
+    late = (
+        None if effect.interval_s is None else (3.0, None if effect.interval_s[1] is None else 4.0)
+    )
+    trial = replace(trial, effects=(replace(effect, interval_s=late),))
+    t = trial.times
+    motions = [part[:3] for part in (simulate(trial), gap_mujoco.simulate(trial))]
+    motions.append(sense(trial.arm, trial.effects, t, *trial.motion.at(t)))
+    for i, (q, dq, tau) in enumerate(motions):
+        torque = tau - (trial.disturbance() if i < 2 else 0.0)
+        ddq = slope(t, dq)
+        without = predict(trial.arm, (), t, q, dq, ddq, tau)
+        expected = predict(trial.arm, trial.effects, t, q, dq, ddq, tau) - without
+        error, size = rms(slow(torque - without - expected)), rms(slow(expected))
+        assert error.max() < tolerance * size.max() + 2e-3, (i, error, size)
+
+
+def test_pybullet_recording_has_the_noise_of_a_panda():
+    trial = replace(draw(1, "null"), seconds=3.0)
+    recording = pybullet_recording(trial)
+    clean = simulate(trial)
+    assert recording.q.shape == (3000, 7)
+    levels = np.asarray(trial.noise.dq_above_50hz) / np.sqrt(0.9)
+    assert np.allclose((recording.dq - clean[1]).std(axis=0), levels, rtol=0.1)
+    steps = recording.tau / np.asarray(trial.noise.tau_step)
+    assert np.allclose(steps, np.round(steps), atol=1e-6)
+
+
+def test_oracle_sees_what_can_be_seen():
+    strong = draw(3, "single", "coulomb_friction")
+    weak = draw(1, "single", "encoder_offset")
+    weak = replace(weak, effects=(replace(weak.effects[0], joints=(1,)),))
+    assert detectability(strong)[0] > 20.0
+    assert detectability(weak)[0] < 1.0  # gravity does not change with joint 1
+    fit = Oracle(strong, pinocchio_recording(strong)).fit()
+    truth, found = strong.effects[0].number("Fc"), fit.effects[0].number("Fc")
+    assert abs(found - truth) < 0.05 * truth
+    joint = strong.effects[0].joints[0] - 1
+    assert fit.held_rmse_nm[joint] < 0.5 * fit.before_rmse_nm[joint]
+    other = second(strong)
+    assert other.effects == strong.effects and np.array_equal(other.arm.theta, strong.arm.theta)
+    assert not np.allclose(other.motion.w, strong.motion.w)
+
+
+def _peeking(trial):
+    """A workflow that knows the trial, and says so as `adapter gap` would."""
+    findings = [{**effect.as_dict(), "evidence": 1.0} for effect in trial.effects]
+    return lambda logs, model, **more: {"findings": findings, "unexplained": []}
+
+
+def test_trials_run_and_score():
+    trials = draw(1, "null"), draw(3, "single", "coulomb_friction")
+    rows = [run_trial(trial, "pinocchio", _peeking(trial)) for trial in trials]
+    figures = summary(rows)
+    assert figures["shares"]["null_false"][3:] == [0, 1]
+    assert figures["shares"]["single_exact"][3:] == [1, 1]
+    assert "coulomb_friction" in table(figures)
+
+
+def test_judge_compares_with_the_oracle_on_another_motion(tmp_path):
+    """The true effect on the nominal arm: worse than the oracle, far better than no effect."""
+    trial = draw(3, "single", "coulomb_friction")
+    recording = pinocchio_recording(trial)
+    save_model(documented("panda"), tmp_path / "out.json")
+    named = {"findings": [e.as_dict() for e in trial.effects], "model_out": "out.json"}
+    ratios = [
+        torque_judge(trial, recording, result, tmp_path)["torque_ratio"]
+        for result in (named, {**named, "findings": []})
+    ]
+    assert 1.0 < ratios[0] < ratios[1]
+    assert torque_judge(trial, recording, {"findings": []}, tmp_path) == {}
+
+
+def test_scorer_tells_right_from_wrong():
+    truth = {
+        "seed": 0,
+        "kind": "single",
+        "effects": [
+            {
+                "effect": "payload",
+                "joints": [],
+                "interval_s": [7.0, None],
+                "parameters": {"m": 1.0, "cx": 0.0, "cy": 0.0, "cz": 0.2},
+            }
+        ],
+    }
+    right = {
+        "effect": "payload",
+        "joints": [],
+        "interval_s": [7.2, None],
+        "parameters": {"m": 1.05, "cx": 0.01, "cy": 0.0, "cz": 0.2},
+        "evidence": 0.99,
+    }
+    row = score_trial({"findings": [right]}, truth, [50.0])
+    assert row["exact"] and row["parameters"] == [True] and np.isclose(row["date_errors_s"][0], 0.2)
+    heavy = {**right, "parameters": {**right["parameters"], "m": 1.3}, "std": {"m": 0.05}}
+    assert score_trial({"findings": [heavy]}, truth, [50.0])["parameters"] == [False]
+    body = {"effect": "link_inertia", "joints": [7], "parameters": {}, "evidence": 0.95}
+    assert score_trial({"findings": [body]}, truth, [50.0])["wrong"] == ["link_inertia"]
+    listed = {**body, "ambiguous_with": ["payload"]}
+    row = score_trial({"findings": [listed]}, truth, [50.0])
+    assert row["named"] == 1 and not row["exact"] and not row["wrong"]
+    extra = {
+        "effect": "coulomb_friction",
+        "joints": [2],
+        "parameters": {"Fc": 1.0},
+        "evidence": 0.97,
+    }
+    row = score_trial({"findings": [right, extra]}, truth, [50.0])
+    assert not row["exact"] and row["sure_wrong"] == 1
+    outside = {**truth, "kind": "outside"}
+    row = score_trial({"findings": [right], "unexplained": [{"joint": 1}]}, outside, [50.0])
+    assert row["unexplained"] and row["sure_wrong"] == 1
+
+
+def test_written_by_pinocchio_too(tmp_path):
+    paths = write_trial(pinocchio_trial(9, "null"), tmp_path)
+    assert [path.name for path in paths] == ["recording.mcap", "nominal.urdf", "truth.json"]
+    assert read_log(paths[0]).q.shape == (20000, 7)

@@ -1,0 +1,238 @@
+"""The simulated arm against Pinocchio: rigid dynamics, timing, link motion, payload, brakes."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from drivers.interface import DriverError
+from drivers.pybullet_arm import PyBulletArm
+from sim.effects import payload
+from sim.noise import levels_of
+from sim.plant import Plant
+from sim.scenarios import build
+from sim.truth import panda, turn
+from tests.helpers.arm_data import pin_model, rms, rnea
+from tests.sim.test_dynamics import oracle_motion
+
+T_S = 1e-3
+MOTION_S = 2.0
+
+
+def reference(t, q0, speed=1.0):
+    """A smooth motion from rest: q, dq, ddq (n,) at time t."""
+    w = 2 * np.pi * np.array([0.5, 0.4, 0.6, 0.45, 0.8, 0.7, 0.9]) * speed
+    a = np.array([0.3, 0.25, 0.3, 0.3, 0.3, 0.3, 0.3])
+    return q0 + a * (1 - np.cos(w * t)), a * w * np.sin(w * t), a * w * w * np.cos(w * t)
+
+
+def drive(plant, seconds=MOTION_S, payload=None):
+    """Computed-torque motion; clean samples as arrays t, q, dq, tau and the list of samples."""
+    model = pin_model(plant.truth)
+    data, samples = model.createData(), []
+    for k in range(round(seconds / T_S)):
+        plant.read()
+        if payload is not None and k * T_S == payload.start_s:
+            model = pin_model(plant.truth, payload)
+            data = model.createData()
+        sample = plant.clean()
+        samples.append(sample)
+        want, speed, push = reference((k + 1) * T_S, plant.truth.ready)
+        push = push + 100.0 * (want - sample.q) + 20.0 * (speed - sample.dq)
+        plant.command(pin.rnea(model, data, sample.q, sample.dq, push))
+    return [np.array([getattr(s, key) for s in samples]) for key in ("q", "dq", "tau")], samples
+
+
+def rigid_torque(truth, q, dq, payload=None):
+    """RNEA on samples 1 to m - 2 with central differences of dq, and those ddq."""
+    ddq = (dq[2:] - dq[:-2]) / (2 * T_S)
+    return rnea(pin_model(truth, payload), q[1:-1], dq[1:-1], ddq), ddq
+
+
+def plant_of(truth, **options):
+    return Plant(truth, noise=levels_of("none"), **options)
+
+
+@pytest.fixture(scope="module")
+def moved():
+    plant = plant_of(panda())
+    signals, _ = drive(plant)
+    assert plant.fault is None and not plant.saturated
+    return signals
+
+
+def moving(x):
+    """Without the start, where the torque has a corner."""
+    return x[50:]
+
+
+def test_rigid_dynamics_hold_between_the_signals_of_a_sample(moved):
+    q, dq, tau = moved
+    model, _ = rigid_torque(panda(), q, dq)
+    left = moving(model - tau[1:-1])
+    assert np.all(rms(left) < 1e-4 * rms(tau - tau.mean(0)))
+
+
+def test_torque_and_acceleration_have_no_lag_between_them(moved):
+    q, dq, tau = moved
+    model, _ = rigid_torque(panda(), q, dq)
+    slope = np.gradient(tau, T_S, axis=0)[1:-1]
+    model, slope, tau = moving(model), moving(slope), moving(tau[1:-1])
+    lag_s = np.sum(slope * (tau - model), axis=0) / np.sum(slope**2, axis=0)
+    assert np.all(np.abs(lag_s) < 5e-6)
+
+
+def test_velocity_is_the_derivative_of_position_at_the_same_instant(moved):
+    q, dq, _ = moved
+    # Fourth-order difference: the truncation of the plain one is of the size looked for.
+    slope = (8 * (q[3:-1] - q[1:-3]) - (q[4:] - q[:-4])) / (12 * T_S)
+    ddq = np.gradient(dq, T_S, axis=0)[2:-2]
+    left, ddq = moving(slope - dq[2:-2]), moving(ddq)
+    skew_s = np.sum(left * ddq, axis=0) / np.sum(ddq**2, axis=0)
+    assert np.all(np.abs(skew_s) < 1e-6)
+
+
+def test_own_acceleration_is_that_of_the_oracle():
+    plant = plant_of(panda())
+    (q, dq, tau), _ = drive(plant, 0.3)
+    model = pin_model(panda())
+    wanted = pin.aba(model, model.createData(), q[-1], dq[-1], tau[-1])
+    assert plant.ddq() == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["bent_link", "wall_mounted"])
+def test_rigid_dynamics_hold_in_other_scenarios(name):
+    plant = build(name, 3, noise="none").plant()
+    (q, dq, tau), _ = drive(plant, 0.8)
+    model, _ = rigid_torque(plant.truth, q, dq)
+    assert np.all(rms(moving(model - tau[1:-1])) < 1e-4 * rms(tau - tau.mean(0)))
+
+
+def test_link_motion_is_that_of_the_samples_own_instant():
+    plant = build("bent_link", 1, noise="none").plant()
+    (q, dq, _), samples = drive(plant, 0.5)
+    ddq = (dq[2:] - dq[:-2]) / (2 * T_S)
+    for k in range(60, 480, 40):
+        twist, accel = oracle_motion(plant.truth, q[k], dq[k], ddq[k - 1])
+        assert samples[k].links.twist == pytest.approx(twist, abs=1e-9)
+        assert samples[k].links.accel == pytest.approx(accel, abs=1e-3 * 9.81)
+
+
+def test_link_motion_at_rest_reads_gravity_upwards():
+    plant = build("nominal", links=True, noise="none").plant()
+    links = plant.read().links
+    assert links.accel[0] == pytest.approx([0, 0, 9.81, 0, 0, 0], abs=1e-9)
+    assert np.linalg.norm(links.accel[:, :3], axis=1) == pytest.approx(np.full(7, 9.81))
+    assert links.twist == pytest.approx(np.zeros((7, 6)), abs=1e-12)
+
+
+def test_payload_comes_at_its_time_without_a_jump_in_speed():
+    R = turn(0, 0.4) @ turn(2, 0.7)
+    load = payload(1.0, [0.02, -0.03, 0.15], R @ np.diag([2e-3, 3e-3, 4e-3]) @ R.T, 0.5)
+    plant = plant_of(panda().with_changes(effects=(load,)))
+    (q, dq, tau), _ = drive(plant, 1.0, payload=load)
+    empty, ddq = rigid_torque(panda(), q, dq)
+    full, _ = rigid_torque(panda(), q, dq, load)
+    scale = rms(tau - tau.mean(0))
+    # Row k belongs to sample k + 1. Left out: the change at 0.5 s and the corner that the
+    # controller's answer puts into the torque a sample later.
+    before, after = slice(50, 498), slice(502, None)
+    assert np.all(rms((empty - tau[1:-1])[before]) < 1e-4 * scale)
+    assert np.all(rms((full - tau[1:-1])[after]) < 1e-3 * scale)
+    assert rms((empty - tau[1:-1])[after]).max() > 0.5
+    assert np.all(np.abs(np.diff(dq, axis=0))[495:505] < 2e-3 * np.abs(ddq).max() + 1e-3)
+
+
+def test_brakes_carry_a_payload_too():
+    load = payload(1.0, [0.0, 0.0, 0.15], t_s=0.2)
+    plant = plant_of(panda().with_changes(effects=(load,)))
+    for _ in range(800):
+        sample = plant.read()
+    assert sample.q == pytest.approx(panda().ready, abs=1e-6)
+    still = np.zeros((1, 7))
+    hold = rnea(pin_model(panda(), load), sample.q[None], still, still)[0]
+    assert sample.tau == pytest.approx(hold, abs=1e-4)
+
+
+def test_stiff_friction_brings_a_joint_to_rest_without_ringing():
+    truth = build("friction", noise="none").truth.with_changes(gravity=np.zeros(3))
+    plant = plant_of(truth)
+    plant.read()
+    for k in range(400):
+        plant.command(np.array([0, 0, 0, 0, 0, 0, 0.6 if k < 20 else 0.0]))
+        plant.read()
+    tail = []
+    for _ in range(50):
+        plant.command(np.zeros(7))
+        tail.append(plant.read().dq)
+    assert np.abs(tail).max() < 1e-3
+    assert np.all(np.abs(np.diff(tail, axis=0)) < 1e-4)
+
+
+def test_arm_holds_until_commanded_and_brakes_when_commands_end():
+    plant = plant_of(panda())
+    for _ in range(300):
+        first = plant.read()
+    assert first.stamp_ns == 299_000_000
+    assert first.q == pytest.approx(panda().ready, abs=1e-9)
+    (q, dq, _), _ = drive(plant, 0.5)
+    assert np.abs(dq[-1]).max() > 0.3
+    for k in range(600):
+        last = plant.read()
+        assert plant.braked == (k >= 20)
+    assert np.abs(last.dq).max() < 1e-6
+    assert np.abs(last.q - q[-1]).max() < 0.3
+    plant.command(last.tau)
+    assert not plant.braked
+    plant.stop()
+    assert plant.braked
+
+
+def test_torque_is_cut_at_the_effort_limit_and_says_so():
+    plant = plant_of(panda())
+    hold = plant.read().tau
+    plant.command(hold + np.array([0, 0, 0, 0, 0, 0, 50.0]))
+    assert plant.saturated
+    assert plant.read().tau[6] == 12.0
+    plant.command(hold)
+    assert not plant.saturated
+
+
+def test_leaving_the_range_of_a_joint_brakes_for_good():
+    arm = PyBulletArm(plant_of(panda()))
+    arm.connect()
+    hold = arm.read().tau
+    with pytest.raises(DriverError, match=r"panda_joint\d (left its range|exceeded its speed)"):
+        for _ in range(2000):
+            arm.command(hold + np.array([0, 0, 0, 20.0, 0, 0, 0]))
+            arm.read()
+    for _ in range(1000):
+        sample = arm.read()
+    assert np.abs(sample.dq).max() < 1e-6
+
+
+def test_driver_says_what_it_cannot_do():
+    arm = PyBulletArm(plant_of(panda()))
+    with pytest.raises(DriverError, match="connect"):
+        arm.read()
+    arm.connect()
+    assert arm.joint_names[0] == "panda_joint1" and arm.link_names[6] == "panda_link7"
+    assert [arm.read().stamp_ns for _ in range(3)] == [0, 1_000_000, 2_000_000]
+    assert arm.plant_time_ns > 0
+    for bad in (np.zeros(6), np.full(7, np.nan)):
+        with pytest.raises(DriverError, match="7 finite torques"):
+            arm.command(bad)
+    arm.close()
+    arm.close()
+    with pytest.raises(DriverError, match="closed"):
+        arm.read()
+    with pytest.raises(DriverError, match="closed"):
+        arm.connect()
+
+
+def test_plants_do_not_disturb_each_other():
+    alone = drive(plant_of(panda()), 0.1)[0]
+    first, other = plant_of(panda()), build("wall_mounted", noise="none").plant()
+    other.read()
+    both = drive(first, 0.1)[0]
+    other.close()
+    assert all(np.array_equal(a, b) for a, b in zip(alone, both, strict=True))
