@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.signal import butter, sosfilt, sosfreqz
+from numpy.typing import NDArray
 
 from drivers.interface import JointSample, LinkMotion
 from sim.options import NOISES
@@ -22,6 +22,7 @@ HIGH_HZ = 50.0  # "above 50 Hz"
 BAND_HZ = (10.0, 40.0)
 BLOCK = 16  # samples drawn at once: dear enough one by one, a hitch in the loop if many
 TAPS = 256  # samples after which the band filter has forgotten an input but for 2e-4
+POINTS = 1 << 14  # of the band filter's response, over the frequencies up to half the rate
 MAX_JITTER = 0.45  # of a period: stamps stay in order
 
 Draw = Callable[[np.random.Generator], Array]
@@ -170,9 +171,7 @@ class _Band:
 
     def __init__(self, gain: Array) -> None:
         self._gain = gain
-        pulse = np.zeros(TAPS)
-        pulse[0] = 1.0
-        response = sosfilt(_band_filter(), pulse)[::-1]
+        response = np.fft.irfft(band_response()[1])[:TAPS][::-1]
         self._rows = np.zeros((BLOCK, TAPS - 1 + BLOCK))
         for i, row in enumerate(self._rows):
             row[i : i + TAPS] = response
@@ -186,8 +185,17 @@ class _Band:
         return self._gain * (self._rows @ inputs)
 
 
-def _band_filter() -> Array:
-    return butter(2, BAND_HZ, btype="bandpass", fs=RATE_HZ, output="sos")
+def band_response() -> tuple[Array, NDArray[np.complex128]]:
+    """Frequencies, Hz, and the response there of a Butterworth band-pass of second order.
+
+    By the bilinear transform, as `scipy.signal.butter` has it, which takes a second to import.
+    """
+    f = np.linspace(0.0, RATE_HZ / 2, POINTS + 1)
+    low, high = np.tan(np.pi * np.array(BAND_HZ) / RATE_HZ)
+    s = 1j * np.tan(np.pi * f[1:-1] / RATE_HZ)
+    normal = (s * s + low * high) / (s * (high - low))
+    inner = 1.0 / (normal * normal + np.sqrt(2.0) * normal + 1.0)
+    return f, np.concatenate(([0.0], inner, [0.0]))
 
 
 def _share_above() -> float:
@@ -201,7 +209,7 @@ def _torque_parts(levels: NoiseLevels) -> tuple[Array, Array]:
     Both parts have power in both bands: the white one between 10 and 40 Hz, the band one in its
     skirts above 50 Hz. Two linear equations in the two powers.
     """
-    f, response = sosfreqz(_band_filter(), worN=1 << 14, fs=RATE_HZ)
+    f, response = (x[:-1] for x in band_response())
     power = np.abs(response) ** 2 / len(f)
     high, inside = f >= HIGH_HZ, (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
     shares = np.array([[high.mean(), power[high].sum()], [inside.mean(), power[inside].sum()]])

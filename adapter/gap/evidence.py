@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
-from scipy.signal import welch
 
 from adapter.model.spatial import Array
 
@@ -147,6 +146,8 @@ def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> 
         floor: least standard deviation, N m.
         windows: at least so many; the more, the less does slow noise count in short recordings.
     """
+    from scipy.signal import welch  # takes a second; the learner's monitor has no use for it
+
     window = min(NOISE_WINDOW, max(len(residual) // windows, SHORTEST_WINDOW))
     _, power = welch(
         residual,

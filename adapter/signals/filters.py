@@ -20,8 +20,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from filterpy.common import Q_continuous_white_noise
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from adapter.errors import SettingsError
@@ -71,6 +69,10 @@ class FilterSettings:
 
 def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     """(k1, k2) of L from filterpy's Kalman filter in its steady state, 1/s and 1/s²."""
+    # Brings scipy.stats, a second of processor time, which the learner's process has no use for.
+    from filterpy.common import Q_continuous_white_noise
+    from filterpy.kalman import KalmanFilter
+
     period = settings.period_s
     noise = USUAL_DQ_NOISE if settings.dq_noise is None else settings.dq_noise
     drive = settings.dq_drive

@@ -6,11 +6,7 @@ import ctypes
 import gc
 import os
 
-import pytest
-
 from adapter.realtime import real_time
-
-pytestmark = pytest.mark.alone
 
 
 def test_everything_is_given_back():

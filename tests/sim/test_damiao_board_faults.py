@@ -26,8 +26,6 @@ from tests.helpers.board_tools import (
     rig,
 )
 
-pytestmark = pytest.mark.alone
-
 READY = build("nominal").truth.ready
 TICKS = 400
 SHARE = 0.1

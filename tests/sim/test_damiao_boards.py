@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -20,8 +21,10 @@ import pytest
 
 from sim.damiao import codec as wire
 from sim.damiao.bus import open_bus
+from sim.damiao.command import run
 from sim.damiao.host import ServedBus
 from sim.damiao.motor import SETS
+from sim.damiao.options import add_arguments
 from sim.damiao.server import BoardOptions, Boards
 from sim.effects import Effect
 from sim.noise import levels_of
@@ -44,20 +47,12 @@ from tests.helpers.board_tools import (
     rig,
     write_register,
 )
-
-pytestmark = pytest.mark.alone
+from tests.helpers.hardware_rigs import SERVE_CAN
 
 READY = build("nominal").truth.ready
 LIMP = BoardOptions(stand=False)
 GROUP = "239.74.163.2"
-COMMAND = """
-import argparse, sys
-from sim.damiao.command import run
-from sim.damiao.options import add_arguments
-parser = argparse.ArgumentParser()
-add_arguments(parser)
-sys.exit(run(parser.parse_args()))
-"""
+IPV6_GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
 
 
 # Bytes of the reference page, section 2, 3 and 5.
@@ -435,14 +430,17 @@ def multicast_or_skip(channel: str, port: int) -> can.BusABC:
         pytest.skip(f"no multicast group {channel} on this machine: {error.__cause__}")
 
 
-def test_boards_on_multicast_do_not_hear_themselves_and_pass_over_noise() -> None:
+@pytest.mark.parametrize("channel", [GROUP, IPV6_GROUP])
+def test_boards_on_multicast_do_not_hear_themselves_and_pass_over_noise(channel) -> None:
     port = free_port()
-    with multicast_or_skip(GROUP, port) as host, open_bus("udp_multicast", GROUP, port) as far:
+    family = socket.AF_INET6 if ":" in channel else socket.AF_INET
+    with multicast_or_skip(channel, port) as host, open_bus("udp_multicast", channel, port) as far:
         boards = Boards(far, build("nominal"))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
-            noise.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        with socket.socket(family, socket.SOCK_DGRAM) as noise:
+            if family == socket.AF_INET:
+                noise.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             for junk in (b"", b"\xc1", b"no frame at all", bytes(2000)):
-                noise.sendto(junk, (GROUP, port))
+                noise.sendto(junk, (channel, port))
         for motor in (*IDS, *IDS):
             host.send(frame(0x7FF, refresh(motor)))
         stop = threading.Event()
@@ -458,21 +456,23 @@ def test_boards_on_multicast_do_not_hear_themselves_and_pass_over_noise() -> Non
     assert boards.frames == {"unreadable": 4, "refresh": 14}
 
 
-def start(*options: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", COMMAND, *options], stdout=subprocess.PIPE, text=True
-    )
+def command(*options: str) -> int:
+    """The command in this process."""
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    return run(parser.parse_args(options))
 
 
-@pytest.mark.parametrize("channel", [GROUP, "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"])
-def test_across_processes_until_sigterm(tmp_path, channel) -> None:
+def test_across_processes_until_sigterm(tmp_path) -> None:
     port, figures = free_port(), tmp_path / "figures.json"
-    with multicast_or_skip(channel, port) as bus:
-        server = start("--channel", channel, "--port", str(port), "--json", str(figures))
+    with multicast_or_skip(GROUP, port) as bus:
+        server = subprocess.Popen(
+            [sys.executable, "-c", SERVE_CAN, "--port", str(port), "--json", str(figures)],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
         try:
             ready = server.stdout.readline()
-            where = f"[{channel}]" if ":" in channel else channel
-            assert f"can://{where}:{port}?interface=udp_multicast" in ready
+            assert f"can://{GROUP}:{port}?interface=udp_multicast" in ready
             for motor in IDS:
                 bus.send(frame(motor, ENABLE))
                 message = receive(bus, 0x10 + motor)
@@ -483,12 +483,8 @@ def test_across_processes_until_sigterm(tmp_path, channel) -> None:
                     bus.send(frame(motor, mit(PANDA[motor - 1], READY[motor - 1], kp=300, kd=5)))
                 for motor in IDS:
                     assert receive(bus, 0x10 + motor) is not None
-            second = subprocess.run(
-                [sys.executable, "-c", COMMAND, "--channel", channel, "--port", str(port)],
-                capture_output=True, text=True, timeout=60,
-            )  # fmt: skip
-            assert second.returncode != 0
-            assert "another arm answers as motor 1" in second.stderr
+            with pytest.raises(ValueError, match="another arm answers as motor 1"):
+                command("--port", str(port))
             server.send_signal(signal.SIGTERM)
             rest, _ = server.communicate(timeout=60)
         finally:
@@ -502,17 +498,13 @@ def test_across_processes_until_sigterm(tmp_path, channel) -> None:
     assert not told["in_stand"]
 
 
-def test_a_process_ends_by_itself_after_its_duration() -> None:
+def test_it_ends_by_itself_after_its_duration(capsys) -> None:
     port = free_port()
     multicast_or_skip(GROUP, port).shutdown()
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND, "--port", str(port), "--duration", "0.3",
-         "--scenario", "payload_at_20s", "--set", "mass=2", "--set", "noise=real"],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "ready: " in done.stdout
-    assert "simulated " in done.stdout
+    options = ["--scenario", "payload_at_20s", "--set", "mass=2", "--set", "noise=real"]
+    assert command("--port", str(port), "--duration", "0.3", *options) == 0
+    said = capsys.readouterr().out
+    assert "ready: " in said and "simulated " in said
 
 
 @pytest.mark.parametrize(
@@ -527,17 +519,14 @@ def test_a_process_ends_by_itself_after_its_duration() -> None:
     ],
 )
 def test_wrong_options_are_refused_in_a_sentence(options, says) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND, "--port", str(free_port()), *options],
-        capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert done.returncode != 0
-    assert says in done.stderr.splitlines()[-1]
+    with pytest.raises(ValueError, match=says) as refused:
+        command("--port", str(free_port()), *options)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare for a bare network")
 def test_a_machine_without_route_is_told_which_one_it_needs() -> None:
-    bare = ["unshare", "--net", sys.executable, "-c", COMMAND]
+    bare = ["unshare", "--net", sys.executable, "-c", SERVE_CAN]
     if subprocess.run(["unshare", "--net", "true"], capture_output=True).returncode:
         pytest.skip("this user may not open a network namespace")
     done = subprocess.run(bare, capture_output=True, text=True, timeout=60)
