@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 
-from drivers.files.log import LogArm
 from drivers.interface import Driver, DriverError
 
 Builder = Callable[[str], Driver]
-# Behind these an arm may be real. Loaded by name when one is opened: no arm needs the libraries
-# of another. The class takes (address, joint names, whether the arm may be moved).
+# Loaded by name when one is opened: no arm needs the libraries of another, and an address that is
+# wrong is told before anything is loaded.
+LOG = "drivers.files.log:LogArm"  # takes (file, joint names)
+# Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
 HARDWARE = {"fci": "drivers.fci.arm:FciArm", "can": "drivers.damiao.arm:DamiaoArm"}
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
@@ -48,9 +49,14 @@ def open_driver(
     if scheme in builders:
         return builders[scheme](rest)
     if scheme == "log":
-        return LogArm(rest, joint_names)
+        return _load(LOG)(rest, joint_names)
     if scheme not in HARDWARE:
         raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
-    module, _, name = HARDWARE[scheme].partition(":")
-    driver: Driver = getattr(import_module(module), name)(address, joint_names, allow_motion)
-    return driver
+    return _load(HARDWARE[scheme])(address, joint_names, allow_motion)
+
+
+def _load(target: str) -> Callable[..., Driver]:
+    """The class that "MODULE:NAME" names."""
+    module, _, name = target.partition(":")
+    found: Callable[..., Driver] = getattr(import_module(module), name)
+    return found

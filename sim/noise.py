@@ -7,14 +7,14 @@ random numbers, drawn ahead in blocks of fixed length.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interface import JointSample, LinkMotion
-from sim.options import NOISES
+from sim.noise_levels import NOISES, NoiseLevels, check_levels
 from sim.truth import Array, facts_of
 
 RATE_HZ = 1000.0
@@ -28,51 +28,6 @@ MAX_JITTER = 0.45  # of a period: stamps stay in order
 Draw = Callable[[np.random.Generator], Array]
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseLevels:
-    """Sizes of what the sensors add; scalars or one value per joint.
-
-    Attributes:
-        tau_above_50hz: torque noise above 50 Hz, N m rms; white over all frequencies.
-        tau_10_to_40hz: torque noise between 10 and 40 Hz, share of the white noise included.
-        tau_step: quantisation of the torque, N m; 0 for none.
-        dq_above_50hz: velocity noise above 50 Hz, rad/s rms; white.
-        q_above_50hz: position noise above 50 Hz, rad rms; white.
-        link_twist: white noise on link twists, m/s and rad/s rms.
-        link_accel: white noise on link accelerations, m/s² and rad/s² rms.
-        dropouts: share of samples that never arrive.
-        repeats: share of samples that carry the values of the one before.
-        stamp_jitter_s: error of the stamp (not of the instant), s rms, cut at 0.45 periods.
-    """
-
-    tau_above_50hz: float | list[float] = 0.0
-    tau_10_to_40hz: float | list[float] = 0.0
-    tau_step: float | list[float] = 0.0
-    dq_above_50hz: float | list[float] = 0.0
-    q_above_50hz: float | list[float] = 0.0
-    link_twist: float = 0.0
-    link_accel: float = 0.0
-    dropouts: float = 0.0
-    repeats: float = 0.0
-    stamp_jitter_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            if not np.all(np.asarray(getattr(self, item.name)) >= 0.0):
-                raise ValueError(f"noise {item.name!r} is negative or not a number")
-        if self.dropouts >= 1.0:
-            raise ValueError(f"noise 'dropouts' is {self.dropouts}; have: below 1")
-
-    @property
-    def twist_and_accel(self) -> Array:
-        """(2, 1): the link noise as it scales rows of twist and acceleration."""
-        return np.array([[self.link_twist], [self.link_accel]])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers for a truth file."""
-        return asdict(self)
-
-
 def levels_of(name: str, **changes: float) -> NoiseLevels:
     """Noise levels by name: `real` (a Panda's log) or `none`, with some of them changed.
 
@@ -81,9 +36,7 @@ def levels_of(name: str, **changes: float) -> NoiseLevels:
     """
     if name not in NOISES:
         raise ValueError(f"no noise {name!r}; have: {', '.join(NOISES)}")
-    known = {item.name for item in fields(NoiseLevels)}
-    for key in changes.keys() - known:
-        raise ValueError(f"no noise level {key!r}; have: {', '.join(sorted(known))}")
+    check_levels(changes)
     base = NoiseLevels() if name == "none" else NoiseLevels(**facts_of("panda")["noise"])
     return replace(base, **changes)
 

@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from sim.noise_levels import NOISES, check_levels
+
 
 class ScenarioKind(NamedTuple):
     """What a scenario offers: options (numbers from 0 up), and whether links are measured."""
@@ -25,14 +27,13 @@ SCENARIOS = {
 }
 DEFAULT_SCENARIO = "nominal"
 COMMON_OPTIONS = ("noise", "links", "levels")
-NOISES = ("real", "none")
 
 
 def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
     """The scenario's own options as numbers.
 
     Raises:
-        ValueError: unknown scenario, option or noise, or a value out of range; with the choices.
+        ValueError: unknown scenario, option, noise or level, or a value out of range; with choices.
     """
     if name not in SCENARIOS:
         raise ValueError(f"no scenario {name!r}; have: {', '.join(SCENARIOS)}")
@@ -45,6 +46,7 @@ def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
         raise ValueError(f"{name}: links is {links!r}; have: True, False")
     if noise not in NOISES:
         raise ValueError(f"no noise {noise!r}; have: {', '.join(NOISES)}")
+    check_levels(options.get("levels", {}))
     return numbers
 
 

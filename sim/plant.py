@@ -10,7 +10,8 @@ from drivers.interface import DriverError, JointSample, LinkMotion
 from sim.dynamics import link_motion
 from sim.effects import ENCODER, TORQUE
 from sim.engine import PERIOD_S, Engine
-from sim.noise import NoiseLevels, SensorNoise, levels_of
+from sim.noise import SensorNoise, levels_of
+from sim.noise_levels import NoiseLevels
 from sim.sensors import Sensors
 from sim.truth import Array, Truth
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from sim.effects import payload, per_joint
-from sim.noise import NoiseLevels, levels_of
+from sim.noise import levels_of
+from sim.noise_levels import NoiseLevels
 from sim.options import SCENARIOS, check
 from sim.plant import Plant
 from sim.truth import Array, Truth, facts_of, panda, turn

@@ -166,8 +166,8 @@ def _check_learning(args: argparse.Namespace) -> None:
     if args.robot is not None:
         _check_robot(args.robot)
     _check_files(args.config, args.truth, args.resume)
-    if args.effects is not None:
-        import_module(NAMES).check_effects(args)
+    if args.effects is not None or args.config is not None:
+        import_module(NAMES).check_learning(args)
 
 
 def _check_robot(name: str) -> None:

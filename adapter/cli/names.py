@@ -1,4 +1,4 @@
-"""Names on a command line that other rooms know. Nothing here takes long to load."""
+"""Names on a command line and in a settings file that other rooms know; light to load."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import argparse
 from adapter.effects import LEARNED
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.errors import SettingsError
+from adapter.runs.config import read_config
 from drivers.faults.spec import Faults
 from sim.options import DEFAULT_SCENARIO, options_of
 from sim.options import check as check_scenario
@@ -37,6 +38,8 @@ def effects_named(text: str) -> tuple[str, ...]:
     return names
 
 
-def check_effects(args: argparse.Namespace) -> None:
-    """`--effects`. Raises SettingsError."""
-    effects_named(args.effects)
+def check_learning(args: argparse.Namespace) -> None:
+    """`--effects` and what `--config` says. Raises SettingsError."""
+    if args.effects is not None:
+        effects_named(args.effects)
+    read_config(args.config)

@@ -16,10 +16,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from adapter.control.excitation import ExcitationSettings, RandomMotion, smooth_step
+from adapter.control.excitation import RandomMotion, smooth_step
 from adapter.control.feedforward import Feedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
+from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
 from drivers.interface import Driver, JointSample

@@ -19,7 +19,8 @@ from rich.table import Table
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import to_urdf
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, Learner, LearnerSettings
+from adapter.learning.learner import Filtered, Learner
+from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import log_cholesky_from_theta
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -29,7 +30,8 @@ from adapter.physics.networks import (
     link_motion,
     theta_from_log_cholesky_torch,
 )
-from adapter.runs.pipeline import PipelineSettings, make_front_end
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import make_front_end
 from adapter.runs.terminal import console, write_json
 from adapter.signals.filters import JointFilter
 from drivers.interface import JointSample

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from adapter.learning.learner import Learner, LearnerSettings
-from adapter.learning.schema import SchemaSettings
+from adapter.learning.learner import Learner
+from adapter.learning.settings import LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import gravity_down
 from adapter.model.spatial import Array

@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.experiments.results import PandaResults
 from adapter.experiments.stated import panda_stated
 from adapter.experiments.topology import panda_logs, topology_trials
-from adapter.learning.learner import LearnerSettings
+from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.spatial import Array
 from adapter.realtime.session import run_lockstep
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.run_folder import RunData, run_data
 from adapter.runs.score import TORQUE_WINDOW_S, Course, figures, reference_from, trailing_rms
 from adapter.runs.terminal import json_ready

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.discovery import UNSEEN_BASE, Discovery, discover
 from adapter.model.robots import documented
 from adapter.model.tree import BASE, Tree
 from adapter.realtime.session import run_lockstep
-from adapter.runs.pipeline import PipelineSettings, make_front_end
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import make_front_end
 from drivers.files.mcap import Log
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm

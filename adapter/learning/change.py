@@ -2,49 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from adapter.errors import SettingsError
+from adapter.learning.settings import ChangeSettings
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 
 BURST_BLOCK = 500  # samples
-
-
-@dataclass(frozen=True)
-class ChangeSettings:
-    """When a torque error means that something changed.
-
-    Attributes:
-        enabled: whether changes are looked for.
-        fast, slow: samples that the error and its level are averaged over.
-        all_factor: alarm when the rms over all joints, each in units of its level, exceeds this.
-        one_factor: alarm when a single joint's does.
-        burst_factor: neither alarms below this multiple of the largest burst seen before; real
-            arms show bursts where friction reverses.
-        burst_memory: samples over which such a burst is forgotten.
-        arm_after: samples of θ learning before the first alarm can be.
-        rearm_after: samples after a change before the next can be.
-        wait: samples after an alarm while the filters fill with the new state; the error must
-            still be there behind them, or the alarm was a burst.
-    """
-
-    enabled: bool = True
-    fast: int = 50
-    slow: int = 2000
-    all_factor: float = 2.6
-    one_factor: float = 5.0
-    burst_factor: float = 1.5
-    burst_memory: int = 20_000
-    arm_after: int = 5000
-    rearm_after: int = 3000
-    wait: int = 130
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.fast < self.slow:
-            raise SettingsError("change.fast must be at least 1 and below change.slow")
 
 
 @jit

@@ -7,8 +7,7 @@ whose base's motion comes with each state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,10 +16,14 @@ from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.learning.adam import FlatAdam
-from adapter.learning.change import ChangeDetector, ChangeSettings
+from adapter.learning.change import ChangeDetector
 from adapter.learning.known_effects import KnownEffects, believed
-from adapter.learning.schema import RestingBase, Schema, SchemaSettings
-from adapter.learning.theta import Theta, ThetaKnowledge, ThetaSettings
+from adapter.learning.schema import RestingBase, Schema
+from adapter.learning.settings import (
+    LearnerSettings,
+    Mode,
+)
+from adapter.learning.theta import Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import Moments
 from adapter.learning.trace import Trace
 from adapter.model.spatial import Array
@@ -35,55 +38,6 @@ REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a senso
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
-
-
-class Mode(StrEnum):
-    """What an update descends: the cost over all samples, or (the paper) that of the newest."""
-
-    MOMENTS = "moments"
-    SAMPLE = "sample"
-
-
-MODES = tuple(Mode)
-
-
-@dataclass(frozen=True)
-class LearnerSettings:
-    """How the self is learned.
-
-    Attributes:
-        mode: see `Mode`.
-        effects: names from the catalogue, learned beside θ.
-        seed: of the random start of λ.
-        update_every: states for each ADAM step; every state joins the moments.
-        wait_for_schema: whether θ waits until λ has converged.
-        held_samples: newest states kept to rebuild θ's moments from when λ has moved.
-        rebuild_rows: how many of them each state redoes.
-        rebuild_stds: by how many of its standard deviations λ may leave θ's moments.
-        schema, theta, change: of the parts.
-    """
-
-    mode: str = Mode.MOMENTS
-    effects: tuple[str, ...] = ()
-    seed: int = 0
-    update_every: int = 1
-    wait_for_schema: bool = True
-    held_samples: int = 60_000
-    rebuild_rows: int = 10
-    rebuild_stds: float = 1.0
-    schema: SchemaSettings = field(default_factory=SchemaSettings)
-    theta: ThetaSettings = field(default_factory=ThetaSettings)
-    change: ChangeSettings = field(default_factory=ChangeSettings)
-
-    def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise SettingsError(f"no learner mode '{self.mode}'; have: {', '.join(MODES)}")
-        if self.held_samples < 1000:
-            raise SettingsError(f"held_samples must be at least 1000, got {self.held_samples}")
-        if self.update_every < 1:
-            raise SettingsError(f"update_every must be at least 1, got {self.update_every}")
-        if self.rebuild_rows < 2:
-            raise SettingsError(f"rebuild_rows must be at least 2, got {self.rebuild_rows}")
 
 
 @dataclass(frozen=True)

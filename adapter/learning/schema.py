@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.errors import SettingsError
 from adapter.learning.schema_kernels import (
     Count,
     MotionMoments,
@@ -32,6 +31,7 @@ from adapter.learning.schema_kernels import (
     steepest,
     without_noise,
 )
+from adapter.learning.settings import SchemaSettings
 from adapter.model.spatial import (
     Array,
     exp_rotation,
@@ -49,43 +49,6 @@ LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
 # Where dw is carried by λ: samples between two looks at λ, and the turn (rad) in between that
 # spoils them.
 CARRIED_SAMPLES, CARRIED_TURN = 400, 2e-3
-
-
-@dataclass(frozen=True)
-class SchemaSettings:
-    """How λ is learned.
-
-    Attributes:
-        rate: ADAM's longest step per sample, rad and m.
-        share: longest step as a share of the distance to the optimum.
-        sample_rate: ADAM's rate in mode `sample`.
-        start_rms: spread of the random starting λ, rad and m.
-        forget_s: time constant of the forgotten window in moving samples x 1 ms; None keeps all.
-        judge_every: updates between two looks at curvature and identifiability.
-        rotation_goal, position_goal: std and remaining distance below which λ has converged.
-        stable_updates: for how many updates in a row that must hold.
-        spin_measured: whether measured link motion has angular accelerations dw. Where not, the
-            base's is carried along the tree by eq. 8d with the present λ, and moments made
-            while λ still turned are dropped.
-    """
-
-    rate: float = 1.5e-2
-    share: float = 0.15
-    sample_rate: float = 1e-3
-    start_rms: float = 0.01
-    forget_s: float | None = None
-    judge_every: int = 10
-    rotation_goal: float = 0.005
-    position_goal: float = 0.0025
-    stable_updates: int = 200
-    spin_measured: bool = True
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "share", "sample_rate", "start_rms", "judge_every"):
-            if not getattr(self, name) > 0:
-                raise SettingsError(f"schema.{name} must be above zero, got {getattr(self, name)}")
-        if self.forget_s is not None and self.forget_s < 0.05:
-            raise SettingsError(f"schema.forget_s must be at least 0.05 s, got {self.forget_s}")
 
 
 @dataclass(frozen=True)

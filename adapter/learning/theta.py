@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.base import LinearEffect
 from adapter.errors import SettingsError
+from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
     Given,
     Indices,
@@ -60,47 +61,6 @@ BASE_LEVEL_SAMPLES = 2000  # that the running mean of the base's squared errors 
 
 SMALLEST_LOAD = 0.01  # kg; below it the start after a change is the link as it was
 LOAD_RADIUS = 0.03  # m; of gyration of a load whose inertia is not known yet
-
-
-@dataclass(frozen=True)
-class ThetaSettings:
-    """How θ is learned.
-
-    Attributes:
-        rate: ADAM's rate per sample on the log-Cholesky parameters.
-        settled_rate: the same once θ has converged: smaller steps, no spikes.
-        betas: ADAM's averaging constants.
-        average: samples that the reported running mean spans.
-        settled_average: the same once θ has converged.
-        restarts: samples after a change at which the spare body is put to the point mass that
-            fits best so far; ADAM refines it from there.
-        warm_up: samples in the moments before the first step.
-        forget_s: time constant of directional forgetting in moving samples x 1 ms; None: none.
-        model_error: torque that the model is not trusted to explain, N m; no weight looks below
-            it. None: 0.025 where friction or another effect is found (a real arm, whose friction
-            no such model explains better), 0.001 else.
-        sample_rate: ADAM's rate in mode `sample`.
-    """
-
-    rate: float = 3e-3
-    settled_rate: float = 1e-3
-    betas: tuple[float, float] = (0.97, 0.99)
-    average: int = 100
-    settled_average: int = 30
-    restarts: tuple[int, ...] = (50, 100, 200, 400)
-    warm_up: int = 50
-    forget_s: float | None = None
-    model_error: float | None = None
-    sample_rate: float = 1e-3
-
-    def __post_init__(self) -> None:
-        for name in ("rate", "settled_rate", "average", "settled_average", "sample_rate"):
-            if not getattr(self, name) > 0:
-                raise SettingsError(f"theta.{name} must be above zero, got {getattr(self, name)}")
-        if len(self.betas) != 2 or not all(0.0 <= beta < 1.0 for beta in self.betas):
-            raise SettingsError(f"theta.betas must be two numbers in [0, 1), got {self.betas}")
-        if self.forget_s is not None and self.forget_s < 0.5:
-            raise SettingsError(f"theta.forget_s must be at least 0.5 s, got {self.forget_s}")
 
 
 def neutral_body() -> Array:

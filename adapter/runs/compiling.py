@@ -14,7 +14,8 @@ from numba.core import event
 
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from adapter.runs.pipeline import PipelineSettings, make_front_end
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import make_front_end
 from adapter.runs.replay import ReplayOptions, replay
 from drivers.files.mcap import Log
 from drivers.interface import JointSample

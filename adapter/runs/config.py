@@ -11,10 +11,11 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from adapter.control.excitation import ExcitationSettings
+from adapter.control.settings import ExcitationSettings
 from adapter.errors import SettingsError
+from adapter.learning.settings import LearnerSettings
 from adapter.model.self_model import SelfModel, Tool
-from adapter.runs.pipeline import PipelineSettings
+from adapter.signals.settings import FilterSettings, FrontEndSettings
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,15 @@ class ToolSettings:
         xx, xy, xz, yy, yz, zz = self.inertia
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         return Tool(self.mass, np.array(self.com), tensor)
+
+
+@dataclass(frozen=True)
+class PipelineSettings:
+    """Settings of the parts."""
+
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
+    learner: LearnerSettings = field(default_factory=LearnerSettings)
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,15 @@ from adapter.gap.result import GapResult
 from adapter.gap.workflow import GapSettings
 from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
-from adapter.learning.learner import LearnerSettings
+from adapter.learning.settings import LearnerSettings
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
-from adapter.runs.pipeline import Pipeline, PipelineSettings, make_front_end
+from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
 from adapter.signals.matching import matching
 from adapter.signals.validation import validation_torque_rmse

@@ -17,8 +17,9 @@ from adapter.learning.learner import Learner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import Snapshot
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.records import LinkMotionKind
 
 KEPT_LEARNER, KEPT_MONITOR = "learner.npz", "monitor.pickle"

@@ -10,7 +10,8 @@ import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
-from adapter.learning.learner import Learner, LearnerSettings
+from adapter.learning.learner import Learner
+from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 from adapter.effects.active import lasting_effects, with_bodies
-from adapter.learning.learner import Filtered, KnownArm, Learner, LearnerSettings
+from adapter.learning.learner import Filtered, KnownArm, Learner
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.filters import FilterSettings
-from adapter.signals.front_end import FrontEnd, FrontEndSettings
+from adapter.runs.config import PipelineSettings
+from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
-
-
-@dataclass(frozen=True)
-class PipelineSettings:
-    """Settings of the parts."""
-
-    filter: FilterSettings = field(default_factory=FilterSettings)
-    front_end: FrontEndSettings = field(default_factory=FrontEndSettings)
-    learner: LearnerSettings = field(default_factory=LearnerSettings)
 
 
 class Pipeline:

@@ -17,9 +17,11 @@ from adapter.learning.checkpoint import load_checkpoint
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.batch import learn_batch
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import Outcome, collect
-from adapter.runs.pipeline import Pipeline, PipelineSettings
-from adapter.signals.filters import FilterSettings, noise_from_samples
+from adapter.runs.pipeline import Pipeline
+from adapter.signals.filters import noise_from_samples
+from adapter.signals.settings import FilterSettings
 from drivers.files.mcap import Log
 from drivers.interface import DriverError, JointSample, LinkMotion
 

@@ -16,7 +16,6 @@ so jitter, missing and dropped samples need no grid. All joints go through one c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from adapter.errors import SettingsError
 from adapter.physics.kernels import jit
+from adapter.signals.settings import FilterSettings
 
 Array = NDArray[np.float64]
 
@@ -32,39 +32,6 @@ THIRD_DIFFERENCE_GAIN = 20.0
 
 USUAL_DQ_NOISE = 5e-3  # rad/s, of a Panda
 SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
-
-
-@dataclass(frozen=True)
-class FilterSettings:
-    """How the filter weighs noise against change.
-
-    Attributes:
-        bandwidth_hz: corner of L; used where `dq_drive` is not given. Real Pandas show a torque
-            oscillation of 10 to 40 Hz that no rigid model explains, so the default stays below
-            (held-out error on a real log, worst joint: 0.90 at 6 Hz, 0.93 at 8, 0.96 at 10).
-        dq_noise: standard deviation of one dq sample, rad/s; only the ratio to `dq_drive` matters.
-            None: a replay takes it from the recording's high frequencies.
-        dq_drive: white-noise intensity of dq's second derivative, rad/s³/√Hz; sets the gains
-            together with `dq_noise` instead of `bandwidth_hz`.
-        period_s: nominal sample period, s.
-    """
-
-    bandwidth_hz: float = 6.0
-    dq_noise: float | None = None
-    dq_drive: float | None = None
-    period_s: float = 1e-3
-
-    def __post_init__(self) -> None:
-        for name in ("bandwidth_hz", "dq_noise", "period_s"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0.0:
-                raise SettingsError(f"filter.{name} must be above zero, got {getattr(self, name)}")
-        if self.dq_drive is not None and not self.dq_drive > 0.0:
-            raise SettingsError(f"filter.dq_drive must be above zero, got {self.dq_drive}")
-        if self.dq_drive is None and self.bandwidth_hz > 0.1 / self.period_s:
-            raise SettingsError(
-                f"filter.bandwidth_hz {self.bandwidth_hz} is above a tenth of the sample rate "
-                f"({0.1 / self.period_s:.0f} Hz)"
-            )
 
 
 def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:

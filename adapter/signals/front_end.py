@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
-from adapter.signals.filters import (
-    NEVER,
-    FilterSettings,
-    FilterState,
-    Gains,
-    JointFilter,
-    filter_step,
-)
+from adapter.signals.filters import NEVER, FilterState, Gains, JointFilter, filter_step
 from adapter.signals.records import StateLayout
+from adapter.signals.settings import FilterSettings, FrontEndSettings
 from adapter.signals.twist import TwistSynthesis
 from drivers.interface import JointSample
 
@@ -66,30 +58,6 @@ PLAY_RAD = 0.012  # a motor crosses the play of its gear in no time: no step of 
 USUAL_OVER = 200.0  # samples that "usual" looks back on
 JUMP_CONFIRMED = 3  # samples in a row that confirm a step of position
 STUCK_RAD = 3e-3  # a joint's readings stand still while its speed would have brought it so far
-
-
-@dataclass(frozen=True)
-class FrontEndSettings:
-    """What counts as a usable sample.
-
-    Attributes:
-        rest_dq: below this on every joint (filtered, rad/s) the arm rests and teaches nothing.
-        max_gap_s: a longer hole in the stamps restarts the filter.
-        q_margin: how far beyond a documented position limit a reading may lie, rad.
-        range_factor: how far beyond documented speed and effort, as a factor.
-        saturation: share of the effort limit from which a torque counts as saturated.
-    """
-
-    rest_dq: float = 0.02
-    max_gap_s: float = 0.02
-    q_margin: float = 0.3
-    range_factor: float = 3.0
-    saturation: float = 0.98
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) > 0.0:
-                raise SettingsError(f"front_end.{name} must be above zero")
 
 
 class Rules(NamedTuple):

@@ -14,7 +14,8 @@ import numpy as np
 
 from drivers.interface import JointSample
 from sim.engine import PERIOD_S, Engine, Law
-from sim.noise import NoiseLevels, SensorNoise
+from sim.noise import SensorNoise
+from sim.noise_levels import NoiseLevels
 from sim.truth import Array, Truth
 
 PERIOD_NS = round(PERIOD_S * 1e9)

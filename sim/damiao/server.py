@@ -17,7 +17,8 @@ from sim.damiao.faults import Faults, Outbox
 from sim.damiao.motor import motor_set
 from sim.damiao.robot import MotorBank
 from sim.effects import ENCODER, TORQUE
-from sim.noise import NoiseLevels, levels_of
+from sim.noise import levels_of
+from sim.noise_levels import NoiseLevels
 from sim.scenarios import Scenario
 from sim.truth import Array
 

@@ -26,7 +26,8 @@ from sim.hidden.sizes import (
     draw_effect,
     log_uniform,
 )
-from sim.noise import NoiseLevels, levels_of
+from sim.noise import levels_of
+from sim.noise_levels import NoiseLevels
 from sim.truth import Array, Truth, body_of, panda
 from sim.urdf_writer import urdf
 

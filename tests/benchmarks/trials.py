@@ -20,8 +20,9 @@ import numpy as np
 
 from adapter.cli.arguments import build_parser
 from adapter.cli.run import controller_of, open_arm, run_plan
-from adapter.control.excitation import ExcitationSettings, RandomMotion
+from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import Learner
 from adapter.learning.theta import Theta

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError
 from adapter.model.urdf import read_urdf
 from adapter.realtime.session import run_lockstep

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adapter.control.controller import ControlSettings, ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.sample_clock import SampleClock
+from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.urdf import read_urdf
 from drivers.interface import JointSample

@@ -13,14 +13,16 @@ from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.known_effects import KnownEffects, believed, learnable, not_taken_off
-from adapter.learning.learner import KnownArm, Learner, LearnerSettings
+from adapter.learning.learner import KnownArm, Learner
+from adapter.learning.settings import LearnerSettings
 from adapter.learning.theta import STEP_SMOOTHING
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.batch import learn_batch
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
-from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.records import StateLayout
 from tests.helpers.arm_data import (
     ArmData,

@@ -12,8 +12,8 @@ from adapter.cli.results import disagreement_lines
 from adapter.gap.monitor import Monitor
 from adapter.gap.monitor_evidence import Blocks
 from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import PipelineSettings
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout

@@ -14,11 +14,12 @@ import pinocchio as pin
 from scipy.signal import butter, sosfilt
 
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, KnownArm, Learner, LearnerSettings
+from adapter.learning.learner import Filtered, KnownArm, Learner
+from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
-from adapter.signals.filters import FilterSettings
 from adapter.signals.front_end import FrontEnd
+from adapter.signals.settings import FilterSettings
 from drivers.files.mcap import Log
 from drivers.interface import JointSample, LinkMotion
 from sim.dynamics import link_motion

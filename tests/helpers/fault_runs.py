@@ -8,12 +8,13 @@ from functools import cache
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.learning.learner import Learner
 from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, frame_errors
-from adapter.runs.pipeline import PipelineSettings, make_front_end, make_learner
+from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.front_end import FrontEnd
 from drivers.faults.driver import FaultyDriver, with_faults
 from tests.helpers.arm_data import Motion, arm, model_torque, panda_model, record, rms

@@ -14,7 +14,7 @@ from scipy.signal import butter, sosfilt
 
 from sim.hidden import Trial, draw, nominal_urdf
 from sim.hidden.record import Recording, write_files
-from sim.noise import NoiseLevels
+from sim.noise_levels import NoiseLevels
 from tests.helpers.gap_effects import Array, sense
 
 NOISE_STREAM = 1 << 35

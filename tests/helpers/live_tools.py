@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
 from adapter.model.urdf import read_urdf
 from adapter.realtime.jobs import LearnerJob, RecordingJob, View
 from adapter.realtime.loop import LiveOptions

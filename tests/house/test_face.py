@@ -72,6 +72,8 @@ def test_importing_the_package_loads_next_to_nothing() -> None:
         (["run", "--robot", "pnada"], 2, "panda"),
         (["run", "--config", "nowhere.toml"], 2, "nowhere.toml"),
         (["run", "--effects", "magic"], 2, "coulomb_friction"),
+        (["run", "--set", 'levels={"q_above_50hzz": 0}'], 2, "q_above_50hz,"),
+        (["run", "--set", "levels=3"], 2, "q_above_50hz,"),
         (["replay", "README.md", "--effects", "magic"], 2, "coulomb_friction"),
         (["run", "--scenario", "nowhere"], 2, "bent_link"),
         (["run", "--set", "mass=1"], 2, "noise, links, levels"),
@@ -100,6 +102,22 @@ def test_importing_the_package_loads_next_to_nothing() -> None:
 def test_help_and_wrong_use_load_nothing_heavy(words: list[str], code: int, said: str) -> None:
     found, heavy, text = loaded(*words)
     assert (found, heavy) == (code, set()) and said in text
+
+
+@pytest.mark.parametrize(
+    ("toml", "said"),
+    [
+        ("gravty = [0.0]", "gravity"),
+        ("[pipeline.filter]\nbandwidth_hz = 0", "bandwidth_hz"),
+        ('[pipeline.learner]\neffects = ["magic"]', "coulomb_friction"),
+        ('[pipeline.learner]\nmode = "magic"', "moments"),
+    ],
+)
+def test_wrong_settings_load_nothing_heavy(tmp_path: Path, toml: str, said: str) -> None:
+    path = tmp_path / "my.toml"
+    path.write_text(toml)
+    found, heavy, text = loaded("run", "--config", str(path))
+    assert (found, heavy) == (2, set()) and said in text
 
 
 def test_matplotlib_is_loaded_where_a_panel_is_drawn() -> None:

@@ -16,7 +16,7 @@ from adapter.cli.arguments import NAMES
 from adapter.cli.main import RUN_BY
 from adapter.cli.run import SIMULATED_BY
 from adapter.cli.sim import ARMS
-from drivers.registry import HARDWARE
+from drivers.registry import HARDWARE, LOG
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("adapter", "drivers", "sim")
@@ -41,7 +41,7 @@ def graph() -> grimp.ImportGraph:
     by_name["adapter.cli.sim"] = [m for s in ARMS.values() for m in (s.options, s.command)]
     by_name["adapter.cli.arguments"] = [NAMES]
     by_name["adapter.cli.run"] = [SIMULATED_BY]
-    by_name["drivers.registry"] = [target.partition(":")[0] for target in HARDWARE.values()]
+    by_name["drivers.registry"] = [target.partition(":")[0] for target in (LOG, *HARDWARE.values())]
     for importer, imported in by_name.items():
         for module in imported:
             assert module in whole.modules, f"{importer} names {module}, which is not there"

@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.learning.change import ChangeDetector, ChangeSettings
+from adapter.learning.change import ChangeDetector
 from adapter.learning.learner import Learner
-from adapter.learning.theta import ThetaSettings
+from adapter.learning.settings import ChangeSettings, ThetaSettings
 from adapter.runs.outcome import changes, collect, learned_model
 from adapter.signals.records import stamps_of
 from sim.scenarios import build

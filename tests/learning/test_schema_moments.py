@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from adapter.learning.schema import RestingBase, Schema, SchemaSettings
+from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.schema_kernels import (
     N_SIGNALS,
     accumulate,
@@ -14,6 +14,7 @@ from adapter.learning.schema_kernels import (
     signals,
     without_noise,
 )
+from adapter.learning.settings import SchemaSettings
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
 from adapter.model.tree import Tree

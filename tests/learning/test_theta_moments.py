@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from adapter.effects import effects_by_name
-from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Theta, ThetaKnowledge, ThetaSettings
+from adapter.learning.settings import ThetaSettings
+from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import body_from_log_cholesky, forget_along, pull_back
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.inertia import min_eigenvalue, pseudo_inertia

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from adapter.errors import ModelError, SettingsError
-from adapter.learning.change import ChangeSettings
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
-from adapter.learning.learner import KnownArm, Learner, LearnerSettings
-from adapter.learning.schema import SchemaSettings
+from adapter.learning.learner import KnownArm, Learner
+from adapter.learning.settings import ChangeSettings, LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import TreeData
 from adapter.model.inertia import is_consistent
 from adapter.model.self_model import SelfModel

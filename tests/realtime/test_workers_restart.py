@@ -13,9 +13,9 @@ import pytest
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
 from adapter.realtime.session import run_lockstep
+from adapter.runs.config import PipelineSettings
 from adapter.runs.live import learner_job, single_thread_learner
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import PipelineSettings
 from tests.helpers import live_tools as tools
 
 pytestmark = pytest.mark.alone

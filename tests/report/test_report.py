@@ -11,17 +11,18 @@ import numpy as np
 import pytest
 
 from adapter.control.controller import ExcitationController
-from adapter.control.excitation import ExcitationSettings
 from adapter.control.limits import MotionLimits
-from adapter.learning.learner import LearnerSettings
+from adapter.control.settings import ExcitationSettings
+from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.report import render, write_report
 from adapter.report.schema_panels import rotation_path
 from adapter.report.style import thin
 from adapter.report.words import headline
+from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import Pipeline, PipelineSettings
+from adapter.runs.pipeline import Pipeline
 from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data, save_run
 from adapter.runs.score import Course, figures, reference_from
 from drivers.pybullet_arm import PyBulletArm

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from adapter.errors import SettingsError
-from adapter.learning.learner import Learner, LearnerSettings
+from adapter.learning.learner import Learner
+from adapter.learning.settings import LearnerSettings
 from adapter.model.spatial import log_rotation, matrix_from_zxz
-from adapter.runs.pipeline import Pipeline, PipelineSettings
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import Pipeline
 from adapter.runs.replay import MOST_PER_UPDATE, Replay, ReplayOptions, replay
 from adapter.runs.score import theta_score
 from adapter.signals.matching import matching

@@ -8,12 +8,8 @@ from filterpy.kalman import KalmanFilter
 from scipy.signal import csd, lsim
 
 from adapter.errors import SettingsError
-from adapter.signals.filters import (
-    FilterSettings,
-    JointFilter,
-    noise_from_samples,
-    steady_state_poles,
-)
+from adapter.signals.filters import JointFilter, noise_from_samples, steady_state_poles
+from adapter.signals.settings import FilterSettings
 from sim.scenarios import build
 from tests.helpers.arm_data import pin_model, rnea
 

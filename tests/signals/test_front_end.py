@@ -8,12 +8,13 @@ import pytest
 
 from adapter.errors import SettingsError
 from adapter.model.self_model import Limits
-from adapter.signals.front_end import FrontEnd, FrontEndSettings
+from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import (
     LinkMotionKind,
     StateLayout,
     stamps_of,
 )
+from adapter.signals.settings import FrontEndSettings
 from drivers.interface import JointSample, LinkMotion
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
 

@@ -1,0 +1,79 @@
+"""How the arm is moved. Light to load: wrong settings are told at once."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from adapter.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class ExcitationSettings:
+    """How the arm moves.
+
+    Attributes:
+        seed: of the random motion.
+        sines: in each joint's motion.
+        low_hz, high_hz: between these frequencies.
+        share: of the velocity, acceleration and jerk limits that is never exceeded.
+        range_share: of a joint's range that is used at most.
+        margin: kept from the position limits, rad.
+        start_s, stop_s: length of the soft start and of the safe stop.
+        rests: (from, to) seconds of motion time in which the arm rests; the stop before and the
+            start after each lie behind its first and its second instant.
+        slow_s: seconds of motion time at `slow_share` of the speed, before a smooth step to all
+            of it within `start_s`; 0 for none.
+        slow_share: share of the speed meanwhile.
+    """
+
+    seed: int = 0
+    sines: int = 5
+    low_hz: float = 0.1
+    high_hz: float = 1.0
+    share: float = 0.9
+    range_share: float = 0.8
+    margin: float = 0.15
+    start_s: float = 1.0
+    stop_s: float = 1.0
+    rests: tuple[tuple[float, float], ...] = ()
+    slow_s: float = 0.0
+    slow_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.sines < 1:
+            raise SettingsError(f"excitation.sines must be at least 1, got {self.sines}")
+        if not 0.0 < self.low_hz < self.high_hz:
+            raise SettingsError(
+                f"excitation: frequencies must be 0 < low_hz < high_hz, got {self.low_hz}, "
+                f"{self.high_hz}"
+            )
+        for name in ("share", "range_share"):
+            if not 0.0 < getattr(self, name) <= 0.95:
+                raise SettingsError(f"excitation.{name} must be above 0 and at most 0.95")
+        for name in ("margin", "start_s", "stop_s"):
+            if not getattr(self, name) > 0.0:
+                raise SettingsError(f"excitation.{name} must be above zero")
+        if any(len(rest) != 2 for rest in self.rests):
+            raise SettingsError("excitation.rests needs pairs of (from, to) seconds")
+        for begin, end in self.rests:
+            if end - begin < self.stop_s:
+                raise SettingsError(f"excitation.rests: {begin} to {end} s is shorter than a stop")
+        self._check_slow_start()
+
+    def _check_slow_start(self) -> None:
+        if not 0.0 < self.slow_share <= 1.0:
+            raise SettingsError("excitation.slow_share must be above 0 and at most 1")
+        if not (self.slow_s == 0.0 or self.start_s <= self.slow_s < math.inf):
+            raise SettingsError(
+                f"excitation.slow_s must be 0 or at least start_s ({self.start_s} s), "
+                f"got {self.slow_s}"
+            )
+        quicker = self.slow_s, self.slow_s + self.start_s
+        for begin, end in self.rests if self.slow_s else ():
+            for at, length in ((begin, self.stop_s), (end, self.start_s)):
+                if at < quicker[1] and at + length > quicker[0]:
+                    raise SettingsError(
+                        f"excitation.rests: {begin} to {end} s begins or ends while the motion "
+                        f"becomes quicker, {quicker[0]} to {quicker[1]} s"
+                    )
