@@ -12,7 +12,6 @@ import resource
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from types import TracebackType
 
 MCL_CURRENT, MCL_FUTURE = 1, 2  # <sys/mman.h>
 DEFAULT_PRIORITY = 70  # above the kernel's interrupt threads (50), below its watchdogs (99)
@@ -74,12 +73,7 @@ class RealTime:
             self._ask(request_fifo(self._priority))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._undo.close()
 
     def _ask(self, answer: tuple[Grant, Callable[[], None] | None]) -> None:

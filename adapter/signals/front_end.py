@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -13,29 +11,22 @@ from numpy.typing import NDArray
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
-from adapter.signals.filters import NEVER, FilterState, Gains, JointFilter, filter_step
+from adapter.signals.checks import (
+    STREAK,
+    Mark,
+    Verdict,
+    believed,
+    in_order,
+    judge,
+    packed,
+    rules_of,
+    unpacked,
+)
+from adapter.signals.filters import NEVER, JointFilter, filter_step
 from adapter.signals.records import StateLayout
 from adapter.signals.settings import FilterSettings, FrontEndSettings
 from adapter.signals.twist import TwistSynthesis
 from drivers.interface import JointSample
-
-
-class Verdict(IntEnum):
-    """Why a sample is not learned from; counted under these names in lower case."""
-
-    GOOD = 0
-    NON_FINITE = 1
-    OUT_OF_RANGE = 2
-    REPEATED = 3
-    TIME_BACKWARDS = 4
-    FILTER_SETTLING = 5
-    AT_REST = 6
-    TORQUE_SATURATED = 7
-    IMPLAUSIBLE_STEP = 8
-    STUCK_JOINT = 9
-    ENCODER_JUMP = 10
-    TIME_AHEAD = 11
-
 
 NOTEWORTHY = (
     Verdict.NON_FINITE,
@@ -46,74 +37,6 @@ NOTEWORTHY = (
     Verdict.STUCK_JOINT,
     Verdict.ENCODER_JUMP,
 )
-# What no joint of an arm does, where its documentation is silent: rad, rad/s, N m.
-Q_CAP, DQ_CAP, TAU_CAP = 1e4, 1e3, 1e5
-RESYNC_AFTER = 100  # stamps in a row that lie before the newest: the newest was wrong
-STREAK = 10  # so many old stamps in a row are a clock put back, not late samples
-# From one sample to the next a reading may change by so many times its usual change, plus, for
-# every period between them, these shares of documented speed and effort; a position, beyond what
-# its speed explains, by this share of a period's way at full speed.
-USUAL_STEPS, Q_STEP, DQ_STEP, TAU_STEP = 6.0, 0.5, 0.02, 0.02
-PLAY_RAD = 0.012  # a motor crosses the play of its gear in no time: no step of an encoder
-USUAL_OVER = 200.0  # samples that "usual" looks back on
-JUMP_CONFIRMED = 3  # samples in a row that confirm a step of position
-STUCK_RAD = 3e-3  # a joint's readings stand still while its speed would have brought it so far
-
-
-class Rules(NamedTuple):
-    """What does not change from sample to sample.
-
-    Attributes:
-        range: (4, n) lowest and highest q, highest |dq| and |tau|.
-        effort: (n,) |tau| from which a torque counts as saturated.
-        floor: (3, n) change of q, dq, tau from sample to sample that is always believed.
-        rest_dq: rad/s; gap_ns: a longer hole restarts the filter.
-        gains: of the filter.
-    """
-
-    range: Array
-    effort: Array
-    floor: Array
-    rest_dq: float
-    gap_ns: int
-    gains: Gains
-
-
-class Memory(NamedTuple):
-    """What the front end remembers; overwritten in place.
-
-    Attributes:
-        last: (3, n) q, dq, tau of the last sample in range.
-        good, doubted: (3, n) the last believed reading, the last one that was not.
-        usual: (3, n) squares of the readings' usual changes.
-        since: (n,) int64 stamps at which the joints' readings last changed.
-        ahead: (3 n,) the reading whose stamp lay far ahead.
-        marks: (9,) int64, see `Mark`.
-        filter: of the filter.
-    """
-
-    last: Array
-    good: Array
-    doubted: Array
-    usual: Array
-    since: NDArray[np.int64]
-    ahead: Array
-    marks: NDArray[np.int64]
-    filter: FilterState
-
-
-class Mark(IntEnum):
-    """Places in `Memory.marks`: stamps (NEVER: none), counts, and a joint (from 1, 0: none)."""
-
-    SATURATED_UNTIL = 0
-    FIRST_MOVING = 1
-    OLD_STAMPS = 2  # how many samples in a row came with a stamp before the newest
-    SEEN = 3  # newest stamp in order
-    AHEAD = 4  # a stamp far ahead that nobody has confirmed yet
-    DOUBTED = 5  # stamp of a step that nobody has confirmed yet
-    CONFIRMED = 6  # how many samples in a row confirm it
-    JUMPED = 7  # joint whose encoder jumped
-    USUAL_DT = 8  # ns between samples
 
 
 class Samples(NamedTuple):
@@ -137,146 +60,6 @@ class Answers(NamedTuple):
     records: Array
     verdicts: NDArray[np.int64]
     holes: NDArray[np.int64]
-
-
-@jit
-def judge(q, dq, tau, allowed, last):
-    """Verdict on raw readings: GOOD, NON_FINITE, OUT_OF_RANGE or REPEATED, all those of `last`.
-
-    `last` (3, n) is overwritten with good readings.
-    """
-    lower, upper, dq_max, tau_max = allowed[0], allowed[1], allowed[2], allowed[3]
-    same = True
-    for j in range(q.shape[0]):
-        if not (np.isfinite(q[j]) and np.isfinite(dq[j]) and np.isfinite(tau[j])):
-            return Verdict.NON_FINITE
-    for j in range(q.shape[0]):
-        if q[j] < lower[j] or q[j] > upper[j] or abs(dq[j]) > dq_max[j] or abs(tau[j]) > tau_max[j]:
-            return Verdict.OUT_OF_RANGE
-        same = same and q[j] == last[0, j] and dq[j] == last[1, j] and tau[j] == last[2, j]
-    if same:
-        return Verdict.REPEATED
-    last[0], last[1], last[2] = q, dq, tau
-    return Verdict.GOOD
-
-
-@jit
-def in_order(stamp, gap_ns, times, marks):
-    """Verdict on a stamp: GOOD, TIME_BACKWARDS, or TIME_AHEAD until the next one confirms it."""
-    if times[0] == NEVER:
-        marks[Mark.SEEN] = stamp
-        return Verdict.GOOD
-    if stamp <= times[0]:
-        marks[Mark.OLD_STAMPS] += 1
-        if marks[Mark.OLD_STAMPS] < RESYNC_AFTER:
-            return Verdict.TIME_BACKWARDS
-    elif stamp - max(times[0], marks[Mark.SEEN]) > gap_ns:
-        confirmed = marks[Mark.AHEAD] != NEVER and 0 < stamp - marks[Mark.AHEAD] <= gap_ns
-        marks[Mark.AHEAD] = stamp
-        if not confirmed:
-            return Verdict.TIME_AHEAD
-    marks[Mark.SEEN] = stamp
-    return Verdict.GOOD
-
-
-@jit
-def off(s, j, x, reference, dt_ns):
-    """How far reading s of joint j is from where the reference says it is after dt_ns."""
-    way = 1e-9 * dt_ns * reference[1, j] if s == 0 else 0.0
-    return abs(x[s, j] - reference[s, j] - way)
-
-
-@jit
-def steps(x, reference, dt_ns, usual, floor, usual_dt_ns):
-    """Readings x (3, n) that a step away from the reference: 0 none, 1 some, 2 a position too."""
-    ratio, found = max(1.0, dt_ns / usual_dt_ns), 0
-    for s in range(3):
-        for j in range(x.shape[1]):
-            most = USUAL_STEPS * math.sqrt(usual[s, j]) + ratio * floor[s, j]
-            most += PLAY_RAD if s == 0 else 0.0
-            if off(s, j, x, reference, dt_ns) > most:
-                found = max(found, 2 if s == 0 else 1)
-    return found
-
-
-@jit
-def get_used(x, reference, dt_ns, usual, floor):
-    """Let the usual changes follow; what is out of the usual counts as just not."""
-    for s in range(3):
-        for j in range(x.shape[1]):
-            most = USUAL_STEPS * math.sqrt(usual[s, j]) + floor[s, j]
-            e = min(off(s, j, x, reference, dt_ns), most)
-            usual[s, j] += (e * e - usual[s, j]) / USUAL_OVER
-
-
-@jit
-def stands_still(stamp, x, good, since):
-    """Whether a joint's readings are those of before, although its speed says it moves."""
-    stuck = False
-    for j in range(x.shape[1]):
-        if x[0, j] != good[0, j] or x[1, j] != good[1, j] or x[2, j] != good[2, j]:
-            since[j] = stamp
-        stuck = stuck or abs(x[1, j]) * 1e-9 * (stamp - since[j]) > STUCK_RAD
-    return stuck
-
-
-@jit
-def plausible(stamp, x, rules, memory):
-    """Verdict on readings x (3, n) after the last good ones: whether an arm can do that.
-
-    A step is believed when the next sample confirms it: a spike lasts for one. A step of position
-    that the speed does not explain is believed after `JUMP_CONFIRMED`, and to be the encoder's.
-    Behind a gap nothing can be said of steps.
-    """
-    good, doubted, usual, marks = memory.good, memory.doubted, memory.usual, memory.marks
-    dt_ns = stamp - memory.filter.times[0]
-    if marks[Mark.USUAL_DT] == 0:
-        marks[Mark.USUAL_DT] = dt_ns
-    marks[Mark.USUAL_DT] += (min(dt_ns, 2 * marks[Mark.USUAL_DT]) - marks[Mark.USUAL_DT]) // 64
-    if stands_still(stamp, x, good, memory.since):
-        return Verdict.STUCK_JOINT
-    if dt_ns > rules.gap_ns:
-        return Verdict.GOOD
-    usual_dt = marks[Mark.USUAL_DT]
-    found = steps(x, good, dt_ns, usual, rules.floor, usual_dt)
-    get_used(x, good, dt_ns, usual, rules.floor)
-    if found == 0:
-        return Verdict.GOOD
-    marks[Mark.CONFIRMED] += 1
-    since_ns = stamp - marks[Mark.DOUBTED]
-    if marks[Mark.DOUBTED] == NEVER or steps(x, doubted, since_ns, usual, rules.floor, usual_dt):
-        marks[Mark.CONFIRMED] = 0
-    doubted[:] = x
-    marks[Mark.DOUBTED] = stamp
-    if found == 1 and marks[Mark.CONFIRMED] > 0:
-        return Verdict.GOOD
-    if found == 2 and marks[Mark.CONFIRMED] >= JUMP_CONFIRMED:
-        for j in range(x.shape[1]):
-            worst = marks[Mark.JUMPED] - 1
-            if worst < 0 or off(0, j, x, good, dt_ns) > off(0, worst, x, good, dt_ns):
-                marks[Mark.JUMPED] = j + 1
-        return Verdict.ENCODER_JUMP
-    return Verdict.IMPLAUSIBLE_STEP
-
-
-@jit
-def believed(stamp, x, rules, memory):
-    """(verdict, whether a gap lies before it) of readings x (3, n) in range and in order."""
-    marks, times = memory.marks, memory.filter.times
-    if times[0] == NEVER:
-        memory.since[:] = stamp
-        marks[Mark.JUMPED] = 0
-        return Verdict.GOOD, False
-    if marks[Mark.JUMPED]:
-        return Verdict.ENCODER_JUMP, False
-    verdict = plausible(stamp, x, rules, memory)
-    gap = stamp - times[0] > rules.gap_ns
-    if verdict == Verdict.ENCODER_JUMP and stamp - times[1] < rules.gains.settle_ns:
-        # it was the first that was wrong
-        marks[Mark.JUMPED] = 0
-        times[0] = NEVER
-        return Verdict.GOOD, gap
-    return verdict, gap
 
 
 @jit
@@ -370,34 +153,6 @@ def process(signals, rules, memory, whole, records, answers):
             row[2 + 3 * n : 2 + 4 * n] = y[2 * n :]
 
 
-def packed(rules: Rules) -> Array:
-    """The rules in one array; its inverse is in `unpacked`."""
-    tables = (rules.range.ravel(), rules.effort, rules.floor.ravel())
-    return np.concatenate([*tables, [rules.rest_dq, rules.gap_ns, *rules.gains]])
-
-
-@jit
-def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 6,), (8, 3, n) and (n + 11,)."""
-    n = memory.shape[2]
-    at = 8 * n
-    rest_dq, gap_ns, k1, k2 = rules[at], rules[at + 1], rules[at + 2], rules[at + 3]
-    delay_ns, settle_ns = rules[at + 4], rules[at + 5]
-    gains = Gains(k1, k2, int(delay_ns), int(settle_ns))
-    allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
-    own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, int(gap_ns), gains)
-    since, marks, times = whole[:n], whole[n : n + 9], whole[n + 9 :]
-    ahead, old, y, dy = (
-        memory[4].reshape(3 * n),
-        memory[5].reshape(3 * n),
-        memory[6].reshape(3 * n),
-        memory[7].reshape(3 * n),
-    )
-    state = FilterState(times, old, y, dy)
-    last, good, doubted, usual = memory[0], memory[1], memory[2], memory[3]
-    return own, Memory(last, good, doubted, usual, since, ahead, marks, state)
-
-
 class FrontEnd:
     """Checks, filters and completes samples, one by one.
 
@@ -422,7 +177,7 @@ class FrontEnd:
         self.layout = StateLayout(n)
         self.filter = JointFilter(n, filter_settings)
         self.twist = TwistSynthesis(documented)
-        self._rules = self._rules_of(documented)
+        self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         self._kept, self._whole = np.zeros((8, 3, n)), np.zeros(n + 11, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
@@ -436,25 +191,6 @@ class FrontEnd:
         self.refused: Counter[str] = Counter()
         self.gaps: list[tuple[int, float]] = []
         self.messages: list[str] = []
-
-    def _rules_of(self, documented: SelfModel) -> Rules:
-        limits, s = documented.limits, self.settings
-        allowed = [
-            np.nan_to_num(limits.lower - s.q_margin, nan=-Q_CAP),
-            np.nan_to_num(limits.upper + s.q_margin, nan=Q_CAP),
-            np.nan_to_num(limits.velocity * s.range_factor, nan=DQ_CAP),
-            np.nan_to_num(limits.effort * s.range_factor, nan=TAU_CAP),
-        ]
-        floor = np.array(
-            [
-                Q_STEP * self.filter.settings.period_s * limits.velocity,
-                DQ_STEP * limits.velocity,
-                TAU_STEP * limits.effort,
-            ]
-        )
-        floor[np.isnan(floor)] = np.inf  # where nothing is documented
-        effort, gap_ns = limits.effort * s.saturation, round(1e9 * s.max_gap_s)
-        return Rules(np.array(allowed), effort, floor, s.rest_dq, gap_ns, self.filter.gains)
 
     @property
     def delay_s(self) -> float:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -146,20 +146,20 @@ class McapWriter:
 
     def add_metadata(self, name: str, values: Mapping[str, Any]) -> None:
         """Add a metadata record at once, each value as JSON text."""
-        with _Naming(self.path):
+        with _naming(self.path):
             self._writer.add_metadata(name, {k: to_json(v) for k, v in values.items()})
         self.flush()
 
     def attach(self, name: str, data: bytes, media_type: str = "application/json") -> None:
         """Add a file (a model, a configuration) to the recording at once."""
         now = time.time_ns()
-        with _Naming(self.path):
+        with _naming(self.path):
             self._writer.add_attachment(now, now, name, media_type, data)
         self.flush()
 
     def flush(self) -> None:
         """Close the open chunk and hand it to the operating system."""
-        with _Naming(self.path):
+        with _naming(self.path):
             self._writer.flush()
         self._oldest = None
 
@@ -167,7 +167,7 @@ class McapWriter:
         """Write the index and close the file; may be called more than once."""
         if self._file.closed:
             return
-        with _Naming(self.path):
+        with _naming(self.path):
             try:
                 self._writer.finish()
             finally:
@@ -176,12 +176,7 @@ class McapWriter:
     def __enter__(self) -> McapWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _encode(
@@ -213,7 +208,7 @@ class McapWriter:
     def _add(self, channel: int, stamp_ns: int, data: bytes) -> None:
         # Log times cannot be negative; the header stamp keeps what the arm said.
         log_time = max(int(stamp_ns), 0)
-        with _Naming(self.path):
+        with _naming(self.path):
             self._writer.add_message(channel, log_time, data, log_time, self.messages)
         self.messages += 1
         now = time.monotonic()
@@ -223,23 +218,12 @@ class McapWriter:
             self.flush()
 
 
-class _Naming:
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
     """Turns a full disk and the like into a DriverError that names the file."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        return
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if isinstance(error, OSError):
-            raise DriverError(
-                f"{self._path}: cannot be written ({error.strerror}); "
-                "what was recorded before stays readable"
-            ) from error
+    try:
+        yield
+    except OSError as error:
+        raise DriverError(
+            f"{path}: cannot be written ({error.strerror}); what was recorded before stays readable"
+        ) from error
