@@ -23,7 +23,7 @@ import pybullet as bullet
 from sim.dynamics import end_effector
 from sim.effects import LAW, WRENCH
 from sim.joint_effects import Losses, add_up, bend, losses_at, rows_of, step
-from sim.rigid_bodies import Stage, disconnect, load, rigid_truths
+from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
 
 PERIOD_S = 1e-3
@@ -35,7 +35,7 @@ SLOPE_RAD_S = 1e-3  # over which the slope of a law is taken
 STOP_DAMPING = 50.0  # N m s/rad
 
 
-class Law(NamedTuple):
+class DriveLaw(NamedTuple):
     """What the drives do during a tick, (n,) each: kp (q_des - q) + kd (dq_des - dq) + ff, cut.
 
     A drive evaluates its law far more often than a millisecond, so that the law is part of every
@@ -103,7 +103,7 @@ class Engine:
             if effect.place == LAW
             for j in effect.columns(truth.n)
         ]
-        self._stages: list[Stage] = []
+        self._stages: list[ArmClient] = []
         clients: list[int] = []
         self._close = weakref.finalize(self, disconnect, clients)
         for start_s, rigid in rigid_truths(truth, period_s):
@@ -137,9 +137,11 @@ class Engine:
     def tick(self, start: Array, end: Array) -> None:
         """Move on by one period, driving torque (n,) N m linear from `start` to `end`."""
         nothing = self._rest
-        self.drive(Law(nothing, nothing, nothing, nothing, start, end, np.full(self._n, np.inf)))
+        self.drive(
+            DriveLaw(nothing, nothing, nothing, nothing, start, end, np.full(self._n, np.inf))
+        )
 
-    def drive(self, law: Law) -> None:
+    def drive(self, law: DriveLaw) -> None:
         """Move on by one period under a law of the drives."""
         t, h, stored, dq = self._now(), self._h, self._q + self._h / 2 * self._dq, self._dq
         due = self._due()
@@ -197,7 +199,7 @@ class Engine:
     def _now(self) -> float:
         return self._start_s + self._ticks * self._period_s
 
-    def _due(self) -> Stage:
+    def _due(self) -> ArmClient:
         """The stage of the tick that starts now."""
         now = self._now()
         return next(stage for stage in reversed(self._stages) if stage.start_s <= now)
@@ -241,7 +243,9 @@ class Engine:
         now = stage.torques(self._q, self._dq, self._rest)
         return stage.torques(self._q, middle, self._rest) - now
 
-    def _reaching(self, t: float, q: Array, dq: Array, law: Law, ff: Array, ahead: Array) -> Array:
+    def _reaching(
+        self, t: float, q: Array, dq: Array, law: DriveLaw, ff: Array, ahead: Array
+    ) -> Array:
         """What of the drives' torques reaches the rigid arm in the next sub-step, (n,) N m.
 
         Args:

@@ -19,7 +19,7 @@ FLAT = 1e-6  # of the largest moment: so far below zero a principal moment may b
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class ArmClient:
     """An arm in a PyBullet client of its own that holds from `start_s` on.
 
     PyBullet keeps what it computed of a body's masses: a change is another body.
@@ -92,7 +92,7 @@ def _tilted(gravity: Array, rx: float, ry: float) -> Array:
     return np.asarray(about_x.T @ gravity)
 
 
-def load(start_s: float, truth: Truth, period_s: float) -> Stage:
+def load(start_s: float, truth: Truth, period_s: float) -> ArmClient:
     """The rigid arm of a truth in a fresh PyBullet client that steps by `period_s`.
 
     Raises:
@@ -107,7 +107,7 @@ def load(start_s: float, truth: Truth, period_s: float) -> Stage:
         bullet.changeDynamics(arm, j, localInertiaDiagonal=three, physicsClientId=client)
     bullet.setGravity(*truth.gravity.tolist(), physicsClientId=client)
     bullet.setTimeStep(period_s, physicsClientId=client)
-    return Stage(start_s, truth, client, arm)
+    return ArmClient(start_s, truth, client, arm)
 
 
 def load_urdf(text: str, client: int, fixed: bool) -> int:

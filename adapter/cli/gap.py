@@ -17,7 +17,7 @@ from adapter.effects.active import check_effects
 from adapter.effects.export import left_out_of_urdf, to_urdf
 from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
-from adapter.gap.screen import Refusal
+from adapter.gap.screen import RecordingRefused
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap
 from adapter.model.model_file import load_model
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         with _progress(args.quiet) as tell:
             result = find_gap(args.logs, nominal, settings, rollouts, model_out, tell)
-    except Refusal as refusal:
+    except RecordingRefused as refusal:
         names, logs = nominal.tree.joint_names, [log.name for log in args.logs]
         nothing = GapResult.untold(names, nominal.name, logs, args.model, str(refusal))
         _write(args, folder, nothing, {"refused": refusal.kind})

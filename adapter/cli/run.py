@@ -44,7 +44,7 @@ SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: bring
 SLOW_S = 10.0  # an arm that may be real moves at a tenth of the speed for so long
 
 
-class Simulation(Protocol):
+class SimulationLike(Protocol):
     """A simulated arm (`adapter.cli.simulated.Simulation`)."""
 
     scenario: Any
@@ -68,7 +68,7 @@ class RunPlan:
 
     robot: SelfModel
     config: Config
-    world: Simulation | None
+    world: SimulationLike | None
     maybe_real: bool
 
 
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_ARM if result.fault else 0
 
 
-def _write_truth(world: Simulation | None, folder: Path) -> Path | None:
+def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
     """Write the scenario's truth; errors are against it where a scenario was asked for."""
     if world is None:
         return None

@@ -23,7 +23,7 @@ STUCK_EFFORT = 0.1  # of the effort limit that the spring winds up on a reading 
 STUCK_WAY = 0.02  # rad that the measured speed makes meanwhile
 
 
-class Verdict(IntEnum):
+class ReadingVerdict(IntEnum):
     """What a reading is found to be."""
 
     GOOD = 0
@@ -34,7 +34,7 @@ class Verdict(IntEnum):
     BROKEN_OFF = 5  # a jump behind a leap of the stamps
 
 
-VERDICTS = tuple(Verdict)
+VERDICTS = tuple(ReadingVerdict)
 
 
 @jit
@@ -55,7 +55,7 @@ def judge_reading(q, dq, q_ref, between_s, bounds, last):
     last_q, last_dq, reference, way = last[0], last[1], last[2], last[3]
     for j in range(n):
         if not (math.isfinite(q[j]) and math.isfinite(dq[j])):
-            return Verdict.NON_FINITE.value, j
+            return ReadingVerdict.NON_FINITE.value, j
     for j in range(n):
         if not math.isfinite(last_q[j]):
             continue
@@ -64,26 +64,26 @@ def judge_reading(q, dq, q_ref, between_s, bounds, last):
         low, high = min(speed * least_s, speed * most_s), max(speed * least_s, speed * most_s)
         room = JUMP + DRIFT * velocity[j] * most_s
         if abs(dq[j]) > FASTER * velocity[j]:
-            return Verdict.JUMPED.value, j
+            return ReadingVerdict.JUMPED.value, j
         if abs(dq[j] - last_dq[j]) > DRIFT * velocity[j] + HARDER * most_s:
-            return Verdict.JUMPED.value, j
+            return ReadingVerdict.JUMPED.value, j
         if abs(moved) > JUMP + FASTER * velocity[j] * most_s:
-            return Verdict.JUMPED.value, j
+            return ReadingVerdict.JUMPED.value, j
         if moved < low - room or moved > high + room:
-            return Verdict.JUMPED.value, j
+            return ReadingVerdict.JUMPED.value, j
     for j in range(n):
         if q[j] != last_q[j]:
             continue
         wound = abs(q_ref[j] - reference[j]) > wind[j]
         if wound or abs(way[j] + dq[j] * least_s) > STUCK_WAY:
-            return Verdict.STUCK.value, j
+            return ReadingVerdict.STUCK.value, j
     for j in range(n):
         if q[j] != last_q[j]:
             reference[j], way[j] = q_ref[j], 0.0
         else:
             way[j] += dq[j] * least_s
         last_q[j], last_dq[j] = q[j], dq[j]
-    return Verdict.GOOD.value, 0
+    return ReadingVerdict.GOOD.value, 0
 
 
 class ReadingJudge:
@@ -107,7 +107,9 @@ class ReadingJudge:
         self._last[3] = 0.0
         self.joint = 0
 
-    def judge(self, q: Array, dq: Array, q_ref: Array, between_s: tuple[float, float]) -> Verdict:
+    def judge(
+        self, q: Array, dq: Array, q_ref: Array, between_s: tuple[float, float]
+    ) -> ReadingVerdict:
         """What a reading is, by its numbers: one of the first four.
 
         Args:
@@ -123,15 +125,16 @@ LONGEST_STEP_NS = 20_000_000  # a longer step of the stamps alone is a clock tha
 
 _SINCE = f"for {1e-9 * BLIND_NS:g} s; the arm is stopped"
 _WHY = {
-    Verdict.NON_FINITE: f"no usable joint reading {_SINCE}",
-    Verdict.GOOD: f"no usable joint reading {_SINCE}",
-    Verdict.REPEATED: f"no newer joint reading {_SINCE}; look at the arm's clock and the "
+    ReadingVerdict.NON_FINITE: f"no usable joint reading {_SINCE}",
+    ReadingVerdict.GOOD: f"no usable joint reading {_SINCE}",
+    ReadingVerdict.REPEATED: f"no newer joint reading {_SINCE}; look at the arm's clock and the "
     "connection",
-    Verdict.JUMPED: f"joint {{}} reads what no joint can move to {_SINCE}; look at its encoder",
-    Verdict.STUCK: "joint {} reads the same while it should move; the arm is stopped; look at "
+    ReadingVerdict.JUMPED: f"joint {{}} reads what no joint can move to {_SINCE}; look at "
     "its encoder",
-    Verdict.BROKEN_OFF: "the samples broke off and joint {} is elsewhere now; the arm is stopped; "
-    "look at the connection",
+    ReadingVerdict.STUCK: "joint {} reads the same while it should move; the arm is stopped; look "
+    "at its encoder",
+    ReadingVerdict.BROKEN_OFF: "the samples broke off and joint {} is elsewhere now; the arm is "
+    "stopped; look at the connection",
 }
 
 
@@ -173,16 +176,16 @@ class ReadingGate:
         Raises ControlError after 20 ms without one, also if this one is; at once for a joint that
         stands still, since its spring is wound up.
         """
-        verdict = Verdict.REPEATED
+        verdict = ReadingVerdict.REPEATED
         if self._clock.fresh:
             times = 1e-9 * self._handled_ns, 1e-9 * self._stamped_ns
             between_s = min(times), max(times)
             verdict = self._judge.judge(sample.q, sample.dq, q_ref, between_s)
-        if verdict == Verdict.JUMPED and self._leapt:
-            verdict = Verdict.BROKEN_OFF
-        if self._blind_ns > BLIND_NS or verdict == Verdict.STUCK:
+        if verdict == ReadingVerdict.JUMPED and self._leapt:
+            verdict = ReadingVerdict.BROKEN_OFF
+        if self._blind_ns > BLIND_NS or verdict == ReadingVerdict.STUCK:
             raise ControlError(_WHY[verdict].format(self._judge.joint + 1))
-        if verdict != Verdict.GOOD:
+        if verdict != ReadingVerdict.GOOD:
             self.unusable += 1
             return False
         self._blind_ns = self._handled_ns = self._stamped_ns = 0

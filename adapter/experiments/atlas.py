@@ -14,7 +14,7 @@ from adapter.experiments.baselines.compare import Errors, arm_tables, choices, c
 from adapter.experiments.falls import Falls, gathered, sets_of
 from adapter.experiments.networks import NetworkResult, NetworkSettings, schema_by_networks
 from adapter.experiments.online import noisy, online_trial, without_velocity
-from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, Learned
+from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
 from adapter.experiments.split import Split, split
 from adapter.experiments.stated import PAPER_BASELINES, atlas_stated
 from adapter.experiments.topology import fall_logs, topology_trials
@@ -98,8 +98,8 @@ class Judged:
     """
 
     body: Body
-    learned: Learned
-    arm: Learned
+    learned: LearnerScores
+    arm: LearnerScores
     kinematics: KinematicErrors
     training: KinematicErrors
 
@@ -127,14 +127,14 @@ class _Judge:
         body = self._body
         how = "mini-batches" if body.name == "FOPnet" else "second moments"
         title = f"First-order-principles networks, λ from {how}"
-        learned = Learned(body.name, title, train_s=body.learning_s)
+        learned = LearnerScores(body.name, title, train_s=body.learning_s)
         learned.tuning = [
             f"λ from {len(learned_from)} samples, 1 % of the training set, by {how} in "
             f"{body.schema_s:.2f} s",
             f"θ over bodies that can exist, {len(body.theta.stages)} sub-problems in "
             f"{body.theta_s:.1f} s",
         ]
-        arm = Learned(f"{body.name}, arm", title, train_s=body.learning_s)
+        arm = LearnerScores(f"{body.name}, arm", title, train_s=body.learning_s)
         training = kinematic_errors(learned_from, body.lam)
         return Judged(
             body,
@@ -325,7 +325,7 @@ def _learning(
     }  # fmt: skip
 
 
-def _comparison(learners: Sequence[Learned], arms: Sequence[Learned]) -> dict[str, Any]:
+def _comparison(learners: Sequence[LearnerScores], arms: Sequence[LearnerScores]) -> dict[str, Any]:
     """All learners, and the best and worst of the paper's three on the control set.
 
     Args:

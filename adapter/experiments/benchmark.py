@@ -19,7 +19,7 @@ from rich.table import Table
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import to_urdf
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, Learner
+from adapter.learning.learner import Filtered, OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import log_cholesky_from_theta
 from adapter.model.robots import documented
@@ -108,7 +108,7 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
     gain = JointFilter(robot.tree.n).noise_gain
     for effects, note in (((), "λ and θ"), (REAL_ARM_EFFECTS, "λ, θ and four effects per joint")):
         settings = LearnerSettings(effects=effects)
-        learner = Learner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))
+        learner = OnlineLearner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))
         for state in states[: WARM_UP // 2]:
             learner.step(state)
         rest = states[WARM_UP // 2 :]
@@ -119,7 +119,7 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
     return rows
 
 
-def _learn(learner: Learner, states: list[Array], k: int) -> None:
+def _learn(learner: OnlineLearner, states: list[Array], k: int) -> None:
     learner.step(states[k])
 
 

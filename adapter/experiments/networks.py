@@ -149,7 +149,7 @@ def schema_by_networks(
     final = costs(frames, signals).numpy()
     joints, best = np.arange(data.tree.n), final.argmin(axis=1)
     chosen = {epoch: x[joints, best] for epoch, x in kept.items()}
-    found = Frames(frames.r0[joints, best][:, None], frames.p[joints, best][:, None])
+    found = StartFrames(frames.r0[joints, best][:, None], frames.p[joints, best][:, None])
     loss = losses[:, joints, best].mean(axis=1)
     return NetworkResult(chosen[total], chosen, loss, final, _converged(found, signals))
 
@@ -164,11 +164,11 @@ def _channels(data: TreeData, settings: NetworkSettings) -> list[str]:
     return ["w", *(["v"] if with_speed else []), *(["a"] if accelerations else [])]
 
 
-def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> Frames:
+def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> StartFrames:
     """Uniform angles, positions within ± the span."""
     angles = rng.uniform(-np.pi, np.pi, (n, settings.starts, 3))
     p = rng.uniform(-settings.position_span, settings.position_span, angles.shape)
-    return Frames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
+    return StartFrames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
 
 
 def _batches(
@@ -195,7 +195,7 @@ def _shortened(step: torch.Tensor, settings: NetworkSettings) -> torch.Tensor:
     return (both * share).flatten(-2)
 
 
-def _converged(frames: Frames, signals: NetworkSignals) -> np.ndarray:
+def _converged(frames: StartFrames, signals: NetworkSignals) -> np.ndarray:
     """By joint (n,) of frames with one start each; see `NetworkResult`."""
     cost, slope, curvature = slope_and_curvature(frames, signals)
     gain = -0.5 * (slope * newton_step(slope, curvature)).sum(dim=-1)
@@ -204,7 +204,7 @@ def _converged(frames: Frames, signals: NetworkSignals) -> np.ndarray:
     return ((cost <= ROUNDING * power) | at_minimum)[:, 0].numpy()
 
 
-def _lam(frames: Frames) -> Array:
+def _lam(frames: StartFrames) -> Array:
     """λ (n, starts, 6) with canonical angles."""
     return np.concatenate([zxz_from_matrix(frames.r0.numpy()), frames.p.numpy()], axis=-1)
 
@@ -249,20 +249,20 @@ class NetworkSignals:
 
 
 @dataclass
-class Frames:
+class StartFrames:
     """Frames of n joints, several starts of each: r0 (n, starts, 3, 3), p (n, starts, 3)."""
 
     r0: Tensor
     p: Tensor
 
-    def moved(self, step: Tensor) -> Frames:
+    def moved(self, step: Tensor) -> StartFrames:
         """The frames after (turn, shift) (n, starts, 6) in the parent's axes."""
         angle = step[..., :3].norm(dim=-1)[..., None, None]
         k = cross_matrix(step[..., :3])
         half = torch.sinc(angle / (2.0 * torch.pi))
         turn = torch.eye(3, dtype=k.dtype) + torch.sinc(angle / torch.pi) * k
         turn = turn + 0.5 * half**2 * (k @ k)
-        return Frames(turn @ self.r0, self.p + step[..., 3:])
+        return StartFrames(turn @ self.r0, self.p + step[..., 3:])
 
 
 def network_signals(data: TreeData, channels: Sequence[str]) -> NetworkSignals:
@@ -296,7 +296,7 @@ def _of_parents(parent: tuple[int, ...], base: BodyMotion, links: BodyMotion, na
     return torch.from_numpy(np.ascontiguousarray(every[:, [i - BASE for i in parent]]))
 
 
-def residuals(frames: Frames, s: NetworkSignals) -> tuple[Tensor, Tensor]:
+def residuals(frames: StartFrames, s: NetworkSignals) -> tuple[Tensor, Tensor]:
     """R0 y - z - W p and R0 y, (n, starts, m c, 3) each."""
     n, starts = frames.p.shape[:2]
     y, z = (x.transpose(0, 1).reshape(n, 1, -1, 3) for x in (s.y, s.z))
@@ -306,12 +306,12 @@ def residuals(frames: Frames, s: NetworkSignals) -> tuple[Tensor, Tensor]:
     return turned - z - lever, turned
 
 
-def costs(frames: Frames, s: NetworkSignals) -> Tensor:
+def costs(frames: StartFrames, s: NetworkSignals) -> Tensor:
     """Half the mean squared error (n, starts) over samples (eq. 18)."""
     return 0.5 * (residuals(frames, s)[0] ** 2).sum(dim=(2, 3)) / len(s.y)
 
 
-def slope_and_curvature(frames: Frames, s: NetworkSignals) -> tuple[Tensor, Tensor, Tensor]:
+def slope_and_curvature(frames: StartFrames, s: NetworkSignals) -> tuple[Tensor, Tensor, Tensor]:
     """`costs`, their gradient (n, starts, 6) and Gauss-Newton's curvature (n, starts, 6, 6)."""
     left, turned = residuals(frames, s)
     n, starts = frames.p.shape[:2]

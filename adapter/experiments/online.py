@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import gravity_down
@@ -63,7 +63,7 @@ def rms(x: Array) -> Array:
     return np.asarray(np.sqrt((x**2).mean(axis=0)))
 
 
-def held_out(learner: Learner, test: TreeData) -> dict[str, float]:
+def held_out(learner: OnlineLearner, test: TreeData) -> dict[str, float]:
     """θ's torque error on exact motion never learned from, and least squares' on the samples."""
     first = learner.tree.rows - learner.tree.n
     states, theta = test.states(), learner.theta
@@ -84,7 +84,7 @@ def held_out(learner: Learner, test: TreeData) -> dict[str, float]:
 
 def online_trial(
     motions: Sequence[TreeData], test: TreeData, true_lam: Array
-) -> tuple[dict[str, Any], Learner]:
+) -> tuple[dict[str, Any], OnlineLearner]:
     """Learn from motions sample by sample, one after the other.
 
     Args:
@@ -96,7 +96,7 @@ def online_trial(
         The figures (times in µs and s), and the learner.
     """
     test = test.take(slice(None, None, HELD_OUT_EVERY))
-    learner = Learner(test.tree, settings=SETTINGS)
+    learner = OnlineLearner(test.tree, settings=SETTINGS)
     seen = frame_observability(learner.tree, true_lam, gravity_down())
     times_ns: list[int] = []
     history: list[dict[str, float]] = []

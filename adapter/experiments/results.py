@@ -36,7 +36,7 @@ class Stated:
 
 
 @dataclass
-class Learned:
+class LearnerScores:
     """One learner of the comparison (Fig. 5).
 
     Attributes:
@@ -93,7 +93,7 @@ class AtlasResults:
     cost: Array
     error_edges: Array
     error_counts: dict[str, Array]
-    learners: list[Learned]
+    learners: list[LearnerScores]
     stated: list[Stated]
     numbers: dict[str, Any]
     moments_error_counts: dict[str, Array] = field(default_factory=dict)

@@ -14,28 +14,28 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` finds the same
     from adapter.gap.monitor import Monitor
     from adapter.gap.result import Finding, GapResult, Leftover
-    from adapter.gap.screen import Fault, Refusal
+    from adapter.gap.screen import RecordingFault, RecordingRefused
     from adapter.gap.workflow import GapSettings, find_gap
 
 _FROM = {
-    "Fault": "screen",
     "Finding": "result",
     "GapResult": "result",
     "GapSettings": "workflow",
     "Leftover": "result",
     "Monitor": "monitor",
-    "Refusal": "screen",
+    "RecordingFault": "screen",
+    "RecordingRefused": "screen",
     "find_gap": "workflow",
 }
 
 __all__ = [
-    "Fault",
     "Finding",
     "GapResult",
     "GapSettings",
     "Leftover",
     "Monitor",
-    "Refusal",
+    "RecordingFault",
+    "RecordingRefused",
     "find_gap",
 ]
 

@@ -89,7 +89,7 @@ def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfMo
 
 
 @dataclass(frozen=True, eq=False)
-class TorqueErrors:
+class ErrorsOverTime:
     """Errors by the recipe of `adapter.signals.validation`, (m, n) N m, at t (m,) s."""
 
     t: Array
@@ -99,7 +99,7 @@ class TorqueErrors:
 
 def torque_errors(
     recording: Recorded, before: SelfModel, after: Sequence[SelfModel], block: float = FOLD_S
-) -> TorqueErrors:
+) -> ErrorsOverTime:
     """Measured less predicted torque; `after` has one model per fold of `block` s, or one."""
     q, dq, ddq, tau = smooth(recording.t, recording.q, recording.dq, recording.tau)
     t = recording.t[0] + 1e-3 * np.arange(len(q))
@@ -111,7 +111,7 @@ def torque_errors(
         if rows.any():
             new[rows] = (tau - ModelTorque(model)(q, dq, ddq, t))[rows]
     edge = round(RECIPE_EDGE_S / 1e-3)
-    return TorqueErrors(t[edge:-edge], old[edge:-edge], new[edge:-edge])
+    return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])
 
 
 def rms(errors: Sequence[Array]) -> Array:

@@ -17,8 +17,8 @@ import numpy as np
 
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Blocks, Group, Level
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
-from adapter.gap.monitor_signatures import Frames
-from adapter.learning.learner import Learner
+from adapter.gap.monitor_signatures import LearnedFrames
+from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 
 ENOUGH = 3000  # states behind θ before its least squares is taken over
@@ -48,7 +48,7 @@ class Monitor:
         self._n, self._delay_s = n, delay_s
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
         self._blocks, self._found = Blocks(n), DisagreementList(say)
-        self._frames: Frames | None = None
+        self._frames: LearnedFrames | None = None
         self._groups: list[Group] = []
         self._rows: list[tuple[float, Array]] = []
 
@@ -63,7 +63,7 @@ class Monitor:
         """
         return self._found.reports
 
-    def __call__(self, learner: Learner, table: Array) -> None:
+    def __call__(self, learner: OnlineLearner, table: Array) -> None:
         """Look at states (m, size) that the learner has just learned from."""
         rows = self._blocks.add(table)
         if not rows:
@@ -77,7 +77,7 @@ class Monitor:
             if len(self._rows) == ROWS_PER_GROUP:
                 self._take(learner, self._frames)
 
-    def _outdated(self, learner: Learner) -> bool:
+    def _outdated(self, learner: OnlineLearner) -> bool:
         """Nothing is known yet, or λ was learned further while nothing else was new."""
         if self._frames is None:
             return True
@@ -85,7 +85,7 @@ class Monitor:
         moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
         return bool(moved > MOVED) and not self._found.active
 
-    def _take_over(self, learner: Learner) -> None:
+    def _take_over(self, learner: OnlineLearner) -> None:
         """Start from what the learner knows."""
         theta, n = learner.theta, self._n
         H, rhs = theta.information()
@@ -98,12 +98,12 @@ class Monitor:
             H, rhs = H[np.ix_(rest, rest)], rhs[rest]
         self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
         R0, p = learner.frames
-        self._frames = Frames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
+        self._frames = LearnedFrames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
         self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
 
-    def _take(self, learner: Learner, frames: Frames) -> None:
+    def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
         """A group is full: judge the window with it, and let the oldest group into the belief."""
         t, table = (np.array(column) for column in zip(*self._rows, strict=True))
         self._rows = []
@@ -113,7 +113,9 @@ class Monitor:
         if len(self._groups) == GROUPS:
             self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
-    def _group(self, learner: Learner, frames: Frames, t: Array, table: Array) -> Group:
+    def _group(
+        self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array
+    ) -> Group:
         q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
         Y = frames.regressor(q, dq, ddq)
         tool = Y[:, :, -10:] @ self._tool

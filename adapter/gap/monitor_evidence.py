@@ -81,7 +81,7 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Rows:
+class Window:
     """The last seconds, in groups of rows one after the other: g groups of r rows.
 
     Attributes:
@@ -103,7 +103,7 @@ class Evidence:
         belief: from before them.
     """
 
-    def __init__(self, rows: Rows, belief: Belief) -> None:
+    def __init__(self, rows: Window, belief: Belief) -> None:
         self.rows = rows
         root = np.sqrt(rows.weight)
         self._Z = rows.Z * root[:, :, None]

@@ -14,7 +14,7 @@ from adapter.gap.monitor_evidence import (
     Evidence,
     Group,
     Level,
-    Rows,
+    Window,
     coefficients,
     log_evidence,
 )
@@ -92,7 +92,7 @@ class DisagreementDetector:
         )
         if weight is None:
             weight = self._found.weights(t, self._level.weight)
-        return Evidence(Rows(t, self._found.columns(t, Z, S), S, tau, weight), self._belief)
+        return Evidence(Window(t, self._found.columns(t, Z, S), S, tau, weight), self._belief)
 
     def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
         """Notice that something reported acts no more."""

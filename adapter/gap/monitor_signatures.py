@@ -68,7 +68,7 @@ def watched() -> tuple[list[Effect], list[Effect]]:
 
 
 def candidates(n: int) -> tuple[Signature, ...]:
-    """All of them for an arm of n joints, in the order of the columns of `Frames.signatures`."""
+    """All of them for n joints, in the order of the columns of `LearnedFrames.signatures`."""
     found, at = [], 0
     at_joints, at_flange = watched()
     for effect in at_joints:
@@ -83,7 +83,7 @@ def candidates(n: int) -> tuple[Signature, ...]:
     return tuple(found)
 
 
-class Frames:
+class LearnedFrames:
     """The learned frames, and all columns of torque on them.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
-from adapter.gap.timing import Timing, check_timing, uniform
+from adapter.gap.timing import RecordingClock, check_timing, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -33,7 +33,7 @@ EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
 
-class Fault(StrEnum):
+class RecordingFault(StrEnum):
     """What is wrong with a recording, as in the JSON file."""
 
     ROBOT = "robot"
@@ -51,17 +51,17 @@ class Fault(StrEnum):
     @property
     def is_an_answer(self) -> bool:
         """Whether nothing is wrong with the recording, it only holds too little."""
-        return self is Fault.MOTION
+        return self is RecordingFault.MOTION
 
 
-class Refusal(ValueError):
+class RecordingRefused(ValueError):
     """A recording that the search for the gap must not use; one sentence says why.
 
     Attributes:
         kind: of what is wrong.
     """
 
-    def __init__(self, kind: Fault, sentence: str) -> None:
+    def __init__(self, kind: RecordingFault, sentence: str) -> None:
         super().__init__(sentence)
         self.kind = kind
 
@@ -78,7 +78,7 @@ class Screened:
     """
 
     log: Log
-    timing: Timing
+    timing: RecordingClock
     moving: tuple[int, ...]
     notes: list[str]
 
@@ -101,8 +101,8 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     keep = uniform(log.stamp_ns, *signals)
     log = rows_of(log, keep)
     if timing.span_s < MOTION_S or len(log) < 100:
-        raise Refusal(
-            Fault.DATA,
+        raise RecordingRefused(
+            RecordingFault.DATA,
             f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
             f"{timing.samples}; record at least {MOTION_S:g} s, better 20 s, of motion.",
         )
@@ -142,9 +142,11 @@ def _of_this_robot(log: Log, model: SelfModel) -> Log:
         ) from None
 
 
-def _another_robot(log: Log, model: SelfModel, recorded: Sequence[str], why: str) -> Refusal:
-    return Refusal(
-        Fault.ROBOT,
+def _another_robot(
+    log: Log, model: SelfModel, recorded: Sequence[str], why: str
+) -> RecordingRefused:
+    return RecordingRefused(
+        RecordingFault.ROBOT,
         f"{log.path} is a recording of another robot than {model.name}: {why}; its "
         f"{len(recorded)} joints are {', '.join(recorded)}, those of the model "
         f"({model.tree.n}) are {', '.join(model.tree.joint_names)}; give the model of the arm "
@@ -152,7 +154,7 @@ def _another_robot(log: Log, model: SelfModel, recorded: Sequence[str], why: str
     )
 
 
-def _check_motion_units(log: Log, model: SelfModel, timing: Timing) -> None:
+def _check_motion_units(log: Log, model: SelfModel, timing: RecordingClock) -> None:
     names = model.tree.joint_names
     gain = timing.velocity_gain
     seen = np.flatnonzero(np.isfinite(gain))
@@ -161,15 +163,15 @@ def _check_motion_units(log: Log, model: SelfModel, timing: Timing) -> None:
     beyond = np.flatnonzero((share > BEYOND_SHARE) & (upper < TURNS_RAD) & (upper > 0))
     middle = float(np.median(gain[seen])) if seen.size else 1.0
     if 1 / 1.2 < middle / DEGREES < 1.2:
-        raise Refusal(
-            Fault.DEGREES,
+        raise RecordingRefused(
+            RecordingFault.DEGREES,
             f"{log.path}: dq is {middle:.3g} times the rate of q, so dq is in degrees per second "
             "while q is in radians; convert dq to rad/s (`adapter import` does).",
         )
     if beyond.size or 1 / 1.2 < middle * DEGREES < 1.2:
         k = int(np.argmax(np.abs(log.q).max(axis=0)))
-        raise Refusal(
-            Fault.DEGREES,
+        raise RecordingRefused(
+            RecordingFault.DEGREES,
             f"{log.path}: {names[k]} reaches {np.abs(log.q[:, k]).max():.3g}, where its limit is "
             f"{upper[k]:.3g} rad, and dq is {middle:.3g} times the rate of q: positions look like "
             "degrees; convert them to radians (`adapter import` does).",
@@ -177,8 +179,8 @@ def _check_motion_units(log: Log, model: SelfModel, timing: Timing) -> None:
     wrong = [j for j in seen if not 0.5 < gain[j] < 2.0]
     if wrong:
         told = ", ".join(f"{names[j]} {gain[j]:.3g}" for j in wrong)
-        raise Refusal(
-            Fault.VELOCITY,
+        raise RecordingRefused(
+            RecordingFault.VELOCITY,
             f"{log.path}: dq is not the rate of q, their ratio is {told} instead of 1; check "
             "sign, unit and order of the velocities, or leave them out of the recording.",
         )
@@ -225,8 +227,8 @@ def _check_motion(
     wide, fast = _extent(q, dq)
     k = int(np.argmax(wide))
     long = float((np.abs(dq).max(axis=1) > 0.5 * MOVES_DQ).sum() * GRID_S)
-    raise Refusal(
-        Fault.MOTION,
+    raise RecordingRefused(
+        RecordingFault.MOTION,
         f"{log.path}: too little motion to tell anything: {names[k]} moves most, by "
         f"{wide[k]:.2g} rad at {fast[k]:.2g} rad/s, and the arm is in motion for {long:.2g} s; "
         f"move {', '.join(names)} by at least {WANTED_RAD} rad with at least {WANTED_DQ} rad/s, "
@@ -257,8 +259,8 @@ def _silent(log: Log, names: Sequence[str]) -> list[str]:
     """A note on joints whose torque never changes. Raises Refusal where no torque does."""
     dead = [name for name, span in zip(names, np.ptp(log.tau, axis=0), strict=True) if span == 0]
     if len(dead) == len(names):
-        raise Refusal(
-            Fault.TORQUE,
+        raise RecordingRefused(
+            RecordingFault.TORQUE,
             f"{log.path}: the torques never change ({', '.join(f'{x:.3g}' for x in log.tau[0])} "
             "N m throughout) though the arm moves; record measured joint torques.",
         )
@@ -305,8 +307,9 @@ def judge_torque(
     cheap = [r for r in others if r.cost < best.cost + NAMED_UNIT_COST]
     if best.kind == "scale":
         best = next((r for r in cheap if unit(r)), best)
-    raise Refusal(
-        Fault(best.kind), f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}"
+    raise RecordingRefused(
+        RecordingFault(best.kind),
+        f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}",
     )
 
 

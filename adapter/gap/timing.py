@@ -25,7 +25,7 @@ Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Timing:
+class RecordingClock:
     """What a recording's clock is like.
 
     Attributes:
@@ -127,7 +127,7 @@ class Timing:
         return [*said, sentence + "."]
 
 
-def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Timing:
+def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingClock:
     """Examine a recording's clock.
 
     Args:
@@ -148,7 +148,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Timing:
     again = same["q"] & same["dq"] & same["tau"] & moving
     fresh = ~again & moving
     late_s, std_s, gain = _lateness(since_s[keep], q[keep], dq[keep], period_s)
-    return Timing(
+    return RecordingClock(
         samples=m,
         kept=len(keep),
         span_s=float(since_s[keep[-1]] - since_s[keep[0]]) if len(keep) else 0.0,

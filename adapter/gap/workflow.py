@@ -22,10 +22,10 @@ from adapter.gap.findings import told_of
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
 from adapter.gap.held_out import HeldOut, Simulate, Task, lasting, measure, model_of
 from adapter.gap.result import GapResult
-from adapter.gap.screen import Refusal, Screened, refuse
+from adapter.gap.screen import RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.signals import Recorded, prepare
-from adapter.gap.timing import Timing
+from adapter.gap.timing import RecordingClock
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -90,7 +90,7 @@ def find_gap(
     nominal = lasting(model if isinstance(model, SelfModel) else documented(str(model)))
     try:
         task = _task(logs, nominal, settings, progress)
-    except Refusal as refusal:
+    except RecordingRefused as refusal:
         if not refusal.kind.is_an_answer:
             raise
         names = [log.path.name if isinstance(log, Log) else Path(log).name for log in logs]
@@ -140,7 +140,7 @@ def _task(
     )
 
 
-def _lateness(timing: Timing) -> float:
+def _lateness(timing: RecordingClock) -> float:
     """How much later dq is than q, where that is known, s."""
     late, std = timing.lateness_s, timing.lateness_std_s
     return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import SettingsError
-from adapter.learning.learner import Change, Learner
+from adapter.learning.learner import Change, OnlineLearner
 from adapter.learning.schema_kernels import MotionMoments
 from adapter.learning.theta_kernels import Moments
 from adapter.signals.records import LinkMotionKind
@@ -50,7 +50,7 @@ _STATE = {
 }
 
 
-def save_checkpoint(learner: Learner, path: str | Path, *, sync: bool = True) -> None:
+def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = True) -> None:
     """Write a learner's state; an existing file is replaced in one go, or not at all.
 
     With `sync` it is on the disk afterwards, safe from a power cut and not only from a kill.
@@ -77,7 +77,7 @@ def save_checkpoint(learner: Learner, path: str | Path, *, sync: bool = True) ->
     part_file.replace(path)
 
 
-def load_checkpoint(learner: Learner, path: str | Path) -> None:
+def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     """Put a fresh learner into the state of a file.
 
     Raises:
@@ -117,7 +117,7 @@ def _put(owner: object, name: str, value: np.ndarray | None) -> None:
         setattr(owner, name, value if value.ndim else value.item())
 
 
-def _about(learner: Learner) -> str:
+def _about(learner: OnlineLearner) -> str:
     tree = learner.tree
     about: dict[str, Any] = {
         "parent": tree.parent,

@@ -88,11 +88,11 @@ class Watch(Protocol):
     def reports(self) -> list[dict[str, Any]]:
         """What it has to tell."""
 
-    def __call__(self, learner: Learner, table: Array) -> None:
+    def __call__(self, learner: OnlineLearner, table: Array) -> None:
         """Take states (m, size), known effects taken off, that were just learned from."""
 
 
-class Learner:
+class OnlineLearner:
     """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
 
     Args:

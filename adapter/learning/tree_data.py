@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.networks import LinkMotion
+from adapter.physics.networks import FrameMotion
 from adapter.signals.records import KIND, STAMP, LinkMotionKind, StateLayout
 
 
@@ -42,10 +42,10 @@ class BodyMotion:
         v = np.zeros_like(self.w) if self.v is None else self.v
         return np.concatenate([v, self.w, self.a, self.dw], axis=-1)
 
-    def torch(self) -> LinkMotion:
+    def torch(self) -> FrameMotion:
         """As the networks take it; a velocity that nothing measures is zero there."""
         v = np.zeros_like(self.w) if self.v is None else self.v
-        return LinkMotion(
+        return FrameMotion(
             *(torch.from_numpy(np.ascontiguousarray(x)) for x in (v, self.w, self.a, self.dw))
         )
 

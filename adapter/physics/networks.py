@@ -33,7 +33,7 @@ MOMENT_Z = 5  # place of the moment about the joint axis in a wrench [f; m], eq.
 Joints = tuple[Tensor, Tensor, Tensor]
 
 
-class LinkMotion(NamedTuple):
+class FrameMotion(NamedTuple):
     """Motion of a link frame, or of several (then with a dimension of bodies before the last).
 
     Attributes:
@@ -76,8 +76,8 @@ def turn_z(q: Tensor, x: Tensor) -> Tensor:
 
 
 def link_step(
-    parent: LinkMotion, q_j: Tensor, dq_j: Tensor, ddq_j: Tensor, lam_j: Tensor
-) -> LinkMotion:
+    parent: FrameMotion, q_j: Tensor, dq_j: Tensor, ddq_j: Tensor, lam_j: Tensor
+) -> FrameMotion:
     """k_j(k_i, q_j, dq_j, ddq_j; λ_j): the motion of link j from that of its parent (eq. 10a).
 
     Args:
@@ -101,7 +101,7 @@ def link_step(
     w_j = w_i + _along_z(dq_j)  # 8b
     a_j = into_j(a + cross(dw, p) + cross(w, cross(w, p)))  # 8c
     dw_j = into_j(dw) + cross(w_i, _along_z(dq_j)) + _along_z(ddq_j)  # 8d
-    return LinkMotion(v_j, w_j, a_j, dw_j)
+    return FrameMotion(v_j, w_j, a_j, dw_j)
 
 
 def _along_z(x: Tensor) -> Tensor:
@@ -109,7 +109,7 @@ def _along_z(x: Tensor) -> Tensor:
     return torch.stack([zero, zero, x], dim=-1)
 
 
-def base_motion(base: Tensor | LinkMotion, like: Tensor) -> LinkMotion:
+def base_motion(base: Tensor | FrameMotion, like: Tensor) -> FrameMotion:
     """The motion k_0 of the base (m, 3) each: measured, or at rest under gravity.
 
     Args:
@@ -117,13 +117,13 @@ def base_motion(base: Tensor | LinkMotion, like: Tensor) -> LinkMotion:
             the acceleration of gravity (3,) in base axes of a base at rest.
         like: (m, n) joint angles; number of samples, type and device are taken from it.
     """
-    if isinstance(base, LinkMotion):
+    if isinstance(base, FrameMotion):
         return base
     zero = like.new_zeros((like.shape[0], 3))
-    return LinkMotion(zero, zero, -base.to(like).expand_as(zero), zero)
+    return FrameMotion(zero, zero, -base.to(like).expand_as(zero), zero)
 
 
-def link_motion(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | LinkMotion) -> LinkMotion:
+def link_motion(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | FrameMotion) -> FrameMotion:
     """Motion of every body, (m, bodies, 3) each (eq. 10b); the base first if it floats.
 
     Args:
@@ -134,12 +134,12 @@ def link_motion(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | LinkMoti
     """
     q, dq, ddq = joints
     k_base = base_motion(base, q)
-    k: list[LinkMotion] = []
+    k: list[FrameMotion] = []
     for j, i in enumerate(tree.parent):
         parent = k_base if i == BASE else k[i]
         k.append(link_step(parent, q[:, j], dq[:, j], ddq[:, j], lam[j]))
     bodies = [k_base, *k] if tree.floating else k
-    return LinkMotion(*(torch.stack(list(part), dim=1) for part in zip(*bodies, strict=True)))
+    return FrameMotion(*(torch.stack(list(part), dim=1) for part in zip(*bodies, strict=True)))
 
 
 def skew(x: Tensor) -> Tensor:
@@ -158,7 +158,7 @@ def bullet(w: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
 
 
-def body_wrench_regressor(k: LinkMotion) -> Tensor:
+def body_wrench_regressor(k: FrameMotion) -> Tensor:
     """W (..., 6, 10): wrench [f; m] at the frame's origin = W θ (eqs. 11, 12)."""
     cross = skew(k.w)
     force = torch.cat(
@@ -181,7 +181,7 @@ def to_parent(wrench: Tensor, q_j: Tensor, lam_j: Tensor) -> Tensor:
     return torch.cat([force, rotation @ wrench[:, 3:] + skew(lam_j[3:]) @ force], dim=1)
 
 
-def wrenches(tree: Tree, lam: Tensor, theta: Tensor, q: Tensor, k: LinkMotion) -> Tensor:
+def wrenches(tree: Tree, lam: Tensor, theta: Tensor, q: Tensor, k: FrameMotion) -> Tensor:
     """Total wrench [f; m] on every body, (m, bodies, 6), in its frame (eqs. 14c, 15).
 
     Args:
@@ -210,7 +210,7 @@ def torques(tree: Tree, wrench: Tensor) -> Tensor:
 
 
 def inverse_dynamics(
-    tree: Tree, lam: Tensor, theta: Tensor, joints: Joints, base: Tensor | LinkMotion
+    tree: Tree, lam: Tensor, theta: Tensor, joints: Joints, base: Tensor | FrameMotion
 ) -> Tensor:
     """τ (m, rows), N m; the base's wrench [f; m] in its frame first if it floats (eq. 5).
 
@@ -235,7 +235,7 @@ def bodies_on(tree: Tree) -> list[list[int]]:
     return found
 
 
-def wrench_regressors(tree: Tree, lam: Tensor, q: Tensor, k: LinkMotion) -> list[Tensor]:
+def wrench_regressors(tree: Tree, lam: Tensor, q: Tensor, k: FrameMotion) -> list[Tensor]:
     """For every body W (m, 6, 10 b): its total wrench is W times the θ of the b `bodies_on` it.
 
     Eqs. 11 to 14, linear in θ; arguments as for `wrenches`.
@@ -250,7 +250,7 @@ def wrench_regressors(tree: Tree, lam: Tensor, q: Tensor, k: LinkMotion) -> list
     return wide
 
 
-def regressor(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | LinkMotion) -> Tensor:
+def regressor(tree: Tree, lam: Tensor, joints: Joints, base: Tensor | FrameMotion) -> Tensor:
     """Y (m, rows, 10 bodies): τ = Y θ with θ's rows one after the other.
 
     Arguments as for `inverse_dynamics`.

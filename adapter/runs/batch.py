@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.signals.records import stamp_of
 
@@ -27,7 +27,7 @@ THETA_POLISH = ((250, 1.0), (250, 0.3))
 
 
 def learn_batch(
-    learner: Learner, tables: Iterable[Array], every: int, progress: Callable[[int], None]
+    learner: OnlineLearner, tables: Iterable[Array], every: int, progress: Callable[[int], None]
 ) -> None:
     """Learn from states, `every` of them at a time.
 
@@ -50,7 +50,7 @@ def learn_batch(
     learner.follow_convergence()
 
 
-def _learn_schema(learner: Learner, tables: Iterable[Array], every: int) -> tuple[Array, int]:
+def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -> tuple[Array, int]:
     """Let λ take all states.
 
     Returns:
@@ -75,7 +75,7 @@ def _learn_schema(learner: Learner, tables: Iterable[Array], every: int) -> tupl
 
 
 def _learn_theta(
-    learner: Learner, torque: Array, every: int, waiting: int, progress: Callable[[int], None]
+    learner: OnlineLearner, torque: Array, every: int, waiting: int, progress: Callable[[int], None]
 ) -> None:
     """Let θ take all states; it begins to step behind the first `waiting` of them, as live."""
     theta, usual = learner.theta, learner.settings.theta.rate
@@ -93,7 +93,7 @@ def _learn_theta(
             moving = theta.updates < FIRST_STEPS or _gain(learner, before) > GAIN
 
 
-def _gain(learner: Learner, before: Array) -> float:
+def _gain(learner: OnlineLearner, before: Array) -> float:
     """Mean share of the joints' error variances that went, on all samples, from `before` (P,)."""
     theta = learner.theta
     return float(np.mean(1.0 - theta.variance() / theta.variance(before)))

@@ -13,7 +13,7 @@ import numpy as np
 
 from adapter.gap.monitor import Monitor
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import Snapshot
@@ -28,7 +28,7 @@ STD_EVERY = 50  # publications; the covariance behind the standard deviations ta
 
 def single_thread_learner(
     documented: SelfModel, settings: PipelineSettings, resume: Path | None, aloud: bool = False
-) -> Learner:
+) -> OnlineLearner:
     """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit.
 
     A monitor looks over its shoulder; `aloud`, it tells at once what it finds.
@@ -81,13 +81,13 @@ def keep_quiet(line: str) -> None:
     """Where nobody wants to hear at once; a function with a name can travel in a file."""
 
 
-def keep_learner(learner: Learner, folder: Path) -> None:
+def keep_learner(learner: OnlineLearner, folder: Path) -> None:
     """Leave a learner and its monitor to a successor in an empty folder. Raises OSError."""
     save_checkpoint(learner, folder / KEPT_LEARNER, sync=False)
     (folder / KEPT_MONITOR).write_bytes(pickle.dumps(learner.watch))
 
 
-def restore_learner(learner: Learner, folder: Path) -> None:
+def restore_learner(learner: OnlineLearner, folder: Path) -> None:
     """Put a fresh learner into the state that its predecessor left in this private folder."""
     load_checkpoint(learner, folder / KEPT_LEARNER)
     learner.watch = pickle.loads((folder / KEPT_MONITOR).read_bytes())
@@ -100,7 +100,7 @@ class Publisher:
         self._calls = 0
         self._std: tuple[Any, Any, Any] | None = None
 
-    def __call__(self, learner: Learner) -> Snapshot:
+    def __call__(self, learner: OnlineLearner) -> Snapshot:
         """The estimate as it stands."""
         if self._std is None or self._calls % STD_EVERY == 0:
             self._std = self._deviations(learner)
@@ -121,7 +121,7 @@ class Publisher:
         )
 
     @staticmethod
-    def _deviations(learner: Learner) -> tuple[Any, Any, Any]:
+    def _deviations(learner: OnlineLearner) -> tuple[Any, Any, Any]:
         n, schema, theta = learner.tree.n, learner.schema, learner.theta
         covariance = schema.covariance()
         turned = schema.R0 @ covariance[:, :3, :3] @ np.swapaxes(schema.R0, 1, 2)

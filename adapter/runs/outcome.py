@@ -10,7 +10,7 @@ import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -70,7 +70,7 @@ class Outcome:
     disagreements: tuple[dict[str, Any], ...] | None = None
 
 
-def collect(learner: Learner) -> Outcome:
+def collect(learner: OnlineLearner) -> Outcome:
     """Read off a learner what there is to tell."""
     schema, theta = learner.schema, learner.theta
     to_parent = np.zeros((learner.tree.n, 6, 6))  # (phi, d) -> (turn in the parent's axes, d)

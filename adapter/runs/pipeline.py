@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from adapter.effects.active import lasting_effects, with_bodies
-from adapter.learning.learner import Filtered, KnownArm, Learner
+from adapter.learning.learner import Filtered, KnownArm, OnlineLearner
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
@@ -42,13 +42,13 @@ def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEn
     return FrontEnd(documented, settings.filter, settings.front_end)
 
 
-def make_learner(documented: SelfModel, settings: PipelineSettings) -> Learner:
+def make_learner(documented: SelfModel, settings: PipelineSettings) -> OnlineLearner:
     """The learner of a pipeline with these settings; it takes over the effects of the model."""
     front_end = make_front_end(documented, settings)
     whole = with_bodies(documented)
     known = lasting_effects(whole.effects, whole.tree.n)
     tool = documented.tool
-    return Learner(
+    return OnlineLearner(
         documented.tree,
         documented.gravity,
         settings.learner,

@@ -52,7 +52,7 @@ class ImportSpec:
     Attributes:
         sources: a file for each signal (time, q, dq, tau), "" for those without their own. Text
             tables or .npz.
-        columns: selectors of each signal in its file (`Table.columns`), or the key
+        columns: selectors of each signal in its file (`SourceTable.columns`), or the key
             in an .npz. Where absent: the usual names, or the whole of a signal's own file.
         units: time s, ms, us, ns; q rad, deg; dq rad, deg (per second; that of q where absent);
             tau Nm, mNm.
@@ -116,7 +116,7 @@ def _assignments(text: str, what: str) -> dict[str, tuple[str, ...]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class SourceTable:
     """Columns (m, k) of one file and their names, () where the file has no header."""
 
     path: Path
@@ -171,7 +171,7 @@ class Table:
         return f"; named {', '.join(self.names)}" if self.names else ""
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> SourceTable:
     """A text table; separator and header are found out, `#` lines are comments.
 
     The separator is `;` (then with decimal commas, if there are commas), `,` or white space. A
@@ -208,7 +208,7 @@ def read_table(path: Path) -> Table:
             f"{path}: the header names {len(names)} columns, line {lines[0][0]} has "
             f"{values.shape[1]} values"
         )
-    return Table(path, tuple(names), values)
+    return SourceTable(path, tuple(names), values)
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -347,7 +347,7 @@ class _Reader:
         if unknown:
             raise DriverError(f"no signal '{unknown[0]}'; have: {', '.join(SIGNALS)}")
         self._spec = spec
-        self._tables: dict[Path, Table] = {}
+        self._tables: dict[Path, SourceTable] = {}
         self._arrays: dict[Path, dict[str, Array]] = {}
 
     def source(self, signal: str) -> Path | None:

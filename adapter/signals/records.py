@@ -26,7 +26,7 @@ class LinkMotionKind(IntEnum):
     MEASURED = 2
 
 
-class Columns(NamedTuple):
+class StateColumns(NamedTuple):
     """First column of each signal of a state, and how many columns there are; see `columns`."""
 
     q: int
@@ -53,7 +53,9 @@ def columns(n, floating):
     base = tau + n + (6 if floating else 0)
     motion_q = base + (12 if floating else 0)
     motion = motion_q + 2 * n
-    return Columns(2, 2 + n, 2 + 2 * n, tau, base, motion_q, motion_q + n, motion, motion + 12 * n)
+    return StateColumns(
+        2, 2 + n, 2 + 2 * n, tau, base, motion_q, motion_q + n, motion, motion + 12 * n
+    )
 
 
 class StateLayout:

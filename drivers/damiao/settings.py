@@ -79,7 +79,7 @@ class BusSettings:
         return tuple(can_id + self.reply_offset for can_id in self.ids)
 
     @property
-    def budget(self) -> Budget:
+    def budget(self) -> BusTime:
         """Bus time of one tick's frames. Raises DriverError where they do not fit."""
         return budget(self.joints, self.rate_hz, self.fd, self.bitrate, self.data_bitrate)
 
@@ -147,7 +147,7 @@ TYPICAL_FRAMES = 200  # drawn to find the mean number of stuff bits
 
 
 @dataclass(frozen=True)
-class Budget:
+class BusTime:
     """Bus time of one tick.
 
     Attributes:
@@ -189,7 +189,7 @@ def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
 
 def budget(
     joints: int, rate_hz: int, fd: bool, bitrate: int, data_bitrate: int | None = None
-) -> Budget:
+) -> BusTime:
     """Bus time of one command to and one reply from each joint.
 
     Args:
@@ -230,17 +230,17 @@ def budget(
 
 def frame_times(
     joints: int, rate_hz: int, fd: bool, bitrate: int, data_bitrate: int | None = None
-) -> Budget:
+) -> BusTime:
     """As `budget`, without judging."""
     fast = float(data_bitrate or bitrate) if fd else float(bitrate)
     command, reply, worst = (
         1e6 * (slow_bits / bitrate + fast_bits / fast) for slow_bits, fast_bits in _bit_counts(fd)
     )
     typical_us = joints * (command + reply)
-    return Budget(typical_us, 2 * joints * worst, reply, typical_us * rate_hz / 1e6)
+    return BusTime(typical_us, 2 * joints * worst, reply, typical_us * rate_hz / 1e6)
 
 
-def _fits(found: Budget, rate_hz: int) -> bool:
+def _fits(found: BusTime, rate_hz: int) -> bool:
     return found.load <= TYPICAL_SHARE and found.worst_us * rate_hz / 1e6 <= WORST_SHARE
 
 

@@ -67,7 +67,7 @@ def arrival_ns(wall_ns: int) -> int:
     return now_ns
 
 
-class Ring:
+class StateRing:
     """The reader's end of the ring.
 
     Args:
@@ -111,7 +111,7 @@ class Ring:
         return True
 
 
-def serve(udp: socket.socket, ring: Ring, event: int, parent: int, state_size: int) -> None:
+def serve(udp: socket.socket, ring: StateRing, event: int, parent: int, state_size: int) -> None:
     """Pass on datagrams until the parent is gone."""
     room = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNT.size)
     sender, source = ("", 0), (0, bytes(4))
@@ -150,7 +150,7 @@ def main(arguments: list[str]) -> None:
     with contextlib.suppress(OSError):  # not permitted: an ordinary priority has to do
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     shared = mmap.mmap(memory, ring_size(state_size))
-    ring = Ring(shared, state_size)
+    ring = StateRing(shared, state_size)
     WORD.pack_into(shared, READY, 1)
     os.eventfd_write(event, 1)
     serve(socket.socket(fileno=udp), ring, event, parent, state_size)

@@ -84,7 +84,7 @@ class CdrError(ValueError):
     """A message is not what its schema says, or values don't fit one."""
 
 
-class _Body:
+class _MessageBuilder:
     """Builds the constant stretches of a message: everything but its stamp and its doubles."""
 
     def __init__(self) -> None:
@@ -144,7 +144,7 @@ class JointStateEncoder:
         fields: Sequence[str] = ("position", "velocity", "effort"),
     ) -> None:
         self._shape = (len(names),)
-        body = _Body()
+        body = _MessageBuilder()
         body.text(frame_id)
         body.count(len(names))
         for name in names:
@@ -178,7 +178,7 @@ class MotionEncoder:
     """Encodes TwistStamped or AccelStamped (same bytes) of one frame."""
 
     def __init__(self, frame_id: str) -> None:
-        body = _Body()
+        body = _MessageBuilder()
         body.text(frame_id)
         body.doubles(6)
         (self._piece,) = body.pieces

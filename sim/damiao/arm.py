@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.interface import JointSample
-from sim.engine import PERIOD_S, Engine, Law
+from sim.engine import PERIOD_S, DriveLaw, Engine
 from sim.noise import SensorNoise
 from sim.noise_levels import NoiseLevels
 from sim.truth import Array, Truth
@@ -56,13 +56,15 @@ class World:
     def _place(self, q: Array) -> None:
         zero = np.zeros(self._n)
         self._engine.place(q, zero)
-        self._law = Law(q, zero, zero, zero, zero, zero, zero)
+        self._law = DriveLaw(q, zero, zero, zero, zero, zero, zero)
         self._engine.drive(self._law)  # whatever is set up on first use is set up before the clock
         self._engine.place(q, zero)
         self._from, self._to = (q, zero), (q, zero)
         self._lists()
 
-    def advance(self, now_ns: int, law_at: Callable[[int, Array], Law], t0_ns: int | None) -> None:
+    def advance(
+        self, now_ns: int, law_at: Callable[[int, Array], DriveLaw], t0_ns: int | None
+    ) -> None:
         """Simulate every tick that has begun by now.
 
         Args:

@@ -21,7 +21,7 @@ READ, WRITE, SAVE, REFRESH = 0x33, 0x55, 0xAA, 0xCC
 INTEGER_REGISTERS = frozenset({7, 8, 9, 10, 13, 14, 15, 16, 35, 36})  # the others are float32
 
 
-class Scale(NamedTuple):
+class FullScale(NamedTuple):
     """Full scale of a motor's angle (rad), speed (rad/s) and torque (N m)."""
 
     pmax: float
@@ -53,7 +53,7 @@ def from_code(code: int, low: float, high: float, bits: int) -> float:
     return low + code / ((1 << bits) - 1) * (high - low)
 
 
-def decode_command(data: bytes, scale: Scale) -> MitCommand:
+def decode_command(data: bytes, scale: FullScale) -> MitCommand:
     """The eight bytes of a MIT command."""
     word = int.from_bytes(data, "big")
     pmax, vmax, tmax = scale
@@ -71,7 +71,7 @@ def encode_feedback(
     status: int,
     motion: tuple[float, float, float],
     temperatures: tuple[float, float],
-    scale: Scale,
+    scale: FullScale,
 ) -> bytes:
     """The eight bytes of a feedback frame.
 

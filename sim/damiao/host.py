@@ -17,7 +17,7 @@ from sim.scenarios import Scenario
 SETTLE_TICKS = 300  # the motors take the arm over from its stand
 
 
-class Served(Protocol):
+class Serviceable(Protocol):
     """Boards that work when they are called."""
 
     def service(self) -> int:
@@ -58,7 +58,7 @@ class ServedBus(WrappedBus):
         serving: whether to do so; without it the boards' owner calls `Boards.service`.
     """
 
-    def __init__(self, bus: can.BusABC, boards: Served) -> None:
+    def __init__(self, bus: can.BusABC, boards: Serviceable) -> None:
         """Wrap the host's end of a bus."""
         super().__init__(bus)
         self._boards, self.serving = boards, True

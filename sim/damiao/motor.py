@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from sim.damiao.codec import (
     AT_REST,
     INTEGER_REGISTERS,
+    FullScale,
     MitCommand,
-    Scale,
     decode_command,
     encode_feedback,
 )
@@ -35,26 +35,26 @@ class MotorType:
     """
 
     name: str
-    scale: Scale
+    scale: FullScale
     gear: float
     rated: float
 
 
-DM4310 = MotorType("DM4310", Scale(12.5, 30.0, 10.0), 10.0, 3.0)
-DM4340 = MotorType("DM4340", Scale(12.5, 10.0, 28.0), 40.0, 9.0)
-DM6006 = MotorType("DM6006", Scale(12.5, 45.0, 20.0), 6.0, 8.0)
-DM8009 = MotorType("DM8009", Scale(12.5, 45.0, 54.0), 9.0, 20.0)
-DM10010L = MotorType("DM10010L", Scale(12.5, 25.0, 200.0), 10.0, 80.0)
+DM4310 = MotorType("DM4310", FullScale(12.5, 30.0, 10.0), 10.0, 3.0)
+DM4340 = MotorType("DM4340", FullScale(12.5, 10.0, 28.0), 40.0, 9.0)
+DM6006 = MotorType("DM6006", FullScale(12.5, 45.0, 20.0), 6.0, 8.0)
+DM8009 = MotorType("DM8009", FullScale(12.5, 45.0, 54.0), 9.0, 20.0)
+DM10010L = MotorType("DM10010L", FullScale(12.5, 25.0, 200.0), 10.0, 80.0)
 
-Fitting = tuple[MotorType, Scale]  # a type and what is written into its registers 21 to 23
+Fitting = tuple[MotorType, FullScale]  # a type and what is written into its registers 21 to 23
 
 _WIDE, _WRIST = DM10010L.scale._replace(tmax=100.0), DM6006.scale._replace(tmax=12.5)
 _OPENARM = (DM8009, DM8009, DM4340, DM4340, DM4310, DM4310, DM4310)
 
 SETS: dict[str, tuple[Fitting, ...]] = {
     "panda": ((DM10010L, _WIDE),) * 4 + ((DM6006, _WRIST),) * 3,
-    "panda_fitted": ((DM10010L, Scale(4.0, 4.0, 100.0)),) * 4
-    + ((DM6006, Scale(4.0, 4.0, 12.5)),) * 3,
+    "panda_fitted": ((DM10010L, FullScale(4.0, 4.0, 100.0)),) * 4
+    + ((DM6006, FullScale(4.0, 4.0, 12.5)),) * 3,
     "openarm": tuple((kind, kind.scale) for kind in _OPENARM),
 }
 
@@ -108,7 +108,7 @@ class Motor:
         rotor_c, mosfet_c: temperatures, deg C.
     """
 
-    def __init__(self, motor_id: int, reply_id: int, kind: MotorType, scale: Scale) -> None:
+    def __init__(self, motor_id: int, reply_id: int, kind: MotorType, scale: FullScale) -> None:
         self.kind, self.scale = kind, scale
         self.status = DISABLED
         self.command = AT_REST
@@ -203,7 +203,7 @@ class Motor:
             return
         self.registers[register] = value
         if register in (PMAX, VMAX, TMAX):
-            self.scale = Scale(*(self.registers[k] for k in (PMAX, VMAX, TMAX)))
+            self.scale = FullScale(*(self.registers[k] for k in (PMAX, VMAX, TMAX)))
         elif register == TIMEOUT:
             self._limit_ns = int(value) * TIMEOUT_UNIT_NS if value else NEVER_NS
             self.deadline_ns = NEVER_NS
@@ -222,7 +222,7 @@ def _fits(register: int, value: float) -> bool:
     return math.isfinite(value) and (register not in (PMAX, VMAX, TMAX) or value > 0)
 
 
-def _delivered(motor_id: int, reply_id: int, kind: MotorType, scale: Scale) -> dict[int, float]:
+def _delivered(motor_id: int, reply_id: int, kind: MotorType, scale: FullScale) -> dict[int, float]:
     """Registers as a motor has them when it is switched on; plausible where nothing hangs on it."""
     values: dict[int, float] = dict.fromkeys([*range(37), *range(50, 56), 80, 81], 0.0)
     values.update(dict.fromkeys(INTEGER_REGISTERS, 0))

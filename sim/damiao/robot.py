@@ -10,7 +10,7 @@ from sim.damiao import codec, motor
 from sim.damiao.arm import World
 from sim.damiao.faults import HOT_C, JUMP_RAD, STATUS, Faults, spiked
 from sim.damiao.motor import Motor, in_joint_angles, motor_set
-from sim.engine import Law
+from sim.engine import DriveLaw
 from sim.truth import Array
 
 REPLY_OFFSET = 0x10  # reply id = command id + 0x10, as OpenArm sets it
@@ -60,7 +60,7 @@ class MotorBank:
             return self._serve_register(j, data, now_ns, now_s)
         return self._obey(j, data, now_ns, now_s)
 
-    def law(self, start_ns: int, reached: Array) -> Law:
+    def law(self, start_ns: int, reached: Array) -> DriveLaw:
         """The motors' law in the tick that begins at an instant; (7,) torques reached by then."""
         rows = np.zeros((7, len(self.motors)))
         warm_up = self._world.ticks % WARM_UP_TICKS == 0
@@ -72,7 +72,7 @@ class MotorBank:
             if unit.drives:
                 q_des, dq_des, kp, kd, ff = in_joint_angles(unit.command, unit.zero)
                 rows[:, j] = q_des, dq_des, kp, kd, reached[j], ff, unit.most_torque
-        return Law(*rows)
+        return DriveLaw(*rows)
 
     def _index(self) -> None:
         self._by_id = {unit.motor_id: j for j, unit in enumerate(self.motors)}

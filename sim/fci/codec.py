@@ -81,7 +81,7 @@ class RobotMode(IntEnum):
     RECOVERY = 6
 
 
-class Controller(IntEnum):
+class ControllerMode(IntEnum):
     """Controller mode, alike in Move and in the state; OTHER stands for no motion."""
 
     JOINT_IMPEDANCE = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.fci.codec import JOINTS, TICK_S, Controller, Generator, Request, RobotCommand
+from sim.fci.codec import JOINTS, TICK_S, ControllerMode, Generator, Request, RobotCommand
 from sim.truth import Array, Limits
 
 START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
@@ -20,7 +20,7 @@ ACCELERATION = "joint_motion_generator_velocity_discontinuity"
 JERK = "joint_motion_generator_acceleration_discontinuity"
 
 
-class JointMotion:
+class DesiredMotion:
     """Desired joint motion; derivatives are backward differences over a tick.
 
     Attributes:
@@ -83,18 +83,18 @@ COMMUNICATION = "communication_constraints_violation"
 TORQUE_JUMP = "controller_torque_discontinuity"
 
 POSSIBLE = {
-    (Controller.JOINT_IMPEDANCE, Generator.JOINT_POSITION),
-    (Controller.JOINT_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (Controller.CARTESIAN_IMPEDANCE, Generator.JOINT_POSITION),
-    (Controller.CARTESIAN_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (Controller.EXTERNAL, Generator.JOINT_POSITION),
-    (Controller.EXTERNAL, Generator.JOINT_VELOCITY),
+    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_POSITION),
+    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_VELOCITY),
+    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_POSITION),
+    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_VELOCITY),
+    (ControllerMode.EXTERNAL, Generator.JOINT_POSITION),
+    (ControllerMode.EXTERNAL, Generator.JOINT_VELOCITY),
 }
 
 
 def allowed(controller: int, generator: int, version: int) -> bool:
     """Whether this robot makes such a motion; Cartesian generators it does not."""
-    if (controller, generator) == (Controller.EXTERNAL, Generator.NONE):
+    if (controller, generator) == (ControllerMode.EXTERNAL, Generator.NONE):
         return version == 10
     return (controller, generator) in POSSIBLE
 
@@ -114,9 +114,9 @@ class CommandedMotion:
     def __init__(self, request: Request, q: Array, limits: Limits) -> None:
         controller, generator = request.move_modes()
         self.request = request
-        self.controller, self.generator = Controller(controller), Generator(generator)
+        self.controller, self.generator = ControllerMode(controller), Generator(generator)
         self.tau: Array = np.zeros(JOINTS)
-        self.path = JointMotion(self.generator, q, limits)
+        self.path = DesiredMotion(self.generator, q, limits)
         self.finished = False
         self._arrived = np.zeros(WINDOW, dtype=bool)
         self._ticks = self._missed = self._before = 0
@@ -124,7 +124,7 @@ class CommandedMotion:
     @property
     def by_torque(self) -> bool:
         """The client's torques drive the arm, not the internal controller."""
-        return self.controller == Controller.EXTERNAL
+        return self.controller == ControllerMode.EXTERNAL
 
     @property
     def begun(self) -> bool:

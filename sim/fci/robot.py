@@ -11,7 +11,7 @@ from sim.fci.arm import Arm
 from sim.fci.codec import (
     ERRORS,
     TICK_S,
-    Controller,
+    ControllerMode,
     Floats,
     Request,
     RobotCommand,
@@ -269,7 +269,7 @@ class Reporter:
         frame.set_id(message_id)
         motion = robot.motion
         if motion is None:
-            frame.set_modes(0, Controller.OTHER, robot.mode, 0.0)
+            frame.set_modes(0, ControllerMode.OTHER, robot.mode, 0.0)
         else:
             generator = motion.generator + 1
             frame.set_modes(generator, motion.controller, robot.mode, motion.success_rate)

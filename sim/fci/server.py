@@ -34,7 +34,7 @@ MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it i
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
 
 
-class Session:
+class ClientSession:
     """A client from its TCP connection to its end.
 
     Attributes:
@@ -199,7 +199,7 @@ class FciServer:
         self._listener.setblocking(False)
         self._listener.listen()
         self.port: int = self._listener.getsockname()[1]
-        self._session: Session | None = None
+        self._session: ClientSession | None = None
         self._ticks = Ticks()
         self._tick = self._id = self._silent_until = 0
         self._sent = self._clients = self._refused = 0
@@ -298,7 +298,7 @@ class FciServer:
             tcp.close()
             return
         self._clients += 1
-        self._session = Session(tcp, self._version)
+        self._session = ClientSession(tcp, self._version)
 
     def _drop(self) -> None:
         session, self._session = self._session, None

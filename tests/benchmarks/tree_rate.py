@@ -24,7 +24,7 @@ import torch
 
 from adapter.experiments.falls import Falls
 from adapter.experiments.online import noisy, online_trial, without_velocity
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.tree_data import TreeData
 from adapter.model.robots import documented
 from adapter.model.spatial import matrix_from_zxz
@@ -59,7 +59,7 @@ def floating_panda() -> TreeTruth:
     )
 
 
-def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, Learner]:
+def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, OnlineLearner]:
     """Learn sample by sample; what came of it and how long the samples took."""
     truth, parts = motions(robot, folder, round(seconds / 10.0) + 1)
     learned_from = [noisy(part, k) if noise else part for k, part in enumerate(parts[:-1])]
@@ -67,7 +67,7 @@ def learn(robot: str, folder: Path, seconds: float, noise: bool) -> tuple[Row, L
     return {"robot": robot, "noise": noise, **figures}, learner
 
 
-def parts_of(learner: Learner, data: TreeData, repeats: int) -> Row:
+def parts_of(learner: OnlineLearner, data: TreeData, repeats: int) -> Row:
     """Median time of each part of a sample's work, µs."""
     schema, theta, frames = learner.schema, learner.theta, learner.frames
     states = data.take(slice(0, repeats)).states(first_ns=10**15)

@@ -24,7 +24,7 @@ from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.theta import Theta
 from adapter.model.inertia import min_eigenvalue
 from adapter.model.robots import documented
@@ -43,7 +43,9 @@ LATE_S, END_S = 15.0, 30.0
 class Watched:
     """A learner that calls `look` with itself before each state it learns from."""
 
-    def __init__(self, learner: Learner, look: Callable[[Learner, np.ndarray], None]) -> None:
+    def __init__(
+        self, learner: OnlineLearner, look: Callable[[OnlineLearner, np.ndarray], None]
+    ) -> None:
         self.learner, self._look = learner, look
 
     def step(self, record: np.ndarray) -> None:
@@ -76,8 +78,8 @@ class Task:
 
 
 def learn(
-    task: Task, look: Callable[[Learner, np.ndarray], None] = lambda learner, record: None
-) -> tuple[Row, Learner]:
+    task: Task, look: Callable[[OnlineLearner, np.ndarray], None] = lambda learner, record: None
+) -> tuple[Row, OnlineLearner]:
     """Run what `adapter run` runs, without its clock; the figures of λ and θ, and the learner."""
     import torch
 
@@ -176,7 +178,7 @@ def theta_trial(
     ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
 
-    def look(learner: Learner, record: np.ndarray) -> None:
+    def look(learner: OnlineLearner, record: np.ndarray) -> None:
         theta = learner.theta
         if theta.updates % 50 or not theta.updates:
             return
@@ -252,7 +254,7 @@ def payload_trial(job: tuple[int, float]) -> Row:
     errors: list[tuple[float, np.ndarray]] = []
     marks: Row = {}
 
-    def look(learner: Learner, record: np.ndarray) -> None:
+    def look(learner: OnlineLearner, record: np.ndarray) -> None:
         t = 1e-9 * stamp_of(record) + 0.0375  # the sample that completed the state
         if t < 18.0:
             return
@@ -305,7 +307,7 @@ def rest_trial(job: tuple[int]) -> Row:
     marks: Row = {}
     errors: list[tuple[float, float]] = []
 
-    def look(learner: Learner, record: np.ndarray) -> None:
+    def look(learner: OnlineLearner, record: np.ndarray) -> None:
         t = 1e-9 * stamp_of(record)
         at, theta = learner.layout, learner.theta
         if not theta.updates:

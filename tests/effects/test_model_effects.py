@@ -13,7 +13,7 @@ from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.known_effects import KnownEffects, believed, learnable, not_taken_off
-from adapter.learning.learner import KnownArm, Learner
+from adapter.learning.learner import KnownArm, OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.learning.theta import STEP_SMOOTHING
 from adapter.model.self_model import SelfModel
@@ -179,7 +179,7 @@ def test_measured_link_motion_goes_with_the_links_angles() -> None:
     np.testing.assert_array_equal(freed[:, AT.motion_q], synthesized[:, AT.motion_q])
 
 
-def learn(data: ArmData, model: SelfModel, *effects: str) -> Learner:
+def learn(data: ArmData, model: SelfModel, *effects: str) -> OnlineLearner:
     settings = PipelineSettings(learner=LearnerSettings(effects=effects, seed=3))
     learner = make_learner(model, settings)
     for state in states_of(data, model):
@@ -187,7 +187,7 @@ def learn(data: ArmData, model: SelfModel, *effects: str) -> Learner:
     return learner
 
 
-def held_out(learner: Learner, *effects: dict[str, object]) -> np.ndarray:
+def held_out(learner: OnlineLearner, *effects: dict[str, object]) -> np.ndarray:
     """(n,) torque error of θ alone on another motion of an arm with effects, N m rms."""
     q, dq, ddq = record(arm(), Motion(6.0, seed=104), noisy=False).true[:3]
     tau = ModelTorque(with_effects(*effects))(q, dq, ddq)
@@ -361,4 +361,4 @@ def test_effects_need_an_arm() -> None:
     model = with_effects(TAKEN_OFF["joint_spring"])
     known = lasting_effects(model.effects, N)
     with pytest.raises(SettingsError, match="model's arm"):
-        Learner(model.tree, model.gravity, known=KnownArm(effects=known))
+        OnlineLearner(model.tree, model.gravity, known=KnownArm(effects=known))

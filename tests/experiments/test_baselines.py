@@ -25,7 +25,7 @@ from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.networks import (
     DTYPE,
-    LinkMotion,
+    FrameMotion,
     inverse_dynamics,
     link_motion,
     theta_from_log_cholesky,
@@ -149,13 +149,13 @@ def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
         zero = q.new_zeros((len(q), 3))
         for unit in torch.eye(6 + TREE.n, dtype=DTYPE):
             a, dw, ddq = (x.expand(len(q), -1) for x in unit.split([3, 3, TREE.n]))
-            base = LinkMotion(zero, zero, a, dw)
+            base = FrameMotion(zero, zero, a, dw)
             columns.append(inverse_dynamics(TREE, lam, theta, (q, still, ddq), base))
         return torch.stack(columns, dim=2)
 
     base = data.base.torch()
     for v in (base.v, torch.zeros_like(base.v)):
-        moving = LinkMotion(v, base.w, base.a, base.dw)
+        moving = FrameMotion(v, base.w, base.a, base.dw)
         tau = lagrange_torque(mass, *data.joint_signals(), moving).detach().numpy()
         assert relative(tau, data.tau[:, 6:]) < 1e-9
 
@@ -165,7 +165,7 @@ def test_mass_matrix_of_the_network_is_positive_definite_and_learns() -> None:
     torch.manual_seed(0)
     net = MassNetwork(torch.rand(8, 8, dtype=DTYPE) + 0.5, (5, 4), seed=0).double()
     q, dq, ddq = (torch.randn(3, 2, dtype=DTYPE) for _ in range(3))
-    base = LinkMotion(*(torch.randn(3, 3, dtype=DTYPE) for _ in range(4)))
+    base = FrameMotion(*(torch.randn(3, 3, dtype=DTYPE) for _ in range(4)))
     m = net(10.0 * q)
     assert torch.equal(m, m.mT) and torch.linalg.eigvalsh(m).min() > 0.0
 

@@ -14,7 +14,7 @@ from adapter.experiments.baselines.compare import Errors, Tables, compare
 from adapter.experiments.baselines.elm import ElmCommittee
 from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
-from adapter.experiments.results import Learned
+from adapter.experiments.results import LearnerScores
 from adapter.experiments.split import SETS, split
 
 CHANNELS = {"w", "v", "a", "dw"}
@@ -113,7 +113,7 @@ def test_errors_by_hand() -> None:
     errors = Errors(2)
     errors.add("test", tau[:2], estimate[:2])
     errors.add("test", tau[2:], estimate[2:])
-    found = errors.into(Learned("x", "x"))
+    found = errors.into(LearnerScores("x", "x"))
     # Relative errors 0, 0.5, 0.5, 2: the fourth sample is not above 0.1 N m.
     np.testing.assert_allclose(found.boxes["test"][0], [0.075, 0.375, 0.5, 0.875, 1.775])
     assert np.isnan(found.boxes["test"][1]).all()

@@ -16,7 +16,7 @@ from adapter.experiments.page.figure5 import arm_panels, not_judged, whole_panel
 from adapter.experiments.page.figure6 import logarithmic, turns_and_shifts
 from adapter.experiments.page.page import render_experiment, write_experiment
 from adapter.experiments.page.words import SETS, headline, scientific, sentences
-from adapter.experiments.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.model.tree import Tree
 from adapter.runs.run_folder import RunFolderError
 from tests.helpers.browser import Links, screenshot
@@ -64,11 +64,11 @@ ONLINE = {
 MOST_BYTES = 2_000_000
 
 
-def learner(name: str, medians: tuple[float, ...]) -> Learned:
+def learner(name: str, medians: tuple[float, ...]) -> LearnerScores:
     joints = len(NAMES) if name == "FOPnet" else len(ARM)
     by_set = dict(zip(SETS, medians, strict=True))
     size = np.linspace(0.8, 1.2, joints)
-    return Learned(
+    return LearnerScores(
         name,
         f"{name} in full",
         boxes={s: np.minimum(x * np.outer(size, PER_CENT), 2.0) for s, x in by_set.items()},

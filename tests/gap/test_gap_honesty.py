@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from adapter.effects import CATALOGUE
-from adapter.gap import Fault, GapSettings, Refusal
+from adapter.gap import GapSettings, RecordingFault, RecordingRefused
 from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
 from adapter.gap.evidence import Noise
 from adapter.gap.findings import doubted, findings_of, parameter_std, told_of
@@ -280,9 +280,9 @@ def test_positions_beyond_either_limit_are_noted(side: str) -> None:
     (note,) = [note for note in refuse(log, tight, ARM).notes if "may go from" in note]
     assert note.startswith("panda_joint3 goes from")
     numbered = replace(log, joint_names=tuple(f"other{k}" for k in range(1, 8)))
-    with pytest.raises(Refusal) as refused:
+    with pytest.raises(RecordingRefused) as refused:
         refuse(numbered, tight, ARM)
-    assert refused.value.kind is Fault.ROBOT
+    assert refused.value.kind is RecordingFault.ROBOT
 
 
 def test_degrees_of_an_arm_whose_joints_only_turn_backwards() -> None:
@@ -290,9 +290,9 @@ def test_degrees_of_an_arm_whose_joints_only_turn_backwards() -> None:
     model = replace(PANDA, limits=replace(PANDA.limits, lower=low, upper=np.zeros(N)))
     degrees = 180.0 / np.pi
     q = -np.abs(MOVED[0]) - 0.5
-    with pytest.raises(Refusal) as refused:
+    with pytest.raises(RecordingRefused) as refused:
         refuse(log_of(degrees * q, degrees * -np.sign(MOVED[0]) * MOVED[1]), model, ARM)
-    assert refused.value.kind is Fault.DEGREES
+    assert refused.value.kind is RecordingFault.DEGREES
 
 
 def test_task_and_shortfall_are_plain_records() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pybullet_data
 import pytest
 
-from adapter.gap.screen import Refusal, Screened, moving_joints, refuse
+from adapter.gap.screen import RecordingRefused, Screened, moving_joints, refuse
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -28,7 +28,7 @@ def taken(log: Log, model: SelfModel | None = None) -> Screened:
 
 def refused(log: Log, kind: str, model: SelfModel | None = None) -> str:
     """The one sentence."""
-    with pytest.raises(Refusal) as caught:
+    with pytest.raises(RecordingRefused) as caught:
         taken(log, model)
     said = str(caught.value)
     assert caught.value.kind == kind, said

@@ -14,7 +14,7 @@ import pinocchio as pin
 from scipy.signal import butter, sosfilt
 
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Filtered, KnownArm, Learner
+from adapter.learning.learner import Filtered, KnownArm, OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -249,12 +249,12 @@ def states_of(
     return front_end.step_table(data.stamp_ns, data.q, data.dq, data.tau, data.twists, data.accels)
 
 
-def learner_for(model: SelfModel | None = None, **settings: object) -> Learner:
+def learner_for(model: SelfModel | None = None, **settings: object) -> OnlineLearner:
     """A learner as `make_learner` builds it."""
     model = model or panda_model()
     front_end = FrontEnd(model)
     tool = None if model.tool is None else model.tool.theta()
-    return Learner(
+    return OnlineLearner(
         model.tree,
         model.gravity,
         LearnerSettings(**settings),  # type: ignore[arg-type]

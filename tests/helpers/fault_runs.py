@@ -10,7 +10,7 @@ import numpy as np
 from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.realtime.session import LockstepResult, run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, frame_errors
@@ -30,7 +30,7 @@ EVERY_SHARE = tuple(f"{name}={share}" for name in SHARED for share in SHARES)
 class Watched:
     """A learner that asks of every estimate whether it is finite, and keeps it."""
 
-    def __init__(self, learner: Learner) -> None:
+    def __init__(self, learner: OnlineLearner) -> None:
         self.learner, self.finite = learner, True
         self.history: list[np.ndarray] = []
 
@@ -50,7 +50,7 @@ class FaultRun:
     text: str
     driver: FaultyDriver
     front_end: FrontEnd
-    learner: Learner
+    learner: OnlineLearner
     result: LockstepResult
     finite: bool
     history: list[np.ndarray]
@@ -123,12 +123,12 @@ def _held_out() -> tuple[np.ndarray, ...]:
     return tuple(x[500::40] for x in record(arm(), Motion(6.0, 105), noisy=False).true)
 
 
-def _torque(learner: Learner, theta: np.ndarray) -> np.ndarray:
+def _torque(learner: OnlineLearner, theta: np.ndarray) -> np.ndarray:
     q, dq, ddq, _ = _held_out()
     return model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq)
 
 
-def difference(a: Learner, b: Learner) -> Difference:
+def difference(a: OnlineLearner, b: OnlineLearner) -> Difference:
     """Of the learner b from the learner a."""
     one, two = collect(a), collect(b)
     apart = (one.theta - two.theta).ravel()

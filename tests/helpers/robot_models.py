@@ -15,7 +15,7 @@ from adapter.errors import ModelWarning
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, rpy_from_matrix, z_to_axis
 from adapter.model.urdf import model_from_urdf
-from adapter.physics.networks import LinkMotion
+from adapter.physics.networks import FrameMotion
 
 SHARED = Path(__file__).parents[2].parent / "shared"
 PANDA = Path(__file__).parents[2] / "adapter" / "model" / "robots" / "panda.urdf"
@@ -108,8 +108,8 @@ class Case:
     q: torch.Tensor
     dq: torch.Tensor
     ddq: torch.Tensor
-    base: torch.Tensor | LinkMotion
-    motion: LinkMotion
+    base: torch.Tensor | FrameMotion
+    motion: FrameMotion
     tau: np.ndarray
 
 
@@ -133,9 +133,9 @@ def pinocchio_case(text: str, floating: bool, samples: int = 5, seed: int = 1) -
         signals.append((q, dq, ddq))
         motions.append(np.stack(bodies))
         torques.append(_torques(oracle, pin.rnea(oracle, data, *full), model))
-    motion = LinkMotion(*(torch.from_numpy(np.stack(motions)[:, :, k]) for k in range(4)))
+    motion = FrameMotion(*(torch.from_numpy(np.stack(motions)[:, :, k]) for k in range(4)))
     if floating:
-        base: torch.Tensor | LinkMotion = LinkMotion(
+        base: torch.Tensor | FrameMotion = FrameMotion(
             *(torch.from_numpy(np.stack(bases)[:, k]) for k in range(4))
         )
     else:

@@ -7,7 +7,7 @@ import pytest
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from tests.helpers.arm_data import (
     Motion,
     arm,
@@ -24,7 +24,7 @@ from tests.helpers.arm_data import (
 SECONDS = 15.0
 
 
-def learned(seed: int, effects: tuple[str, ...], friction: bool = False) -> Learner:
+def learned(seed: int, effects: tuple[str, ...], friction: bool = False) -> OnlineLearner:
     truth = rubbing(0.3, 0.05) if friction else arm()
     learner = learner_for(effects=effects, seed=seed)
     for state in states_of(record(truth, Motion(SECONDS, seed=seed))):
@@ -32,7 +32,7 @@ def learned(seed: int, effects: tuple[str, ...], friction: bool = False) -> Lear
     return learner
 
 
-def held_out_error(learner: Learner) -> float:
+def held_out_error(learner: OnlineLearner) -> float:
     """Torque error on a motion that was not learned from, effects included, N m rms."""
     q, dq, ddq = (x[::20] for x in trajectory(Motion(10.0, seed=99)))
     model = ModelTorque(replace(panda_model(), theta=learner.theta.theta))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adapter.learning.change import ChangeDetector
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import ChangeSettings, ThetaSettings
 from adapter.runs.outcome import changes, collect, learned_model
 from adapter.signals.records import stamps_of
@@ -33,7 +33,7 @@ def loaded_arm(mass: float) -> Truth:
     return build("payload_at_20s", mass=mass, t_s=AT_S).truth
 
 
-def held_out_error(learner: Learner, truth: Truth, seed: int = 101) -> np.ndarray:
+def held_out_error(learner: OnlineLearner, truth: Truth, seed: int = 101) -> np.ndarray:
     q, dq, ddq, tau = record(truth, Motion(6.0, seed), noisy=False).true
     theta = learner.theta.theta
     return rms(tau - model_torque(panda_model(), learner.schema.lam, theta, q, dq, ddq))

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED
 from adapter.model.spatial import log_rotation, matrix_from_zxz
 from adapter.physics.identifiability import FrameObservability, frame_observability
@@ -35,7 +35,7 @@ KINDS = ("synthesized", "measured")
 class Run:
     """A learner at the end of a log, and how far off it was on the way."""
 
-    learner: Learner
+    learner: OnlineLearner
     truth: Truth
     seen: FrameObservability
     time_s: np.ndarray

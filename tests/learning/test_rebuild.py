@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import exp_rotation
 from tests.helpers.arm_data import Motion, arm, learner_for, panda_model, record, states_of
 
@@ -17,7 +17,7 @@ def states() -> np.ndarray:
     return states_of(record(arm(), Motion(SECONDS, 8)))
 
 
-def learner_at(truth: bool, **settings) -> Learner:
+def learner_at(truth: bool, **settings) -> OnlineLearner:
     """A learner whose λ stands at the truth, or a little off it, and whose θ begins at once."""
     learner = learner_for(wait_for_schema=False, **settings)
     learner.schema.set_lam(panda_model().lam)
@@ -30,7 +30,7 @@ def learner_at(truth: bool, **settings) -> Learner:
 
 
 @cache
-def learned(truth: bool) -> Learner:
+def learned(truth: bool) -> OnlineLearner:
     learner = learner_at(truth)
     for state in states():
         learner.step(state)

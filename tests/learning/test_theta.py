@@ -8,7 +8,7 @@ import pytest
 
 from adapter.effects import effects_by_name
 from adapter.effects.torque import ModelTorque
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.model.inertia import min_eigenvalue
 from adapter.model.self_model import SelfModel, Tool
 from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressors
@@ -34,7 +34,9 @@ FRICTION = ("viscous_friction", "coulomb_friction", "torque_offset", "motor_iner
 AT = StateLayout(N)
 
 
-def learn(data: ArmData, model: SelfModel | None = None, **settings) -> tuple[Learner, np.ndarray]:
+def learn(
+    data: ArmData, model: SelfModel | None = None, **settings
+) -> tuple[OnlineLearner, np.ndarray]:
     """The learner after a recording, and the smallest pseudo-inertia eigenvalue on the way."""
     learner = learner_for(model, **settings)
     smallest = []
@@ -46,7 +48,7 @@ def learn(data: ArmData, model: SelfModel | None = None, **settings) -> tuple[Le
 
 
 @cache
-def plain(seed: int) -> tuple[Learner, np.ndarray, ArmData]:
+def plain(seed: int) -> tuple[OnlineLearner, np.ndarray, ArmData]:
     data = record(arm(), Motion(SECONDS, seed))
     return (*learn(data, seed=seed), data)
 
@@ -56,12 +58,14 @@ def held_out(seed: int, truth=None) -> ArmData:
     return record(truth or arm(), Motion(6.0, 100 + seed), noisy=False)
 
 
-def held_out_rms(learner: Learner, theta: np.ndarray, data: ArmData, model=None) -> np.ndarray:
+def held_out_rms(
+    learner: OnlineLearner, theta: np.ndarray, data: ArmData, model=None
+) -> np.ndarray:
     q, dq, ddq, tau = data.true
     return rms(tau - model_torque(model or panda_model(), learner.schema.lam, theta, q, dq, ddq))
 
 
-def batch_theta(learner: Learner, data: ArmData) -> np.ndarray:
+def batch_theta(learner: OnlineLearner, data: ArmData) -> np.ndarray:
     """Weighted batch least squares on the same filtered states, by numpy alone."""
     table = states_of(data)[::8]
     q, dq, ddq, tau = (np.ascontiguousarray(table[:, k]) for k in (AT.q, AT.dq, AT.ddq, AT.tau))
@@ -135,7 +139,7 @@ def test_standard_deviations_are_of_the_size_of_the_errors(seed: int) -> None:
 
 
 @cache
-def with_friction(seed: int) -> Learner:
+def with_friction(seed: int) -> OnlineLearner:
     truth = build("friction", seed).truth
     return learn(record(truth, Motion(12.0, seed)), seed=seed, effects=FRICTION)[0]
 
@@ -200,7 +204,7 @@ def tool_torque(data: ArmData) -> np.ndarray:
 
 
 @cache
-def bare_and_loaded(known: bool) -> tuple[Learner, Learner]:
+def bare_and_loaded(known: bool) -> tuple[OnlineLearner, OnlineLearner]:
     """The same motion without a tool, and with one that is known or not."""
     data = record(arm(), Motion(6.0, 3))
     model = replace(panda_model(), tool=TOOL) if known else panda_model()

@@ -9,7 +9,7 @@ import pytest
 
 from adapter.errors import ModelError, SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
-from adapter.learning.learner import KnownArm, Learner
+from adapter.learning.learner import KnownArm, OnlineLearner
 from adapter.learning.settings import ChangeSettings, LearnerSettings, SchemaSettings
 from adapter.learning.tree_data import TreeData
 from adapter.model.inertia import is_consistent
@@ -45,7 +45,7 @@ def test_a_falling_tree_is_learned(seed: int, kind: str) -> None:
     model, parts, test = falling(seed)
     schema = SchemaSettings(judge_every=20, spin_measured=kind != "carried")
     settings = LearnerSettings(rebuild_rows=3, rebuild_stds=3.0, schema=schema)
-    learner = Learner(model.tree, settings=settings)
+    learner = OnlineLearner(model.tree, settings=settings)
     for k, part in enumerate(parts):
         data = with_noise(part if kind == "all" else bare(part), seed + k)
         if kind == "carried":
@@ -78,7 +78,7 @@ def test_a_fixed_tree_with_friction_and_fewer_updates() -> None:
     friction = np.array([0.3, 0.2, 0.4])
     data = replace(data, tau=data.tau + friction * data.dq)
     settings = LearnerSettings(effects=("viscous_friction",), update_every=2)
-    learner = Learner(model.tree, model.gravity, settings)
+    learner = OnlineLearner(model.tree, model.gravity, settings)
     for state in states_of(data)[:3500]:
         assert learner.step(state)
     assert learner.schema.updates == 1750 and learner.theta_started_ns is not None
@@ -90,12 +90,12 @@ def test_a_fixed_tree_with_friction_and_fewer_updates() -> None:
 
 def test_a_base_at_rest_needs_gravity() -> None:
     with pytest.raises(SettingsError, match="gravity"):
-        Learner(on_a_table(4)[0].tree)
+        OnlineLearner(on_a_table(4)[0].tree)
 
 
 def test_what_is_not_finite_is_refused_and_counted() -> None:
     model, parts, _ = falling(1)
-    learner = Learner(model.tree, settings=LearnerSettings(wait_for_schema=False))
+    learner = OnlineLearner(model.tree, settings=LearnerSettings(wait_for_schema=False))
     states = states_of(parts[0])
     for state in states[:300]:
         learner.step(state)
@@ -145,7 +145,9 @@ def test_a_falling_tree_notices_a_load_and_goes_on_from_a_checkpoint(tmp_path: P
     change = ChangeSettings(slow=300, arm_after=4000, one_factor=2.5, wait=60)
     settings = LearnerSettings(effects=("viscous_friction",), change=change)
     known = KnownArm(hand=model.tree.link_names.index("l3"))
-    whole, first, second = (Learner(model.tree, None, settings, known=known) for _ in range(3))
+    whole, first, second = (
+        OnlineLearner(model.tree, None, settings, known=known) for _ in range(3)
+    )
     for state in states:
         whole.step(state)
     assert len(whole.changes) == 1
@@ -162,7 +164,7 @@ def test_a_falling_tree_notices_a_load_and_goes_on_from_a_checkpoint(tmp_path: P
         for state in states[first.learned : cut]:
             first.step(state)
         save_checkpoint(first, tmp_path / "c.npz")
-        first = Learner(model.tree, None, settings, known=known)
+        first = OnlineLearner(model.tree, None, settings, known=known)
         load_checkpoint(first, tmp_path / "c.npz")
     load_checkpoint(second, tmp_path / "c.npz")
     for state in states[7500:]:
@@ -182,7 +184,7 @@ def test_a_falling_tree_notices_a_load_and_goes_on_from_a_checkpoint(tmp_path: P
 def test_a_change_is_looked_for_in_the_joints_torques(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hand that falls shows a load in its joints; the base's wrench has other units and noise."""
     model, parts, _ = falling(1)
-    learner = Learner(model.tree, settings=LearnerSettings(wait_for_schema=False))
+    learner = OnlineLearner(model.tree, settings=LearnerSettings(wait_for_schema=False))
     seen: list[np.ndarray] = []
     monkeypatch.setattr(learner.change, "look", lambda error: bool(seen.append(error.copy())))
     state = states_of(parts[0])[0]

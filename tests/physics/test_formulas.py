@@ -12,7 +12,7 @@ from adapter.model.spatial import matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics import kernels, networks
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of
-from adapter.physics.networks import DTYPE, LinkMotion
+from adapter.physics.networks import DTYPE, FrameMotion
 from adapter.physics.rigid_arm import RigidArm
 from tests.helpers.robot_models import (
     ROBOTS,
@@ -73,13 +73,13 @@ def test_gradients_of_the_networks(floating: bool) -> None:
     base = [torch.randn(2, 3, dtype=DTYPE, requires_grad=True) for _ in range(4)]
 
     def motion(lam, q, dq, ddq, *base):  # type: ignore[no-untyped-def]
-        return tuple(networks.link_motion(tree, lam, (q, dq, ddq), LinkMotion(*base)))
+        return tuple(networks.link_motion(tree, lam, (q, dq, ddq), FrameMotion(*base)))
 
     def torque(lam, theta, q, dq, ddq, *base):  # type: ignore[no-untyped-def]
-        return networks.inverse_dynamics(tree, lam, theta, (q, dq, ddq), LinkMotion(*base))
+        return networks.inverse_dynamics(tree, lam, theta, (q, dq, ddq), FrameMotion(*base))
 
     def regressor(lam, q, dq, ddq, *base):  # type: ignore[no-untyped-def]
-        return networks.regressor(tree, lam, (q, dq, ddq), LinkMotion(*base))
+        return networks.regressor(tree, lam, (q, dq, ddq), FrameMotion(*base))
 
     assert torch.autograd.gradcheck(motion, (lam, *signals, *base))
     assert torch.autograd.gradcheck(torque, (lam, theta, *signals, *base))
@@ -100,10 +100,10 @@ class Random:
         self.joints = JointMotion(*(3.0 * rng.normal(size=(3, m, n))))
         self.gravity = 9.81 * rng.normal(size=3)
         self.base = base_at_rest(self.gravity)[None]
-        base: LinkMotion | torch.Tensor = torch.from_numpy(self.gravity)
+        base: FrameMotion | torch.Tensor = torch.from_numpy(self.gravity)
         if floating or moving:
             self.base = rng.normal(size=(m, 12))
-            base = LinkMotion(*torch.from_numpy(self.base).split(3, dim=1))
+            base = FrameMotion(*torch.from_numpy(self.base).split(3, dim=1))
         q, dq, ddq = (torch.from_numpy(x) for x in self.joints)
         lam = torch.from_numpy(self.lam)
         self.given = self.tree, lam, (q, dq, ddq), base
@@ -166,7 +166,7 @@ def test_one_sample_is_one_row_of_the_table() -> None:
 def test_compiled_wrench_of_a_body_is_the_networks() -> None:
     rng = np.random.default_rng(0)
     rows, theta = rng.normal(size=(20, 12)), rng.normal(size=10)
-    parts = LinkMotion(*torch.from_numpy(rows).split(3, dim=1))
+    parts = FrameMotion(*torch.from_numpy(rows).split(3, dim=1))
     expected = networks.body_wrench_regressor(parts).numpy()
     for row, theirs in zip(rows, expected, strict=True):
         W, wrench = np.full((6, 10), np.nan), np.full(6, np.nan)

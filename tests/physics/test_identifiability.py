@@ -16,7 +16,7 @@ from adapter.physics.identifiability import (
     numerical_rank,
     random_motion,
 )
-from adapter.physics.networks import LinkMotion, inverse_dynamics, link_motion, link_step
+from adapter.physics.networks import FrameMotion, inverse_dynamics, link_motion, link_step
 from tests.helpers.robot_models import pin_model, read_quietly, urdf_text
 
 PANDA = documented("panda")
@@ -113,7 +113,7 @@ def test_frame_jacobian_against_numerical_derivatives() -> None:
         turned = exp_rotation(change[:3]) @ matrix_from_zxz(lam_j[:3])
         lam = torch.from_numpy(np.r_[zxz_from_matrix(turned), lam_j[3:] + change[3:]])
         signals = (torch.from_numpy(x) for x in (q, dq, ddq))
-        k = link_step(LinkMotion(*(torch.from_numpy(x) for x in parent)), *signals, lam)
+        k = link_step(FrameMotion(*(torch.from_numpy(x) for x in parent)), *signals, lam)
         return torch.cat(list(k), dim=1).numpy()[0]
 
     step = 1e-6 * np.eye(6)
@@ -129,7 +129,7 @@ def test_a_floating_base_shows_every_frame() -> None:
 
 def test_motion_of_a_floating_base_comes_first() -> None:
     model = PANDA.with_base(floating=True)
-    base = LinkMotion(*(torch.full((2, 3), float(k), dtype=torch.float64) for k in range(4)))
+    base = FrameMotion(*(torch.full((2, 3), float(k), dtype=torch.float64) for k in range(4)))
     q = torch.zeros(2, 7, dtype=torch.float64)
     k = link_motion(model.tree, torch.from_numpy(model.lam), (q, q, q), base)
     assert k.v.shape == (2, 8, 3) and torch.equal(k.a[:, 0], base.a)

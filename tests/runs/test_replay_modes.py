@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from adapter.errors import SettingsError
-from adapter.learning.learner import Learner
+from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.spatial import log_rotation, matrix_from_zxz
 from adapter.runs.config import PipelineSettings
@@ -38,7 +38,7 @@ def settings(**learner) -> PipelineSettings:
     return PipelineSettings(learner=LearnerSettings(seed=3, **learner))
 
 
-def state_bytes(learner: Learner) -> bytes:
+def state_bytes(learner: OnlineLearner) -> bytes:
     """Everything that a learner knows."""
     schema, theta = learner.schema, learner.theta
     parts = [schema.R0, schema.p, schema.information, theta.x, theta.mean]

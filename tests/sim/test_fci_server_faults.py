@@ -15,7 +15,7 @@ from sim.fci.clock import PERIOD_NS, Ticks
 from sim.fci.codec import ERRORS, Generator, Request, RobotCommand, RobotMode, StateFrame
 from sim.fci.command import run
 from sim.fci.faults import JUMP_RAD, Fault, Spoiler
-from sim.fci.motion import JointMotion
+from sim.fci.motion import DesiredMotion
 from sim.fci.options import add_arguments
 from sim.fci.robot import RECOVERY_TICKS, Robot
 from sim.fci.server import FciServer
@@ -225,7 +225,7 @@ def test_joint_positions_that_break_a_limit(robot, positions, error):
 )
 def test_joint_velocities_that_lead_too_far(speed, start, error):
     truth = build("nominal").truth
-    path = JointMotion(Generator.JOINT_VELOCITY, truth.ready + start * np.eye(7)[1], truth.limits)
+    path = DesiredMotion(Generator.JOINT_VELOCITY, truth.ready + start * np.eye(7)[1], truth.limits)
     for k in range(5000):
         found = path.follow(ZERO, speed(k) * np.eye(7)[1])
         if found is not None:

@@ -12,7 +12,7 @@ from adapter.experiments.baselines.features import Columns, arm_problem, sub_cha
 from adapter.experiments.baselines.learner import Baseline
 from adapter.experiments.baselines.presets import Choice, learners
 from adapter.experiments.falls import Falls, sets_of
-from adapter.experiments.results import BOX_PERCENTILES, Learned
+from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
 from adapter.experiments.split import SETS, Split
 from adapter.learning.batch.prediction_errors import relative_errors
 from adapter.model.spatial import Array
@@ -64,7 +64,7 @@ def choices(
     return learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed)
 
 
-def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> list[Learned]:
+def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> list[LearnerScores]:
     """Choose every learner's settings, train it on the training set, judge it on all three sets.
 
     Args:
@@ -86,7 +86,7 @@ def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> li
             errors.add(name, y, learner.predict(x))
         facts = learner.facts()
         sizes = ", ".join(f"{value:,.6g} {what}" for what, value in facts.sizes.items())
-        learned = Learned(choice.key, choice.title, train_s=facts.train_s)
+        learned = LearnerScores(choice.key, choice.title, train_s=facts.train_s)
         learned.sizes, learned.selection = dict(facts.sizes), selection
         learned.tuning = [sizes, *facts.tuning, _told(choice, selection)]
         found.append(errors.into(learned))
@@ -194,7 +194,7 @@ class Errors:
             self._square[name] += np.square(tau - estimate).sum(axis=0)
             self._count[name] += len(tau)
 
-    def into(self, learned: Learned) -> Learned:
+    def into(self, learned: LearnerScores) -> LearnerScores:
         """Fill in boxes, percentiles and root mean squares."""
         for name in SETS:
             if not self._relative[name]:

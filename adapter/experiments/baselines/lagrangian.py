@@ -33,7 +33,7 @@ from adapter.experiments.baselines.learner import (
 )
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.spatial import Array
-from adapter.physics.networks import LinkMotion
+from adapter.physics.networks import FrameMotion
 
 BASE_ROWS = 6  # [v; w] of the carrier come before the joints in x
 FIRST_ANSWERS = 0.1  # gain of the last layer's first weights
@@ -43,7 +43,7 @@ MassMatrix = Callable[[Tensor], Tensor]
 
 
 def lagrange_torque(
-    mass: MassMatrix, q: Tensor, dq: Tensor, ddq: Tensor, base: LinkMotion
+    mass: MassMatrix, q: Tensor, dq: Tensor, ddq: Tensor, base: FrameMotion
 ) -> Tensor:
     """Joint torques (m, n), N m, of an arm whose mass matrix is `mass`.
 
@@ -189,7 +189,7 @@ class DeepLagrangian(Baseline):
         """Torques of rows of X, the frame flying along with the carrier."""
         n = self.columns.n
         q, dq, ddq, w, a, dw = torch.split(x[:, : 3 * n + 9], [n, n, n, 3, 3, 3], dim=1)
-        return lagrange_torque(mass, q, dq, ddq, LinkMotion(torch.zeros_like(w), w, a, dw))
+        return lagrange_torque(mass, q, dq, ddq, FrameMotion(torch.zeros_like(w), w, a, dw))
 
     def _answer(self, x: Array) -> Array:
         place = self._mass.last.weight.device

@@ -18,7 +18,7 @@ from adapter.experiments.page.figure4 import (
     skeleton,
 )
 from adapter.experiments.page.words import OURS, SETS, baselines, fopnet, letter
-from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, Learned
+from adapter.experiments.results import BOX_PERCENTILES, AtlasResults, LearnerScores
 from adapter.model.spatial import Array
 from adapter.report.style import (
     STAND_IN,
@@ -35,7 +35,7 @@ LARGEST = 2.0  # of eq. 20: torques of opposite sign
 ROOM = 1.2  # times, between what is shown and the end of a logarithmic axis
 
 
-def arm_rows(atlas: AtlasResults, learner: Learned) -> dict[str, Array]:
+def arm_rows(atlas: AtlasResults, learner: LearnerScores) -> dict[str, Array]:
     """By set the boxes (arm joints, 5) of a learner of the whole tree or of the arm alone.
 
     Raises:

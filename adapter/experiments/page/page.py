@@ -32,7 +32,7 @@ from adapter.experiments.page.words import (
     sentences,
     with_unit,
 )
-from adapter.experiments.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.report.html import fill, write_whole
 from adapter.report.page import Tile
@@ -253,7 +253,7 @@ def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
     return [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners]
 
 
-def _joints(learner: Learned) -> str:
+def _joints(learner: LearnerScores) -> str:
     known = {len(x) for x in (*learner.rmse.values(), *learner.boxes.values())}
     return str(max(known)) if known else NOTHING
 

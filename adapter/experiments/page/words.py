@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adapter.experiments.results import AtlasResults, Learned, PandaResults, Stated
+from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.report.style import SUPERSCRIPTS
 from adapter.report.words import NARROW, NOTHING, count, number
 
@@ -104,23 +104,23 @@ def ours_text(item: Stated) -> str:
     return with_unit(value, item.unit, 3)
 
 
-def letter(learner: Learned) -> str:
+def letter(learner: LearnerScores) -> str:
     """Which part of the paper's Fig. 5 shows this learner; empty where none does."""
     first = learner.name.replace("-", " ").split()[:1]
     return LETTERS.get(first[0].lower(), "") if first else ""
 
 
-def fopnet(atlas: AtlasResults) -> Learned | None:
+def fopnet(atlas: AtlasResults) -> LearnerScores | None:
     """The learner of the paper."""
     return next((x for x in atlas.learners if letter(x) == LETTERS["fopnet"]), None)
 
 
-def baselines(atlas: AtlasResults) -> list[Learned]:
+def baselines(atlas: AtlasResults) -> list[LearnerScores]:
     """The paper's three."""
     return [x for x in atlas.learners if letter(x) in ("a", "b", "c")]
 
 
-def best_baseline(atlas: AtlasResults) -> Learned | None:
+def best_baseline(atlas: AtlasResults) -> LearnerScores | None:
     """Of the paper's three the one with the smallest median error on the control set."""
     name = atlas.numbers.get("best_baseline")
     return next((x for x in baselines(atlas) if x.name == name), None)
