@@ -168,28 +168,9 @@ def _go(
 ) -> LiveResult:
     """The live run itself; an arm that may be real shows its plan and has a dead man's switch."""
     config, robot, maybe_real = plan.config, plan.robot, plan.maybe_real
-    recording, controller = None, controller_of(args, config, robot, driver)
+    controller = controller_of(args, config, robot, driver)
     duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
-    if not args.no_record:
-        metadata = recording_metadata(
-            config,
-            robot,
-            shlex.join(sys.argv[1:]),
-            driver=args.driver,
-            scenario=args.scenario,
-            commands_without_gravity=driver.adds_gravity,
-        )
-        attachments = {"documented.json": dumps(robot).encode()}
-        if truth is not None:
-            attachments["truth.json"] = truth.read_bytes()
-        path = args.record or folder / "recording.mcap"
-        recording = RecordingJob(
-            path,
-            metadata,
-            attachments,
-            overwrite=args.record is None,
-            describe=describe_estimate,
-        )
+    recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     display = None if args.quiet else DisplayJob(partial(make_display, duration_s))
 
     def show_plan() -> None:
@@ -210,6 +191,30 @@ def _go(
         Jobs(learner, recording, display),
         LiveOptions(duration_s, deadman=deadman, before_motion=show_plan),
         say=lambda line: console.print(line, soft_wrap=True),
+    )
+
+
+def _recording(
+    args: argparse.Namespace, plan: RunPlan, driver: Driver, folder: Path, truth: Path | None
+) -> RecordingJob:
+    """The recording, with all that a replay needs to repeat the run."""
+    metadata = recording_metadata(
+        plan.config,
+        plan.robot,
+        shlex.join(sys.argv[1:]),
+        driver=args.driver,
+        scenario=args.scenario,
+        commands_without_gravity=driver.adds_gravity,
+    )
+    attachments = {"documented.json": dumps(plan.robot).encode()}
+    if truth is not None:
+        attachments["truth.json"] = truth.read_bytes()
+    return RecordingJob(
+        args.record or folder / "recording.mcap",
+        metadata,
+        attachments,
+        overwrite=args.record is None,
+        describe=describe_estimate,
     )
 
 

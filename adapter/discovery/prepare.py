@@ -218,15 +218,7 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
     Raises:
         SettingsError: of some link neither angular velocity nor angular acceleration is there.
     """
-    heard: dict[str, Array] = {}
-    for table, names in ((log.twists, ("v", "w")), (log.accels, ("a", "dw"))):
-        if table is None:
-            continue
-        for k, name in enumerate(names):
-            part = table[rows][:, :, 3 * k : 3 * k + 3]
-            size = np.nanmax(np.abs(part), initial=0.0, where=np.isfinite(part), axis=(0, 2))
-            if (size > STILL).any():
-                heard[name] = part
+    heard = _heard(log, rows)
     lacking: dict[str, np.ndarray] = {
         name: np.asarray(~np.isfinite(x).all(axis=2).any(axis=0)) for name, x in heard.items()
     }
@@ -244,7 +236,7 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
             del heard[name]
     values = {k: np.where(lacking[k][None, :, None], 0.0, heard[k]) for k in CHANNELS if k in heard}
     measured = tuple(k for k in values if not lacking[k].any())
-    notes = []
+    notes: list[str] = []
     if not {"w", "dw"} & set(measured):
         measured = ("dw", *measured)
         notes.append(
@@ -258,6 +250,20 @@ def channels_of(log: Log, rows: np.ndarray) -> Channels:
             "from turning alone, and places of joints cannot be learned"
         )
     return Channels(values, {k: lacking[k] for k in values}, measured, tuple(notes))
+
+
+def _heard(log: Log, rows: np.ndarray) -> dict[str, Array]:
+    """By channel (k, links, 3) those in which some link moves."""
+    heard: dict[str, Array] = {}
+    for table, names in ((log.twists, ("v", "w")), (log.accels, ("a", "dw"))):
+        if table is None:
+            continue
+        for k, name in enumerate(names):
+            part = table[rows][:, :, 3 * k : 3 * k + 3]
+            size = np.nanmax(np.abs(part), initial=0.0, where=np.isfinite(part), axis=(0, 2))
+            if (size > STILL).any():
+                heard[name] = part
+    return heard
 
 
 def listed(names: Sequence[str], which: np.ndarray) -> str:

@@ -208,22 +208,7 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
             shares[root] = rootings(search, structure, root)
     posterior = search.posterior(structure, shares)
     names = body_names(bodies)
-    edges, confidence = [], []
-    roots: dict[str, float] = {}
-    for option, ranked in zip(structure.chosen, posterior, strict=True):
-        way = _direction(structure, shares, option.link)
-        share = dict(ranked)[option]
-        if option.link in shares:
-            share = roots[names[option.link]] = shares[option.link][option.link]
-        elif option.parent == FREE:
-            roots[names[option.link]] = share
-        elif option.parent == bodies.unseen_base:
-            roots[names[option.parent]] = max(share, roots.get(names[option.parent], 0.0))
-        confidence.append(share * (way if way >= DECIDED else 1.0))
-        others = [(o, p) for o, p in ranked if o != option and p >= WORTH_TELLING]
-        rival = _edge(bodies, *others[0]) if others else None
-        edge = _edge(bodies, option, share, rival)
-        edges.append(replace(edge, confidence=way * share, directed=way >= DECIDED))
+    edges, roots, confidence = _judged(bodies, structure, shares, posterior)
     order = {name: k for k, name in enumerate(bodies.log.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
     kept = tuple(edge for edge in edges if edge.parent is not None)
@@ -239,6 +224,34 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         structure=structure,
         hypotheses=hypotheses,
     )
+
+
+def _judged(
+    bodies: Bodies,
+    structure: Structure,
+    shares: dict[int, dict[int, float]],
+    posterior: Sequence[Sequence[tuple[Option, float]]],
+) -> tuple[list[Edge], dict[str, float], list[float]]:
+    """Every edge, the probability of each root by name, and of each link how sure its edge is."""
+    names = body_names(bodies)
+    edges: list[Edge] = []
+    roots: dict[str, float] = {}
+    confidence: list[float] = []
+    for option, ranked in zip(structure.chosen, posterior, strict=True):
+        way = _direction(structure, shares, option.link)
+        share = dict(ranked)[option]
+        if option.link in shares:
+            share = roots[names[option.link]] = shares[option.link][option.link]
+        elif option.parent == FREE:
+            roots[names[option.link]] = share
+        elif option.parent == bodies.unseen_base:
+            roots[names[option.parent]] = max(share, roots.get(names[option.parent], 0.0))
+        confidence.append(share * (way if way >= DECIDED else 1.0))
+        others = [(o, p) for o, p in ranked if o != option and p >= WORTH_TELLING]
+        rival = _edge(bodies, *others[0]) if others else None
+        edge = _edge(bodies, option, share, rival)
+        edges.append(replace(edge, confidence=way * share, directed=way >= DECIDED))
+    return edges, roots, confidence
 
 
 def _direction(structure: Structure, shares: dict[int, dict[int, float]], link: int) -> float:

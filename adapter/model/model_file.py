@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ def _refuse_constant(name: str) -> float:
 
 
 def _to_json(model: SelfModel) -> dict[str, Any]:
-    tree, tool = model.tree, model.tool
+    tree = model.tree
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -101,26 +102,10 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         "base_theta": _numbers(model.base_theta),
         "effects": _plain(model.effects),
         "gravity": _numbers(model.gravity),
-        "tool": None
-        if tool is None
-        else {
-            "mass": float(tool.mass),
-            "com": _numbers(tool.com),
-            "inertia": _numbers(tool.inertia),
-            "link": tool.link,
-        },
+        "tool": None if model.tool is None else _plain(asdict(model.tool)),
         "limits": {key: _numbers(getattr(model.limits, key)) for key in LIMITS},
         "axis": _numbers(model.axis),
-        "frames": [
-            {
-                "name": f.name,
-                "joint": f.joint,
-                "parent": f.parent,
-                "rotation": _numbers(f.rotation),
-                "position": _numbers(f.position),
-            }
-            for f in model.frames
-        ],
+        "frames": [_plain(asdict(frame)) for frame in model.frames],
     }
 
 

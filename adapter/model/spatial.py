@@ -93,38 +93,11 @@ def exp_rotation(vector: ArrayLike) -> Array:
 
 def log_rotation(rotation: ArrayLike) -> Array:
     """Rotation vectors (..., 3) of (..., 3, 3) rotations, angle in [0, π]."""
+    from scipy.spatial.transform import Rotation
+
     r = np.asarray(rotation, dtype=np.float64)
-    quaternion = _quaternion(r)
-    vector, scalar = quaternion[..., 1:], quaternion[..., :1]
-    length = np.linalg.norm(vector, axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(length, scalar)
-    scale = np.where(length > 0, angle / np.where(length > 0, length, 1.0), 2.0)
-    out: Array = vector * scale
-    return out
-
-
-def _quaternion(r: Array) -> Array:
-    """Unit quaternions [w x y z] with w >= 0 of (..., 3, 3) rotations, from the largest part."""
-    d = [r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]]
-    trace = d[0] + d[1] + d[2]
-    a = r[..., 2, 1] - r[..., 1, 2]
-    b = r[..., 0, 2] - r[..., 2, 0]
-    c = r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = (r[..., i, j] + r[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    # Four proportional copies of the quaternion; the longest is the best conditioned.
-    copies = np.stack(
-        [
-            np.stack([1 + trace, a, b, c], axis=-1),
-            np.stack([a, 1 + 2 * d[0] - trace, xy, xz], axis=-1),
-            np.stack([b, xy, 1 + 2 * d[1] - trace, yz], axis=-1),
-            np.stack([c, xz, yz, 1 + 2 * d[2] - trace], axis=-1),
-        ],
-        axis=-2,
-    )
-    longest = np.argmax(np.linalg.norm(copies, axis=-1), axis=-1)
-    best = np.take_along_axis(copies, longest[..., None, None], axis=-2)[..., 0, :]
-    unit = best / np.linalg.norm(best, axis=-1, keepdims=True)
-    out: Array = np.where(unit[..., :1] < 0, -unit, unit)
+    vectors = Rotation.from_matrix(r.reshape(-1, 3, 3)).as_rotvec()
+    out: Array = vectors.reshape(r.shape[:-1])
     return out
 
 

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from adapter.errors import ModelError
 
@@ -78,14 +74,6 @@ class Tree:
         return ((self.base_name,) if self.floating else ()) + self.link_names
 
     @cached_property
-    def adjacency(self) -> NDArray[np.int64]:
-        """A, (N+1, N+1), symmetric, 1 where two links share a joint; row 0 is the base."""
-        a = np.zeros((self.n + 1, self.n + 1), dtype=np.int64)
-        for k, i in enumerate(self.parent):
-            a[i + 1, k + 1] = a[k + 1, i + 1] = 1
-        return a
-
-    @cached_property
     def children(self) -> tuple[tuple[int, ...], ...]:
         """For each link the links that hang on it."""
         return tuple(tuple(j for j, i in enumerate(self.parent) if i == k) for k in range(self.n))
@@ -103,41 +91,6 @@ class Tree:
         if name not in self.joint_names:
             raise ModelError(f"no joint '{name}'; have: {', '.join(self.joint_names)}")
         return self.joint_names.index(name)
-
-    @classmethod
-    def from_adjacency(
-        cls,
-        adjacency: ArrayLike,
-        floating: bool = False,
-        joint_names: Sequence[str] = (),
-        link_names: Sequence[str] = (),
-        base_name: str = "base",
-    ) -> Tree:
-        """The tree of a symmetric 0/1 matrix (N+1, N+1) whose row 0 is the base.
-
-        Raises:
-            ModelError: not square, not symmetric, not 0/1, loops or separate parts, or links
-                not numbered parents first.
-        """
-        a = np.asarray(adjacency)
-        if a.ndim != 2 or a.shape[0] != a.shape[1] or a.shape[0] < 2:
-            raise ModelError(f"A must be (N+1, N+1) with N at least 1, got shape {a.shape}")
-        if not (np.isin(a, (0, 1)).all() and (a == a.T).all() and not a.diagonal().any()):
-            raise ModelError("A must be symmetric, hold only 0 and 1, and 0 on its diagonal")
-        if a.sum() != 2 * (len(a) - 1):
-            raise ModelError(
-                f"A has {int(a.sum()) // 2} edges; a tree of {len(a)} links has {len(a) - 1}"
-            )
-        parent = []
-        for k in range(1, len(a)):
-            earlier = np.flatnonzero(a[k, :k])
-            if len(earlier) != 1:
-                raise ModelError(
-                    f"link {k} of A has {len(earlier)} earlier neighbours, it needs exactly one: "
-                    "the links form a loop, separate parts, or are not numbered parents first"
-                )
-            parent.append(int(earlier[0]) - 1)
-        return cls(tuple(parent), floating, tuple(joint_names), tuple(link_names), base_name)
 
 
 def _numbered(kind: str, n: int) -> tuple[str, ...]:

@@ -218,24 +218,8 @@ def run_live(
             if controller is not None:
                 controller.detach()
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
-        return LiveResult(
-            samples=session.samples,
-            set_aside=session.set_aside,
-            passed_on=supervisor.passed_on,
-            skipped=supervisor.skipped,
-            unlearned=supervisor.unlearned,
-            restarts=supervisor.restarts,
-            recorded=supervisor.recorded,
-            unrecorded=supervisor.unrecorded,
-            ended=session.ended,
-            fault=session.fault,
-            timing=loop.report(),
-            grants=real_time.grants,
-            collected=collected,
-            troubles=supervisor.troubles,
-            tracking=None if controller is None else controller.tracking(),
-            intake=copy.deepcopy(driver.intake),
-        )
+        tracking = None if controller is None else controller.tracking()
+        return loop.result(real_time.grants, collected, tracking)
 
 
 def _without_fail(say: Callable[[str], None]) -> Callable[[str], None]:
@@ -326,6 +310,26 @@ class _Loop:
         ended_ns = time.monotonic_ns()
         self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 
-    def report(self) -> TimingReport:
-        """What the timing was so far."""
-        return self._timing.report(self._clock.missed, self._clock.missed_own)
+    def result(
+        self, grants: list[Grant], collected: Any, tracking: dict[str, Any] | None
+    ) -> LiveResult:
+        """What became of the run."""
+        session, supervisor = self._session, self._supervisor
+        return LiveResult(
+            samples=session.samples,
+            set_aside=session.set_aside,
+            passed_on=supervisor.passed_on,
+            skipped=supervisor.skipped,
+            unlearned=supervisor.unlearned,
+            restarts=supervisor.restarts,
+            recorded=supervisor.recorded,
+            unrecorded=supervisor.unrecorded,
+            ended=session.ended,
+            fault=session.fault,
+            timing=self._timing.report(self._clock.missed, self._clock.missed_own),
+            grants=grants,
+            collected=collected,
+            troubles=supervisor.troubles,
+            tracking=tracking,
+            intake=copy.deepcopy(self._driver.intake),
+        )
