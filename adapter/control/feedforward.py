@@ -8,8 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.base import smooth_sign
-from adapter.effects.by_joint import ByJoint
+from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
 from adapter.effects.catalogue import effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.errors import SettingsError
@@ -116,14 +115,15 @@ class ModelFeedforward:
         tau = self._rigid()
         if known is not None:
             link, speed, pull = signals[0, 0], signals[1, 0], signals[2, 0]
-            total = tau + known.torque(link, speed, pull, tau)
+            total = tau + known.torque(JointSignals(link, speed, pull, tau))
             if known.pushed:
                 push = np.empty((1, len(tau), 1))
                 wrench_torques(self._frames, signals[0], known.wrench[:, None], push)
                 total = total - push[0, :, 0]
             tau = total + known.gain * total
+        at = JointSignals(q, dq, ddq)
         for effect, value in zip(self._effects, self._values, strict=True):
-            tau = tau + value * effect.column(q, dq, ddq)
+            tau = tau + value * effect.column(at)
         return tau
 
     def _rigid(self) -> Array:

@@ -9,11 +9,10 @@ from adapter.effects.base import (
     LEVEL_BY_LOAD,
     TWO_LEVELS,
     Array,
+    JointSignals,
     JointTorque,
     Parameter,
-    Template,
     Values,
-    smooth_sign,
 )
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import BOTH_WAYS, STILL
@@ -26,6 +25,7 @@ class AsymmetricFriction(JointTorque):
     name = "asymmetric_friction"
     title = "asymmetric friction"
     parameters = (Parameter("Fc_pos", "N m"), Parameter("Fc_neg", "N m"))
+    prior_std = (1.0, 1.0)
     positive = ("Fc_pos", "Fc_neg")
     log_odds = -3.0  # Coulomb friction and an offset say the same in simpler words
     inexact = 0.02
@@ -34,21 +34,9 @@ class AsymmetricFriction(JointTorque):
     form = TWO_LEVELS
     shows = ((STILL, "fades or changes sign"), (BOTH_WAYS, "is larger one way than the other"))
 
-    def templates(self) -> tuple[Template, ...]:
-        """Both sizes."""
-        return (Template((1.0, 1.0), lambda x: {"Fc_pos": float(x[0]), "Fc_neg": float(x[1])}),)
-
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """Fc_pos where dq > 0, -Fc_neg where dq < 0, smoothed around rest."""
-        sign = smooth_sign(dq, ddq, smoothing_s)
+        sign = at.direction
         return np.asarray(np.where(sign > 0.0, values["Fc_pos"], values["Fc_neg"]) * sign)
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:

@@ -11,9 +11,8 @@ from adapter.effects.base import (
     Parameter,
     Values,
     late_jit,
-    smooth_sign,
 )
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import FLANK
 
@@ -58,7 +57,7 @@ class Backlash(MotionEffect):
         still = np.zeros_like(q)
         return motion.moved(joint, link - q, still, still)
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """Half the play."""
-        tables.half_play[joint] += 0.5 * float(values["b"])
+        sums.half_play[joint] += 0.5 * float(values["b"])
         return True

@@ -12,6 +12,7 @@ predicts is computed in four stages, and every effect belongs to one of them:
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, wraps
@@ -20,7 +21,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums, JointSignals
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import Split
 from adapter.errors import ModelError
@@ -34,6 +35,7 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 FEWEST_TO_FILTER = 100  # instants
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
+BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
 
 # Forms of friction that turns with the direction of motion; finer ones say which they refine.
 LEVEL, LEVEL_BY_LOAD, TWO_LEVELS = "one level", "one level by load", "two levels"
@@ -141,7 +143,7 @@ class Template:
     label: str = ""
 
 
-class Effect:
+class Effect(ABC):
     """A physical effect: its names, what it needs, how to look for it.
 
     Attributes:
@@ -149,8 +151,8 @@ class Effect:
         scope: what `joints` counts: `JOINT` one joint each, `LINK` the link of that number,
             `FLANGE` and `BASE` none, `ALL` all joints or one.
         parameters: in the order of the catalogue.
-        prior_std: how large its parameter may well be, in its unit, where it has but one; the
-            prior's mean is zero. One prior for the search, the learner and the monitor.
+        prior_std: how large its coefficient may well be, or each of several; the prior's mean is
+            zero. One prior for the search, the learner and the monitor.
         phrase: how to say that it is there.
         shows: what it shows in the experiments of `splits` that touch it.
         positive: keys of parameters that physics keeps above zero.
@@ -173,7 +175,7 @@ class Effect:
     title: ClassVar[str]
     scope: ClassVar[str] = JOINT
     parameters: ClassVar[tuple[Parameter, ...]]
-    prior_std: ClassVar[float]
+    prior_std: ClassVar[float | tuple[float, ...]]
     phrase: ClassVar[Phrase] = Phrase()
     shows: ClassVar[tuple[tuple[Split, str], ...]] = ()
     positive: ClassVar[tuple[str, ...]] = ()
@@ -193,17 +195,18 @@ class Effect:
         """ln of how often it starts while an arm is being recorded."""
         return START_ODDS if self.sudden else RARE_START_ODDS
 
-    def templates(self) -> tuple[Template, ...]:
-        """Ways to look for it; one parameter, linear, by default."""
-        key = self.parameters[0].key
-        return (Template((self.prior_std,), lambda x: {key: float(x[0])}),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Coefficients (k,) to parameters; one of each unless an effect says otherwise."""
+        return {p.key: float(value) for p, value in zip(self.parameters, x, strict=True)}
 
-    def columns(
-        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
-    ) -> tuple[Array, ...]:
+    def templates(self) -> tuple[Template, ...]:
+        """Ways to look for it; one unless an effect has a nonlinear setting."""
+        return (Template(tuple(map(float, np.atleast_1d(self.prior_std))), self.decode),)
+
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """Torque (..., n) on each joint per unit of each coefficient of the first template.
 
-        Only for effects of a joint that are linear; tau is the rigid torque.
+        Only for effects of a joint that are linear.
         """
         return ()
 
@@ -215,8 +218,8 @@ class Effect:
         """Whether physics allows these parameters; a fit may ask for others."""
         return all(float(values[key]) > 0.0 for key in self.positive)
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
-        """Add what one instant shows of the effect to tables; False where it shows nothing.
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+        """Add what one instant shows of the effect to sums; False where it shows nothing.
 
         `joint` from 0, or all of them.
         """
@@ -267,17 +270,17 @@ def _check_number(name: str, p: Parameter, given: Any) -> None:
 class MotionEffect(Effect):
     """Makes the measured motion differ from that of the links."""
 
+    @abstractmethod
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """Motion of the links behind a measured motion; tau (m, n) is the joint torque."""
-        raise NotImplementedError
 
 
 class BodyEffect(Effect):
     """Changes inertias or gravity."""
 
+    @abstractmethod
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """(theta (n, 10), gravity (3,)) with the effect; joint from 0, -1 for the last."""
-        raise NotImplementedError
 
 
 class TorqueEffect(Effect):
@@ -285,21 +288,23 @@ class TorqueEffect(Effect):
 
     Attributes:
         after_sensors: whether it is added to what the torque sensors say, last of all.
+        by_load: whether it depends on the rigid torque, and not on the motion alone.
     """
 
     after_sensors: ClassVar[bool] = False
+    by_load: ClassVar[bool] = False
 
+    @abstractmethod
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(m, n) N m that it adds; tau (m, n) is the rigid torque."""
-        raise NotImplementedError
 
 
 class SensorEffect(Effect):
     """Makes the measured torque differ from the torque."""
 
+    @abstractmethod
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(m, n) N m as the sensors say it, of the torques tau (m, n); joint -1: all joints."""
-        raise NotImplementedError
 
 
 def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
@@ -307,9 +312,6 @@ def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
     out = np.zeros_like(motion.q)
     out[:, joint] = torque
     return out
-
-
-SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 
 
 def late_jit(function: Kernel) -> Kernel:
@@ -328,59 +330,35 @@ def late_jit(function: Kernel) -> Kernel:
     return cast(Kernel, call)
 
 
-def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -> Array:
-    """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s.
-
-    Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a step;
-    what jumps in the effect must be as smooth as what jumps in the torque, so w is at least as
-    far as dq goes within that time.
-    """
-    if not smoothing_s or ddq is None:
-        return np.tanh(dq / SMOOTHING_DQ)
-    return np.tanh(dq / np.hypot(SMOOTHING_DQ, smoothing_s * ddq))
-
-
 class JointTorque(TorqueEffect):
-    """A torque effect that each joint has for itself, by its own signals and numbers alone.
+    """A torque effect that each joint has for itself, by its own signals and numbers alone."""
 
-    Attributes:
-        by_load: whether its law depends on the rigid torque.
-    """
+    @abstractmethod
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """Torque, N m, of the signals' shape; parameters are numbers or arrays that fit it.
 
-    by_load: ClassVar[bool] = False
-
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
-        """Torque, same shape as dq, of signals in rad, rad/s, rad/s², N m (the rigid torque).
-
-        Parameters are numbers or arrays that fit the signals' shape. Where the signals have gone
-        through a low-pass, `smoothing_s` says how long it takes a step; what jumps in the effect
-        must be as smooth as what jumps in the torque.
+        What jumps must be as smooth as `JointSignals.direction`.
         """
-        raise NotImplementedError
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The law on one joint."""
         q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
         numbers = {key: float(value) for key, value in values.items()}
-        return on_joint(motion, joint, self.law(q, dq, ddq, own, numbers))
+        return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), numbers))
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The law itself."""
         assert isinstance(joint, int)
-        tables.add_law(self, joint, values)
+        sums.add_law(self, joint, values)
         return True
 
     def simulated(self, values: Values) -> dict[str, Any]:
         """The law on one joint."""
-        return {"law": lambda q, dq, ddq, tau: float(self.law(q, dq, ddq, tau, values))}
+
+        def law(q: Array, dq: Array, ddq: Array, tau: Array) -> float:
+            return float(self.law(JointSignals(q, dq, ddq, tau), values))
+
+        return {"law": law}
 
     def absent(self, n: int) -> dict[str, Array]:
         """Parameters (n,) each of joints without it; what may not be zero stands at its least."""
@@ -388,7 +366,12 @@ class JointTorque(TorqueEffect):
 
 
 class LinearEffect(JointTorque):
-    """A torque effect with one parameter per joint in which it is linear; the learner has these."""
+    """A torque effect with one parameter per joint in which it is linear: its law is its column.
+
+    The learner has those that do not depend on the rigid torque, see `catalogue.LEARNED`.
+    """
+
+    prior_std: ClassVar[float]
 
     @property
     def key(self) -> str:
@@ -400,27 +383,17 @@ class LinearEffect(JointTorque):
         """Unit of the parameter."""
         return self.parameters[0].unit
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
-        """Torque per unit of the parameter; the arguments are those of `law`."""
-        raise NotImplementedError
+    @abstractmethod
+    def column(self, at: JointSignals) -> Array:
+        """Torque per unit of the parameter, of the signals' shape."""
 
-    def columns(
-        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
-    ) -> tuple[Array, ...]:
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """The one column."""
-        return (self.column(q, dq, ddq, smoothing_s),)
+        return (self.column(at),)
 
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """Parameter times column."""
-        return np.asarray(values[self.key] * self.column(q, dq, ddq, smoothing_s))
+        return np.asarray(values[self.key] * self.column(at))
 
 
 def polar(x: Array) -> tuple[float, float]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import BASE, Array, BodyEffect, Parameter, Template, Values
+from adapter.effects.base import BASE, Array, BodyEffect, Parameter, Values
 from adapter.effects.phrases import Length, Phrase
 from adapter.effects.splits import LEVELLED, LOADS
 from adapter.model.spatial import exp_rotation
@@ -21,15 +20,12 @@ class BaseTilt(BodyEffect):
     title = "base tilt"
     scope = BASE
     parameters = (Parameter("rx", "rad"), Parameter("ry", "rad"))
+    prior_std = (0.03, 0.03)
     phrase = Phrase(
         "the base is tilted by {length}",
         lengths=(Length(("rx", "ry"), "°", 180.0 / math.pi, name="tilt"),),
     )
     shows = ((LOADS, "grows with the load"), (LEVELLED, "shows"))
-
-    def templates(self) -> tuple[Template, ...]:
-        """Both angles."""
-        return (Template((0.03, 0.03), _decode),)
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """Gravity seen from the tilted base."""
@@ -46,7 +42,3 @@ class BaseTilt(BodyEffect):
             return NO_PLACE
         more.turn_base(self.turn(values))
         return None
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    return {"rx": float(x[0]), "ry": float(x[1])}

@@ -1,36 +1,70 @@
-"""Lasting effects as tables over the joints: for one sample at a time, in real time.
+"""Lasting effects as sums over the joints: for one sample at a time, in real time.
 
 What an effect does over a recording is in its own file, and so is what one instant shows of it
-(`Effect.at_instant`): it adds itself to the tables here, entries of all joints go through one
+(`Effect.at_instant`): it adds itself to the sums here, entries of all joints go through one
 call, and nothing is looked up by name on the way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.spatial import Array
 
+SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 
-class Law(Protocol):
+
+def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -> Array:
+    """sign(dq), smoothed around rest as tanh(dq / w): w = 0.01 rad/s.
+
+    Where the signals have gone through a low-pass, `smoothing_s` says how long it takes a step;
+    what jumps in an effect must be as smooth as what jumps in the torque, so w is at least as
+    far as dq goes within that time.
+    """
+    if not smoothing_s or ddq is None:
+        return np.tanh(dq / SMOOTHING_DQ)
+    return np.tanh(dq / np.hypot(SMOOTHING_DQ, smoothing_s * ddq))
+
+
+class JointSignals(NamedTuple):
+    """What the torque of a joint may depend on: signals of any one shape, (n,), (m,), (m, n).
+
+    Attributes:
+        q, dq, ddq: rad, rad/s, rad/s².
+        tau: rigid torque, N m; left out where nothing depends on it.
+        smoothing_s: how long the low-pass that the signals went through takes a step.
+    """
+
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array = np.zeros(())
+    smoothing_s: float = 0.0
+
+    @property
+    def direction(self) -> Array:
+        """sign(dq), as smooth as the signals are."""
+        return smooth_sign(self.dq, self.ddq, self.smoothing_s)
+
+
+class JointLaw(Protocol):
     """A torque that a joint has by its own signals; see `effects.base.JointTorque`."""
 
     by_load: ClassVar[bool]
 
-    @property
-    def law(self) -> Callable[..., Array]: ...
+    def law(self, at: JointSignals, values: Mapping[str, Any]) -> Array: ...
 
     def absent(self, n: int) -> dict[str, Array]: ...
 
 
 @dataclass(eq=False)
-class Tables:
+class EffectSums:
     """Sums over the effects of n joints, to which each effect adds its own.
 
     Attributes:
@@ -51,17 +85,17 @@ class Tables:
     compliance: Array
     log_gain: Array
     delay_s: Array
-    laws: list[tuple[Law, dict[str, Array]]] = field(default_factory=list)
+    laws: list[tuple[JointLaw, dict[str, Array]]] = field(default_factory=list)
     _taken: list[set[int]] = field(default_factory=list)
 
     @classmethod
-    def zero(cls, n: int) -> Tables:
+    def zero(cls, n: int) -> EffectSums:
         """Of n joints without effects."""
         offset, half_play, compliance, log_gain, delay_s = np.zeros((5, n))
         wave = np.zeros(n, dtype=complex)
         return cls(np.zeros(6), offset, wave, half_play, compliance, log_gain, delay_s)
 
-    def add_law(self, effect: Law, joint: int, values: Mapping[str, Any]) -> None:
+    def add_law(self, effect: JointLaw, joint: int, values: Mapping[str, Any]) -> None:
         """A law on one joint: beside its like on other joints, in a new table where taken."""
         free = (k for k, (own, _) in enumerate(self.laws) if own is effect)
         at = next((k for k in free if joint not in self._taken[k]), len(self.laws))
@@ -93,13 +127,13 @@ class ByJoint:
     """Effects of n joints at one instant; what a joint has none of is zero.
 
     Attributes:
-        laws, wrench, offset, half_play, compliance, delay_s: see `Tables`.
+        laws, wrench, offset, half_play, compliance, delay_s: see `EffectSums`.
         ripple, phase: (n,) rad, of what an encoder adds once a turn.
         gain: (n,) of the torque sensors.
         left_out: names of what a single instant cannot show.
     """
 
-    laws: tuple[tuple[Law, dict[str, Array]], ...]
+    laws: tuple[tuple[JointLaw, dict[str, Array]], ...]
     wrench: Array
     offset: Array
     ripple: Array
@@ -126,11 +160,6 @@ class ByJoint:
         """Whether a law depends on the rigid torque."""
         return any(effect.by_load for effect, _ in self.laws)
 
-    def torque(
-        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
-    ) -> Array | float:
+    def torque(self, at: JointSignals) -> Array | float:
         """Sum of the laws (..., n) for signals of that shape; the wrench is not in it."""
-        total: Array | float = 0.0
-        for effect, values in self.laws:
-            total = total + effect.law(q, dq, ddq, tau, values, smoothing_s)
-        return total
+        return sum((effect.law(at, values) for effect, values in self.laws), 0.0)

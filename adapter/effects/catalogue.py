@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeGuard
 
 from adapter.effects.asymmetric_friction import AsymmetricFriction
 from adapter.effects.backlash import Backlash
@@ -54,9 +55,14 @@ CATALOGUE: dict[str, Effect] = {
     )
 }
 
-# Linear in one parameter per joint: what the learner can carry beside θ from nothing.
+
+def learnable(effect: Effect) -> TypeGuard[LinearEffect]:
+    """Whether the learner can carry it beside θ from nothing: linear, from the motion alone."""
+    return isinstance(effect, LinearEffect) and not effect.by_load
+
+
 LEARNED: dict[str, LinearEffect] = {
-    name: effect for name, effect in CATALOGUE.items() if isinstance(effect, LinearEffect)
+    name: effect for name, effect in CATALOGUE.items() if learnable(effect)
 }
 
 # What a real arm's joints have, as far as anybody knows before it has moved. Those that the data
@@ -77,7 +83,7 @@ def registered(effect: Effect) -> Iterator[Effect]:
     if effect.name in CATALOGUE:
         raise SettingsError(f"there is an effect '{effect.name}' already")
     CATALOGUE[effect.name] = effect
-    if isinstance(effect, LinearEffect):
+    if learnable(effect):
         LEARNED[effect.name] = effect
     try:
         yield effect

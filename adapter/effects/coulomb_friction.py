@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import LEVEL, Array, LinearEffect, Parameter, Values, smooth_sign
+from adapter.effects.base import LEVEL, Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL
 from adapter.model.urdf_text import FRICTION, Additions
@@ -17,20 +17,16 @@ class CoulombFriction(LinearEffect):
     prior_std = 1.0  # published Panda values are 0.2 to 0.5 (Knezevic)
     positive = ("Fc",)
     inexact = 0.02
-    phrase = Phrase(
-        "{who} {lacks} {x} of Coulomb friction",
-        "Fc",
-        "{who} {has} {x} less Coulomb friction than the model says",
-    )
+    phrase = Phrase.lacks("Fc", "Coulomb friction")
     form = LEVEL
     shows = ((STILL, "fades or changes sign"),)
     sudden = True
     watched = True
     bundled = True
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+    def column(self, at: JointSignals) -> Array:
         """tanh(dq / w) with w = 0.01 rad/s, or as far as dq goes within the smoothing time."""
-        return smooth_sign(dq, ddq, smoothing_s)
+        return at.direction
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Dry friction."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS
 from adapter.model.urdf_text import Additions
@@ -18,11 +18,7 @@ class EncoderOffset(MotionEffect):
     title = "encoder offset"
     parameters = (Parameter("o", "rad"),)
     prior_std = 0.012
-    phrase = Phrase(
-        "the encoder of {who} reads {x} too much",
-        "o",
-        "the encoder of {who} reads {x} too little",
-    )
+    phrase = Phrase.reads("o", "encoder")
     shows = ((LOADS, "grows with the load"),)
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
@@ -30,9 +26,9 @@ class EncoderOffset(MotionEffect):
         still = np.zeros(len(motion.t))
         return motion.moved(joint, still - float(values["o"]), still, still)
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The offset."""
-        tables.offset[joint] += float(values["o"])
+        sums.offset[joint] += float(values["o"])
         return True
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:

@@ -11,11 +11,10 @@ from adapter.effects.base import (
     Motion,
     MotionEffect,
     Parameter,
-    Template,
     Values,
     polar,
 )
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, TURN
 
@@ -26,14 +25,15 @@ class EncoderRipple(MotionEffect):
     name = "encoder_ripple"
     title = "encoder ripple"
     parameters = (Parameter("a", "rad"), Parameter("phase", "rad"))
+    prior_std = (5e-3, 5e-3)
     log_odds = -2.0
     inexact = 0.02
     phrase = Phrase("the encoder of {who} errs by {a} once per turn")
     shows = ((LOADS, "grows with the load"), (TURN, "changes sign along the turn"))
 
-    def templates(self) -> tuple[Template, ...]:
-        """Sine and cosine."""
-        return (Template((5e-3, 5e-3), _decode),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Of sine and cosine."""
+        return dict(zip(("a", "phase"), polar(x), strict=True))
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - a sin(q + phase) with its two derivatives (to first order in a)."""
@@ -42,12 +42,7 @@ class EncoderRipple(MotionEffect):
         sine, cosine = a * np.sin(angle), a * np.cos(angle)
         return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The wave."""
-        tables.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
+        sums.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
         return True
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    size, phase = polar(x)
-    return {"a": size, "phase": phase}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from adapter.effects.base import (
@@ -11,11 +9,10 @@ from adapter.effects.base import (
     Array,
     Motion,
     Parameter,
-    Template,
     TorqueEffect,
     Values,
 )
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums
 from adapter.effects.phrases import Length, Phrase
 from adapter.effects.splits import ALONE
 
@@ -32,6 +29,7 @@ class ExternalWrench(TorqueEffect):
         *(Parameter(key, "N") for key in KEYS[:3]),
         *(Parameter(key, "N m") for key in KEYS[3:]),
     )
+    prior_std = (15.0, 15.0, 15.0, 2.0, 2.0, 2.0)
     inexact = 0.05
     phrase = Phrase(
         "something pushes the flange with {length}",
@@ -42,20 +40,12 @@ class ExternalWrench(TorqueEffect):
     passing = True
     watched = True
 
-    def templates(self) -> tuple[Template, ...]:
-        """Force and moment."""
-        return (Template((15.0, 15.0, 15.0, 2.0, 2.0, 2.0), _decode),)
-
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """-J^T w."""
         wrench = np.array([values[key] for key in KEYS], dtype=float)
         return -motion.arm.wrench_torque(motion.q, wrench)
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The wrench."""
-        tables.wrench += np.array([values[key] for key in KEYS], dtype=float)
+        sums.wrench += np.array([values[key] for key in KEYS], dtype=float)
         return True
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    return dict(zip(KEYS, map(float, x), strict=True))

@@ -9,8 +9,8 @@ from adapter.effects.base import (
     TorqueEffect,
     Values,
     on_joint,
-    smooth_sign,
 )
+from adapter.effects.by_joint import smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LATER, STILL
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Template, Values
-from adapter.effects.by_joint import Tables
+from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values
+from adapter.effects.by_joint import EffectSums
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS
-
-COMPLIANCE = 2e-4  # rad/(N m), typical: 1/k of a harmonic drive of 5000 N m/rad
 
 
 class JointElasticity(MotionEffect):
@@ -19,14 +17,15 @@ class JointElasticity(MotionEffect):
     name = "joint_elasticity"
     title = "joint elasticity"
     parameters = (Parameter("k", "N m/rad"),)
+    prior_std = 2e-4  # rad/(N m), of 1/k: a typical harmonic drive has 5000 N m/rad
     positive = ("k",)
     inexact = 0.05
     phrase = Phrase("{who} {is} elastic, with a stiffness of {k}")
     shows = ((LOADS, "grows with the square of the load"),)
 
-    def templates(self) -> tuple[Template, ...]:
-        """In 1/k, which is zero where the gear is rigid."""
-        return (Template((COMPLIANCE,), _decode),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Of 1/k, which is zero where the gear is rigid."""
+        return {"k": 1.0 / float(x[0]) if x[0] else math.inf}
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - tau/k with two derivatives: fourth ones of q, nothing but noise above a band."""
@@ -34,11 +33,7 @@ class JointElasticity(MotionEffect):
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The compliance."""
-        tables.compliance[joint] += 1.0 / float(values["k"])
+        sums.compliance[joint] += 1.0 / float(values["k"])
         return True
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    return {"k": 1.0 / float(x[0]) if x[0] else math.inf}

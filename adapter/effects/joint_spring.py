@@ -8,9 +8,9 @@ import numpy as np
 
 from adapter.effects.base import (
     Array,
+    JointSignals,
     JointTorque,
     Parameter,
-    Template,
     Values,
 )
 from adapter.effects.phrases import Phrase
@@ -24,6 +24,7 @@ class JointSpring(JointTorque):
     name = "joint_spring"
     title = "joint spring"
     parameters = (Parameter("k", "N m/rad"), Parameter("q0", "rad"))
+    prior_std = (1.0, 1.0)
     phrase = Phrase(
         "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"
     )
@@ -31,27 +32,18 @@ class JointSpring(JointTorque):
     watched = True
     over_angle = True
 
-    def templates(self) -> tuple[Template, ...]:
-        """Coefficients of the springs that rest at 0 and at 1 rad."""
-        return (Template((1.0, 1.0), _decode),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Of two springs that rest at 0 and at 1 rad."""
+        k = float(x[0] + x[1])
+        return {"k": k, "q0": float(x[1]) / k if k else 0.0}
 
-    def columns(
-        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
-    ) -> tuple[Array, ...]:
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """q and q - 1 rad."""
-        return q, q - 1.0
+        return at.q, at.q - 1.0
 
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """k (q - q0)."""
-        return np.asarray(values["k"] * (q - values["q0"]))
+        return np.asarray(values["k"] * (at.q - values["q0"]))
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Stiffness, which MJCF has and URDF has not."""
@@ -59,8 +51,3 @@ class JointSpring(JointTorque):
         if part is None:
             more.pull[joint] -= values["k"] * values["q0"]
         return part
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    k = float(x[0] + x[1])
-    return {"k": k, "q0": float(x[1]) / k if k else 0.0}

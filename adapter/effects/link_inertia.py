@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import LINK, Array, BodyEffect, Parameter, Template, Values
+from adapter.effects.base import BODY_STD, LINK, Array, BodyEffect, Parameter, Values
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import WEIGHED
 from adapter.model.urdf_text import Additions
@@ -19,15 +19,15 @@ class LinkInertia(BodyEffect):
     title = "wrong link inertia"
     scope = LINK
     parameters = (Parameter("dtheta", "kg, kg m, kg m2", count=10),)
+    prior_std = BODY_STD
     log_odds = -2.0
     phrase = Phrase("{who} {has} other inertias than the model says ({torque})")
     shows = ((WEIGHED, "shows"),)
     is_theta = True
 
-    def templates(self) -> tuple[Template, ...]:
-        """Ten inertial parameters."""
-        sizes = (1.0, 0.1, 0.1, 0.1, *(0.03 * np.ones(6)))
-        return (Template(tuple(map(float, sizes)), _decode),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Of ten inertial parameters."""
+        return {"dtheta": [float(value) for value in x]}
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """Link `joint` with its change."""
@@ -39,7 +39,3 @@ class LinkInertia(BodyEffect):
         """Part of the link."""
         more.dtheta[joint] += np.asarray(values["dtheta"], dtype=float)
         return None
-
-
-def _decode(x: Array) -> dict[str, Any]:
-    return {"dtheta": [float(v) for v in x]}

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.effects.base import (
-    LEVEL_BY_LOAD,
-    Array,
-    JointTorque,
-    Parameter,
-    Values,
-    smooth_sign,
-)
+from adapter.effects.base import LEVEL_BY_LOAD, Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, STILL
 
 
-class LoadDependentFriction(JointTorque):
+class LoadDependentFriction(LinearEffect):
     """Friction in proportion to the torque that the gear carries."""
 
     name = "load_dependent_friction"
@@ -35,14 +28,6 @@ class LoadDependentFriction(JointTorque):
     by_load = True
     shows = ((LOADS, "grows with the load"), (STILL, "fades or changes sign"))
 
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
-        """Fl |tau| sign(dq)."""
-        return np.asarray(values["Fl"] * np.abs(tau) * smooth_sign(dq, ddq, smoothing_s))
+    def column(self, at: JointSignals) -> Array:
+        """|tau| sign(dq)."""
+        return np.asarray(np.abs(at.tau) * at.direction)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, LinearEffect, Parameter, Values
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL
 from adapter.model.urdf_text import ARMATURE, Additions
@@ -16,17 +16,13 @@ class MotorInertia(LinearEffect):
     parameters = (Parameter("B", "kg m2"),)
     prior_std = 0.1  # a link-side sensor should see none; catalogue sizes are 0.05 to 0.3
     positive = ("B",)
-    phrase = Phrase(
-        "{who} {lacks} {x} of reflected motor inertia",
-        "B",
-        "{who} {has} {x} less motor inertia than the model says",
-    )
+    phrase = Phrase.lacks("B", "reflected motor inertia")
     shows = ((SPEEDS, "is gone"), (STILL, "is gone"))
     watched = True
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+    def column(self, at: JointSignals) -> Array:
         """ddq."""
-        return ddq
+        return at.ddq
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Armature, which MJCF has and URDF has not."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import FLANGE, Array, BodyEffect, Parameter, Template, Values
+from adapter.effects.base import BODY_STD, FLANGE, Array, BodyEffect, Parameter, Values
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import BARE
 from adapter.model.inertia import body_from_theta, six_from_tensor, tensor_from_six, theta_from_body
@@ -26,6 +26,7 @@ class Payload(BodyEffect):
         Parameter("cz", "m"),
         Parameter("inertia", "kg m2", count=6, optional=True),
     )
+    prior_std = BODY_STD
     positive = ("m",)
     phrase = Phrase(
         "the flange carries {x}", "m", "the flange carries {x} less than the model says"
@@ -35,10 +36,9 @@ class Payload(BodyEffect):
     watched = True
     is_theta = True
 
-    def templates(self) -> tuple[Template, ...]:
-        """Ten inertial parameters."""
-        sizes = (1.0, 0.1, 0.1, 0.1, *(0.03 * np.ones(6)))
-        return (Template(tuple(map(float, sizes)), parameters_of),)
+    def decode(self, x: Array) -> dict[str, Any]:
+        """Of ten inertial parameters."""
+        return parameters_of(x)
 
     def body(self, theta: Array, gravity: Array, joint: int, values: Values) -> tuple[Array, Array]:
         """The last link with the body."""

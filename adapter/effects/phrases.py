@@ -43,6 +43,18 @@ class Phrase:
     less: str = ""
     lengths: tuple[Length, ...] = ()
 
+    @classmethod
+    def lacks(cls, key: str, what: str) -> Phrase:
+        """Of a torque that the model lacks, or has too much of."""
+        less = f"{{who}} {{has}} {{x}} less {what} than the model says"
+        return cls(f"{{who}} {{lacks}} {{x}} of {what}", key, less)
+
+    @classmethod
+    def reads(cls, key: str, sensor: str) -> Phrase:
+        """Of a sensor that reads too much, or too little."""
+        said = f"the {sensor} of {{who}} reads {{x}} too"
+        return cls(f"{said} much", key, f"{said} little")
+
     @property
     def verb(self) -> str:
         """What several joints do: a model lacks what "{lacks}" says, the rest shows."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,11 @@ from adapter.effects.base import (
     LEVEL,
     TWO_LEVELS,
     Array,
+    JointSignals,
     JointTorque,
     Parameter,
     Template,
     Values,
-    smooth_sign,
 )
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL
@@ -43,37 +42,29 @@ class StribeckFriction(JointTorque):
 
     def templates(self) -> tuple[Template, ...]:
         """Both levels at several velocity scales."""
-        return tuple(
-            Template((1.0, 1.0), partial(_decode, vs), f"vs = {vs:g} rad/s") for vs in VELOCITIES
-        )
+        return tuple(map(_template, VELOCITIES))
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another vs."""
-        vs = ratio * float(values["vs"])
-        return Template((1.0, 1.0), partial(_decode, vs), f"vs = {vs:.3g} rad/s")
+        return _template(ratio * float(values["vs"]))
 
     def possible(self, values: Values) -> bool:
         """Friction that falls with speed, all of it positive."""
         return 0.0 < float(values["Fc"]) < float(values["Fs"])
 
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """The Stribeck curve."""
         level, rest, vs = (values[key] for key in ("Fc", "Fs", "vs"))
-        curve = level + (rest - level) * np.exp(-((dq / vs) ** 2))
-        return np.asarray(curve * smooth_sign(dq, ddq, smoothing_s))
+        curve = level + (rest - level) * np.exp(-((at.dq / vs) ** 2))
+        return np.asarray(curve * at.direction)
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """What stays in motion, as dry friction."""
         return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
 
 
-def _decode(vs: float, x: Array) -> dict[str, Any]:
-    return {"Fc": float(x[0]), "Fs": float(x[1]), "vs": vs}
+def _template(vs: float) -> Template:
+    def decode(x: Array) -> dict[str, Any]:
+        return {"Fc": float(x[0]), "Fs": float(x[1]), "vs": vs}
+
+    return Template((1.0, 1.0), decode, f"vs = {vs:.3g} rad/s")

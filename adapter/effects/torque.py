@@ -22,18 +22,6 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
-__all__ = [
-    "Active",
-    "ModelTorque",
-    "active_effects",
-    "added",
-    "bodies",
-    "lasting_effects",
-    "moved_links",
-    "sensed_torque",
-    "sensors",
-]
-
 
 def sensed_torque(motion: Motion, effects: Sequence[Active]) -> Array:
     """tau (m, n) that the sensors would read, stage by stage (see `effects.base`)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, Motion, Parameter, SensorEffect, Values
-from adapter.effects.by_joint import Tables
+from adapter.effects.by_joint import EffectSums, JointSignals
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import KNOWN_WEIGHT, LOADS
 
@@ -17,19 +17,13 @@ class TorqueGain(SensorEffect):
     title = "torque sensor gain"
     parameters = (Parameter("g", "1", lower=-0.95),)
     prior_std = 0.05
-    phrase = Phrase(
-        "the torque sensor of {who} reads {x} too much",
-        "g",
-        "the torque sensor of {who} reads {x} too little",
-    )
+    phrase = Phrase.reads("g", "torque sensor")
     shows = ((LOADS, "grows with the load"), (KNOWN_WEIGHT, "misreads it in proportion"))
     watched = True
 
-    def columns(
-        self, q: Array, dq: Array, ddq: Array, tau: Array, smoothing_s: float = 0.0
-    ) -> tuple[Array, ...]:
+    def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """The torque itself."""
-        return (tau,)
+        return (at.tau,)
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(1 + g) tau on the joint."""
@@ -37,7 +31,7 @@ class TorqueGain(SensorEffect):
         out[:, joint] *= 1.0 + float(values["g"])
         return out
 
-    def at_instant(self, tables: Tables, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """The gain."""
-        tables.log_gain[joint] += np.log1p(float(values["g"]))
+        sums.log_gain[joint] += np.log1p(float(values["g"]))
         return True

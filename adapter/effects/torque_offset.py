@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.effects.base import Array, LinearEffect, Parameter
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
 
 
@@ -15,16 +15,12 @@ class TorqueOffset(LinearEffect):
     title = "torque sensor offset"
     parameters = (Parameter("o", "N m"),)
     prior_std = 1.0
-    phrase = Phrase(
-        "the torque sensor of {who} reads {x} too much",
-        "o",
-        "the torque sensor of {who} reads {x} too little",
-    )
+    phrase = Phrase.reads("o", "torque sensor")
     after_sensors = True  # whatever else the sensors do
     sudden = True
     watched = True
     bundled = True
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+    def column(self, at: JointSignals) -> Array:
         """One."""
-        return np.ones_like(dq)
+        return np.ones_like(at.dq)

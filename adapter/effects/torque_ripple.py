@@ -9,6 +9,7 @@ import numpy as np
 
 from adapter.effects.base import (
     Array,
+    JointSignals,
     JointTorque,
     Parameter,
     Template,
@@ -41,17 +42,9 @@ class TorqueRipple(JointTorque):
         """Sine and cosine of each number per turn."""
         return tuple(Template((0.3, 0.3), partial(_decode, n), f"n = {n}") for n in NUMBERS)
 
-    def law(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        tau: Array,
-        values: Values,
-        smoothing_s: float = 0.0,
-    ) -> Array:
+    def law(self, at: JointSignals, values: Values) -> Array:
         """a sin(n q + phase)."""
-        return np.asarray(values["a"] * np.sin(values["n"] * q + values["phase"]))
+        return np.asarray(values["a"] * np.sin(values["n"] * at.q + values["phase"]))
 
 
 def _decode(n: int, x: Array) -> dict[str, Any]:

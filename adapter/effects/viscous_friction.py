@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, LinearEffect, Parameter, Values
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL
 from adapter.model.urdf_text import DAMPING, Additions
@@ -17,19 +17,15 @@ class ViscousFriction(LinearEffect):
     prior_std = 1.0  # published Panda values are 0.03 to 0.09 (Knezevic)
     positive = ("Fv",)
     inexact = 0.02
-    phrase = Phrase(
-        "{who} {lacks} {x} of viscous friction",
-        "Fv",
-        "{who} {has} {x} less viscous friction than the model says",
-    )
+    phrase = Phrase.lacks("Fv", "viscous friction")
     shows = ((SPEEDS, "rises in proportion to the speed"), (STILL, "is gone"))
     sudden = True
     watched = True
     bundled = True
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+    def column(self, at: JointSignals) -> Array:
         """dq."""
-        return dq
+        return at.dq
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Damping."""

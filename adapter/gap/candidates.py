@@ -31,9 +31,10 @@ from adapter.effects.base import (
     TorqueEffect,
     Values,
     on_joint,
-    smooth_sign,
 )
+from adapter.effects.by_joint import smooth_sign
 from adapter.effects.torque import added, bodies, moved_links, sensors
+from adapter.gap.result import UNEXPLAINED
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
@@ -95,11 +96,15 @@ class Stages:
     sensed: Array
     bare: Array
 
+    @property
+    def unmoved(self) -> bool:
+        """Whether the links move as the joint sensors say."""
+        return self.links.q is self.signals.motion.q
+
     def low_regressor(self, link: int | None = None, gate: Array | None = None) -> Array:
         """(c, k, n) regressor in the band: of one link (from 0) or all, while a gate is open."""
         rows = slice(None) if link is None else slice(10 * link, 10 * link + 10)
-        unmoved = self.links.q is self.signals.motion.q
-        if unmoved and gate is None:
+        if self.unmoved and gate is None:
             return self.signals.low_regressor[rows]
         Y = self.links.arm.regressor(self.links.q, self.links.dq, self.links.ddq)
         Y = Y[:, :, rows] if gate is None else Y[:, :, rows] * gate[:, :, None]
@@ -156,12 +161,20 @@ def signatures(
             k = 10 * (joint if joint >= 0 else n - 1)
             columns = tuple(range(k, k + 10))
         else:
-            tables.append(_differences(at, effect, template, joint))
+            tables.append(_signatures(at, effect, template, joint))
             columns = tuple(range(size, size + len(template.prior_std)))
             size += len(columns)
         odds = _log_odds(effect, joint, n)
         candidates.append(Candidate(effect, template, joint, columns, odds))
     return np.concatenate(tables), candidates
+
+
+def _signatures(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
+    """(c, k, n) of one effect; those that hang on the measured motion alone are kept."""
+    if isinstance(effect, TorqueEffect) and not effect.by_load and at.unmoved:
+        key = effect.name, template.label, joint
+        return at.signals.once(key, lambda: _differences(at, effect, template, joint))
+    return _differences(at, effect, template, joint)
 
 
 def _differences(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
@@ -192,7 +205,6 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
     return bodies(links, (Active(effect, joint, values),)) - at.bare
 
 
-UNEXPLAINED = "unexplained"
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
 SLOW_PIECES = 10  # over time
 SIZE_NM = 0.3
@@ -222,6 +234,7 @@ class Pattern(TorqueEffect):
         self.name = f"{UNEXPLAINED}:{label}"  # type: ignore[misc]
         self.parameters = (Parameter("x", "N m", count=count),)  # type: ignore[misc]
         self.depends_on, self.basis, self._count = depends_on, basis, count
+        self.by_load = any(name.startswith("tau") for name in depends_on)  # type: ignore[misc]
         self.log_odds = log_odds  # type: ignore[misc]
 
     @property

@@ -55,42 +55,67 @@ def scores(G: Array, g: Array, prior_std: Array) -> tuple[Array, Array, Array]:
     return 0.5 * (chi2 - np.linalg.slogdet(A)[1]), chi2, prior_std * x
 
 
-class Carried:
-    """What is carried along: its signatures, their priors, and what they do to others.
+class Normal:
+    """Least squares with a prior, by products of signatures: what is known of coefficients.
+
+    Args:
+        G: (c, c) products of white signatures with one another; g: (c,) with the data.
+        prior_std: (c,) of the coefficients; the prior's mean is zero.
+
+    Attributes:
+        x: (c,) most probable coefficients.
+    """
+
+    def __init__(self, G: Array, g: Array, prior_std: Array) -> None:
+        self.G, self.g, self.prior_std = G, g, prior_std
+        self._factor = cho_factor(G + np.diag(prior_std**-2.0), lower=True)
+        self.x = cho_solve(self._factor, g)
+
+    def covariance(self) -> Array:
+        """(c, c) of its coefficients after the data."""
+        return np.asarray(cho_solve(self._factor, np.eye(len(self.g))))
+
+    def std(self) -> Array:
+        """(c,) of its coefficients after the data."""
+        return np.sqrt(np.diagonal(self.covariance()))
+
+    def part(self, at: np.ndarray) -> Normal:
+        """Some of its coefficients alone."""
+        return Normal(self.G[np.ix_(at, at)], self.g[at], self.prior_std[at])
+
+    def worth(self, own: np.ndarray, rest: np.ndarray) -> Score:
+        """Evidence of some of its coefficients, `rest` carried along with them."""
+        G, C = self.G[np.ix_(own, own)], self.G[np.ix_(own, rest)]
+        return score(*self.part(rest).reduced(G, C, self.g[own]), self.prior_std[own])
+
+    def reduced(self, G: Array, C: Array, g: Array) -> tuple[Array, Array]:
+        """(G, g) of further signatures once these have explained what they can.
+
+        Products G (..., k, k) with one another, C (..., k, c) with these, g (..., k) with the data.
+        """
+        solved = self.solved(C)
+        return G - solved @ np.swapaxes(C, -1, -2), g - solved @ self.g
+
+    def solved(self, C: Array) -> Array:
+        """C A^-1 of products C (..., c) with these, A their information."""
+        flat = C.reshape(-1, C.shape[-1])
+        return np.asarray(cho_solve(self._factor, flat.T).T.reshape(C.shape))
+
+
+class Carried(Normal):
+    """What is carried along, with its signatures.
 
     Args:
         N: (c, r) white signatures; prior_std: (c,); data: (r,) white residual.
     """
 
     def __init__(self, N: Array, prior_std: Array, data: Array) -> None:
-        self.N, self.prior_std, self.data = N, prior_std, data
-        self.g = N @ data
-        information = N @ N.T
-        information[np.diag_indices(len(N))] += prior_std**-2.0
-        self._factor = cho_factor(information, lower=True)
-        self.x = cho_solve(self._factor, self.g)
-
-    def covariance(self) -> Array:
-        """(c, c) of its coefficients after the data."""
-        return np.asarray(cho_solve(self._factor, np.eye(len(self.N))))
-
-    def std(self) -> Array:
-        """(c,) of its coefficients after the data."""
-        return np.sqrt(np.diagonal(self.covariance()))
+        self.N, self.data = N, data
+        super().__init__(N @ N.T, N @ data, prior_std)
 
     def without(self, X: Array) -> tuple[Array, Array]:
         """(G, g) of signatures X (k, r) once the carried ones have explained what they can."""
         return self.reduced(X @ X.T, X @ self.N.T, X @ self.data)
-
-    def reduced(self, G: Array, C: Array, g: Array) -> tuple[Array, Array]:
-        """The same from products: G (..., k, k), C (..., k, c) with the carried, g (..., k)."""
-        solved = self.solved(C)
-        return G - solved @ np.swapaxes(C, -1, -2), g - solved @ self.g
-
-    def solved(self, C: Array) -> Array:
-        """C A^-1 of products C (..., c) with the carried, A their information."""
-        flat = C.reshape(-1, C.shape[-1])
-        return np.asarray(cho_solve(self._factor, flat.T).T.reshape(C.shape))
 
 
 ORDER = 6  # at 25 Hz

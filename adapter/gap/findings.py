@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -82,32 +82,16 @@ def _flat(values: dict[str, Any]) -> Array:
     return np.concatenate([np.atleast_1d(np.asarray(v, dtype=float)) for v in values.values()])
 
 
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What a search comes to.
-
-    Attributes:
-        findings: effects that the model lacks; unexplained: what no effect explains.
-        where: what the nominal model's residual follows, see `disagreement`.
-        noise_floor_nm: (n,) of the torques.
-    """
-
-    findings: tuple[Finding, ...]
-    unexplained: tuple[Leftover, ...]
-    where: tuple[dict[str, Any], ...]
-    noise_floor_nm: Array
-
-
-def told_of(found: Found, ends: Sequence[float], curves: Curves) -> Told:
-    """What there is to tell.
+def told_of(
+    found: Found, ends: Sequence[float]
+) -> tuple[tuple[Finding, ...], tuple[Leftover, ...]]:
+    """Effects that the model lacks, and what no effect explains.
 
     Args:
         found: of the search; ends: (recordings,) s, when each ends.
-        curves: of the first recording.
     """
-    left, floor = leftovers_of(found, ends), noise_floor(found.fit)
-    findings = doubted(findings_of(found, ends), left)
-    return Told(findings, left, tuple(disagreement(curves, floor)), floor)
+    left = leftovers_of(found, ends)
+    return doubted(findings_of(found, ends), left), left
 
 
 def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
@@ -190,7 +174,7 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
         shares = {name: explained(residual[:, j], x) for name, x in signals.items()}
         follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
-        size = float(np.sqrt(np.mean(residual[:, j] ** 2)))
+        size = _rms(residual[:, j])
         names = tuple(follows) or (f"q{j + 1}", "t")
         out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, ends[0])))
     return out
@@ -205,7 +189,7 @@ def _outbursts(fit: Fit) -> list[Leftover]:
     for j in range(fit.n):
         rows = counted[:, j]
         spans = [w for w in np.unique(window[rows]) if np.sum(rows & (window == w)) >= FEW_ROWS]
-        sizes = [float(np.sqrt(np.mean(residual[rows & (window == w), j] ** 2))) for w in spans]
+        sizes = [_rms(residual[rows & (window == w), j]) for w in spans]
         if len(sizes) < FEW_SPANS:
             continue
         usual, worst = float(np.median(sizes)), int(np.argmax(sizes))
@@ -230,48 +214,47 @@ def doubted(findings: Sequence[Finding], leftovers: Sequence[Leftover]) -> tuple
 
 
 def _patterns_left(found: Found, ends: Sequence[float]) -> tuple[Leftover, ...]:
-    """What patterns found."""
-    fit = found.fit
-    out = []
+    """What patterns found, on each joint that is not merely its named effects' inexactness."""
+    fit, out = found.fit, []
     for j in range(fit.n):
-        own = [
-            (k, e)
-            for k, e in enumerate(fit.named)
-            if isinstance(e.candidate.effect, Pattern) and e.candidate.joint == j
-        ]
+        own = [k for k, e in enumerate(fit.named) if e.is_pattern and e.candidate.joint == j]
         if not own:
             continue
-        parts = [fit.model.contribution(0, k)[:, j] for k, _ in own]
+        parts = [fit.model.contribution(0, k)[:, j] for k in own]
         left, pattern = fit.model.residual(0)[:, j], np.sum(parts, axis=0)
-        floor, rmse = (float(np.sqrt(np.mean(x**2))) for x in (left, left + pattern))
-        named = [
-            float(np.sqrt(np.mean(fit.model.contribution(e.recording or 0, k)[:, j] ** 2)))
-            for k, e in enumerate(fit.named)
-            if e.candidate.effect.inexact
-        ]
-        size = float(np.sqrt(np.mean(pattern**2)))
-        if rmse < VISIBLE * floor or size < DISCREPANCY * max(named, default=0.0):
+        floor, rmse = _rms(left), _rms(left + pattern)
+        if rmse < VISIBLE * floor or _rms(pattern) < DISCREPANCY * _idealised(fit, j):
             continue
         order = np.argsort([-np.mean(part**2) for part in parts])
-        signals = [s for i in order for s in own[i][1].candidate.effect.depends_on]
-        interval = next((e.interval_s for _, e in own if e.interval_s != WHOLE), WHOLE)
-        out.append(
-            Leftover(
-                joint=j + 1,
-                rmse_nm=rmse,
-                noise_floor_nm=floor,
-                depends_on=tuple(dict.fromkeys(signals)),
-                interval_s=(max(interval[0], 0.0), min(interval[1], ends[0])),
-            )
-        )
+        signals = [s for i in order for s in fit.named[own[i]].candidate.effect.depends_on]
+        dated = (fit.named[k].interval_s for k in own)
+        begin, end = next((x for x in dated if x != WHOLE), WHOLE)
+        interval = max(begin, 0.0), min(end, ends[0])
+        out.append(Leftover(j + 1, rmse, floor, tuple(dict.fromkeys(signals)), interval))
     return tuple(out)
+
+
+def _idealised(fit: Fit, joint: int) -> float:
+    """Torque on a joint (from 0) of the largest named effect that is an idealisation, N m rms."""
+    return max(
+        (
+            _rms(fit.model.contribution(e.recording or 0, k)[:, joint])
+            for k, e in enumerate(fit.named)
+            if e.candidate.effect.inexact
+        ),
+        default=0.0,
+    )
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x**2)))
 
 
 BINS = 12
 SIGNALS = ("q", "dq", "ddq", "tau")
 
 
-def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
+def disagreement(curves: Curves, noise_floor_nm: Array) -> tuple[dict[str, Any], ...]:
     """Of the nominal model, joint by joint.
 
     Returns:
@@ -282,7 +265,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
     out = []
     for j in range(curves.before.shape[1]):
         residual = curves.before[:, j]
-        rmse = float(np.sqrt(np.mean(residual**2)))
+        rmse = _rms(residual)
         signals = {f"{name}{j + 1}": getattr(curves, name)[:, j] for name in SIGNALS}
         signals["t"] = curves.t
         shares = {name: explained(residual, x) for name, x in signals.items()}
@@ -294,7 +277,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> list[dict[str, Any]]:
                 "follows": dict(sorted(shares.items(), key=lambda pair: -pair[1])),
             }
         )
-    return out
+    return tuple(out)
 
 
 def explained(residual: Array, x: Array) -> float:

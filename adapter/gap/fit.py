@@ -20,7 +20,7 @@ from adapter.effects.base import ArmDynamics, TorqueEffect
 from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
-from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of, score
+from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
@@ -382,9 +382,7 @@ def _jumps(torque: Array) -> Array:
 
 def worth(fit: Fit, carried: Carried, place: int) -> Score:
     """Evidence of one of the named effects, what is carried with it eliminated."""
-    own, rest = beside(fit, place)
-    others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
-    return score(*others.without(carried.N[own]), carried.prior_std[own])
+    return carried.worth(*beside(fit, place))
 
 
 def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:

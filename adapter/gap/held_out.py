@@ -13,8 +13,8 @@ from adapter.errors import ModelError
 from adapter.gap.evidence import Carried
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
+from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of
 from adapter.gap.result import Curves, RolloutCurves, Shortfall
-from adapter.gap.rivals import FOLD_S, FOLDS, block_s, fold_of, fold_rows
 from adapter.gap.search import Found
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
 from adapter.model.inertia import is_consistent
@@ -67,20 +67,10 @@ def model_of(model: SelfModel, fit: Fit) -> SelfModel:
     return replace(model, theta=theta, effects=(*model.effects, *entries(fit)))
 
 
-def held_out_coefficients(fit: Fit, carried: Carried) -> list[Array]:
-    """Coefficients of a fit, one set per fold, each without that fold's blocks of time.
-
-    Names, dates and the noise are those that all data gave; what is fitted is refitted.
-    """
-    fold = fold_rows(fit)
-    seen = [fold != f for f in range(FOLDS)]
-    return [Carried(carried.N[:, s], carried.prior_std, carried.data[s]).x for s in seen]
-
-
 def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfModel]:
     """One model per fold: the named effects refitted without that fold's blocks of time."""
     models = []
-    for x in held_out_coefficients(fit, carried):
+    for x in Folds.of(fit, carried).coefficients():
         try:
             models.append(model_of(model, fit.at(x)))
         except ModelError:  # a coefficient at its bound without these data
@@ -202,7 +192,7 @@ def _off(simulated: Array, measured: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class GapTask:
     """What there is to work with.
 
     Attributes:
@@ -247,7 +237,7 @@ class HeldOut:
 
 
 def measure(
-    task: Task, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
+    task: GapTask, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
     found = _corrected_where_it_pays(task, found)
@@ -288,7 +278,7 @@ def lasting(model: SelfModel) -> SelfModel:
     return replace(model, effects=tuple(kept))
 
 
-def _corrected_where_it_pays(task: Task, found: Found) -> Found:
+def _corrected_where_it_pays(task: GapTask, found: Found) -> Found:
     """Without the corrections of the inertias where they do not pay on held-out data."""
     bare = uncorrected(found)
     level = noise_floor(found.fit)
@@ -317,7 +307,7 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     own, model = found.fit.recordings[i], found.fit.model
     nominal = Model((own,), np.zeros_like(found.fit.dtheta), known=model.known)
     after = np.empty_like(own.tau)
-    for f, x in enumerate(held_out_coefficients(found.fit, found.carried)):
+    for f, x in enumerate(Folds.of(found.fit, found.carried).coefficients()):
         rows = fold_of(own.t, block_s(found.fit)) == f
         after[rows] = found.fit.at(x).without_patterns().model.residual(i)[rows]
     rows = np.searchsorted(own.motion.t, own.t - 1e-9)

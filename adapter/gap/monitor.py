@@ -15,17 +15,56 @@ from typing import Any
 
 import numpy as np
 
-from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Blocks, Group, Level
+from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
+from adapter.signals.records import StateLayout, stamp_of
 
+BLOCK_NS = 40_000_000  # states averaged to one row: 25 rows a second
+HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
 ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
 KEEP = 1.0 - 0.2 / 120.0  # of the belief, from one group to the next
 MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
 START_INFLATION = 2.0  # of sums of rows, before it is measured
+
+
+class Blocks:
+    """Averages states to rows; cheap for each of them.
+
+    Args:
+        n: joints.
+    """
+
+    def __init__(self, n: int) -> None:
+        at = StateLayout(n)
+        self._n, self._signals = n, slice(at.q.start, at.tau.stop)
+        self._sum = np.zeros(4 * n)
+        self._count, self._begin_ns, self._last_ns, self._stamps = 0, 0, 0, 0
+
+    def add(self, table: Array) -> list[tuple[float, Array]]:
+        """Take states (m, size); rows (s, (4 n,)) of the blocks that they complete."""
+        return [row for state in table if (row := self._add_one(state)) is not None]
+
+    def _add_one(self, state: Array) -> tuple[float, Array] | None:
+        stamp = stamp_of(state)
+        done = None
+        if self._count and not 0 < stamp - self._last_ns <= HOLE_NS:
+            self._count = 0
+        elif self._count and stamp - self._begin_ns >= BLOCK_NS:
+            middle = self._begin_ns + self._stamps / self._count
+            done = 1e-9 * middle, self._sum / self._count
+            self._count = 0
+        if not self._count:
+            self._sum[:] = 0.0
+            self._begin_ns, self._stamps = stamp, 0
+        self._sum += state[self._signals]
+        self._stamps += stamp - self._begin_ns
+        self._count += 1
+        self._last_ns = stamp
+        return done
 
 
 class Monitor:
@@ -49,7 +88,7 @@ class Monitor:
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
         self._blocks, self._found = Blocks(n), DisagreementList(say)
         self._frames: LearnedFrames | None = None
-        self._groups: list[Group] = []
+        self._groups: list[RowGroup] = []
         self._rows: list[tuple[float, Array]] = []
 
     @property
@@ -113,9 +152,7 @@ class Monitor:
         if len(self._groups) == GROUPS:
             self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
-    def _group(
-        self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array
-    ) -> Group:
+    def _group(self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array) -> RowGroup:
         q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
         Y = frames.regressor(q, dq, ddq)
         tool = Y[:, :, -10:] @ self._tool
@@ -126,11 +163,11 @@ class Monitor:
         for k in range(columns.shape[1]):
             Z[:, joints, links + k * self._n + joints] = columns[:, k]
         model = Z @ self._belief.mean()[: self._size] + tool
-        return Group(t, Z, frames.signatures(q, dq, ddq, model, Y), tau - tool)
+        return RowGroup(t, Z, frames.signatures(q, dq, ddq, model, Y), tau - tool)
 
-    def _absorb(self, group: Group) -> None:
+    def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""
-        Z = self._found.columns(group.t, group.Z, group.S)
+        Z = self._found.columns(group)
         weight = self._found.weights(group.t, self._level.weight)
         residual = group.tau - Z @ self._belief.mean()
         if (weight == self._level.weight).all():

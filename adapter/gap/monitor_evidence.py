@@ -11,19 +11,16 @@ G and b its information and right side with x integrated out, P the prior's info
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from adapter.gap.evidence import score, scores
 from adapter.gap.monitor_signatures import Signature
 from adapter.model.spatial import Array
-from adapter.signals.records import StateLayout, stamp_of
 
-BLOCK_NS = 40_000_000  # states averaged to one row: 25 rows a second
-HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
 ROWS_PER_GROUP = 5
 CLIP = 9.0  # times its level: what a row says at most about the level
 LEVEL_ROWS, LEVEL_SUMS = 250.0, 40.0  # rows and sums that the level is averaged over
@@ -80,32 +77,39 @@ class Belief:
         self.H = self.H[np.ix_(rest, rest)] - cross @ gain[:, :-1]
 
 
-@dataclass(frozen=True)
-class Window:
-    """The last seconds, in groups of rows one after the other: g groups of r rows.
+@dataclass(frozen=True, eq=False)
+class RowGroup:
+    """Rows one after the other, with all that is computed of them once.
 
     Attributes:
-        t: (g r,) s; Z: (g r, n, D); S: (g r, n, K); tau: (g r, n); weight: (g r, n).
+        t: (r,) s.
+        Z: (r, n, D) regressor and columns of the learned effects.
+        S: (r, n, K) signatures; tau: (r, n) N m.
     """
 
     t: Array
     Z: Array
     S: Array
     tau: Array
-    weight: Array
+
+    @classmethod
+    def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:
+        """One group of all rows of several."""
+        keys = ("t", "Z", "S", "tau")
+        return cls(*(np.concatenate([getattr(group, key) for group in groups]) for key in keys))
 
 
 class Evidence:
     """Evidence of any candidate from any start, on rows and a belief.
 
     Args:
-        rows: the last seconds.
+        rows: the last seconds; weight: (r, n) of each row on each joint.
         belief: from before them.
     """
 
-    def __init__(self, rows: Window, belief: Belief) -> None:
-        self.rows = rows
-        root = np.sqrt(rows.weight)
+    def __init__(self, rows: RowGroup, weight: Array, belief: Belief) -> None:
+        self.rows, self.weight = rows, weight
+        root = np.sqrt(weight)
         self._Z = rows.Z * root[:, :, None]
         self._S = rows.S * root[:, :, None]
         mean = belief.mean()
@@ -129,14 +133,16 @@ class Evidence:
         """(D,) by which the rows move the belief's mean."""
         return np.asarray(self._inverse.T @ self._pull)
 
-    def information(self, step: int, columns: np.ndarray | None = None) -> tuple[Array, Array]:
-        """(s, k, k) G and (s, k) b for starts at every `step` rows, the first row first."""
-        S = self._S if columns is None else self._S[:, :, columns]
+    def information(
+        self, step: int, columns: Array | slice = slice(None), first: int = 0
+    ) -> tuple[Array, Array]:
+        """(s, k, k) G and (s, k) b for starts at every `step` rows from the row `first` on."""
+        S = self._S[first:, :, columns]
         D, K = self._Z.shape[2], S.shape[2]
         blocks = len(S) // step
-        Zb = self._Z.reshape(blocks, -1, D).transpose(0, 2, 1)
+        Zb = self._Z[first:].reshape(blocks, -1, D).transpose(0, 2, 1)
         Sb = S.reshape(blocks, -1, K)
-        rb = self._r.reshape(blocks, -1, 1)
+        rb = self._r[first:].reshape(blocks, -1, 1)
         back = slice(None, None, -1)
         B = np.cumsum((Zb @ Sb)[back], axis=0)[back]
         C = np.cumsum((Sb.transpose(0, 2, 1) @ Sb)[back], axis=0)[back]
@@ -145,87 +151,18 @@ class Evidence:
         return C - X.transpose(0, 2, 1) @ X, b - self._pull @ X
 
     def from_row(self, first: int) -> tuple[Array, Array]:
-        """(K, K) G and (K,) b of all columns for a start at one row."""
-        K = self._S.shape[2]
-        S = self._S[first:].reshape(-1, K)
-        B = self._Z[first:].reshape(len(S), -1).T @ S
-        X = self._inverse @ B
-        b = S.T @ self._r[first:].ravel() - X.T @ self._pull
-        return S.T @ S - X.T @ X, b
+        """(1, K, K) G and (1, K) b of all columns for a start at one row."""
+        return self.information(len(self._S) - first, first=first)
 
     def leftover(self, candidate: Signature, a: Array, first: int) -> Array:
         """(rows, n) residual that stays when the candidate acts with coefficients a."""
         added = self.rows.S[:, :, candidate.columns] @ a
         added[:first] = 0.0
-        root = np.sqrt(self.rows.weight)
+        root = np.sqrt(self.weight)
         D = self._Z.shape[2]
         right = self._Z.reshape(-1, D).T @ (self._r - added * root).ravel()
         shift = self._inverse.T @ (self._inverse @ right)
         return np.asarray(self.residual - added - self.rows.Z @ shift)
-
-
-def log_evidence(signature: Signature, G: Array, b: Array) -> Array:
-    """(s,) L of a signature from its own G (s, k, k) and b (s, k)."""
-    return scores(G, b, signature.std)[0] + signature.log_odds
-
-
-def coefficients(signature: Signature, G: Array, b: Array) -> Array:
-    """(k,) most likely coefficients from G (k, k) and b (k,)."""
-    return score(G, b, signature.std).x
-
-
-class Blocks:
-    """Averages states; cheap for each of them.
-
-    Args:
-        n: joints.
-    """
-
-    def __init__(self, n: int) -> None:
-        at = StateLayout(n)
-        self._n, self._signals = n, slice(at.q.start, at.tau.stop)
-        self._sum = np.zeros(4 * n)
-        self._count, self._begin_ns, self._last_ns, self._stamps = 0, 0, 0, 0
-
-    def add(self, table: Array) -> list[tuple[float, Array]]:
-        """Take states (m, size); rows (s, (4 n,)) of the blocks that they complete."""
-        if len(table) == 1:
-            done = self._add_one(table[0])
-            return [] if done is None else [done]
-        return [row for state in table if (row := self._add_one(state)) is not None]
-
-    def _add_one(self, state: Array) -> tuple[float, Array] | None:
-        stamp = stamp_of(state)
-        done = None
-        if self._count and not 0 < stamp - self._last_ns <= HOLE_NS:
-            self._count = 0
-        elif self._count and stamp - self._begin_ns >= BLOCK_NS:
-            middle = self._begin_ns + self._stamps / self._count
-            done = 1e-9 * middle, self._sum / self._count
-            self._count = 0
-        if not self._count:
-            self._sum[:] = 0.0
-            self._begin_ns, self._stamps = stamp, 0
-        self._sum += state[self._signals]
-        self._stamps += stamp - self._begin_ns
-        self._count += 1
-        self._last_ns = stamp
-        return done
-
-
-@dataclass(eq=False)
-class Group:
-    """`ROWS_PER_GROUP` rows with all that is computed of them once.
-
-    Attributes:
-        t: (r,) s; Z: (r, n, D0) regressor and the learned effects' columns; S: (r, n, K)
-            signatures; tau: (r, n).
-    """
-
-    t: Array
-    Z: Array
-    S: Array
-    tau: Array
 
 
 class Level:

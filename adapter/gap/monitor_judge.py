@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from adapter.gap.monitor_evidence import (
-    ROWS_PER_GROUP,
-    Belief,
-    Evidence,
-    Group,
-    Level,
-    Window,
-    coefficients,
-    log_evidence,
-)
+from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Evidence, Level, RowGroup
 from adapter.gap.monitor_signatures import Signature, candidates
+from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
 GROUPS = 10  # in the window, 0.2 s each
@@ -54,11 +46,11 @@ class DisagreementDetector:
         self._peaks, self._power_peak = np.zeros(len(self._candidates)), np.ones(n)
         self._recent: list[Array] = []
         self._powers: list[Array] = []
-        self._groups: Sequence[Group] = ()
+        self._groups: Sequence[RowGroup] = ()
         self._judged, self._now_s = GROUPS, 0.0
         self._quiet_until_s, self._began_s = -np.inf, np.inf
 
-    def judge(self, groups: Sequence[Group], now_s: float) -> None:
+    def judge(self, groups: Sequence[RowGroup], now_s: float) -> None:
         """Look at a window: what is over, what is new."""
         self._groups, self._now_s = groups, now_s
         self._judged += 1
@@ -66,7 +58,7 @@ class DisagreementDetector:
         evidence = self._evidence()
         G, b = evidence.information(ROWS_PER_GROUP)
         scores = np.array(
-            [log_evidence(c, _block(G, c.columns), b[:, c.columns]) for c in self._candidates]
+            [c.evidence(_block(G, c.columns), b[:, c.columns]) for c in self._candidates]
         )
         left = evidence.residual - evidence.rows.Z @ evidence.shift
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
@@ -86,13 +78,10 @@ class DisagreementDetector:
         self._powers = [np.ones_like(x) for x in self._powers]
 
     def _evidence(self, weight: Array | None = None) -> Evidence:
-        t, Z, S, tau = (
-            np.concatenate([getattr(g, key) for g in self._groups])
-            for key in ("t", "Z", "S", "tau")
-        )
+        rows = RowGroup.joined(self._groups)
         if weight is None:
-            weight = self._found.weights(t, self._level.weight)
-        return Evidence(Window(t, self._found.columns(t, Z, S), S, tau, weight), self._belief)
+            weight = self._found.weights(rows.t, self._level.weight)
+        return Evidence(replace(rows, Z=self._found.columns(rows)), weight, self._belief)
 
     def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
         """Notice that something reported acts no more."""
@@ -128,7 +117,7 @@ class DisagreementDetector:
         if end_s <= found.since_s + EDGE_S:
             return -np.inf
         found.over_s = end_s
-        ended = self._evidence(evidence.rows.weight)
+        ended = self._evidence(evidence.weight)
         found.over_s = np.inf
         return ended.total - evidence.total
 
@@ -143,7 +132,7 @@ class DisagreementDetector:
             return
         candidate, t = self._candidates[which], evidence.rows.t
         G, b = evidence.information(1, candidate.columns)
-        fine = log_evidence(candidate, G, b)
+        fine = candidate.evidence(G, b)
         first = int(np.argmax(fine))
         if fine[first] - fine[0] < NEW:  # it may have been there all along: nothing new
             return
@@ -156,22 +145,20 @@ class DisagreementDetector:
 
     def _name(self, evidence: Evidence, first: int, score: float, may_wait: bool) -> None:
         """Tell what began at row `first`, unless it may wait and two names are close."""
-        t, weight = evidence.rows.t, evidence.rows.weight.copy()
+        t, weight = evidence.rows.t, evidence.weight.copy()
         since_s = float(t[first]) - HALF_ROW_S
         weight[np.abs(t - since_s) < EDGE_S] = 0.0
         clear = self._evidence(weight)
         G, b = clear.from_row(first)
-        fits = [(_block(G[None], c.columns), b[None, c.columns]) for c in self._candidates]
-        best = np.array(
-            [log_evidence(c, *fit)[0] for c, fit in zip(self._candidates, fits, strict=True)]
-        )
+        fits = [(_block(G, c.columns), b[:, c.columns]) for c in self._candidates]
+        best = np.array([c.evidence(*x)[0] for c, x in zip(self._candidates, fits, strict=True)])
         order = np.argsort(-best)
         which = int(order[0])
         close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - MARGIN]
         if close and may_wait:
             return
         candidate = self._candidates[which]
-        a = coefficients(candidate, fits[which][0][0], fits[which][1][0])
+        a = candidate.coefficients(*(x[0] for x in fits[which]))
         joints = self._left(clear, candidate, a, first)
         if joints:
             self._found.unexplained(joints, since_s, self._now_s, score)
@@ -188,7 +175,7 @@ class DisagreementDetector:
         whole = np.sum(evidence.residual[late] ** 2, axis=0)
         much = np.mean(left, axis=0) > LEFT_RATIO * self._level.row
         much &= left.sum(axis=0) > LEFT_SHARE * whole
-        return [int(j) for j in np.flatnonzero(much & (evidence.rows.weight[-1] > 0.0))]
+        return [int(j) for j in np.flatnonzero(much & (evidence.weight[-1] > 0.0))]
 
     def _report_power(self, power: Array) -> None:
         """Something that no candidate looks like, but that is there for a second."""
@@ -215,7 +202,6 @@ def _block(G: Array, columns: np.ndarray) -> Array:
     return np.asarray(G[:, columns[:, None], columns])
 
 
-UNEXPLAINED = "unexplained"
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states
 MUTED = 1e-3  # weight of a joint with something unexplained
 
@@ -313,14 +299,14 @@ class DisagreementList:
         found.over_s = found.entry["over_s"] = over_s
         self._say(sentence(found.entry))
 
-    def columns(self, t: Array, Z: Array, S: Array) -> Array:
-        """Z (m, n, D0) with the columns of what was reported, where it acts."""
-        parts = [Z]
+    def columns(self, rows: RowGroup) -> Array:
+        """(r, n, D) the rows' Z with the columns of what was reported, where it acts."""
+        parts = [rows.Z]
         for found in self.active:
             if found.candidate is not None:
-                on = found.on(t)[:, None, None]
-                parts.append(S[:, :, found.candidate.columns] * on)
-        return np.concatenate(parts, axis=2) if len(parts) > 1 else Z
+                on = found.on(rows.t)[:, None, None]
+                parts.append(rows.S[:, :, found.candidate.columns] * on)
+        return np.concatenate(parts, axis=2) if len(parts) > 1 else rows.Z
 
     def weights(self, t: Array, level: Array) -> Array:
         """(m, n); next to nothing for joints that nothing explains, nothing around the edges."""

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.base import FLANGE, START_ODDS, Effect
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE
+from adapter.gap.evidence import score, scores
 from adapter.model.spatial import Array
 from adapter.physics import kernels
 
@@ -53,6 +55,14 @@ class Signature:
         """From 1; none at the flange."""
         return [] if self.joint < 0 else [self.joint + 1]
 
+    def evidence(self, G: Array, b: Array) -> Array:
+        """(s,) ln of how much better it explains than nothing, from its G (s, k, k), b (s, k)."""
+        return scores(G, b, self.std)[0] + self.log_odds
+
+    def coefficients(self, G: Array, b: Array) -> Array:
+        """(k,) most likely coefficients from its G (k, k) and b (k,)."""
+        return score(G, b, self.std).x
+
     def decode(self, x: Array) -> dict[str, Any]:
         """Coefficients (k,) as parameters of the catalogue, those that are one number."""
         if self.effect.is_theta and x[0] < SMALLEST_MASS:
@@ -68,7 +78,7 @@ def watched() -> tuple[list[Effect], list[Effect]]:
 
 
 def candidates(n: int) -> tuple[Signature, ...]:
-    """All of them for n joints, in the order of the columns of `LearnedFrames.signatures`."""
+    """All of them for an arm of n joints, in the order of `LearnedFrames.signatures`."""
     found, at = [], 0
     at_joints, at_flange = watched()
     for effect in at_joints:
@@ -110,9 +120,10 @@ class LearnedFrames:
     def signatures(self, q: Array, dq: Array, ddq: Array, tau: Array, Y: Array) -> Array:
         """(m, n, K) torque per unit of each coefficient; tau (m, n) is the model's, Y its own."""
         joints, parts = np.arange(self.n), []
+        at = JointSignals(q, dq, ddq, tau, self._smoothing_s)
         at_joints, at_flange = watched()
         for effect in at_joints:
-            for column in effect.columns(q, dq, ddq, tau, self._smoothing_s):
+            for column in effect.columns(at):
                 table = np.zeros((*q.shape, self.n))
                 table[:, joints, joints] = column
                 parts.append(table)

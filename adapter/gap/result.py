@@ -3,12 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from adapter.model.spatial import Array
+
+UNEXPLAINED = "unexplained"  # the name of what no effect of the catalogue explains
+
+# Of `GapResult`, as they are in the JSON file.
+IN_FILE = (
+    "problem",
+    "noise_floor_nm",
+    "before",
+    "after",
+    "model_out",
+    "where",
+    "what_next",
+    "stopped_after_rounds",
+    "notes",
+    "recordings",
+    "model_in",
+    "joint_names",
+    "wall_s",
+)
 
 
 @dataclass(frozen=True)
@@ -45,38 +64,10 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """As in the JSON file."""
-        return {
-            "effect": self.effect,
-            "joints": list(self.joints),
-            "interval_s": list(self.interval_s),
-            "lasting": self.lasting,
-            "parameters": self.parameters,
-            "std": self.std,
-            "units": self.units,
-            "evidence": self.evidence,
-            "ambiguous_with": list(self.overlaps),
-            "overlap": self.overlaps,
-            "split_by": self.split_by,
-            "z": self.detectability,
-            "torque_rms_nm": self.torque_rms_nm.tolist(),
-        }
-
-    def entry(self) -> dict[str, Any]:
-        """As in a model file; what lasts has no end there, what lasted throughout no start."""
-        return {
-            "effect": self.effect,
-            "joints": list(self.joints),
-            "interval_s": self._file_interval(),
-            "parameters": self.parameters,
-            "std": self.std,
-            "units": self.units,
-            "evidence": self.evidence,
-        }
-
-    def _file_interval(self) -> list[float | None] | None:
-        begin = self.interval_s[0] if self.interval_s[0] > 0.0 else None
-        end = None if self.lasting else self.interval_s[1]
-        return None if begin is None and end is None else [begin, end]
+        own = asdict(self)
+        del own["title"]
+        own["ambiguous_with"], own["overlap"] = list(self.overlaps), own.pop("overlaps")
+        return {**own, "z": own.pop("detectability")}
 
 
 @dataclass(frozen=True)
@@ -96,16 +87,6 @@ class Leftover:
     depends_on: tuple[str, ...]
     interval_s: tuple[float, float]
 
-    def as_dict(self) -> dict[str, Any]:
-        """As in the JSON file."""
-        return {
-            "joint": self.joint,
-            "rmse_nm": self.rmse_nm,
-            "noise_floor_nm": self.noise_floor_nm,
-            "depends_on": list(self.depends_on),
-            "interval_s": list(self.interval_s),
-        }
-
 
 @dataclass(frozen=True)
 class Shortfall:
@@ -120,14 +101,6 @@ class Shortfall:
     torque_rmse_nm: Array
     rollout_rmse_rad: Array | None = None
     rollout_rmse_rad_s: Array | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """As in the JSON file."""
-        out = {"torque_rmse_nm": self.torque_rmse_nm.tolist()}
-        for key in ("rollout_rmse_rad", "rollout_rmse_rad_s"):
-            value = getattr(self, key)
-            out[key] = None if value is None else [_known(x) for x in value]
-        return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +175,7 @@ class GapResult:
     curves: tuple[Curves, ...] = ()
     rollouts: tuple[RolloutCurves, ...] = ()
     model_out: str | None = None
-    what_next: tuple[str, ...] = field(default=())
+    what_next: tuple[str, ...] = ()
     where: tuple[dict[str, Any], ...] = ()
     stopped_after_rounds: int | None = None
     wall_s: float = 0.0
@@ -226,47 +199,23 @@ class GapResult:
         """Nothing but the reason why nothing could be told."""
         unknown: Array = np.full(len(joint_names), np.nan)
         nothing = Shortfall(unknown, unknown, unknown)
-        return cls(
-            tuple(joint_names),
-            model_name,
-            tuple(recordings),
-            model_in,
-            unknown,
-            nothing,
-            nothing,
-            problem=problem,
-        )
+        names = tuple(joint_names), model_name, tuple(recordings), model_in
+        return cls(*names, unknown, nothing, nothing, problem=problem)
 
     def as_dict(self) -> dict[str, Any]:
         """All but the curves; `adapter.gap.words.as_json` adds the headline."""
-        return {
-            "problem": self.problem,
-            "noise_floor_nm": self.noise_floor_nm.tolist(),
-            "before": self.before.as_dict(),
-            "after": self.after.as_dict(),
-            "findings": [finding.as_dict() for finding in self.findings],
-            "unexplained": [leftover.as_dict() for leftover in self.unexplained],
-            "model_out": self.model_out,
-            "where": [dict(entry) for entry in self.where],
-            "inertial_correction": self._correction(),
-            "what_next": list(self.what_next),
-            "stopped_after_rounds": self.stopped_after_rounds,
-            "notes": list(self.notes),
-            "recordings": list(self.recordings),
-            "model_in": self.model_in,
-            "joint_names": list(self.joint_names),
-            "wall_s": self.wall_s,
-        }
+        own = {key: getattr(self, key) for key in IN_FILE}
+        for key in ("before", "after"):
+            own[key] = asdict(own[key])
+        own["findings"] = [finding.as_dict() for finding in self.findings]
+        own["unexplained"] = [asdict(leftover) for leftover in self.unexplained]
+        return {**own, "inertial_correction": self._correction()}
 
     def _correction(self) -> dict[str, Any] | None:
         if self.corrections is None or self.corrections_prior is None:
             return None
         return {
-            "dtheta": self.corrections.tolist(),
-            "prior_std": self.corrections_prior.tolist(),
+            "dtheta": self.corrections,
+            "prior_std": self.corrections_prior,
             "largest_in_prior_std": float(np.abs(self.corrections / self.corrections_prior).max()),
         }
-
-
-def _known(x: float) -> float | None:
-    return float(x) if np.isfinite(x) else None

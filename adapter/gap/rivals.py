@@ -1,4 +1,4 @@
-"""How a named effect stands: against its rivals, and on data that its fit has not seen."""
+"""How a named effect stands against its rivals: other names for the same data."""
 
 from __future__ import annotations
 
@@ -8,18 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.effects.catalogue import LATENESS
 from adapter.gap.candidates import Candidate, log_odds, simpler_wins
-from adapter.gap.evidence import ORDER, Carried, score, scores
+from adapter.gap.evidence import Carried, scores
 from adapter.gap.fit import Fit, Named, beside
 from adapter.gap.scan import SignatureTable
 from adapter.model.spatial import Array
 
-FOLDS = 4
-FOLD_S = 2.0  # a block of time is held out as a whole: neighbours know each other
 WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
-SHORTEST_S = 0.2
-TIE_CHI2 = 2.0  # by which held-out data may be worse and still leave it to the evidence
 DATES = 50.0  # starts that were looked at
 
 
@@ -86,11 +81,10 @@ class _Products:
     """Products of all candidates' white signatures in one interval.
 
     Attributes:
-        X: (c, r) signatures; carried: (c, p) with the fit's own; data: (c,) with the data.
+        carried: (c, p) with the fit's own; data: (c,) with the data.
         own: of each candidate with itself, (k, k).
     """
 
-    X: Array
     carried: Array
     data: Array
     own: tuple[Array, ...]
@@ -105,7 +99,7 @@ def standings(fit: Fit, carried: Carried, field: SignatureTable) -> tuple[Standi
         if when not in products:
             X = fit.whiten(field.within(*when))
             own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in field.candidates)
-            products[when] = _Products(X, X @ carried.N.T, X @ carried.data, own)
+            products[when] = _Products(X @ carried.N.T, X @ carried.data, own)
         out.append(_standing(fit, carried, field.candidates, products[when], k))
     return tuple(out)
 
@@ -116,14 +110,14 @@ def _standing(
     """The k-th named effect of a fit among the candidates."""
     named = fit.named[k]
     own, rest = beside(fit, k)
-    others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
-    mine = score(*others.without(carried.N[own]), named.candidate.prior_std)
-    signature = named.x @ carried.N[own]
-    size = others.without(signature[None])[0][0, 0]
+    others, mine = carried.part(rest), carried.worth(own, rest)
+    beside_me = named.x @ carried.G[np.ix_(own, rest)]  # my signature's products with the others
+    alone = named.x @ carried.G[np.ix_(own, own)] @ named.x
+    size = alone - others.solved(beside_me) @ beside_me
     C = products.carried[:, rest]
     solved = others.solved(C)
     g = products.data - solved @ others.g
-    cross = products.X @ signature - solved @ (others.N @ signature)
+    cross = products.carried[:, own] @ named.x - solved @ beside_me
     found = []
     taken = {e.candidate.key for e in fit.named}
     for places in _alike(candidates):
@@ -154,38 +148,3 @@ def _alike(candidates: Sequence[Candidate]) -> list[list[int]]:
     for i, c in enumerate(candidates):
         groups.setdefault(len(c.columns), []).append(i)
     return list(groups.values())
-
-
-def block_s(fit: Fit) -> float:
-    """Length of the blocks that are held out: what lasts but a second is in several of them."""
-    spans = [e.interval_s[1] - e.interval_s[0] for e in fit.named]
-    return float(max(min([FOLD_S, *(x / (2 * FOLDS) for x in spans)]), SHORTEST_S))
-
-
-def fold_of(t: Array, block: float) -> np.ndarray:
-    """(m,) fold of each instant: blocks of time in turn."""
-    return np.asarray((t // block).astype(int) % FOLDS)
-
-
-def fold_rows(fit: Fit) -> np.ndarray:
-    """(r,) fold of each white row."""
-    rows = []
-    for own in fit.recordings:
-        rows.append(np.repeat(fold_of(own.t[ORDER:], block_s(fit)), fit.n))
-    return np.concatenate(rows)
-
-
-def pays_held_out(fit: Fit, carried: Carried, k: int) -> bool:
-    """Whether the k-th named effect predicts blocks that its fit has not seen."""
-    fold = fold_rows(fit)
-    own, rest = beside(fit, k)
-    if fit.named[k].candidate.effect is LATENESS:  # the carried error would stand for it
-        rest = rest[rest != fit.dtheta.size]
-    gain = 0.0
-    for f in range(FOLDS):
-        seen, new = fold != f, fold == f
-        for sign, at in ((1.0, rest), (-1.0, np.concatenate([rest, own]))):
-            fitted = Carried(carried.N[np.ix_(at, seen)], carried.prior_std[at], carried.data[seen])
-            left = carried.data[new] - fitted.x @ carried.N[np.ix_(at, new)]
-            gain += sign * float(left @ left)
-    return gain > -TIE_CHI2

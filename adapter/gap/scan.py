@@ -197,19 +197,25 @@ class SignatureTable:
     def together(self, leads: Sequence[Lead]) -> Score:
         """Several leads at once under the noise that they leave, without their odds."""
         parts = [self.gated(lead) for lead in leads]
-        lead_tables = [np.concatenate(x) for x in zip(*parts, strict=True)]
-        tables = [np.concatenate(x) for x in zip(self.carried_tables, lead_tables, strict=True)]
+        tables = [np.concatenate(x) for x in zip(*parts, strict=True)]
         own_std = np.concatenate([lead.candidate.prior_std for lead in leads])
         weights = self._undated(leads)
-        fit = replace(self.fit, weights=weights)
-        prior_std = np.concatenate([fit.prior_std, own_std])
-        x = Carried(fit.whiten(tables), prior_std, fit.whiten(self.targets)).x
-        left = [t - np.tensordot(x, c, 1) for t, c in zip(self.targets, tables, strict=True)]
+        fit, base = replace(self.fit, weights=weights), self.carried
+        if any(lead.interval_s != WHOLE for lead in leads):  # other rows count than in the table
+            white = fit.whiten(self.carried_tables), fit.whiten(self.targets)
+            base = Carried(white[0], fit.prior_std, white[1])
+        X = fit.whiten(tables)
+        C = X @ base.N.T
+        own = score(*base.reduced(X @ X.T, C, X @ base.data), own_std).x
+        carried = base.x - own @ base.solved(C)
+        left = [
+            target - np.tensordot(carried, N, 1) - np.tensordot(own, table, 1)
+            for target, N, table in zip(self.targets, self.carried_tables, tables, strict=True)
+        ]
         quiet = [r * (w > 0.0) for r, w in zip(left, weights, strict=True)]
         fit = replace(fit, noise=tuple(noise_of(r) for r in quiet))
-        N, X = fit.whiten(self.carried_tables), fit.whiten(lead_tables)
-        others = Carried(N, fit.prior_std, fit.whiten(self.targets))
-        return score(*others.without(X), own_std)
+        others = Carried(fit.whiten(self.carried_tables), fit.prior_std, fit.whiten(self.targets))
+        return score(*others.without(fit.whiten(tables)), own_std)
 
     def _undated(self, leads: Sequence[Lead]) -> tuple[Array, ...]:
         """Weights (k, n) of the rows: none where a lead's start is not known well enough yet."""

@@ -11,14 +11,10 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import TorqueEffect
 from adapter.effects.catalogue import WRONG_LINK
 from adapter.gap.candidates import PATTERN_SHARE, Candidate, Pattern
-from adapter.gap.evidence import Carried, Noise, score
+from adapter.gap.evidence import Carried, Noise
 from adapter.gap.fit import Fit, Named, dated, dated_anew, refitted, shaped, under_own_noise, worth
-from adapter.gap.rivals import (
-    Standing,
-    pays_held_out,
-    price,
-    standings,
-)
+from adapter.gap.folds import Folds, pays_held_out
+from adapter.gap.rivals import Standing, price, standings
 from adapter.gap.scan import (
     BELIEF,
     CATALOGUED,
@@ -213,7 +209,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
 
 def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
     """Of the named effects from `first` on the one that is least worth having, if one is not."""
-    values = {}
+    values, folds = {}, Folds.of(fit, carried)
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e)
@@ -221,7 +217,7 @@ def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
             value < BELIEF
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.candidate.effect.possible(e.values)
-            or not pays_held_out(fit, carried, k)
+            or not pays_held_out(fit, folds, k)
         ):
             values[k] = value
     return min(values, key=values.__getitem__) if values else None
@@ -275,9 +271,7 @@ def _all_over(fit: Fit) -> bool:
 def _standing(wide: Fit, carried: Carried, named: Named) -> Standing:
     """What the link's correction is worth, the other links' carried along."""
     own = np.array(named.candidate.columns)
-    rest = np.delete(np.arange(len(carried.N)), own)
-    others = Carried(carried.N[rest], carried.prior_std[rest], carried.data)
-    found = score(*others.without(carried.N[own]), carried.prior_std[own])
+    found = carried.worth(own, np.delete(np.arange(len(carried.x)), own))
     return Standing(named.candidate, found.log_evidence, found.chi2, ())
 
 

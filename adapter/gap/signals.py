@@ -8,9 +8,8 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -60,6 +59,13 @@ class Signals:
     motion: Motion
     tau: Array
     t: Array
+    _kept: dict[Hashable, Array] = field(default_factory=dict, init=False, repr=False)
+
+    def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
+        """What depends on this recording alone, computed the first time it is asked for."""
+        if key not in self._kept:
+            self._kept[key] = compute()
+        return self._kept[key]
 
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
@@ -79,9 +85,12 @@ class Signals:
         out[:, :, joint] = low(basis).T
         return out
 
-    @cached_property
+    @property
     def low_regressor(self) -> Array:
         """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""
+        return self.once("regressor", self._low_regressor)
+
+    def _low_regressor(self) -> Array:
         m = self.motion
         return np.ascontiguousarray(np.moveaxis(low(m.arm.regressor(m.q, m.dq, m.ddq)), 2, 0))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import linear_sum_assignment
 
-from adapter.effects.base import smooth_sign
+from adapter.effects.by_joint import smooth_sign
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.rigid_arm import RigidArm
@@ -52,7 +52,7 @@ SEEN_NM = 0.3  # rms of a joint's model torque below which nothing is read from 
 
 
 @dataclass(frozen=True)
-class Reading:
+class TorqueReading:
     """A way to understand the torque signals.
 
     Attributes:
@@ -154,7 +154,7 @@ def readings(
     tau: Array,
     gravity_only: Array,
     per_gravity: Callable[[Array], Array],
-) -> list[Reading]:
+) -> list[TorqueReading]:
     """All readings of tau (m, n), the recorded one first, then by cost.
 
     Args:
@@ -162,14 +162,14 @@ def readings(
         per_gravity: the model's gravity torque (m, n) for another gravity (3,).
     """
     n = tau.shape[1]
-    as_is = Reading("as recorded", tau, comparison.cost(tau), tuple(range(n)), np.ones(n))
+    as_is = TorqueReading("as recorded", tau, comparison.cost(tau), tuple(range(n)), np.ones(n))
     others = [
         *_signs(comparison, tau, as_is.cost),
         *_scales(comparison, tau),
         *_orders(comparison, tau),
     ]
     free = tau + gravity_only
-    others.append(Reading("gravity", free, comparison.cost(free), as_is.joints, np.ones(n)))
+    others.append(TorqueReading("gravity", free, comparison.cost(free), as_is.joints, np.ones(n)))
     others.append(_mounting(comparison, tau, gravity_only, per_gravity))
     other_size = _other_size(comparison, tau)
     others.sort(key=lambda reading: (reading.kind != "scale" if other_size else 0, reading.cost))
@@ -200,7 +200,7 @@ def _other_size(comparison: TorqueComparison, tau: Array) -> bool:
     return bool(one_way and abs(middle) > np.log(LARGE_FACTOR) and alike > ALIKE)
 
 
-def convincing(comparison: TorqueComparison, best: Reading, as_is: Reading) -> bool:
+def convincing(comparison: TorqueComparison, best: TorqueReading, as_is: TorqueReading) -> bool:
     """Whether another reading is so much better than the recorded one that it must be told."""
     if best.kind == "scale" and _other_size(comparison, as_is.tau):
         return True
@@ -214,10 +214,10 @@ def convincing(comparison: TorqueComparison, best: Reading, as_is: Reading) -> b
     return after < SHARE_OF_MISFIT * before
 
 
-def _signs(comparison: TorqueComparison, tau: Array, cost: float) -> Iterator[Reading]:
+def _signs(comparison: TorqueComparison, tau: Array, cost: float) -> Iterator[TorqueReading]:
     """All joints negated; and those, one after the other, that it pays to negate."""
     n = tau.shape[1]
-    yield Reading("sign", -tau, comparison.cost(-tau), tuple(range(n)), -np.ones(n))
+    yield TorqueReading("sign", -tau, comparison.cost(-tau), tuple(range(n)), -np.ones(n))
     sign = np.ones(n)
     for _ in range(n - 1):
         trials = []
@@ -229,10 +229,12 @@ def _signs(comparison: TorqueComparison, tau: Array, cost: float) -> Iterator[Re
         if lowest > cost - GAIN_OF_EVIDENCE:
             break
         cost, sign[joint] = lowest, -1.0
-        yield Reading("sign", tau * sign, cost, tuple(np.flatnonzero(sign < 0).tolist()), sign)
+        yield TorqueReading(
+            "sign", tau * sign, cost, tuple(np.flatnonzero(sign < 0).tolist()), sign
+        )
 
 
-def _scales(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
+def _scales(comparison: TorqueComparison, tau: Array) -> Iterator[TorqueReading]:
     """One large factor on all joints, or each joint its own (gears, motor currents)."""
     model, n = comparison.model, tau.shape[1]
     seen, own = _sizes(comparison, tau)
@@ -247,10 +249,10 @@ def _scales(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
     factors += [np.full(n, side * size) for size in (*near, common) for side in (1.0, -1.0)]
     for factor in factors:
         read = tau / factor
-        yield Reading("scale", read, comparison.cost(read), tuple(range(n)), factor)
+        yield TorqueReading("scale", read, comparison.cost(read), tuple(range(n)), factor)
 
 
-def _orders(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
+def _orders(comparison: TorqueComparison, tau: Array) -> Iterator[TorqueReading]:
     """The columns in the order that fits best: column by column first, then by swaps."""
     n = tau.shape[1]
     apart = np.abs(tau[:, None, :] - comparison.model[:, :, None]) / comparison.sigma[:, None]
@@ -268,7 +270,9 @@ def _orders(comparison: TorqueComparison, tau: Array) -> Iterator[Reading]:
         cost, order = lowest, np.array(trial_order)
     moved = np.flatnonzero(order != np.arange(n))
     if moved.size:
-        yield Reading("order", tau[:, order], cost, tuple(moved.tolist()), order.astype(float))
+        yield TorqueReading(
+            "order", tau[:, order], cost, tuple(moved.tolist()), order.astype(float)
+        )
 
 
 def _mounting(
@@ -276,7 +280,7 @@ def _mounting(
     tau: Array,
     gravity_only: Array,
     per_gravity: Callable[[Array], Array],
-) -> Reading:
+) -> TorqueReading:
     """Gravity of the usual size along another direction of the base."""
     n = tau.shape[1]
     axes = np.stack([per_gravity(axis) for axis in np.eye(3)], axis=2)
@@ -286,17 +290,17 @@ def _mounting(
     size = float(np.linalg.norm(found))
     gravity = found * (9.81 / size) if size else found
     read = tau + gravity_only - axes @ gravity
-    return Reading("mounting", read, comparison.cost(read), tuple(range(n)), gravity)
+    return TorqueReading("mounting", read, comparison.cost(read), tuple(range(n)), gravity)
 
 
-def unit(reading: Reading) -> str | None:
+def unit(reading: TorqueReading) -> str | None:
     """Name of the unit whose factor all joints have, whatever the sign."""
     size = np.abs(reading.detail)
     return UNITS.get(float(size[0])) if np.ptp(size) == 0 else None
 
 
 def in_words(
-    best: Reading, as_is: Reading, comparison: TorqueComparison, tree: Tree, tau: Array
+    best: TorqueReading, as_is: TorqueReading, comparison: TorqueComparison, tree: Tree, tau: Array
 ) -> str:
     """What a reading says, with the evidence and what to do."""
     names = [tree.joint_names[j] for j in best.joints]

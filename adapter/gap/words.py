@@ -16,7 +16,7 @@ from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
-UNEXPLAINED = "are not explained by any effect of the catalogue"
+NOT_EXPLAINED = "are not explained by any effect of the catalogue"
 SIGNALS = {
     "dq": "velocity",
     "ddq": "acceleration",
@@ -204,12 +204,12 @@ def _left(unexplained: Sequence[Leftover]) -> str:
         return "".join(leftover_sentence(item) for item in worst.values())
     joints = sorted(worst)
     sizes = listed([plain(worst[j].rmse_nm, 2) for j in joints])
-    return f"joints {numbered(joints)}: {sizes} N m {UNEXPLAINED}"
+    return f"joints {numbered(joints)}: {sizes} N m {NOT_EXPLAINED}"
 
 
 def _follows(leftover: Leftover) -> str:
     followed = listed(list(leftover.depends_on)) or "no signal"
-    return f"that follow {followed} {UNEXPLAINED}"
+    return f"that follow {followed} {NOT_EXPLAINED}"
 
 
 def _instant(t: float) -> str:

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.effects.torque import active_effects
-from adapter.gap.findings import told_of
+from adapter.effects.active import active_effects
+from adapter.gap.findings import disagreement, noise_floor, told_of
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
-from adapter.gap.held_out import HeldOut, Simulate, Task, lasting, measure, model_of
+from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
 from adapter.gap.result import GapResult
 from adapter.gap.screen import RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
@@ -110,7 +110,7 @@ def find_gap(
 
 def _task(
     logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
-) -> Task:
+) -> GapTask:
     """Read and screen. Raises Refusal."""
     arm = RigidArm.of(model)
     screened: list[Screened] = []
@@ -125,7 +125,7 @@ def _task(
         fitted, scored = _split(recordings[0], settings.validate_from_s)
     else:
         fitted = scored = recordings
-    return Task(
+    return GapTask(
         model,
         fitted,
         scored,
@@ -156,7 +156,7 @@ def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorde
     return (whole.part(slice(cut)),), (whole.part(slice(cut, None)),)
 
 
-def _nominal_fit(task: Task, settings: GapSettings) -> Fit:
+def _nominal_fit(task: GapTask, settings: GapSettings) -> Fit:
     """The nominal model on the smoothed recordings, under the noise that it leaves."""
     arm = RigidArm.of(task.model)
     everything = tuple(dict.fromkeys((*task.fitted, *task.scored)))
@@ -171,22 +171,22 @@ def _nominal_fit(task: Task, settings: GapSettings) -> Fit:
     ).with_noise()
 
 
-def _result(task: Task, measured: HeldOut) -> GapResult:
+def _result(task: GapTask, measured: HeldOut) -> GapResult:
     """All that was found and measured."""
-    found = measured.found
-    told = told_of(found, [float(r.t[-1]) for r in task.fitted], measured.curves[0])
-    splits = (x for f in told.findings if f.split_by for x in f.split_by.split("; "))
+    found, floor = measured.found, noise_floor(measured.found.fit)
+    findings, left = told_of(found, [float(r.t[-1]) for r in task.fitted])
+    splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,
         model_name=task.model.name,
         recordings=tuple(dict.fromkeys(r.name for r in (*task.fitted, *task.scored))),
         model_in="",
-        noise_floor_nm=told.noise_floor_nm,
+        noise_floor_nm=floor,
         before=measured.before,
         after=measured.after,
-        findings=told.findings,
-        unexplained=told.unexplained,
-        where=told.where,
+        findings=findings,
+        unexplained=left,
+        where=disagreement(measured.curves[0], floor),
         corrections=found.fit.dtheta,
         corrections_prior=found.fit.prior,
         stopped_after_rounds=found.rounds if found.ran_out else None,

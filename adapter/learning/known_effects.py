@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import LEARNED, effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.model.self_model import SelfModel
@@ -155,11 +156,11 @@ class KnownEffects:
         q, dq, ddq, tau = table[:, at.q], table[:, at.dq], table[:, at.ddq], table[:, at.tau]
         if own.pushed:
             tau += self._arm.wrench_torque(q, own.wrench)
-        rigid = tau
+        signals = JointSignals(q, dq, ddq, tau, self._smoothing_s)
         if self._by_load:
-            rigid = tau - own.torque(q, dq, ddq, tau, self._smoothing_s)
+            signals = signals._replace(tau=tau - own.torque(signals))
         if own.laws:
-            tau -= own.torque(q, dq, ddq, rigid, self._smoothing_s)
+            tau -= own.torque(signals)
         if self._encoders is not None:
             self._turn_back(table, self._encoders)
         return table

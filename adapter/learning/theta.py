@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.base import LinearEffect
+from adapter.effects.by_joint import JointSignals
 from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
@@ -191,8 +192,9 @@ class Theta:
     def effect_columns(self, q: Array, dq: Array, ddq: Array) -> Array:
         """(m, e, n) columns of the effects for tables (m, n)."""
         out = np.empty((len(q), len(self.effects), self.tree.n))
+        at = JointSignals(q, dq, ddq, smoothing_s=self.smoothing_s)
         for k, effect in enumerate(self.effects):
-            out[:, k] = effect.column(q, dq, ddq, self.smoothing_s)
+            out[:, k] = effect.column(at)
         return out
 
     def empty_moments(self) -> Moments:

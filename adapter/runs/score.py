@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adapter.effects.active import with_bodies
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
 from adapter.model.model_file import load_model
@@ -127,10 +128,10 @@ class ScoreRows:
         """(k, n) torque of θ (n, 10) and effect parameters (e, n), with the learned frames."""
         learned = replace(self._documented, lam=self._outcome.lam, theta=theta)
         tau = RigidArm.of(learned).torque(self.q, self.dq, self.ddq)
-        for gain, effect in zip(
-            effects, effects_by_name(self._outcome.settings.effects), strict=True
-        ):
-            tau += gain * effect.column(self.q, self.dq, self.ddq, self._outcome.smoothing_s)
+        at = JointSignals(self.q, self.dq, self.ddq, smoothing_s=self._outcome.smoothing_s)
+        names = self._outcome.settings.effects
+        for gain, effect in zip(effects, effects_by_name(names), strict=True):
+            tau += gain * effect.column(at)
         return tau
 
 

@@ -154,9 +154,9 @@ def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> 
         unit = np.zeros(70)
         unit[k] = 1.0
         out[..., k] = ModelTorque(replace(robot, theta=unit.reshape(7, 10)))(q, dq, ddq)
-    for k, effect in enumerate(theta.effects):
-        for j, column in enumerate(effect.column(q, dq, ddq, theta.smoothing_s).T):
-            out[:, j, 80 + 7 * k + j] = column
+    joint = np.arange(7)
+    for k, column in enumerate(theta.effect_columns(q, dq, ddq).swapaxes(0, 1)):
+        out[:, joint, 80 + 7 * k + joint] = column
     return out
 
 

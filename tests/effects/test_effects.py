@@ -11,7 +11,8 @@ import pytest
 
 from adapter.effects.active import active_effects, check_effects
 from adapter.effects.backlash import play
-from adapter.effects.base import Effect, Motion, polar, smooth_sign
+from adapter.effects.base import Effect, Motion, polar
+from adapter.effects.by_joint import JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.payload import parameters_of, theta_of
 from adapter.effects.splits import experiments
@@ -361,8 +362,10 @@ def test_payload_parameters_are_there_and_back() -> None:
 @pytest.mark.parametrize("name", LEARNED)
 def test_columns_are_the_laws_derivative(name: str) -> None:
     effect = LEARNED[name]
-    law = effect.law(Q, DQ, DDQ, RIGID, {effect.key: np.full(N, 2.0)})
-    np.testing.assert_allclose(law, 2.0 * effect.column(Q, DQ, DDQ))
+    at = JointSignals(Q, DQ, DDQ)
+    np.testing.assert_allclose(
+        effect.law(at, {effect.key: np.full(N, 2.0)}), 2.0 * effect.column(at)
+    )
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapter.cli.rollouts import Rollouts
-from adapter.effects.base import Array, LinearEffect, Parameter, Values
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.catalogue import CATALOGUE, registered
 from adapter.effects.export import left_out_of_urdf, to_urdf
 from adapter.effects.phrases import Phrase
@@ -38,9 +38,9 @@ class Drag(LinearEffect):
     phrase = Phrase("{who} {lacks} {x} of drag", "c")
     shows = ((SPEEDS, "grows with the square of the speed"),)
 
-    def column(self, q: Array, dq: Array, ddq: Array, smoothing_s: float = 0.0) -> Array:
+    def column(self, at: JointSignals) -> Array:
         """dq |dq|."""
-        return np.asarray(dq * np.abs(dq))
+        return np.asarray(at.dq * np.abs(at.dq))
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Its slope at 0.5 rad/s, as damping."""

@@ -18,19 +18,17 @@ from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
 from adapter.gap.evidence import Noise
 from adapter.gap.findings import doubted, findings_of, parameter_std, told_of
 from adapter.gap.fit import Fit, Model, Named, refitted, theta_prior, worth
-from adapter.gap.held_out import Task, _curves, lasting, rollout_errors, torque_errors, uncorrected
-from adapter.gap.result import Leftover, Shortfall
-from adapter.gap.rivals import (
-    DATES,
-    FOLD_S,
-    FOLDS,
-    Standing,
-    block_s,
-    fold_of,
-    fold_rows,
-    pays_held_out,
-    price,
+from adapter.gap.folds import FOLD_S, FOLDS, Folds, block_s, fold_of, fold_rows, pays_held_out
+from adapter.gap.held_out import (
+    GapTask,
+    _curves,
+    lasting,
+    rollout_errors,
+    torque_errors,
+    uncorrected,
 )
+from adapter.gap.result import Leftover
+from adapter.gap.rivals import DATES, Standing, price
 from adapter.gap.scan import BELIEF
 from adapter.gap.screen import refuse
 from adapter.gap.search import Budget, Found, _worst, search
@@ -147,7 +145,7 @@ def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     fit = with_effect(nominal_fit(recording(3, on_joint(6, 0.5 * on))), "torque_offset", 6, 0.5)
     fit, carried = refitted(fit)
     assert worth(fit, carried, 0).log_evidence > BELIEF + 20.0
-    assert pays_held_out(fit, carried, 0) is throughout
+    assert pays_held_out(fit, Folds.of(fit, carried), 0) is throughout
     assert _worst(fit, carried) == (None if throughout else 0)
 
 
@@ -213,9 +211,8 @@ def test_what_is_told_of_a_shaken_joint_is_less_sure(shaken: bool) -> None:
         more += on_joint(JOINT, np.sin(2.0 * np.pi * 1.3 * T))
     fit = with_effect(nominal_fit(recording(6, more)), "coulomb_friction", JOINT, FC).with_noise()
     found = settled_as(fit, fit.carried())
-    told = told_of(found, [SECONDS], _curves("a", found, 0))
-    assert {x.joint for x in told.unexplained} == ({JOINT + 1} if shaken else set())
-    (own,) = told.findings
+    (own,), left = told_of(found, [SECONDS])
+    assert {x.joint for x in left} == ({JOINT + 1} if shaken else set())
     assert own.evidence == pytest.approx(1.0) if not shaken else own.evidence < 0.5
 
 
@@ -295,11 +292,10 @@ def test_degrees_of_an_arm_whose_joints_only_turn_backwards() -> None:
     assert refused.value.kind is RecordingFault.DEGREES
 
 
-def test_task_and_shortfall_are_plain_records() -> None:
+def test_a_task_whose_own_recordings_are_scored_is_by_folds() -> None:
     own = recording(1)
-    task = Task(PANDA, (own,), (own,), ((0,),), 1e-3, True, ())
+    task = GapTask(PANDA, (own,), (own,), ((0,),), 1e-3, True, ())
     assert task.folds and not replace(task, scored=(recording(2),)).folds
-    assert Shortfall(np.zeros(2)).as_dict()["rollout_rmse_rad"] is None
 
 
 # ---------------------------------------------------------------- dates

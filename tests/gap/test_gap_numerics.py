@@ -28,7 +28,8 @@ from adapter.gap.candidates import (
 from adapter.gap.evidence import LEAST_NM, ORDER, WHITE, Carried, Noise, noise_of, score, scores
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import Fit, Model, Named, beside, refitted, theta_prior, worth
-from adapter.gap.rivals import fold_rows, pays_held_out, standings
+from adapter.gap.folds import Folds, fold_rows, pays_held_out
+from adapter.gap.rivals import standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
 from adapter.model.robots import documented
@@ -520,9 +521,11 @@ def test_held_out_blocks_pay_for_what_is_there_and_not_for_what_is_not():
     assert set(fold) == {0, 1, 2, 3}
     there = next(c for c in _frictions(fit) if c.joint == RUBS)
     fit, carried = refitted(fit.with_named([Named(there, np.array([FC]))]))
-    assert pays_held_out(fit.with_noise(), carried, 0)
+    assert pays_held_out(fit, Folds.of(fit, carried), 0)
     shuffled = Carried(carried.N, carried.prior_std, -carried.data * np.sign(fold - 1.5))
-    assert not pays_held_out(fit, shuffled, 0)  # another sign in every other pair of blocks
+    assert not pays_held_out(
+        fit, Folds.of(fit, shuffled), 0
+    )  # another sign in every other pair of blocks
 
 
 # ---------------------------------------------------------------- the scan

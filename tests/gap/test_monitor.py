@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from adapter.cli.results import disagreement_lines
-from adapter.gap.monitor import Monitor
-from adapter.gap.monitor_evidence import Blocks
+from adapter.gap.monitor import Blocks, Monitor
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
@@ -38,7 +39,7 @@ def held_out_error(learner: OnlineLearner) -> float:
     model = ModelTorque(replace(panda_model(), theta=learner.theta.theta))
     tau = model(q, dq, ddq)
     for gain, effect in zip(learner.theta.effect_values, learner.theta.effects, strict=True):
-        tau = tau + gain * effect.column(q, dq, ddq)
+        tau = tau + gain * effect.column(JointSignals(q, dq, ddq))
     return float(np.sqrt(np.mean((tau - rnea(pin_model(arm()), q, dq, ddq)) ** 2)))
 
 

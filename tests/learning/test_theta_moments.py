@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from adapter.effects import effects_by_name
+from adapter.effects.by_joint import JointSignals
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import body_from_log_cholesky, forget_along, pull_back
@@ -118,7 +119,7 @@ def full_rows(theta: Theta, of: Case) -> np.ndarray:
         out[:, :, theta.hand] = 0.0
     joint, first = np.arange(n), of.tree.rows - n
     for k, effect in enumerate(theta.effects):
-        column = effect.column(of.data.q, of.data.dq, of.data.ddq)
+        column = effect.column(JointSignals(of.data.q, of.data.dq, of.data.ddq))
         out[:, first + joint, 10 * theta.bodies + k * n + joint] = column
     return out
 
