@@ -112,8 +112,7 @@ def rms(errors: Sequence[Array]) -> Array:
     return np.sqrt(np.mean(np.square(table), axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class RolloutErrors:
+class RolloutErrors(NamedTuple):
     """Simulated less measured by row and joint, (k, n) rad and rad/s, and curves for a plot.
 
     Rows are those that both models could be simulated along; none where one could not at all.
@@ -142,18 +141,18 @@ def rollout_errors(
     u, drive = recording.drive(t)
     segments = [s for s in _segments(len(t)) if recording.is_whole(t[s[0]], t[s[1] - 1])]
     motion = DrivenMotion(t, q, dq, u)
-    old = _along(segments, [before], simulate, motion, drive, block)
-    new = _along(segments, after, simulate, motion, drive, block)
+    old_q, old_dq = _along(segments, [before], simulate, motion, drive, block)
+    new_q, new_dq = _along(segments, after, simulate, motion, drive, block)
     told = np.zeros(len(t), dtype=bool)
     for begin, end in segments:  # a simulation that was refused lacks even its start
-        told[begin:end] = np.isfinite(old[0][begin]).all() and np.isfinite(new[0][begin]).all()
+        told[begin:end] = np.isfinite(old_q[begin]).all() and np.isfinite(new_q[begin]).all()
     thin = slice(None, None, THINNED)
-    curves = RolloutCurves(t[thin], q[thin], old[0][thin], new[0][thin])
+    curves = RolloutCurves(t[thin], q[thin], old_q[thin], new_q[thin])
     return RolloutErrors(
-        _off(old[0], q)[told],
-        _off(old[1], dq)[told],
-        _off(new[0], q)[told],
-        _off(new[1], dq)[told],
+        _off(old_q, q)[told],
+        _off(old_dq, dq)[told],
+        _off(new_q, q)[told],
+        _off(new_dq, dq)[told],
         curves,
     )
 
@@ -248,24 +247,21 @@ def measure(
         model = model_of(task.model, found.fit)
         after = [model if task.one_clock else lasting(model)]
     errors = [torque_errors(r, task.model, after, block) for r in task.scored]
-    old, new = Shortfall(rms([e.before for e in errors])), Shortfall(rms([e.after for e in errors]))
-    rollouts: tuple[RolloutCurves, ...] = ()
+    runs: list[RolloutErrors] = []
     if simulate is not None:
         progress("simulating forward")
         runs = [rollout_errors(r, task.model, after, simulate, block) for r in task.scored]
-        old = replace(
-            old,
-            rollout_rmse_rad=rms([x.before_q for x in runs]),
-            rollout_rmse_rad_s=rms([x.before_dq for x in runs]),
-        )
-        new = replace(
-            new,
-            rollout_rmse_rad=rms([x.after_q for x in runs]),
-            rollout_rmse_rad_s=rms([x.after_dq for x in runs]),
-        )
-        rollouts = tuple(x.curves for x in runs)
-    curves = tuple(_curves(r.name, found, i) for i, r in enumerate(task.fitted))
-    return HeldOut(found, old, new, curves, rollouts)
+
+    def rollout(key: str) -> Array | None:
+        return rms([getattr(run, key) for run in runs]) if runs else None
+
+    return HeldOut(
+        found,
+        Shortfall(rms([e.before for e in errors]), rollout("before_q"), rollout("before_dq")),
+        Shortfall(rms([e.after for e in errors]), rollout("after_q"), rollout("after_dq")),
+        tuple(_curves(r.name, found, i) for i, r in enumerate(task.fitted)),
+        tuple(x.curves for x in runs),
+    )
 
 
 def lasting(model: SelfModel) -> SelfModel:

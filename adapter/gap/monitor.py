@@ -152,7 +152,9 @@ class Monitor:
         if len(self._groups) == GROUPS:
             self._detector.judge(self._groups, float(t[-1]) + self._delay_s)
 
-    def _group(self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array) -> RowGroup:
+    def _group(
+        self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array
+    ) -> RowGroup:
         q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
         Y = frames.regressor(q, dq, ddq)
         tool = Y[:, :, -10:] @ self._tool

@@ -284,7 +284,8 @@ def smooth_motion(t: Array, q: Array, dq: Array, dq_late_s: float = 0.0) -> Smoo
     knots = np.concatenate([np.full(SPLINE_DEGREE, t[0]), inner, np.full(SPLINE_DEGREE, t[-1])])
     level = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
     when = np.clip(t - dq_late_s, t[0], t[-1])
-    slope = _derivative_design(when, knots)
+    first, inner_knots = _differentiated(knots, 1)
+    slope = BSpline.design_matrix(when, inner_knots, SPLINE_DEGREE - 1) @ first
     q_noise = np.maximum(noise_from_samples(q), Q_NOISE_FLOOR)
     dq_noise = np.maximum(noise_from_samples(dq), DQ_NOISE_FLOOR)
     rough = _roughness(knots)
@@ -312,38 +313,29 @@ def _stiffest(data: Array, right: Array, rough: Array) -> Array:
     return np.asarray(cho_solve_banded((factor, True), right))
 
 
-def _derivative_design(t: Array, knots: Array) -> Any:
-    """Sparse matrix of the basis functions' first derivatives at t."""
-    lower = BSpline.design_matrix(t, knots[1:-1], SPLINE_DEGREE - 1)
-    size = len(knots) - SPLINE_DEGREE - 1
-    gain = SPLINE_DEGREE / (knots[SPLINE_DEGREE + 1 : SPLINE_DEGREE + size] - knots[1:size])
-    return lower @ _neighbours(gain, size)
-
-
-def _neighbours(gain: Array, size: int) -> Any:
-    """Sparse (size - 1, size): differences of neighbours times gain (size - 1,)."""
-    bands: Any = [-gain, gain]
-    return diags(bands, offsets=[0, 1], shape=(size - 1, size))
+def _differentiated(knots: Array, order: int) -> tuple[Any, Array]:
+    """A derivative of splines on knots: sparse matrix on their coefficients, and its knots."""
+    degree, size, product = SPLINE_DEGREE, len(knots) - SPLINE_DEGREE - 1, None
+    for _ in range(order):
+        gain = degree / (knots[degree + 1 : degree + size] - knots[1:size])
+        bands: Any = [-gain, gain]
+        step = diags(bands, offsets=[0, 1], shape=(size - 1, size))
+        product = step if product is None else step @ product
+        knots, degree, size = knots[1:-1], degree - 1, size - 1
+    return product, knots
 
 
 def _roughness(knots: Array) -> Any:
     """Integral of products of third derivatives of the basis functions, sparse."""
-    degree, size = SPLINE_DEGREE, len(knots) - SPLINE_DEGREE - 1
-    product: Any = None
-    inner = knots
-    for _ in range(3):
-        gain = degree / (inner[degree + 1 : degree + size] - inner[1:size])
-        step = _neighbours(gain, size)
-        product = step if product is None else step @ product
-        inner, degree, size = inner[1:-1], degree - 1, size - 1
+    third, inner = _differentiated(knots, 3)
     # degree-2 splines: exact with three Gauss points per knot interval
     edges = np.unique(inner)
     nodes, weights = np.polynomial.legendre.leggauss(3)
     half = 0.5 * np.diff(edges)
     points = (edges[:-1, None] + half[:, None] * (1.0 + nodes)).ravel()
-    basis = BSpline.design_matrix(points, inner, degree)
+    basis = BSpline.design_matrix(points, inner, SPLINE_DEGREE - 3)
     mass = basis.T @ diags((half[:, None] * weights).ravel()) @ basis
-    return product.T @ mass @ product
+    return third.T @ mass @ third
 
 
 def _bands(matrix: Any) -> Array:

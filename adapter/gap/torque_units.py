@@ -34,10 +34,8 @@ LEAST_SIZE = 1e-3  # ... and negative mass everywhere is taken for so little of 
 GAIN_OF_EVIDENCE = 25.0  # cost (twice a log-likelihood) that another reading must save, and ...
 CLEAR_SHARE_OF_COST = 0.25  # so much less needs no other evidence
 SHARE_OF_COST = 0.75  # ... the share of the cost that it may leave, unless it lies much nearer
-SHARE_OF_MISFIT, FAR_SHARE_OF_MISFIT = (
-    0.8,
-    0.5,
-)  # of the model as it is: it must lie nearer without any correction, too
+# Of the misfit of the model as it is: a reading must lie nearer without any correction, too.
+SHARE_OF_MISFIT, FAR_SHARE_OF_MISFIT = 0.8, 0.5
 ALIKE = 0.7  # correlation of torques and model that makes them the same in another size
 LARGE_FACTOR = 7.0  # of the torque; models are not wrong by so much, units are
 UNITS = {
@@ -229,9 +227,8 @@ def _signs(comparison: TorqueComparison, tau: Array, cost: float) -> Iterator[To
         if lowest > cost - GAIN_OF_EVIDENCE:
             break
         cost, sign[joint] = lowest, -1.0
-        yield TorqueReading(
-            "sign", tau * sign, cost, tuple(np.flatnonzero(sign < 0).tolist()), sign
-        )
+        turned = tuple(np.flatnonzero(sign < 0).tolist())
+        yield TorqueReading("sign", tau * sign, cost, turned, sign)
 
 
 def _scales(comparison: TorqueComparison, tau: Array) -> Iterator[TorqueReading]:
@@ -303,27 +300,18 @@ def in_words(
     best: TorqueReading, as_is: TorqueReading, comparison: TorqueComparison, tree: Tree, tau: Array
 ) -> str:
     """What a reading says, with the evidence and what to do."""
-    names = [tree.joint_names[j] for j in best.joints]
     before, after = (comparison.error(r.tau) for r in (as_is, best))
     joints = slice(None) if len(best.joints) == len(before) else list(best.joints)
     worst = f"the model is off by {rms(before[joints]):.3g} N m"
+    if best.kind == "scale":
+        return _scale_words(best, rms(tau), rms(comparison.model), rms(after))
     if best.kind == "sign":
+        names = [tree.joint_names[j] for j in best.joints]
         which = "all joints" if len(names) == tree.n else ", ".join(names)
         return (
             f"the torque of {which} has the wrong sign: {worst} there as recorded and by "
             f"{rms(after[joints]):.3g} N m with the sign turned; turn it in the recording, tau "
             "is positive along the joint's axis and holds the arm against gravity."
-        )
-    if best.kind == "scale":
-        name, size = unit(best), np.abs(best.detail)
-        same = np.ptp(size) == 0
-        what = f"{size[0]:.4g} times" if same else ", ".join(f"{x:.3g}" for x in size) + " times"
-        turned = " and with the opposite sign" if np.all(best.detail < 0) else ""
-        guess = name or "gears (torque of the motors), motor currents or another unit"
-        return (
-            f"the torques are {what} what the model needs{turned} (rms {rms(tau):.3g} against "
-            f"{rms(comparison.model):.3g} N m, {rms(after):.3g} N m off after division): {guess}? "
-            "Convert them to N m at the link side (`adapter import` does)."
         )
     if best.kind == "gravity":
         return (
@@ -337,12 +325,26 @@ def in_words(
             f"gravity acts along [{g}] m/s² of the base and not as in the model: {worst} as "
             f"recorded and by {rms(after):.3g} N m so; give the model the gravity of the mounting."
         )
-    order = [tree.joint_names[int(k)] for k in best.detail]
-    pairs = ", ".join(f"{order[j]} holds that of {tree.joint_names[j]}" for j in best.joints)
+    held = [tree.joint_names[int(k)] for k in best.detail]
+    pairs = ", ".join(f"{held[j]} holds that of {tree.joint_names[j]}" for j in best.joints)
     return (
         f"the torques are in another order than the positions, the column of {pairs}: {worst} "
         f"there as recorded and by {rms(after[joints]):.3g} N m put in order; record them in the "
         "order of the joint names."
+    )
+
+
+def _scale_words(best: TorqueReading, recorded: float, model: float, after: float) -> str:
+    """Of torques in another unit; rms of them, of the model and of what division leaves, N m."""
+    size = np.abs(best.detail)
+    same = np.ptp(size) == 0
+    what = f"{size[0]:.4g} times" if same else ", ".join(f"{x:.3g}" for x in size) + " times"
+    turned = " and with the opposite sign" if np.all(best.detail < 0) else ""
+    guess = unit(best) or "gears (torque of the motors), motor currents or another unit"
+    return (
+        f"the torques are {what} what the model needs{turned} (rms {recorded:.3g} against "
+        f"{model:.3g} N m, {after:.3g} N m off after division): {guess}? "
+        "Convert them to N m at the link side (`adapter import` does)."
     )
 
 

@@ -93,9 +93,8 @@ def find_gap(
     except RecordingRefused as refusal:
         if not refusal.kind.is_an_answer:
             raise
-        names = [log.path.name if isinstance(log, Log) else Path(log).name for log in logs]
-        joints = nominal.tree.joint_names
-        return GapResult.untold(joints, nominal.name, names, name, str(refusal))
+        names = [_name(log) for log in logs]
+        return GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
     progress("smoothing")
     fit = _nominal_fit(task, settings)
     progress("searching")
@@ -115,8 +114,7 @@ def _task(
     arm = RigidArm.of(model)
     screened: list[Screened] = []
     for log in logs:
-        name = log.path.name if isinstance(log, Log) else Path(log).name
-        progress(f"reading {name}")
+        progress(f"reading {_name(log)}")
         screened.append(refuse(log if isinstance(log, Log) else read_log(Path(log)), model, arm))
     recordings = tuple(Recorded.of(x.log, _lateness(x.timing)) for x in screened)
     if len(recordings) > 1:
@@ -138,6 +136,10 @@ def _task(
             for note in x.notes
         ),
     )
+
+
+def _name(log: Path | str | Log) -> str:
+    return log.path.name if isinstance(log, Log) else Path(log).name
 
 
 def _lateness(timing: RecordingClock) -> float:
