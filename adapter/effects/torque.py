@@ -57,24 +57,22 @@ def bodies(motion: Motion, effects: Sequence[Active]) -> Array:
     own = [active for active in effects if isinstance(active.effect, BodyEffect)]
     switches = sorted({t for active in own for t in active.interval_s if np.isfinite(t)})
     tau = np.empty_like(motion.q)
-    edges = [-np.inf, *switches, np.inf]
-    for begin, end in pairwise(edges):
-        rows = (motion.t >= begin) & (motion.t < end)
-        if rows.any():
-            arm = _arm_with(motion.arm, [a for a in own if _covers(a, begin, end)])
-            tau[rows] = arm.torque(motion.q[rows], motion.dq[rows], motion.ddq[rows])
+    cuts = [0, *np.searchsorted(motion.t, switches), len(motion.t)]
+    spans = pairwise([-np.inf, *switches, np.inf])
+    for (begin, end), (first, last) in zip(spans, pairwise(cuts), strict=True):
+        if first < last:
+            arm, part = _arm_with(motion.arm, own, begin, end), slice(first, last)
+            tau[part] = arm.torque(motion.q[part], motion.dq[part], motion.ddq[part])
     return tau
 
 
-def _covers(active: Active, begin: float, end: float) -> bool:
-    return active.interval_s[0] <= begin and end <= active.interval_s[1]
-
-
-def _arm_with(arm: ArmDynamics, own: Sequence[Active]) -> ArmDynamics:
+def _arm_with(arm: ArmDynamics, own: Sequence[Active], begin_s: float, end_s: float) -> ArmDynamics:
+    """The arm with those of its effects that act all the time between two instants."""
     theta, gravity = arm.theta, arm.gravity
     for active in own:
         assert isinstance(active.effect, BodyEffect)
-        theta, gravity = active.effect.body(theta, gravity, active.joint, active.values)
+        if active.interval_s[0] <= begin_s and end_s <= active.interval_s[1]:
+            theta, gravity = active.effect.body(theta, gravity, active.joint, active.values)
     return arm.changed(theta, gravity)
 
 

@@ -306,16 +306,7 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     for f, x in enumerate(Folds.of(found.fit, found.carried).coefficients()):
         rows = fold_of(own.t, block_s(found.fit)) == f
         after[rows] = found.fit.at(x).without_patterns().model.residual(i)[rows]
-    rows = np.searchsorted(own.motion.t, own.t - 1e-9)
     motion = own.motion
-    return Curves(
-        recording=name,
-        t=own.t,
-        q=motion.q[rows],
-        dq=motion.dq[rows],
-        ddq=motion.ddq[rows],
-        tau=own.tau,
-        before=nominal.residual(0),
-        after=after,
-        held_out=np.zeros(len(own.t), dtype=bool),
-    )
+    rows = np.searchsorted(motion.t, own.t - 1e-9)
+    signals = motion.q[rows], motion.dq[rows], motion.ddq[rows]
+    return Curves(name, own.t, *signals, own.tau, nominal.residual(0), after)

@@ -67,7 +67,8 @@ class Finding:
         own = asdict(self)
         del own["title"]
         own["ambiguous_with"], own["overlap"] = list(self.overlaps), own.pop("overlaps")
-        return {**own, "z": own.pop("detectability")}
+        own["z"] = own.pop("detectability")
+        return own
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,6 @@ class Curves:
         t: s; q, dq, ddq, tau: smooth motion and measured torque in the band.
         before, after: measured less predicted torque, nominal model and new one, N m; after is
             predicted without the block of data that holds the instant.
-        held_out: (k,) bool, whether the instant is in data that the fit never saw at all.
     """
 
     recording: str
@@ -123,7 +123,6 @@ class Curves:
     tau: Array
     before: Array
     after: Array
-    held_out: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +145,8 @@ class GapResult:
         noise_floor_nm: (n,) rms of the torque noise in the band of the figures.
         before, after: nominal model and new one.
         findings, unexplained: see there.
-        corrections: (n, 10) the small correction of the inertias; corrections_std: of it, and
-            corrections_prior: (n, 10) what was allowed a priori, one standard deviation each.
+        corrections: (n, 10) the small correction of the inertias; corrections_prior: (n, 10)
+            what was allowed a priori, one standard deviation each.
         notes: sentences about the log (timing, joints that stand still, ...).
         problem: why nothing could be told; None where something could.
         curves: one per recording; rollouts: one per recording that was simulated.

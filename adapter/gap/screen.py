@@ -288,24 +288,19 @@ def judge_torque(
         Refusal: see there.
     """
     every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
-    t = np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
+    t = GRID_S * np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
     q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
-    comparison = TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, GRID_S * t))
-
-    def gravity(along: Array) -> Array:
-        return arm.changed(gravity=along).torque(q, 0.0 * q, 0.0 * q)
-
-    as_is, *others = readings(comparison, tau, gravity(arm.gravity), gravity)
+    comparison = TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, t))
+    as_is, *others = readings(comparison, tau)
     best = others[0]
     if renamed and min(as_is.cost, best.cost) > FOREIGN_COST:
         why = "the joints are named otherwise and its torques are not those of such an arm"
         raise _another_robot(log, model, recorded, why)
-    if not convincing(comparison, best, as_is):
+    tilt = best.kind == "mounting" and _angle(best.detail, arm.gravity) < TILT_RAD
+    if tilt or not convincing(comparison, best, as_is):
         return
-    if best.kind == "mounting" and _angle(best.detail, arm.gravity) < TILT_RAD:
-        return
-    cheap = [r for r in others if r.cost < best.cost + NAMED_UNIT_COST]
     if best.kind == "scale":
+        cheap = (r for r in others if r.cost < best.cost + NAMED_UNIT_COST)
         best = next((r for r in cheap if unit(r)), best)
     raise RecordingRefused(
         RecordingFault(best.kind),

@@ -134,14 +134,12 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         stamp_ns: (m,) ns as recorded; q, dq, tau: (m, n) rad, rad/s, N m.
     """
     m = len(stamp_ns)
-    finite = _finite(q, dq, tau)
     increasing = _increasing(stamp_ns)
     keep = uniform(stamp_ns, q, dq, tau)
     steps_s = 1e-9 * np.diff(stamp_ns[increasing])
     period_s = float(np.median(steps_s)) if len(steps_s) else 0.0
     since_s = 1e-9 * (stamp_ns - stamp_ns[increasing[0]]) if m else np.zeros(0)
     gaps = np.flatnonzero(steps_s > HOLE_PERIODS * period_s)
-    holes = [(float(since_s[increasing[k]]), float(steps_s[k])) for k in gaps]
     regular = np.delete(steps_s, gaps)
     same = {name: _same(x) for name, x in (("q", q), ("dq", dq), ("tau", tau))}
     moving = np.any(np.nan_to_num(dq[1:]) != 0.0, axis=1)  # a simulated arm at rest repeats itself
@@ -154,12 +152,12 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         span_s=float(since_s[keep[-1]] - since_s[keep[0]]) if len(keep) else 0.0,
         rate_hz=1.0 / period_s if period_s else 0.0,
         jitter_s=float(np.std(regular)) if len(regular) else 0.0,
-        holes=tuple(holes),
+        holes=tuple((float(since_s[increasing[k]]), float(steps_s[k])) for k in gaps),
         frozen=_runs(again & (np.abs(dq[1:]).max(axis=1) > FROZEN_DQ), since_s),
         repeated=float(again.sum()) / max(m, 1),
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
-        not_finite=int((~finite).sum()),
+        not_finite=int((~_finite(q, dq, tau)).sum()),
         lateness_s=late_s,
         lateness_std_s=std_s,
         velocity_gain=gain,

@@ -9,7 +9,7 @@ the residual plus that of the corrections; a wrong reading needs negative masses
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -77,7 +77,7 @@ class TorqueComparison:
     """
 
     def __init__(self, arm: RigidArm, q: Array, dq: Array, ddq: Array, tau_model: Array) -> None:
-        self.model = tau_model
+        self.model, self._arm, self._q = tau_model, arm, q
         self.sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(tau_model**2, axis=0))
         self._row = np.sqrt(EFFECTIVE / len(q)) / self.sigma
         inertial = arm.regressor(q, dq, ddq) * _inertial_std(arm).ravel()
@@ -97,6 +97,11 @@ class TorqueComparison:
             for j in range(n):
                 joint[:, j, k, j] = std * column[:, j]
         return joint.reshape(m, n, -1)
+
+    def gravity(self, along: Array | None = None) -> Array:
+        """(m, n) N m that the model says gravity takes, or would along another one (3,), m/s²."""
+        still = np.zeros_like(self._q)
+        return self._arm.changed(gravity=along).torque(self._q, still, still)
 
     def cost(self, tau: Array) -> float:
         """Of a reading (m, n), N m."""
@@ -147,18 +152,8 @@ def _inertial_std(arm: RigidArm) -> Array:
     return np.asarray(std)
 
 
-def readings(
-    comparison: TorqueComparison,
-    tau: Array,
-    gravity_only: Array,
-    per_gravity: Callable[[Array], Array],
-) -> list[TorqueReading]:
-    """All readings of tau (m, n), the recorded one first, then by cost.
-
-    Args:
-        gravity_only: (m, n) N m, what the model says gravity takes.
-        per_gravity: the model's gravity torque (m, n) for another gravity (3,).
-    """
+def readings(comparison: TorqueComparison, tau: Array) -> list[TorqueReading]:
+    """All readings of tau (m, n), the recorded one first, then by cost."""
     n = tau.shape[1]
     as_is = TorqueReading("as recorded", tau, comparison.cost(tau), tuple(range(n)), np.ones(n))
     others = [
@@ -166,9 +161,9 @@ def readings(
         *_scales(comparison, tau),
         *_orders(comparison, tau),
     ]
-    free = tau + gravity_only
+    free = tau + comparison.gravity()
     others.append(TorqueReading("gravity", free, comparison.cost(free), as_is.joints, np.ones(n)))
-    others.append(_mounting(comparison, tau, gravity_only, per_gravity))
+    others.append(_mounting(comparison, tau))
     other_size = _other_size(comparison, tau)
     others.sort(key=lambda reading: (reading.kind != "scale" if other_size else 0, reading.cost))
     return [as_is, *others]
@@ -272,15 +267,11 @@ def _orders(comparison: TorqueComparison, tau: Array) -> Iterator[TorqueReading]
         )
 
 
-def _mounting(
-    comparison: TorqueComparison,
-    tau: Array,
-    gravity_only: Array,
-    per_gravity: Callable[[Array], Array],
-) -> TorqueReading:
+def _mounting(comparison: TorqueComparison, tau: Array) -> TorqueReading:
     """Gravity of the usual size along another direction of the base."""
     n = tau.shape[1]
-    axes = np.stack([per_gravity(axis) for axis in np.eye(3)], axis=2)
+    axes = np.stack([comparison.gravity(axis) for axis in np.eye(3)], axis=2)
+    gravity_only = comparison.gravity()
     dynamic = comparison.model - gravity_only
     rows = (axes / comparison.sigma[None, :, None]).reshape(-1, 3)
     found = np.linalg.lstsq(rows, ((tau - dynamic) / comparison.sigma).ravel(), rcond=None)[0]

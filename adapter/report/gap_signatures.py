@@ -175,26 +175,11 @@ def _over_time(result: GapResult, j: int) -> Panel:
     ax = drawing.axes[0]
     _limits(ax, curves.t, [curves.before[:, j], curves.after[:, j]])
     _noise_band(ax, result.noise_floor_nm[j])
-    _held_out(ax, curves)
     _spans(ax, result, j)
     ax.plot(*thin(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
     ax.plot(*thin(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
-    note = f"of {curves.recording}"
-    if curves.held_out.any() and not curves.held_out.all():
-        note += "; the marked stretches were never fitted"
-    return drawing.panel("Over time", "N m", note)
-
-
-def _held_out(ax: Axes, curves: Curves) -> None:
-    """Lines along the foot where data were held out."""
-    if curves.held_out.all():
-        return
-    flags = np.concatenate([[0], curves.held_out.astype(int), [0]])
-    edges = np.flatnonzero(np.diff(flags)).reshape(-1, 2)
-    for start, stop in edges:
-        ends = curves.t[[start, stop - 1]]
-        ax.plot(ends, [0.015] * 2, color=INK, linewidth=3.0, transform=ax.get_xaxis_transform())
+    return drawing.panel("Over time", "N m", f"of {curves.recording}")
 
 
 def _spans(ax: Axes, result: GapResult, j: int) -> None:

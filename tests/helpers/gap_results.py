@@ -58,8 +58,7 @@ def curves(n: int = 7, seconds: float = LONG_S, name: str = "shelf.mcap") -> Cur
     after = NOISE_NM * rng.standard_normal((len(t), n))
     before = after + 0.03 * np.sin(t)[:, None]
     before[:, max(n - 4, 0)] += 2.0 * np.tanh(dq[:, max(n - 4, 0)] / 0.02)
-    held_out = (t % 5.0) > 4.0
-    return Curves(name, t, q, dq, ddq, tau, before, after, held_out)
+    return Curves(name, t, q, dq, ddq, tau, before, after)
 
 
 def rollout(shown: Curves) -> RolloutCurves:
