@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.by_joint import EffectSums, JointSignals
 from adapter.effects.phrases import Phrase
-from adapter.effects.splits import Split
+from adapter.effects.splits import DecidingExperiment
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions
@@ -177,7 +177,7 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     prior_std: ClassVar[float | tuple[float, ...]]
     phrase: ClassVar[Phrase] = Phrase()
-    shows: ClassVar[tuple[tuple[Split, str], ...]] = ()
+    shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]] = ()
     positive: ClassVar[tuple[str, ...]] = ()
     log_odds: ClassVar[float] = 0.0
     inexact: ClassVar[float] = 0.0

@@ -13,7 +13,7 @@ from typing import ClassVar, Protocol
 
 
 @dataclass(frozen=True)
-class Split:
+class DecidingExperiment:
     """An experiment.
 
     Attributes:
@@ -25,25 +25,35 @@ class Split:
     untouched: str = "stays"
 
 
-ALONE = Split("repeat the motion with nothing near the arm")
-BARE = Split("take off what the flange carries and repeat the motion")
-FLANK = Split("reverse the joint slowly with and without a load that keeps the gear on one flank")
-LOADS = Split("repeat the motion with a ladder of loads at the flange, at the same speed")
-WEIGHED = Split(
+ALONE = DecidingExperiment("repeat the motion with nothing near the arm")
+BARE = DecidingExperiment("take off what the flange carries and repeat the motion")
+FLANK = DecidingExperiment(
+    "reverse the joint slowly with and without a load that keeps the gear on one flank"
+)
+LOADS = DecidingExperiment(
+    "repeat the motion with a ladder of loads at the flange, at the same speed"
+)
+WEIGHED = DecidingExperiment(
     "weigh the link apart from the arm, or compute it from its drawing", "does not show"
 )
-SPEEDS = Split(
+SPEEDS = DecidingExperiment(
     "move the joint at constant speeds from 0.01 to 0.5 rad/s over the same range",
     "is the same at all speeds",
 )
-STILL = Split("hold the joint still after moving in either direction", "is the same both times")
-BOTH_WAYS = Split(
+STILL = DecidingExperiment(
+    "hold the joint still after moving in either direction", "is the same both times"
+)
+BOTH_WAYS = DecidingExperiment(
     "move the joint at the same speed forwards and backwards", "is as large either way"
 )
-LATER = Split("repeat the motion after the arm has moved for ten minutes", "is what it was")
-TURN = Split("move the joint over as much of a turn as it has", "is the same all along")
-LEVELLED = Split("measure with a level how the base stands", "does not show")
-KNOWN_WEIGHT = Split(
+LATER = DecidingExperiment(
+    "repeat the motion after the arm has moved for ten minutes", "is what it was"
+)
+TURN = DecidingExperiment(
+    "move the joint over as much of a turn as it has", "is the same all along"
+)
+LEVELLED = DecidingExperiment("measure with a level how the base stands", "does not show")
+KNOWN_WEIGHT = DecidingExperiment(
     "hang a known weight on the flange and read the torque sensors", "leaves its reading right"
 )
 
@@ -52,7 +62,7 @@ class Shown(Protocol):
     """What is asked of an effect here."""
 
     title: ClassVar[str]
-    shows: ClassVar[tuple[tuple[Split, str], ...]]
+    shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]]
 
 
 # In the order of preference: what is easy to do and sure comes first.
@@ -72,12 +82,12 @@ SPLITS = (
 )
 
 
-def split_of(one: Shown, other: Shown) -> Split | None:
+def split_of(one: Shown, other: Shown) -> DecidingExperiment | None:
     """The experiment that tells two effects apart; None where none of them does."""
     return next((s for s in SPLITS if shown(one, s) != shown(other, s)), None)
 
 
-def shown(effect: Shown, split: Split) -> str:
+def shown(effect: Shown, split: DecidingExperiment) -> str:
     """What an effect shows in an experiment."""
     return dict(effect.shows).get(split, split.untouched)
 
@@ -87,7 +97,7 @@ def experiments(effect: Shown, rivals: Iterable[Shown]) -> tuple[str, ...]:
 
     A rival that no experiment tells from it is not in any.
     """
-    by_split: dict[Split, list[Shown]] = {}
+    by_split: dict[DecidingExperiment, list[Shown]] = {}
     for rival in rivals:
         split = split_of(effect, rival)
         if split is not None:
