@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -108,38 +109,65 @@ def _standing(
     fit: Fit, carried: Carried, candidates: Sequence[Candidate], products: _Products, k: int
 ) -> Standing:
     """The k-th named effect of a fit among the candidates."""
-    named = fit.named[k]
-    own, rest = beside(fit, k)
-    others, mine = carried.part(rest), carried.worth(own, rest)
-    beside_me = named.x @ carried.G[np.ix_(own, rest)]  # my signature's products with the others
-    alone = named.x @ carried.G[np.ix_(own, own)] @ named.x
-    size = alone - others.solved(beside_me) @ beside_me
+    named, (own, rest) = fit.named[k], beside(fit, k)
+    mine = carried.worth(own, rest)
+    found = _rivals(named, candidates, products, _reduced(named.x, carried, products, own, rest))
+    best: dict[tuple[str, int], Rival] = {}
+    for rival in sorted(found, key=lambda x: -x.log_evidence):
+        best.setdefault(rival.candidate.key, rival)
+    best.pop(named.candidate.key, None)
+    taken = {e.candidate.key for e in fit.named}
+    rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
+    return Standing(named.candidate, mine.log_evidence + price(named), mine.chi2, tuple(rivals))
+
+
+class _Reduced(NamedTuple):
+    """Products of the candidates once all but one named effect explain what they can.
+
+    Attributes:
+        C: (c, p) with what is carried along; solved: the same times its covariance.
+        g: (c,) with the data; cross: (c,) with the named effect; size: of that with itself.
+    """
+
+    C: Array
+    solved: Array
+    g: Array
+    cross: Array
+    size: float
+
+
+def _reduced(
+    x: Array, carried: Carried, products: _Products, own: np.ndarray, rest: np.ndarray
+) -> _Reduced:
+    """About a named effect with coefficients x (k,) at `own`, beside those at `rest`."""
+    others, mine = carried.part(rest), x @ carried.G[own]
     C = products.carried[:, rest]
     solved = others.solved(C)
-    g = products.data - solved @ others.g
-    cross = products.carried[:, own] @ named.x - solved @ beside_me
-    found = []
-    taken = {e.candidate.key for e in fit.named}
+    size = float(mine[own] @ x - others.solved(mine[rest]) @ mine[rest])
+    cross = products.carried[:, own] @ x - solved @ mine[rest]
+    return _Reduced(C, solved, products.data - solved @ others.g, cross, size)
+
+
+def _rivals(
+    named: Named, candidates: Sequence[Candidate], products: _Products, left: _Reduced
+) -> list[Rival]:
+    """Every candidate in the place of a named effect, in order."""
+    found: dict[int, Rival] = {}
     for places in _alike(candidates):
         at = np.array([candidates[i].columns for i in places])
         std = np.array([candidates[i].prior_std for i in places])
-        G = np.array([products.own[i] for i in places]) - solved[at] @ C[at].swapaxes(1, 2)
-        evidence, chi2, x = scores(G, g[at], std)
+        G = np.array([products.own[i] for i in places])
+        G -= left.solved[at] @ left.C[at].swapaxes(1, 2)
+        evidence, chi2, x = scores(G, left.g[at], std)
         wide = G + (WIDE * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])
-        reached = np.linalg.solve(wide, cross[at][..., None])[..., 0]
-        overlap = np.einsum("bi,bi->b", cross[at], reached) / size
+        reached = np.linalg.solve(wide, left.cross[at][..., None])[..., 0]
+        overlap = np.einsum("bi,bi->b", left.cross[at], reached) / left.size
         for b, i in enumerate(places):
             c = candidates[i]
-            odds = price(replace(named, candidate=c))
-            found.append((float(evidence[b]) + odds, i, float(chi2[b]), float(overlap[b]), x[b]))
-    best: dict[tuple[str, int], Rival] = {}
-    for worth, i, fall, share, at_best in sorted(found, key=lambda entry: (-entry[0], entry[1])):
-        c = candidates[i]
-        if c.key not in best and c.key != named.candidate.key:
-            credible = c.key not in taken and c.effect.possible(c.template.decode(at_best))
-            best[c.key] = Rival(c, worth, fall, share, at_best, credible)
-    evidence_of_mine = mine.log_evidence + price(named)
-    return Standing(named.candidate, evidence_of_mine, mine.chi2, tuple(best.values()))
+            worth = float(evidence[b]) + price(replace(named, candidate=c))
+            possible = c.effect.possible(c.template.decode(x[b]))
+            found[i] = Rival(c, worth, float(chi2[b]), float(overlap[b]), x[b], possible)
+    return [found[i] for i in sorted(found)]
 
 
 def _alike(candidates: Sequence[Candidate]) -> list[list[int]]:

@@ -239,10 +239,8 @@ class SignatureTable:
     def whole(self) -> list[Lead]:
         """Every candidate, acting all the time."""
         leads = []
-        G, g = self.carried.without(self.X)
         for c in self.candidates:
-            k = np.ix_(c.columns, c.columns)
-            found = score(G[k], g[list(c.columns)], c.prior_std)
+            found = score(*self.carried.without(self.X[list(c.columns)]), c.prior_std)
             odds = log_odds(c)
             leads.append(Lead(c, found.log_evidence + odds, found.chi2, found.x, odds=odds))
         return leads
