@@ -127,7 +127,7 @@ def test_rows_are_weighed_by_what_is_left_of_them(solver: str) -> None:
     tau = data.tau.copy()
     tau[:, 6:] += noise * np.random.default_rng(2).normal(size=(400, 5))
     noisy = replace(data, tau=tau)
-    found = learn_theta(noisy, model.lam, 0, BatchThetaSettings(solver=solver, rounds=3))
+    found = learn_theta(noisy, model.lam, 0, BatchThetaSettings(solver=solver))
     std = np.array([s for name, s in found.std.items() if name.startswith("torque")])
     assert (0.8 * noise < std).all() and (std < 1.2 * noise).all()
     error = predicted_torques(data, model.lam, found.theta) - data.tau

@@ -40,8 +40,11 @@ from adapter.model.spatial import Array
 from adapter.physics.networks import theta_from_log_cholesky
 
 SOLVERS = ("consistent", "least squares", "adam")
-# Residuals are not trusted below this share of a row's size when they set its weight.
-RESIDUAL_FLOOR = 1e-6
+# Residuals are not trusted below this share of a row's size when they set its weight; without a
+# floor, rounds of weighting end with the rows that happen to fit best deciding alone.
+RESIDUAL_FLOOR = 1e-4
+# Weights that move by less than this share in a round have settled.
+SETTLED_WEIGHTS = 0.1
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,8 @@ class BatchThetaSettings:
         supervision: "torques", "wrenches" or "both" (eq. 17).
         std: standard deviation of every row of `row_factors`, N or N m. None: the size of its
             signal first, then what the first solve leaves of it.
-        rounds: of weighting by what is left, where `std` is None.
+        rounds: most rounds of weighting by what is left, where `std` is None; fewer once no weight
+            moves by more than a tenth.
         whole: whether all bodies are solved together in the end; without it a floating base
             keeps its start.
         prior: (bodies, 10), for "least squares"; zeros where None.
@@ -64,7 +68,7 @@ class BatchThetaSettings:
     solver: str = "consistent"
     supervision: str = "torques"
     std: tuple[float, ...] | None = None
-    rounds: int = 1
+    rounds: int = 5
     whole: bool = True
     prior: Array | None = None
     adam_steps: int = 5000
@@ -151,7 +155,8 @@ def learn_theta(
     factors_s = time.perf_counter() - began
     solve.run()
     for _ in range(settings.rounds if settings.std is None else 0):
-        solve.reweigh()
+        if solve.reweigh() < SETTLED_WEIGHTS:
+            break
         solve.again()
     names = [row.name for row in rows]
     least = float(min_eigenvalue(solve.theta).min())
@@ -205,10 +210,11 @@ class _Solve:
         if self.settings.whole:
             self._stage("whole tree", tuple(range(self.tree.bodies)))
 
-    def reweigh(self) -> None:
-        """Every row's weight by what the solution leaves of it."""
-        floor = RESIDUAL_FLOOR * scales(self.rows)
+    def reweigh(self) -> float:
+        """Weigh every row by what the solution leaves of it; the largest share a weight moved."""
+        floor, before = RESIDUAL_FLOOR * scales(self.rows), self.std
         self.std = np.maximum([row.residual(self.theta) for row in self.rows], floor)
+        return float(np.abs(self.std / before - 1.0).max())
 
     def rank(self, bodies: tuple[int, ...]) -> int:
         """Base parameters that the rows of these bodies show."""
