@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pybullet as bullet
+from scipy.spatial.transform import Rotation
 
 from sim.falls.babbling import Babbling, plan
 from sim.falls.tree_truth import TreeTruth
@@ -138,7 +139,7 @@ class FreeFall:
             tau: (m, n) N m.
         """
         v, w = bases[:, 4:7], bases[:, 7:]
-        R = _rotations(bases[:-1, :4]) @ self._axes.T
+        R = Rotation.from_quat(bases[:-1, :4]).as_matrix() @ self._axes.T
 
         def into_base(x: Array) -> Array:
             return np.asarray(np.einsum("kij,ki->kj", R, x))
@@ -234,13 +235,3 @@ def _urdf(truth: TreeTruth) -> str:
         parent = names[truth.parent[j] + 1]
         parts.append(joint_text(joint, parent, link, truth.p[j], truth.R[j]))
     return "\n".join([f'<robot name="{truth.name}">', *parts, "</robot>"])
-
-
-def _rotations(quaternions: Array) -> Array:
-    """(m, 3, 3) of unit quaternions (m, 4) x y z w: R = (2w² - 1) I + 2 u uᵀ + 2 w [u x]."""
-    u, w = quaternions[:, :3], quaternions[:, 3, None, None]
-    x, y, z = u.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    outer = u[:, :, None] * u[:, None, :]
-    return np.asarray((2 * w * w - 1) * np.eye(3) + 2 * outer + 2 * w * cross)
