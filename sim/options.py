@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 
 from sim.noise_levels import NOISES, check_levels
 
+DEFAULT_SCENARIO = "nominal"
+COMMON_OPTIONS = ("noise", "links", "levels")
+
 
 class ScenarioKind(NamedTuple):
     """What a scenario offers: options (numbers from 0 up), and whether links are measured."""
@@ -25,8 +28,6 @@ SCENARIOS = {
     "friction": ScenarioKind(),
     "wall_mounted": ScenarioKind(),
 }
-DEFAULT_SCENARIO = "nominal"
-COMMON_OPTIONS = ("noise", "links", "levels")
 
 
 def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:

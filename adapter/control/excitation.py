@@ -31,6 +31,10 @@ UNKNOWN_RANGE = 0.5  # rad to each side, of a joint whose range nobody documente
 # Largest slope and second derivative of the quintic step over one second, and of the product of
 # two that overlap (a stop during the stop before a rest).
 RAMP_SLOPE, RAMP_BEND = 2.4, 12.4
+HOW_TO_STOP = (
+    "To stop: Ctrl-C (or SIGTERM, or close this terminal); a second Ctrl-C stops at once. Keep a "
+    "hand on the emergency stop: it is the only one that needs no software."
+)
 
 
 @jit
@@ -226,12 +230,6 @@ def _phases_through(phase: Array, amplitude: Array, start: Array) -> Array:
         low, high = np.where(short, middle, low), np.where(short, high, middle)
     found: Array = phase + high[:, None] * turn
     return found
-
-
-HOW_TO_STOP = (
-    "To stop: Ctrl-C (or SIGTERM, or close this terminal); a second Ctrl-C stops at once. Keep a "
-    "hand on the emergency stop: it is the only one that needs no software."
-)
 
 
 def plan_lines(

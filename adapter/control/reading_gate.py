@@ -21,6 +21,9 @@ FASTER = 1.5  # of the documented speed is more than a joint does
 HARDER = 100.0  # rad/s² is more than an arm does, five times what a Panda may
 STUCK_EFFORT = 0.1  # of the effort limit that the spring winds up on a reading that stands still
 STUCK_WAY = 0.02  # rad that the measured speed makes meanwhile
+BLIND_NS = 20_000_000  # without a usable reading for so long, the controller gives up
+LONGEST_STEP_NS = 20_000_000  # a longer step of the stamps alone is a clock that was set
+_SINCE = f"for {1e-9 * BLIND_NS:g} s; the arm is stopped"
 
 
 class ReadingVerdict(IntEnum):
@@ -120,10 +123,6 @@ class ReadingJudge:
         return VERDICTS[verdict]
 
 
-BLIND_NS = 20_000_000  # without a usable reading for so long, the controller gives up
-LONGEST_STEP_NS = 20_000_000  # a longer step of the stamps alone is a clock that was set
-
-_SINCE = f"for {1e-9 * BLIND_NS:g} s; the arm is stopped"
 _WHY = {
     ReadingVerdict.NON_FINITE: f"no usable joint reading {_SINCE}",
     ReadingVerdict.GOOD: f"no usable joint reading {_SINCE}",

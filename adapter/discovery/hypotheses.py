@@ -41,6 +41,8 @@ MOUNT_PRIOR = -5.0  # log odds of a frame that does not turn about its z
 MOST_MOUNTED = 24  # pairs of a link that are fitted; with more of them nothing is decided
 MOST_KEPT = 200  # options of a link
 LOST = 18.0  # log odds below the best at which a hypothesis is dropped
+Fits = dict[tuple[int, int], dict[str, float]]  # misfits by channel of (joint column, parent)
+Pair = tuple[int, int, int]  # joint, and two bodies of which the first is a link and moves
 
 
 @dataclass(frozen=True)
@@ -78,9 +80,6 @@ class Hypotheses:
     excess: dict[str, float]
     tolerance: float
     mounted: bool = False
-
-
-Fits = dict[tuple[int, int], dict[str, float]]  # misfits by channel of (joint column, parent)
 
 
 def hypotheses_of(bodies: Bodies, misfit: dict[str, Array]) -> Hypotheses:
@@ -255,8 +254,6 @@ class Scores:
 
 
 # --- with free axes ----------------------------------------------------------------------------
-
-Pair = tuple[int, int, int]  # joint, and two bodies of which the first is a link and moves
 
 
 @dataclass(frozen=True)

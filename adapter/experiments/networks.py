@@ -39,6 +39,8 @@ STATIONARY = 0.05
 # ... and the minimum is the frame's where it leaves less than this share of the signal: noise
 # leaves far less, a wrong frame (a saddle) the better part.
 UNEXPLAINED = 0.05
+# Added to a curvature whose diagonal is 1: where samples show nothing, nothing moves.
+LEVENBERG = 1e-10
 
 
 @dataclass(frozen=True)
@@ -211,8 +213,6 @@ def _lam(frames: StartFrames) -> Array:
 
 # --- the networks of all joints and starts as one batch of tensors ------------------------------
 
-# Added to a curvature whose diagonal is 1: where samples show nothing, nothing moves.
-LEVENBERG = 1e-10
 # [x]× as a linear map of x: row a of the table (3, 9) is that of unit vector a.
 _CROSS = torch.zeros(3, 3, 3, dtype=torch.float64)
 for _a, _b, _c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

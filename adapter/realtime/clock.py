@@ -10,13 +10,11 @@ from collections.abc import Callable
 
 SPIN_NS = 120_000  # wait actively for so long: waking up takes the system some 50 to 100 µs
 TIMER_ABSTIME = 1  # <time.h>
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
-_libc = ctypes.CDLL(None, use_errno=True)
 
 
 def sleep_until(deadline_ns: int) -> None:

@@ -29,6 +29,10 @@ from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter
 from drivers.interface import JointSample, LinkMotion
 
+UNFINISHED = "next"
+HAS_LINKS, HAS_COMMAND = 1, 2
+HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
+
 
 class LearnerLike(Protocol):
     """What is fed: every filtered state once, in order. It must copy what it keeps."""
@@ -135,9 +139,6 @@ class Jobs:
     display: DisplayJob | None = None
 
 
-UNFINISHED = "next"
-
-
 @dataclass(frozen=True)
 class LearnerTask:
     """Run by the learner process.
@@ -238,9 +239,6 @@ class LearnerTask:
                 shutil.rmtree(old, ignore_errors=True)
 
 
-HAS_LINKS, HAS_COMMAND = 1, 2
-
-
 class RawLayout:
     """Where a raw sample lies in `size` float64: stamp (int64 bits, ns), flags (int64 bits),
     q, dq, tau, command (n each), and link motion [twist accel] (links, 12) where links > 0.
@@ -282,9 +280,6 @@ class RawLayout:
         command = record[self.command] if flags & HAS_COMMAND else None
         parts = record[self.q], record[self.dq], record[self.tau]
         return JointSample(stamp_ns, *parts, links), command
-
-
-HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
 
 
 @dataclass(frozen=True)

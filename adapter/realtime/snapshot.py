@@ -1,6 +1,4 @@
-"""Where things lie in the shared memory of an estimate, and how a slot is filled and read.
-
-The present estimate in shared memory: one writer, any number of readers, never torn.
+"""The present estimate in shared memory: one writer, any number of readers, never torn.
 
 Two slots, each with a sequence number: the writer fills the slot that is not the newest, then
 names it the newest. A reader that was overtaken sees the number change and reads again; a
@@ -30,6 +28,8 @@ HEADER_WORDS, TEXT_BYTES = 16, 8192
 SEQUENCE, STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(6)  # words of a slot
 SLOT_WORDS = 8
 LAM_CONVERGED, THETA_CONVERGED = 1, 2
+DEFAULT_NAME = "panda_adapter"
+READ_TIMEOUT_S = 0.2
 
 
 class SnapshotError(MeansError):
@@ -135,10 +135,6 @@ def _alive(pid: int) -> bool:
     except PermissionError:
         return True
     return pid > 0
-
-
-DEFAULT_NAME = "panda_adapter"
-READ_TIMEOUT_S = 0.2
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ IDLE_S = 1e-3  # a worker without work looks again after so long
 ROWS_AT_ONCE = 16  # records between two looks at the clock
 
 Task = Callable[["Port"], Any]
+RESTARTS = 3  # successors of a worker; a fourth death is no accident
 
 
 class Answer(StrEnum):
@@ -218,9 +219,6 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ.pop(key, None)
             else:
                 os.environ[key] = value
-
-
-RESTARTS = 3  # successors of a worker; a fourth death is no accident
 
 
 class WorkerStarter:

@@ -30,6 +30,17 @@ MODEL, DOCUMENTED = "model.json", "documented.json"
 FIGURES, TRACES = "figures.json", "traces.npz"
 FILES = (MODEL, DOCUMENTED, FIGURES, TRACES)
 NEEDED_FIGURES = ("samples", "learned", "refused", "lambda", "theta")
+TRACE_ARRAYS = (
+    "start_lam",
+    "schema_trace",
+    "theta_trace",
+    "score_trace",
+    "fit",
+    "batch",
+    "noise",
+    "lam_shown",
+    "theta_shown",
+)
 
 
 class RunFolderError(ModelError):
@@ -178,19 +189,6 @@ def run_data(
         delay_s=delay_s,
         first_moving_ns=first_moving_ns,
     )
-
-
-TRACE_ARRAYS = (
-    "start_lam",
-    "schema_trace",
-    "theta_trace",
-    "score_trace",
-    "fit",
-    "batch",
-    "noise",
-    "lam_shown",
-    "theta_shown",
-)
 
 
 def save_run(folder: str | Path, data: RunData) -> Path:

@@ -32,6 +32,7 @@ THIRD_DIFFERENCE_GAIN = 20.0
 
 USUAL_DQ_NOISE = 5e-3  # rad/s, of a Panda
 SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
+NEVER = -(2**62)  # a stamp before all others
 
 
 def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
@@ -60,9 +61,6 @@ def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     closed_loop = (np.eye(2) - kalman.K @ kalman.H) @ kalman.F
     poles = np.log(np.linalg.eigvals(closed_loop).astype(complex)) / period
     return float(-(poles[0] + poles[1]).real), float((poles[0] * poles[1]).real)
-
-
-NEVER = -(2**62)  # a stamp before all others
 
 
 class Gains(NamedTuple):

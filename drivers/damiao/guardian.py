@@ -44,6 +44,15 @@ from drivers.damiao.holding import SINK_S, Braker
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
 
+MOST_JOINTS = 15
+HEAD_BYTES = 64
+ROWS = 4  # held angle, angle, speed, torque
+BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
+WATCH_S, HOLD_S = 0.002, 0.005
+SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
+GONE_S = 10.0
+READY = "ready"
+
 
 class GuardianMode(IntEnum):
     """What the guardian is to do."""
@@ -52,12 +61,6 @@ class GuardianMode(IntEnum):
     DRIVE = 1  # take over when commands stop coming
     HOLD = 2  # hold the arm now
     RELEASED = 3  # go
-
-
-MOST_JOINTS = 15
-HEAD_BYTES = 64
-ROWS = 4  # held angle, angle, speed, torque
-BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
 
 
 class GuardianMemory:
@@ -129,12 +132,6 @@ class GuardianMemory:
         """Unmap; may be called more than once."""
         self._head.release()
         self._map.close()
-
-
-WATCH_S, HOLD_S = 0.002, 0.005
-SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
-GONE_S = 10.0
-READY = "ready"
 
 
 class Guardian:

@@ -23,6 +23,10 @@ SLOW = 0.1  # rad/s: below this on every joint the arm counts as standing
 DAMP_AT_MOST_S = 0.5  # a joint that still drifts then is held nevertheless
 FADE_S = 0.2
 SINK_S = 3.0  # over which a held arm is let down
+STEP_S = 0.002
+SETTLE_AT_MOST_S, REST_S, RESTING = 5.0, 0.15, 0.05  # s, s, rad/s
+SETTLE_SHARE, ADOPTIONS = 0.03, 2  # of each step's torque in the mean; times it is carried anew
+STOP_AT_MOST_S, HELD_S = 1.5, 0.5
 
 
 def gains(limits: Scales) -> tuple[float, float]:
@@ -92,12 +96,6 @@ class Braker:
             mit_command(limit, kd=gain[1], tau=share * tau)
             for limit, gain, tau in zip(self._limits, self._gains, self._tau, strict=True)
         ]
-
-
-STEP_S = 0.002
-SETTLE_AT_MOST_S, REST_S, RESTING = 5.0, 0.15, 0.05  # s, s, rad/s
-SETTLE_SHARE, ADOPTIONS = 0.03, 2  # of each step's torque in the mean; times it is carried anew
-STOP_AT_MOST_S, HELD_S = 1.5, 0.5
 
 
 def settle(

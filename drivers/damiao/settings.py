@@ -37,6 +37,15 @@ RANGES = {
     "first_id": (1, 15),
     "reply_offset": (1, 0x7E0),
 }
+CLASSIC_TAIL = 13  # CRC delimiter, ACK, ACK delimiter, 7 of end of frame, 3 of gap
+FD_TAIL = 12  # the same without the CRC delimiter, which is sent at the data rate
+FD_CHECK = 28  # stuff count 4, CRC17, their 6 fixed stuff bits, CRC delimiter
+CRC15_POLYNOMIAL, CRC15_BITS = 0x4599, 15
+STUFF_AFTER = 5  # equal bits
+TYPICAL_SHARE = 0.85  # of a tick that typical frames may fill; motors and hosts need gaps
+WORST_SHARE = 1.0
+ROUND_RATES_HZ = (1000, 800, 500, 400, 250, 200, 100, 50)
+TYPICAL_FRAMES = 200  # drawn to find the mean number of stuff bits
 
 
 @dataclass(frozen=True)
@@ -133,17 +142,6 @@ def _number(key: str, text: str) -> int:
     if not text.isdecimal() or not low <= int(text) <= high:
         raise DriverError(f"option {key} is a whole number from {low} to {high}, not '{text}'")
     return int(text)
-
-
-CLASSIC_TAIL = 13  # CRC delimiter, ACK, ACK delimiter, 7 of end of frame, 3 of gap
-FD_TAIL = 12  # the same without the CRC delimiter, which is sent at the data rate
-FD_CHECK = 28  # stuff count 4, CRC17, their 6 fixed stuff bits, CRC delimiter
-CRC15_POLYNOMIAL, CRC15_BITS = 0x4599, 15
-STUFF_AFTER = 5  # equal bits
-TYPICAL_SHARE = 0.85  # of a tick that typical frames may fill; motors and hosts need gaps
-WORST_SHARE = 1.0
-ROUND_RATES_HZ = (1000, 800, 500, 400, 250, 200, 100, 50)
-TYPICAL_FRAMES = 200  # drawn to find the mean number of stuff bits
 
 
 @dataclass(frozen=True)

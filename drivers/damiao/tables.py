@@ -27,6 +27,28 @@ MOTOR_TYPES = {
 OPENARM = ("DM8009", "DM8009", "DM4340", "DM4340", "DM4310", "DM4310", "DM4310")
 
 DISABLED, ENABLED, COMMUNICATION_LOST = 0x0, 0x1, 0xD
+# Own choice: the makers' pages give no figure for all types; 100 deg C is where winding insulation
+# of the lowest usual class (A, 105 deg C, IEC 60085) comes close.
+WARM_DEGC, HOT_DEGC = 80, 100
+BUS_OFF, RESTARTED, CONTROLLER = 0x040, 0x100, 0x004
+CLASSES = {
+    0x001: "a frame could not be sent in time; is a motor switched on, the bus terminated?",
+    0x002: "arbitration was lost; harmless unless frequent",
+    0x008: "a frame broke the protocol; check bit rates and sample points on both sides",
+    0x010: "the transceiver reports trouble; check the wiring of CAN_H and CAN_L",
+    0x020: "nobody acknowledged a frame; check the motors' power, the cable and the bit rate",
+    0x080: "a bit error on the bus; check cable, terminators and bit rates",
+    0x200: "the error counters changed",
+}
+CONTROLLER_STATES = {
+    0x01: "frames were lost because the receive buffer was full",
+    0x02: "frames were lost because the transmit buffer was full",
+    0x04: "many receive errors (warning level); check cable, terminators and bit rates",
+    0x08: "many transmit errors (warning level); check cable, terminators and bit rates",
+    0x10: "receive errors made the controller passive; check cable, terminators and bit rates",
+    0x20: "transmit errors made the controller passive; check cable, terminators and bit rates",
+    0x40: "the controller has recovered from its errors",
+}
 
 
 @dataclass(frozen=True)
@@ -59,10 +81,6 @@ FAULTS = {
 }
 UNDOCUMENTED = Status("undocumented status", "switch the motor off and on, and ask its maker")
 
-# Own choice: the makers' pages give no figure for all types; 100 deg C is where winding insulation
-# of the lowest usual class (A, 105 deg C, IEC 60085) comes close.
-WARM_DEGC, HOT_DEGC = 80, 100
-
 
 def fault_of(status: int) -> Status | None:
     """What is wrong with a motor of this status; None where it is enabled or disabled."""
@@ -77,27 +95,6 @@ def type_of(limits: Scales) -> str:
         if limits == known:
             return name
     return "unknown type"
-
-
-BUS_OFF, RESTARTED, CONTROLLER = 0x040, 0x100, 0x004
-CLASSES = {
-    0x001: "a frame could not be sent in time; is a motor switched on, the bus terminated?",
-    0x002: "arbitration was lost; harmless unless frequent",
-    0x008: "a frame broke the protocol; check bit rates and sample points on both sides",
-    0x010: "the transceiver reports trouble; check the wiring of CAN_H and CAN_L",
-    0x020: "nobody acknowledged a frame; check the motors' power, the cable and the bit rate",
-    0x080: "a bit error on the bus; check cable, terminators and bit rates",
-    0x200: "the error counters changed",
-}
-CONTROLLER_STATES = {
-    0x01: "frames were lost because the receive buffer was full",
-    0x02: "frames were lost because the transmit buffer was full",
-    0x04: "many receive errors (warning level); check cable, terminators and bit rates",
-    0x08: "many transmit errors (warning level); check cable, terminators and bit rates",
-    0x10: "receive errors made the controller passive; check cable, terminators and bit rates",
-    0x20: "transmit errors made the controller passive; check cable, terminators and bit rates",
-    0x40: "the controller has recovered from its errors",
-}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,9 @@ from collections.abc import Sequence
 GIVE_UP_AFTER = 50  # impossible wall-clock stamps in a row: the interface has its own clock
 DRIFT_PER_NS = 1e-4  # own clocks: how fast a least offset is forgotten, 100 ppm
 SLACK_NS = 2_000  # stamps are floats, 0.24 us apart, and the two clocks are read one by one
+# stamp_ns, q, dq, tau
+Reading = tuple[int, float, float, float]
+NOTHING: Reading = (0, math.nan, math.nan, math.nan)
 
 
 class ArrivalClock:
@@ -87,12 +90,6 @@ class ArrivalClock:
         self._least_ns = None  # it was set, or wrapped around
         self.replaced += 1
         return now
-
-
-# stamp_ns, q, dq, tau
-Reading = tuple[int, float, float, float]
-
-NOTHING: Reading = (0, math.nan, math.nan, math.nan)
 
 
 def at_instant(

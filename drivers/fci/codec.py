@@ -66,6 +66,27 @@ _ACCELEROMETERS: tuple[tuple[str, int], ...] = (
     ("accelerometer_top", 18),
     ("accelerometer_bottom", 18),
 )
+_COMMAND_FIELDS: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = [
+    ("message_id", "<u8"),
+    ("q_c", "<f8", (7,)),
+    ("dq_c", "<f8", (7,)),
+    ("O_T_EE_c", "<f8", (16,)),
+    ("O_dP_EE_c", "<f8", (6,)),
+    ("elbow_c", "<f8", (2,)),
+    ("valid_elbow", "u1"),
+    ("motion_generation_finished", "u1"),
+    ("tau_J_d", "<f8", (7,)),
+]
+COMMAND_DTYPE: dict[int, np.dtype[np.void]] = {
+    tables.PANDA: np.dtype(_COMMAND_FIELDS),
+    tables.FR3: np.dtype([*_COMMAND_FIELDS, ("torque_command_finished", "u1")]),
+}
+HEADER = struct.Struct("<III")  # command, command id, size with header
+LONGEST = 1 << 24  # bytes of a message; a robot model has about 10 kB
+_CONNECT = struct.Struct("<HH")
+_CONNECT_REPLY = struct.Struct("<BH")
+# Translation, rotation and elbow deviation that every client sends; without use here.
+_DEVIATION = (10.0, 3.12, 2.0 * math.pi)
 
 
 class WireError(DriverError):
@@ -89,22 +110,6 @@ def _state_dtype(number: str, counts: tuple[tuple[str, int], ...]) -> np.dtype[n
 STATE_DTYPE: dict[int, np.dtype[np.void]] = {
     tables.PANDA: _state_dtype("<f8", _COUNTS),
     tables.FR3: _state_dtype("<f4", _COUNTS + _ACCELEROMETERS),
-}
-
-_COMMAND_FIELDS: list[tuple[str, str] | tuple[str, str, tuple[int, ...]]] = [
-    ("message_id", "<u8"),
-    ("q_c", "<f8", (7,)),
-    ("dq_c", "<f8", (7,)),
-    ("O_T_EE_c", "<f8", (16,)),
-    ("O_dP_EE_c", "<f8", (6,)),
-    ("elbow_c", "<f8", (2,)),
-    ("valid_elbow", "u1"),
-    ("motion_generation_finished", "u1"),
-    ("tau_J_d", "<f8", (7,)),
-]
-COMMAND_DTYPE: dict[int, np.dtype[np.void]] = {
-    tables.PANDA: np.dtype(_COMMAND_FIELDS),
-    tables.FR3: np.dtype([*_COMMAND_FIELDS, ("torque_command_finished", "u1")]),
 }
 
 
@@ -240,14 +245,6 @@ class CommandEncoder:
         self._torques.pack_into(self._buffer, self._at, *tau)
         self._buffer[self._finish] = finished
         return self._buffer
-
-
-HEADER = struct.Struct("<III")  # command, command id, size with header
-LONGEST = 1 << 24  # bytes of a message; a robot model has about 10 kB
-_CONNECT = struct.Struct("<HH")
-_CONNECT_REPLY = struct.Struct("<BH")
-# Translation, rotation and elbow deviation that every client sends; without use here.
-_DEVIATION = (10.0, 3.12, 2.0 * math.pi)
 
 
 class Reply(NamedTuple):

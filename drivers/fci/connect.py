@@ -17,6 +17,11 @@ from drivers.interface import DriverError
 
 CONNECT_LIMIT_S = 5.0
 _CHUNK = 1 << 16
+REPLY_LIMIT_S = 5.0
+RECOVERY_LIMIT_S = 10.0
+AUTO = "auto"
+OPTIONS = ("protocol", "recover")
+VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
 
 
 class Channel:
@@ -112,13 +117,6 @@ class Channel:
         """Hang up; may be called more than once."""
         self.closed = True
         self._tcp.close()
-
-
-REPLY_LIMIT_S = 5.0
-RECOVERY_LIMIT_S = 10.0
-AUTO = "auto"
-OPTIONS = ("protocol", "recover")
-VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
 
 
 class Target(NamedTuple):

@@ -20,6 +20,10 @@ from drivers.interface import DriverError
 # A reader that wakes up asks for the interpreter lock and waits this long before the running
 # thread is told to give it up. Python's default of 5 ms is five ticks of the robot.
 SWITCH_INTERVAL_S = 50e-6
+RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
+_SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
+START_LIMIT_S = 10.0  # a reader needs about 0.05 s
+RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
 
 
 class QuickSwitching:
@@ -46,12 +50,6 @@ class QuickSwitching:
 
 
 QUICK_SWITCHING = QuickSwitching()
-
-
-RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
-_SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
-START_LIMIT_S = 10.0  # a reader needs about 0.05 s
-RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
 
 
 class Record(NamedTuple):

@@ -107,33 +107,9 @@ ROBOT_MODE_MEANING = {
     ROBOT_RECOVERY: "recovers from an error: wait until it is done",
     7: "is not ready: unlock the brakes and activate FCI in Desk",
 }
-
-
-def status_name(statuses: tuple[str, ...], status: int) -> str:
-    """Name of a status code; "status N" for a code nobody defined."""
-    return statuses[status] if status < len(statuses) else f"status {status}"
-
-
-def meaning(name: str) -> str:
-    """What a status says and what to do, as the end of a sentence."""
-    return MEANING.get(name, f"it answers {name}, which is not defined: check its system version")
-
-
-def version_trouble(server: int, asked: int) -> str:
-    """Why a robot of this version cannot be talked to, as the end of a sentence."""
-    what = LIBFRANKA.get(server, "no libfranka known here")
-    if server in (PANDA, FR3):
-        return f"speaks FCI protocol {server} ({what}), not {asked}: use ?protocol={server}"
-    return (
-        f"speaks FCI protocol {server} ({what}); supported are 5 (Panda/FER, libfranka 0.9) and "
-        "10 (FR3, libfranka 0.18 and newer): bring its system to one of these"
-    )
-
-
 _SMOOTHER = "ask for smoother motion"
 _NO_GENERATOR = "this driver commands torques only; look for another program that moves the arm"
 _BASE = "power the robot off and on; if it stays, its base sensor needs Franka's service"
-
 ERRORS: dict[str, str] = {
     "joint_position_limits_violation": "guide the arm back from the joint's end by hand, recover",
     "cartesian_position_limits_violation": "guide the arm back into its work space, recover",
@@ -185,6 +161,27 @@ ERRORS: dict[str, str] = {
 }
 ERROR_NAMES = tuple(ERRORS)
 ERROR_COUNT = 41
+
+
+def status_name(statuses: tuple[str, ...], status: int) -> str:
+    """Name of a status code; "status N" for a code nobody defined."""
+    return statuses[status] if status < len(statuses) else f"status {status}"
+
+
+def meaning(name: str) -> str:
+    """What a status says and what to do, as the end of a sentence."""
+    return MEANING.get(name, f"it answers {name}, which is not defined: check its system version")
+
+
+def version_trouble(server: int, asked: int) -> str:
+    """Why a robot of this version cannot be talked to, as the end of a sentence."""
+    what = LIBFRANKA.get(server, "no libfranka known here")
+    if server in (PANDA, FR3):
+        return f"speaks FCI protocol {server} ({what}), not {asked}: use ?protocol={server}"
+    return (
+        f"speaks FCI protocol {server} ({what}); supported are 5 (Panda/FER, libfranka 0.9) and "
+        "10 (FR3, libfranka 0.18 and newer): bring its system to one of these"
+    )
 
 
 def raised(bitmap: bytes) -> tuple[str, ...]:

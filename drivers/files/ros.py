@@ -36,19 +36,27 @@ _FIELDS = {
     "geometry_msgs/Accel": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
 }
+_HEADER = ("std_msgs/Header", "builtin_interfaces/Time")
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
+IMU = "sensor_msgs/msg/Imu"
+CDR_LE = b"\x00\x01\x00\x00"
+SECOND_NS = 1_000_000_000
+_STAMP_LE = struct.Struct("<iI")
+_SEC_LIMIT = 2**31
+Bytes = bytes | memoryview
+Rows = NDArray[np.uint8]
+_STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulation header
+_MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
+IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
+_LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
 def _schema(fields: str, uses: tuple[str, ...]) -> str:
     parts = [fields] + [f"MSG: {name}\n{_FIELDS[name]}" for name in uses]
     return f"{_SEPARATOR}\n".join(parts)
 
-
-_HEADER = ("std_msgs/Header", "builtin_interfaces/Time")
-
-JOINT_STATE = "sensor_msgs/msg/JointState"
-TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
-ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
-IMU = "sensor_msgs/msg/Imu"
 
 SCHEMAS = {
     JOINT_STATE: _schema(
@@ -72,12 +80,6 @@ SCHEMAS = {
         (*_HEADER, "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
     ),
 }
-
-
-CDR_LE = b"\x00\x01\x00\x00"
-SECOND_NS = 1_000_000_000
-_STAMP_LE = struct.Struct("<iI")
-_SEC_LIMIT = 2**31
 
 
 class CdrError(ValueError):
@@ -186,15 +188,6 @@ class MotionEncoder:
     def encode(self, stamp_ns: int, vector: Array) -> bytes:
         """One message of a (6,) vector, linear part first. Raises CdrError on a wrong shape."""
         return b"".join((CDR_LE, _stamp(stamp_ns), self._piece, _raw(vector, (6,), "vector")))
-
-
-Bytes = bytes | memoryview
-Rows = NDArray[np.uint8]
-
-_STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulation header
-_MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
-IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
-_LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
 @dataclass(frozen=True, slots=True)

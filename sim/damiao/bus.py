@@ -21,6 +21,10 @@ DATAGRAM_BYTES = 4096
 OWN_FRAMES = 256  # that may be under way
 BUFFER_BYTES = 1 << 20  # 0.1 s of frames at 1 kHz; the kernel may grant less
 ON_THIS_MACHINE = 0  # hop limit: frames do not leave the machine
+INTERFACES = ("udp_multicast", "socketcan")
+MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
+MULTICAST_PORT = 43113  # python-can's default port
+ASK_S = 0.2
 
 
 class BoardsMulticastBus(UdpMulticastBus):
@@ -102,12 +106,6 @@ def _unpacked(data: bytes) -> can.Message:
         return can.Message(**msgpack.unpackb(data), check=True)
     except Exception as error:  # msgpack raises ValueErrors, own classes and RecursionError
         raise can.CanOperationError("a datagram that is no frame came") from error
-
-
-INTERFACES = ("udp_multicast", "socketcan")
-MULTICAST_GROUP = "239.74.163.2"  # python-can's default IPv4 group
-MULTICAST_PORT = 43113  # python-can's default port
-ASK_S = 0.2
 
 
 def open_bus(

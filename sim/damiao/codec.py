@@ -19,6 +19,7 @@ SPECIAL = bytes([0xFF] * 7)
 # Byte 2 on SERVICE_ID.
 READ, WRITE, SAVE, REFRESH = 0x33, 0x55, 0xAA, 0xCC
 INTEGER_REGISTERS = frozenset({7, 8, 9, 10, 13, 14, 15, 16, 35, 36})  # the others are float32
+BUS_OFF, BUS_ERROR = 0x040, 0x080  # error classes of Linux's linux/can/error.h
 
 
 class FullScale(NamedTuple):
@@ -113,9 +114,6 @@ def encode_register_reply(motor_id: int, what: int, register: int, value: float)
 def encode_save_reply(motor_id: int) -> bytes:
     """The reply to a save; its layout is this simulator's choice, no source describes it."""
     return bytes([motor_id & 0xFF, motor_id >> 8, SAVE, 1, 0, 0, 0, 0])
-
-
-BUS_OFF, BUS_ERROR = 0x040, 0x080  # error classes of Linux's linux/can/error.h
 
 
 def data_frame(reply_id: int, data: bytes, fd: bool) -> can.Message:

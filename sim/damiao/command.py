@@ -15,6 +15,8 @@ from sim.damiao.server import BoardOptions, Boards
 from sim.options import options_of
 from sim.scenarios import build
 
+_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+
 
 class Ending:
     """Ends at a signal or when the time is over."""
@@ -79,9 +81,6 @@ def summary(report: dict[str, Any]) -> str:
     if faults:
         lines.append(f"faults struck: {_counts(faults)}")
     return "\n".join(lines)
-
-
-_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -21,6 +21,27 @@ from sim.damiao.codec import (
     encode_feedback,
 )
 
+DISABLED, ENABLED = 0x0, 0x1
+OVER_VOLTAGE, UNDER_VOLTAGE, OVER_CURRENT = 0x8, 0x9, 0xA
+HOT_MOSFET, HOT_ROTOR, LOST_COMMUNICATION, OVERLOAD = 0xB, 0xC, 0xD, 0xE
+# Registers that do something here.
+MST_ID, ESC_ID, TIMEOUT, CTRL_MODE = 7, 8, 9, 10
+OVER_TEMPERATURE, PMAX, VMAX, TMAX, CAN_BR = 2, 21, 22, 23, 35
+MOTOR_POSITION, OUTPUT_POSITION = 80, 81
+# What the motor measures or what it is; a write is answered with the value as it was.
+READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 55, 80, 81})
+TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
+MIT_MODE = 1
+MODES = (1, 2, 3, 4)
+MAX_STANDARD_ID = 0x7FF
+CODE_1M, CODE_5M = 4, 9  # of CAN_BR
+# Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
+AIR_C = 25.0
+ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
+MOSFET_RISE_K, MOSFET_TIME_S = 30.0, 60.0
+MOSFET_LIMIT_C, ROTOR_LIMIT_C = 120.0, 100.0
+NEVER_NS = 1 << 62
+
 
 @dataclass(frozen=True)
 class MotorType:
@@ -64,30 +85,6 @@ def motor_set(name: str) -> tuple[Fitting, ...]:
     if name not in SETS:
         raise ValueError(f"no motors {name!r}; have: {', '.join(SETS)}")
     return SETS[name]
-
-
-DISABLED, ENABLED = 0x0, 0x1
-OVER_VOLTAGE, UNDER_VOLTAGE, OVER_CURRENT = 0x8, 0x9, 0xA
-HOT_MOSFET, HOT_ROTOR, LOST_COMMUNICATION, OVERLOAD = 0xB, 0xC, 0xD, 0xE
-
-# Registers that do something here.
-MST_ID, ESC_ID, TIMEOUT, CTRL_MODE = 7, 8, 9, 10
-OVER_TEMPERATURE, PMAX, VMAX, TMAX, CAN_BR = 2, 21, 22, 23, 35
-MOTOR_POSITION, OUTPUT_POSITION = 80, 81
-# What the motor measures or what it is; a write is answered with the value as it was.
-READ_ONLY = frozenset({13, 14, 15, 16, 17, 18, 19, 20, 36, 50, 51, 52, 53, 54, 55, 80, 81})
-TIMEOUT_UNIT_NS = 50_000  # one of two opinions on register 9; the other is 1 ms
-MIT_MODE = 1
-MODES = (1, 2, 3, 4)
-MAX_STANDARD_ID = 0x7FF
-CODE_1M, CODE_5M = 4, 9  # of CAN_BR
-
-# Thermal model, our choice: at its rated torque a motor gets so much hotter than the air.
-AIR_C = 25.0
-ROTOR_RISE_K, ROTOR_TIME_S = 60.0, 300.0
-MOSFET_RISE_K, MOSFET_TIME_S = 30.0, 60.0
-MOSFET_LIMIT_C, ROTOR_LIMIT_C = 120.0, 100.0
-NEVER_NS = 1 << 62
 
 
 class Motor:

@@ -67,6 +67,32 @@ ERRORS = (
     "joint_via_motion_generator_planning_joint_limit_violation",
     "base_acceleration_initialization_timeout", "base_acceleration_invalid_reading",
 )  # fmt: skip
+COMMAND_BYTES = {5: 370, 10: 371}
+_Q_AT, _DQ_AT, _GENERATOR_END, _TAU_AT, _TORQUE_END = 8, 64, 313, 314, 370
+HEADER = struct.Struct("<III")  # command, command id, size with this header
+LONGEST = 428  # bytes, SetCollisionBehavior
+_CONNECT = struct.Struct("<HH")  # version, UDP port of the client
+NAMES = {
+    5: (
+        "Connect", "Move", "StopMove", "GetCartesianLimit", "SetCollisionBehavior",
+        "SetJointImpedance", "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE",
+        "SetLoad", "SetFilters", "AutomaticErrorRecovery", "LoadModelLibrary",
+    ),
+    10: (
+        "Connect", "Move", "StopMove", "SetCollisionBehavior", "SetJointImpedance",
+        "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE", "SetLoad",
+        "AutomaticErrorRecovery", "GetRobotModel",
+    ),
+}  # fmt: skip
+# Bytes of a request after its header; Move has another size in version 10.
+SIZES = {
+    "Connect": 4, "Move": 56, "StopMove": 0, "GetCartesianLimit": 4, "SetCollisionBehavior": 416,
+    "SetJointImpedance": 56, "SetCartesianImpedance": 48, "SetGuidingMode": 7, "SetEEToK": 128,
+    "SetNEToEE": 128, "SetLoad": 104, "SetFilters": 40, "AutomaticErrorRecovery": 0,
+    "LoadModelLibrary": 2, "GetRobotModel": 0,
+}  # fmt: skip
+MOVE_BYTES_10 = 113
+_LIMIT_REPLY = 153  # bytes of GetCartesianLimit's reply between status and its last byte, with it
 
 
 class RobotMode(IntEnum):
@@ -163,10 +189,6 @@ class RobotCommand:
     torque_finished: bool
 
 
-COMMAND_BYTES = {5: 370, 10: 371}
-_Q_AT, _DQ_AT, _GENERATOR_END, _TAU_AT, _TORQUE_END = 8, 64, 313, 314, 370
-
-
 def read_command(data: bytes | bytearray | memoryview, version: int) -> RobotCommand | None:
     """A RobotCommand; None for a datagram of another size."""
     if len(data) != COMMAND_BYTES[version]:
@@ -239,33 +261,6 @@ _OTHERS = {
 def code_of(request: str, status: Status, version: int) -> int:
     """Number of a status in the reply to a request, one of `NAMES`."""
     return _CODES.get(request, _OTHERS)[status][version == 10]
-
-
-HEADER = struct.Struct("<III")  # command, command id, size with this header
-LONGEST = 428  # bytes, SetCollisionBehavior
-_CONNECT = struct.Struct("<HH")  # version, UDP port of the client
-
-NAMES = {
-    5: (
-        "Connect", "Move", "StopMove", "GetCartesianLimit", "SetCollisionBehavior",
-        "SetJointImpedance", "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE",
-        "SetLoad", "SetFilters", "AutomaticErrorRecovery", "LoadModelLibrary",
-    ),
-    10: (
-        "Connect", "Move", "StopMove", "SetCollisionBehavior", "SetJointImpedance",
-        "SetCartesianImpedance", "SetGuidingMode", "SetEEToK", "SetNEToEE", "SetLoad",
-        "AutomaticErrorRecovery", "GetRobotModel",
-    ),
-}  # fmt: skip
-# Bytes of a request after its header; Move has another size in version 10.
-SIZES = {
-    "Connect": 4, "Move": 56, "StopMove": 0, "GetCartesianLimit": 4, "SetCollisionBehavior": 416,
-    "SetJointImpedance": 56, "SetCartesianImpedance": 48, "SetGuidingMode": 7, "SetEEToK": 128,
-    "SetNEToEE": 128, "SetLoad": 104, "SetFilters": 40, "AutomaticErrorRecovery": 0,
-    "LoadModelLibrary": 2, "GetRobotModel": 0,
-}  # fmt: skip
-MOVE_BYTES_10 = 113
-_LIMIT_REPLY = 153  # bytes of GetCartesianLimit's reply between status and its last byte, with it
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,11 @@ KINDS: dict[str, tuple[str, str, str]] = {
     "version": (NUMBER, "7", "the server says that it speaks this version"),
 }
 AT_ONCE = ("version",)  # these have no time
+LATEST_TICKS = 5
+FLIPPED_BYTES = 8  # at most
+SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
+JUMP_RAD = 0.05
+AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +112,6 @@ def describe() -> str:
         f"  {name}{'=' + usual if usual else ''}: {what}" + (f" ({kind})" if kind else "")
         for name, (kind, usual, what) in KINDS.items()
     )
-
-
-LATEST_TICKS = 5
-FLIPPED_BYTES = 8  # at most
-SPIKES = {"q": 0.5, "dq": 2.0, "tau_J": 20.0}  # rad, rad/s, N m
-JUMP_RAD = 0.05
-AT_A_TIME = ("reflex", "user_stop", "cut", "silence", "clock")
 
 
 class Spoiler:

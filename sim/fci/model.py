@@ -30,6 +30,12 @@ _HEAD = """#include <math.h>
 #include <string.h>
 #define N 7
 """
+COMPILERS = ("cc", "gcc", "clang")
+OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
+TIMEOUT_S = 60.0
+NAME = "simulated_arm"
+# The margin by which the speed limit is lowered near a position limit: v <= sqrt(2 a d) + offset.
+VELOCITY_OFFSET = 0.0  # rad/s
 
 
 def model_source(truth: Truth) -> str:
@@ -63,11 +69,6 @@ def _frames() -> list[str]:
         call = f"pose(q, {count}, {tool}, out)"
         out.append(f"void O_T_J{k}(const double *q, {given}double *out) {{ {call}; }}\n")
     return out
-
-
-COMPILERS = ("cc", "gcc", "clang")
-OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
-TIMEOUT_S = 60.0
 
 
 def model_library(truth: Truth) -> bytes | None:
@@ -104,11 +105,6 @@ def _cache_folder() -> Path:
     if folder.is_symlink() or facts.st_uid != os.getuid() or facts.st_mode & 0o077:
         return Path(tempfile.mkdtemp(prefix="simulated-fci-models-"))
     return folder
-
-
-NAME = "simulated_arm"
-# The margin by which the speed limit is lowered near a position limit: v <= sqrt(2 a d) + offset.
-VELOCITY_OFFSET = 0.0  # rad/s
 
 
 def robot_urdf(truth: Truth) -> str:

@@ -18,6 +18,23 @@ POSITION = "joint_motion_generator_position_limits_violation"
 VELOCITY = "joint_motion_generator_velocity_limits_violation"
 ACCELERATION = "joint_motion_generator_velocity_discontinuity"
 JERK = "joint_motion_generator_acceleration_discontinuity"
+WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
+MOST_MISSED = 20  # in a row, then communication_constraints_violation
+# Until the first command the client still changes over from replies to states. Chosen here: longer
+# than 20 ms, since a client on a machine without real-time kernel may be held up just then.
+FIRST_COMMAND_TICKS = 200
+# N m from one tick to the next; the margin is the rounding of an f32 tau_J_d near 87 N m.
+TORQUE_STEP, ROUNDING = 1.0, 1e-5
+COMMUNICATION = "communication_constraints_violation"
+TORQUE_JUMP = "controller_torque_discontinuity"
+POSSIBLE = {
+    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_POSITION),
+    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_VELOCITY),
+    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_POSITION),
+    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_VELOCITY),
+    (ControllerMode.EXTERNAL, Generator.JOINT_POSITION),
+    (ControllerMode.EXTERNAL, Generator.JOINT_VELOCITY),
+}
 
 
 class DesiredMotion:
@@ -69,27 +86,6 @@ class DesiredMotion:
         if not (np.abs(jerk) <= JERK_PER_ACCELERATION * most).all():
             return JERK
         return None
-
-
-WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
-MOST_MISSED = 20  # in a row, then communication_constraints_violation
-# Until the first command the client still changes over from replies to states. Chosen here: longer
-# than 20 ms, since a client on a machine without real-time kernel may be held up just then.
-FIRST_COMMAND_TICKS = 200
-# N m from one tick to the next; the margin is the rounding of an f32 tau_J_d near 87 N m.
-TORQUE_STEP, ROUNDING = 1.0, 1e-5
-
-COMMUNICATION = "communication_constraints_violation"
-TORQUE_JUMP = "controller_torque_discontinuity"
-
-POSSIBLE = {
-    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_POSITION),
-    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_POSITION),
-    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (ControllerMode.EXTERNAL, Generator.JOINT_POSITION),
-    (ControllerMode.EXTERNAL, Generator.JOINT_VELOCITY),
-}
 
 
 def allowed(controller: int, generator: int, version: int) -> bool:

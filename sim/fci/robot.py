@@ -34,6 +34,7 @@ TORQUE_RANGE, COLLISION, CARTESIAN_COLLISION = (
     "joint_reflex",
     "cartesian_reflex",
 )
+ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
 
 
 class Robot:
@@ -232,9 +233,6 @@ class Robot:
         self.motion = None
         if self.mode == RobotMode.MOVE:
             self.mode = RobotMode.IDLE
-
-
-ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
 
 
 class Reporter:

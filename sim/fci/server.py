@@ -32,6 +32,7 @@ from sim.scenarios import Scenario
 CHUNK = 4096  # bytes at a time; the longest request has 428
 MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
+IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
 
 
 class ClientSession:
@@ -140,9 +141,6 @@ class ClientSession:
             self.close()
             return
         del self._out[:sent]
-
-
-IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
 
 
 class FciServer:

@@ -16,6 +16,8 @@ from drivers.interface import Array, DriverError
 
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
 _DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
+_NEED = "learning needs positions and measured joint torques (effort)"
+_NEED_POSITION = "discovery needs the positions of the joints"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +87,6 @@ def assemble_joints(
             "Recordings hold radians (`adapter import` converts)"
         )
     return Joints(names, stamp_ns, q, dq, tau, warnings)
-
-
-_NEED = "learning needs positions and measured joint torques (effort)"
-_NEED_POSITION = "discovery needs the positions of the joints"
 
 
 def check_type(series: Series, path: Path) -> None:

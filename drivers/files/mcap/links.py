@@ -26,6 +26,7 @@ from drivers.interface import Array
 
 LONGEST_PERIODS = 3.0  # of the sensor; no line is drawn across a longer silence
 MENTIONED = 0.05  # share of messages outside the joint samples' time that is worth a sentence
+_MOST_MATCHED = 0.9  # share of a topic's stamps that joint samples have; below, stamps are its own
 
 
 class Carrier:
@@ -126,9 +127,6 @@ def _slopes(t_s: Array, x: Array) -> Array:
     sides = np.concatenate([[0], near]) + np.concatenate([near, [0]])
     total = np.concatenate([none, rate]) + np.concatenate([rate, none])
     return np.asarray(total / np.maximum(sides, 1)[:, None])
-
-
-_MOST_MATCHED = 0.9  # share of a topic's stamps that joint samples have; below, stamps are its own
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,6 +30,22 @@ from drivers.interface import DriverError
 
 _COMPRESSIONS = ("", "zstd", "lz4")
 _CHUNK_LIMIT = 2**32  # bytes; a larger claim comes from a damaged chunk
+HEAD = 9  # opcode and length
+RECORD = struct.Struct("<BQ")
+_MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
+MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its offsets, crc
+_CRC_SIZE = 4
+_CHUNK_PLACE = struct.Struct("<16xQ")  # in a chunk index, behind two times
+_LENGTH = struct.Struct("<Q")
+_OTHER_FORMATS = {
+    b"SQLite format 3": "it is a rosbag2 of storage sqlite3: turn it into mcap (ros2 bag convert)",
+    b"#ROSBAG": "it is a ROS 1 bag: turn it into a rosbag2 of storage mcap",
+}
+_INVALID = 0  # what a file system leaves behind a cut: zeros
+_IN_CHUNK = frozenset({_INVALID})
+_IN_FILE = frozenset({_INVALID, int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 
 class DamagedChunk(ValueError):
@@ -77,11 +93,6 @@ def _lz4(data: memoryview, size: int, cut: bool) -> memoryview:
 
 
 _DECOMPRESSORS = {"": _stored, "zstd": _zstd, "lz4": _lz4}
-
-
-HEAD = 9  # opcode and length
-RECORD = struct.Struct("<BQ")
-_MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,23 +162,6 @@ def walk(data: memoryview, at: int, until: frozenset[int]) -> Walk:
         at = stop
     found.end = at
     return found
-
-
-MAGIC = b"\x89MCAP0\r\n"
-_CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its offsets, crc
-_CRC_SIZE = 4
-_CHUNK_PLACE = struct.Struct("<16xQ")  # in a chunk index, behind two times
-_LENGTH = struct.Struct("<Q")
-_OTHER_FORMATS = {
-    b"SQLite format 3": "it is a rosbag2 of storage sqlite3: turn it into mcap (ros2 bag convert)",
-    b"#ROSBAG": "it is a ROS 1 bag: turn it into a rosbag2 of storage mcap",
-}
-
-
-_INVALID = 0  # what a file system leaves behind a cut: zeros
-_IN_CHUNK = frozenset({_INVALID})
-_IN_FILE = frozenset({_INVALID, int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)})
 
 
 @dataclass(frozen=True, slots=True)
