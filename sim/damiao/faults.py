@@ -1,86 +1,56 @@
-"""Faults of simulated boards and their bus: how they are written, when they strike, what they do.
+"""Faults of simulated boards and their bus: when they strike, what they do.
 
-A fault is `NAME[=VALUE][@SECONDS]`: from SECONDS after the first frame to a motor on (0 by
-default) it strikes a share VALUE of the frames, or the motor with the number VALUE.
+Their seconds count from the first frame to a motor.
 """
 
 from __future__ import annotations
 
 import contextlib
 import heapq
-import re
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import can
 import numpy as np
 
 from sim.damiao import motor
 from sim.damiao.codec import BUS_ERROR, error_frame
+from sim.faults import JOINT, SECONDS, SHARE, Fault, Kind, Value, read_fault
 
-SHARES = {
-    "drop": "a reply never arrives",
-    "deaf": "a motor does not get a command",
-    "late": "a reply comes 3 ms late",
-    "repeat": "a reply comes twice",
-    "reorder": "a reply comes after the next one",
-    "corrupt": "a reply has one bit flipped or lost its last bytes",
-    "spike": "a reply's angle is off by 0.5 rad",
-    "error_frames": "the bus carries an error frame besides a reply",
-    "enobufs": "the host's controller refuses to send (on a line or a wrapped bus)",
+OF_FRAMES = Value("a share of frames, from 0 to 1", SHARE.fits)
+MOTOR = Value("the number of a motor, from 1 to 7", JOINT.fits)
+KINDS = {
+    "drop": Kind("a reply never arrives", OF_FRAMES),
+    "deaf": Kind("a motor does not get a command", OF_FRAMES),
+    "late": Kind("a reply comes 3 ms late", OF_FRAMES),
+    "repeat": Kind("a reply comes twice", OF_FRAMES),
+    "reorder": Kind("a reply comes after the next one", OF_FRAMES),
+    "corrupt": Kind("a reply has one bit flipped or lost its last bytes", OF_FRAMES),
+    "spike": Kind("a reply's angle is off by 0.5 rad", OF_FRAMES),
+    "error_frames": Kind("the bus carries an error frame besides a reply", OF_FRAMES),
+    "silent": Kind("the motor answers nothing", MOTOR, "1"),
+    "stuck": Kind("its encoder stands still", MOTOR, "1"),
+    "jump": Kind("its encoder jumps by 0.1 rad and stays there", MOTOR, "1"),
+    "overtemp": Kind("its rotor gets too hot", MOTOR, "1"),
+    "undervoltage": Kind("its supply is too low", MOTOR, "1"),
+    "overvoltage": Kind("its supply is too high", MOTOR, "1"),
+    "overcurrent": Kind("its current is too high", MOTOR, "1"),
+    "overload": Kind("it reports overload", MOTOR, "1"),
+    "bus_off": Kind("the bus is dead for so long", SECONDS, "1"),
 }
-MOTORS = {
-    "silent": "the motor answers nothing",
-    "stuck": "its encoder stands still",
-    "jump": "its encoder jumps by 0.1 rad and stays there",
-    "overtemp": "its rotor gets too hot",
-    "undervoltage": "its supply is too low",
-    "overvoltage": "its supply is too high",
-    "overcurrent": "its current is too high",
-    "overload": "it reports overload",
-}
-SECONDS = {"bus_off": "the bus is dead for VALUE seconds"}
-NAMES = (*SHARES, *MOTORS, *SECONDS)
+# What strikes the host's own controller, on a line or a wrapped bus, and not the boards.
+OF_HOSTS = {"enobufs": Kind("the host's controller refuses to send", OF_FRAMES)}
+NAMES = (*KINDS, *OF_HOSTS)
 STATUS = {
     "undervoltage": motor.UNDER_VOLTAGE,
     "overvoltage": motor.OVER_VOLTAGE,
     "overcurrent": motor.OVER_CURRENT,
     "overload": motor.OVERLOAD,
 }
-DEFAULTS = {**dict.fromkeys(SHARES, 0.01), **dict.fromkeys(MOTORS, 1.0), "bus_off": 1.0}
 LATE_NS = 3_000_000
 SPIKE_RAD, JUMP_RAD = 0.5, 0.1
 HOT_C = 130.0
 FAULT_STREAM = 1 << 33  # keeps the draws of faults apart from those of truth and noise
-
-_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
-_ITEM = re.compile(rf"(?P<name>[a-z_]+)(?:=(?P<value>{_NUMBER}))?(?:@(?P<at>{_NUMBER}))?")
-
-
-@dataclass(frozen=True)
-class Fault:
-    """One fault: share of frames, number of the motor or seconds, and when it begins."""
-
-    name: str
-    value: float
-    at_s: float = 0.0
-
-    @classmethod
-    def of(cls, text: str) -> Fault:
-        """Parse NAME[=VALUE][@SECONDS]. Raises ValueError, naming the choices."""
-        found = _ITEM.fullmatch(text.strip())
-        name = found["name"] if found else text.partition("=")[0].partition("@")[0].strip()
-        if name not in NAMES:
-            raise ValueError(f"no fault '{name}'; have: {', '.join(NAMES)}")
-        if found is None:
-            raise ValueError(f"fault '{text}': write {name}[=VALUE][@SECONDS]")
-        value = DEFAULTS[name] if found["value"] is None else float(found["value"])
-        if name in SHARES and value > 1.0:
-            raise ValueError(f"fault '{text}': VALUE is a share of frames, from 0 to 1")
-        if name in MOTORS and value not in range(1, 8):
-            raise ValueError(f"fault '{text}': VALUE is the number of a motor, from 1 to 7")
-        return cls(name, value, float(found["at"] or 0.0))
 
 
 class Faults:
@@ -92,7 +62,7 @@ class Faults:
 
     def __init__(self, texts: Iterable[str] = (), seed: int = 0) -> None:
         """Parse faults. Raises ValueError, naming the choices."""
-        self.faults = tuple(Fault.of(text) for text in texts)
+        self.faults = tuple(read_fault(text, KINDS | OF_HOSTS) for text in texts)
         self.counts: Counter[str] = Counter()
         self._rng = np.random.default_rng([seed, FAULT_STREAM])
         self._by_name: dict[str, list[Fault]] = {}

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from sim.faults import describe, read_fault
 from sim.fci.codec import HOST, PORT, VERSIONS
-from sim.fci.faults import Fault, describe
+from sim.fci.faults import KINDS
 from sim.options import add_scenario, options_of
 from sim.options import check as check_scenario
 
@@ -14,7 +15,7 @@ from sim.options import check as check_scenario
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe()
+    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe(KINDS)
     add = parser.add_argument
     add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
     add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
@@ -29,4 +30,4 @@ def check(args: argparse.Namespace) -> None:
     """Raises ValueError for an arm or a fault that does not exist."""
     check_scenario(args.scenario, options_of(args.set))
     for text in args.fault:
-        Fault.of(text)
+        read_fault(text, KINDS)

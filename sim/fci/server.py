@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from sim.faults import read_fault
 from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
     COMMAND_BYTES,
@@ -24,7 +25,7 @@ from sim.fci.codec import (
     read_command,
     reply,
 )
-from sim.fci.faults import Fault, Spoiler
+from sim.fci.faults import KINDS, Spoiler
 from sim.fci.model import model_library, robot_urdf
 from sim.fci.robot import Reporter, Robot
 from sim.scenarios import Scenario
@@ -152,7 +153,7 @@ class FciServer:
         scenario: the arm, and the seed of noise and faults.
         port: TCP port on 127.0.0.1; 0 takes a free one.
         protocol: 5 (FER/Panda) or 10 (FR3).
-        faults: texts as in `sim.fci.faults`.
+        faults: texts, see `sim.faults`.
         core: processor to stay on; None leaves it to the system.
 
     Attributes:
@@ -175,7 +176,7 @@ class FciServer:
     ) -> None:
         if protocol not in VERSIONS:
             raise ValueError(f"no protocol {protocol}; have: 5, 10")
-        asked = [Fault.of(text) for text in faults]
+        asked = [read_fault(text, KINDS) for text in faults]
         self.protocol = self._version = protocol
         self._core = core
         self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)

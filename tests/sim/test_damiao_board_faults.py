@@ -43,11 +43,11 @@ def run(bench: Rig, ticks: int = TICKS) -> list[list[can.Message]]:
         ("fire", "no fault 'fire'; have: drop, deaf"),
         ("", "no fault ''; have:"),
         ("drop=1.5", "a share of frames"),
-        ("drop=-1", r"write drop\[=VALUE\]\[@SECONDS\]"),
-        ("drop=0.1@", r"write drop\[=VALUE\]\[@SECONDS\]"),
+        ("drop=-1", "a share of frames"),
+        ("drop=0.1@", r"write NAME\[=VALUE\]\[@SECONDS\]"),
         ("silent=8", "number of a motor, from 1 to 7"),
         ("stuck=1.5", "number of a motor, from 1 to 7"),
-        ("late=nan", r"write late\[=VALUE\]"),
+        ("late=nan", r"write NAME\[=VALUE\]"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_choices(text, says) -> None:

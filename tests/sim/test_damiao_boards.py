@@ -58,7 +58,7 @@ IPV6_GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
 # Bytes of the reference page, section 2, 3 and 5.
 
 
-@pytest.mark.parametrize("scale", [wire.Scale(12.5, 30, 10), wire.Scale(12.5, 45, 54)])
+@pytest.mark.parametrize("scale", [wire.FullScale(12.5, 30, 10), wire.FullScale(12.5, 45, 54)])
 def test_all_zero_command_of_the_reference_page(scale) -> None:
     got = wire.decode_command(NOTHING, scale)
     assert got.kp == 0.0
@@ -70,7 +70,7 @@ def test_all_zero_command_of_the_reference_page(scale) -> None:
 
 
 def test_command_fields_lie_where_the_reference_page_says() -> None:
-    scale = wire.Scale(12.5, 30.0, 10.0)
+    scale = wire.FullScale(12.5, 30.0, 10.0)
     low, high = bytes(8), bytes([0xFF] * 8)
     assert wire.decode_command(low, scale) == (-12.5, -30.0, 0.0, 0.0, -10.0)
     assert wire.decode_command(high, scale) == (12.5, 30.0, 500.0, 5.0, 10.0)
@@ -83,7 +83,7 @@ def test_command_fields_lie_where_the_reference_page_says() -> None:
 
 
 def test_feedback_bytes_by_hand() -> None:
-    scale = wire.Scale(12.5, 30.0, 10.0)
+    scale = wire.FullScale(12.5, 30.0, 10.0)
     at_zero = wire.encode_feedback(3, 1, (0.0, 0.0, 0.0), (40, 33), scale)
     assert at_zero == bytes.fromhex("13 7FFF 7F F7FF 28 21")
     ends = wire.encode_feedback(0x13, 0xD, (99.0, -99.0, 99.0), (300, -5), scale)

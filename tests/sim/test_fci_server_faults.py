@@ -11,10 +11,11 @@ import threading
 import numpy as np
 import pytest
 
+from sim.faults import Fault, read_fault
 from sim.fci.clock import PERIOD_NS, Ticks
 from sim.fci.codec import ERRORS, Generator, Request, RobotCommand, RobotMode, StateFrame
 from sim.fci.command import run
-from sim.fci.faults import JUMP_RAD, Fault, Spoiler
+from sim.fci.faults import JUMP_RAD, KINDS, Spoiler
 from sim.fci.motion import DesiredMotion
 from sim.fci.options import add_arguments
 from sim.fci.robot import RECOVERY_TICKS, Robot
@@ -264,7 +265,7 @@ def test_user_stop_and_stop_move(robot):
     ],
 )
 def test_faults_are_read(text, fault):
-    assert Fault.of(text) == fault
+    assert read_fault(text, KINDS) == fault
 
 
 @pytest.mark.parametrize(
@@ -276,14 +277,14 @@ def test_faults_are_read(text, fault):
 )  # fmt: skip
 def test_faults_that_are_none_name_the_choices(text):
     with pytest.raises(ValueError, match="fault"):
-        Fault.of(text)
+        read_fault(text, KINDS)
     with pytest.raises(ValueError, match="user_stop"):
-        Fault.of("dorp")
+        read_fault("dorp", KINDS)
 
 
 def delivered(text, ticks=4000):
     """Ids of what leaves, in order, and the datagrams."""
-    spoiler, out = Spoiler([Fault.of(text)], 5), []
+    spoiler, out = Spoiler([read_fault(text, KINDS)], 5), []
     for tick in range(ticks):
         out += [bytes(x) for x in spoiler.deliver(bytearray(struct.pack("<QQ", tick, 7)), tick)]
     whole = [struct.unpack_from("<Q", x)[0] for x in out if len(x) == 16 and x[8] == 7]
@@ -310,7 +311,7 @@ def test_network_faults():
 
 def test_sensor_faults():
     for text, name in (("nan=0.2", "nan"), ("spike=0.2", "spike")):
-        spoiler, frame, hits = Spoiler([Fault.of(text)], 1), StateFrame(5), 0
+        spoiler, frame, hits = Spoiler([read_fault(text, KINDS)], 1), StateFrame(5), 0
         for tick in range(500):
             for key in ("q", "dq", "tau_J"):
                 frame.fields[key][:] = 0.0
@@ -319,7 +320,7 @@ def test_sensor_faults():
             hits += np.isnan(seen).any() if name == "nan" else bool((np.abs(seen) > 0.1).any())
         assert hits == spoiler.counts[name] and 50 < hits < 150
     for text in ("stuck=3@1", "jump=3@1"):
-        spoiler, frame = Spoiler([Fault.of(text)], 1), StateFrame(10)
+        spoiler, frame = Spoiler([read_fault(text, KINDS)], 1), StateFrame(10)
         for tick, expected in ((999, 0.999), (1000, 1.0), (1500, 1.5)):
             frame.fields["q"][:] = tick / 1000
             spoiler.spoil_values(frame, tick)
