@@ -25,7 +25,8 @@ def plain(value: Any, digits: int = 3) -> str:
     >>> plain(0.012345), plain(12345.6), plain(None), plain(-2.0)
     ('0.0123', '12346', '–', '-2.00')
     """
-    if value is None or not math.isfinite(value):
+    value = _number(value)
+    if not math.isfinite(value):
         return DASH
     if abs(value) < 1e-9:
         return "0"
@@ -38,12 +39,13 @@ def plus_minus(value: Any, std: Any) -> str:
     >>> plus_minus(2.0, 0.03), plus_minus(12345.0, 340.0), plus_minus(1.5, None)
     ('2.000 ± 0.030', '12340 ± 340', '1.50')
     """
-    if value is None or not math.isfinite(value) or not _is_size(std):
+    value, std = _number(value), _number(std)
+    if not math.isfinite(value) or not _is_size(std):
         return plain(value)
     decimals = 1 - _order(std)
     if value and decimals > MOST_DIGITS - 1 - _order(value):
         return plain(value, MOST_DIGITS)
-    shown, doubt = round(float(value), decimals), round(float(std), decimals)
+    shown, doubt = round(value, decimals), round(std, decimals)
     return f"{shown:.{max(decimals, 0)}f} ± {doubt:.{max(decimals, 0)}f}"
 
 
@@ -54,24 +56,23 @@ def measured(value: Any, std: Any, unit: str) -> str:
     ('5.00 ± 0.21 %', '12.30 ± 0.20 mrad')
     """
     factor, name = shown_unit(value, unit)
-    text = plus_minus(_times(value, factor), _times(std, factor))
-    return f"{text} {name}".rstrip()
+    return f"{plus_minus(factor * _number(value), factor * _number(std))} {name}".rstrip()
 
 
 def shown_unit(value: Any, unit: str) -> tuple[float, str]:
     """(factor, name) of the unit in which a value of a file's unit is shown."""
-    if unit == "rad" and _is_size(value) and abs(value) < SMALL_RAD:
+    if unit == "rad" and 0.0 < abs(_number(value)) < SMALL_RAD:
         return 1e3, "mrad"
     return SHOWN_UNITS.get(unit, (1.0, unit))
 
 
 def parameter(finding: Finding, key: str, size: bool = False) -> str:
     """One parameter, a number, of a finding; `size`: without its sign."""
-    value = finding.parameters.get(key)
-    std, unit = finding.std.get(key), finding.units.get(key, "")
-    if unit == "per turn" and value is not None and not _is_size(std):
+    value, std = _number(finding.parameters.get(key)), _number(finding.std.get(key))
+    unit = finding.units.get(key, "")
+    if unit == "per turn" and math.isfinite(value) and not _is_size(std):
         return f"{value:g} {unit}"  # a whole number that was chosen, not fitted
-    return measured(abs(value) if size and value is not None else value, std, unit)
+    return measured(abs(value) if size else value, std, unit)
 
 
 def parameter_lines(finding: Finding) -> list[str]:
@@ -188,13 +189,10 @@ def _order(value: float) -> int:
     return math.floor(math.log10(abs(value)))
 
 
-def _is_size(value: Any) -> bool:
-    return value is not None and math.isfinite(value) and value != 0.0
-
-
-def _times(value: Any, factor: float) -> float | None:
-    return None if value is None else factor * value
+def _is_size(value: float) -> bool:
+    return math.isfinite(value) and value != 0.0
 
 
 def _number(value: Any) -> float:
+    """A value, NaN where there is none."""
     return math.nan if value is None else float(value)

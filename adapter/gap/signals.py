@@ -9,7 +9,7 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
 
+# The band.
 RATE_HZ = 250.0  # of the models
 DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
@@ -34,6 +35,23 @@ BAND_REST, BAND_MARGIN = 1e-3, 1.3
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
+
+# Splines through a motion.
+SPLINE_DEGREE = 5
+KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
+Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
+STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
+
+# A recording again, or as a forward simulation takes it.
+COMMANDS, MEASURED = "commands", "measured"
+ROLLOUT_STEP_S = 1e-3
+SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
+SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
+COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
+UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
+FAR_S = 0.05  # a command older than that does not drive any more
+HOLE_S = 0.05  # between samples: what happened in there is not known
+ROLLOUT_EDGE_S = 0.3
 
 
 def low(x: Array) -> Array:
@@ -132,17 +150,6 @@ def _at(grid: Array, t: Array, tau: Array) -> Array:
     return oaconvolve(raw, _ANTI_ALIAS[:, None], mode="valid", axes=0)[::factor][: len(grid)]
 
 
-COMMANDS, MEASURED = "commands", "measured"
-ROLLOUT_STEP_S = 1e-3
-SAME_S, SAME_STEP_S = 0.05, 0.02  # of a repeat: so much longer or shorter; compared so often
-SAME_RAD, SAME_RAD_S = 3e-4, 3e-3  # rms differences that are noise, no other motion
-COMMAND_DELAY_S = 1e-3  # a command answers a sample and is reached at the end of the next period
-UNLIKE = 0.3  # of the measured torque's size: commands further off mean something else
-FAR_S = 0.05  # a command older than that does not drive any more
-HOLE_S = 0.05  # between samples: what happened in there is not known
-ROLLOUT_EDGE_S = 0.3
-
-
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """One recording.
@@ -178,16 +185,8 @@ class Recorded:
 
     def part(self, rows: slice) -> Recorded:
         """Some of its rows; times stay those of the whole."""
-        return Recorded(
-            self.name,
-            self.t[rows],
-            self.q[rows],
-            self.dq[rows],
-            self.tau[rows],
-            self.command_t,
-            self.commands,
-            self.dq_late_s,
-        )
+        kept = {key: getattr(self, key)[rows] for key in ("t", "q", "dq", "tau")}
+        return replace(self, **kept)
 
     def repeated_in(self, others: Sequence[Recorded]) -> Recorded | None:
         """Another recording of the same motion, if one of these is."""
@@ -208,12 +207,8 @@ class Recorded:
 
     def grid(self) -> Array:
         """(m,) s, even times 1 ms apart within the recording, its edges left out."""
-        span = self.t[-1] - self.t[0] - 2 * ROLLOUT_EDGE_S
-        return (
-            self.t[0]
-            + ROLLOUT_EDGE_S
-            + ROLLOUT_STEP_S * np.arange(max(int(span / ROLLOUT_STEP_S), 0))
-        )
+        begin, span = self.t[0] + ROLLOUT_EDGE_S, self.t[-1] - self.t[0] - 2 * ROLLOUT_EDGE_S
+        return begin + ROLLOUT_STEP_S * np.arange(max(int(span / ROLLOUT_STEP_S), 0))
 
     def is_whole(self, begin_s: float, end_s: float) -> bool:
         """Whether there are samples all the way between two of its times."""
@@ -246,12 +241,6 @@ class Recorded:
         if np.diff(inside).max() > FAR_S:
             return None
         return np.column_stack([np.interp(t, at, column) for column in self.commands.T])
-
-
-SPLINE_DEGREE = 5
-KNOT_S = 0.02  # a joint does nothing that we model within 40 ms
-Q_NOISE_FLOOR, DQ_NOISE_FLOOR = 2e-6, 2e-5  # rad, rad/s: of signals without noise
-STIFFNESS = (-16.0, 6.0)  # range of ln of the penalty on the squared third derivative
 
 
 @dataclass(frozen=True)
