@@ -424,6 +424,17 @@ def test_first_signatures_are_those_of_theta(
     assert bodies["link_inertia", 2] == tuple(range(20, 30))
 
 
+def test_signatures_that_are_kept_are_those_of_any_model():
+    """What hangs on the measured motion alone is computed once, whatever the inertias are."""
+    other = ARM.changed(theta=1.2 * ARM.theta)
+    ways = [(pattern, RUBS) for pattern in patterns(N, RUBS)]
+    used, fresh = prepare(SHORT, ARM), prepare(SHORT, ARM)
+    signatures(stages_of(used, ()), EVERYWHERE, ways)
+    kept, _ = signatures(stages_of(used, (), other), EVERYWHERE, ways)
+    anew, _ = signatures(stages_of(fresh, (), other), EVERYWHERE, ways)
+    assert np.array_equal(kept, anew)
+
+
 def test_joints_that_stand_still_have_no_candidates(signals: Signals):
     _, candidates = signatures(stages_of(signals, ()), (0, 2))
     places = {c.joint for c in candidates if c.effect.scope != LINK}
@@ -526,6 +537,17 @@ def test_held_out_blocks_pay_for_what_is_there_and_not_for_what_is_not():
     assert not pays_held_out(
         fit, Folds.of(fit, shuffled), 0
     )  # another sign in every other pair of blocks
+
+
+def test_what_folds_leave_is_what_their_residuals_are():
+    """By products, as by the rows themselves."""
+    fit = fit_of(SHORT)
+    fit, carried = refitted(fit.with_named([Named(_frictions(fit)[RUBS], np.array([FC]))]))
+    fold, folds, direct = fold_rows(fit), Folds.of(fit, carried), 0.0
+    for f, x in enumerate(folds.coefficients()):
+        left = (carried.data - x @ carried.N)[fold == f]
+        direct += float(left @ left)
+    assert folds.left(np.arange(len(carried.x))) == pytest.approx(direct, rel=1e-9)
 
 
 # ---------------------------------------------------------------- the scan
