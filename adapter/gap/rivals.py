@@ -91,17 +91,17 @@ class _Products:
     own: tuple[Array, ...]
 
 
-def standings(fit: Fit, carried: Carried, field: SignatureTable) -> tuple[Standing, ...]:
+def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standing, ...]:
     """Each named effect of a fit against all candidates in its interval."""
     products: dict[object, _Products] = {}
     out = []
     for k, named in enumerate(fit.named):
         when = (named.interval_s, named.recording)
         if when not in products:
-            X = fit.whiten(field.within(*when))
-            own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in field.candidates)
+            X = fit.whiten(table.within(*when))
+            own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
             products[when] = _Products(X @ carried.N.T, X @ carried.data, own)
-        out.append(_standing(fit, carried, field.candidates, products[when], k))
+        out.append(_standing(fit, carried, table.candidates, products[when], k))
     return tuple(out)
 
 

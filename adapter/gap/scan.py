@@ -349,34 +349,34 @@ class Move:
         )
 
 
-def leads_of(field: SignatureTable) -> list[Lead]:
+def leads_of(table: SignatureTable) -> list[Lead]:
     """The best leads first, no two of one effect on one joint and of one kind of interval."""
     best: dict[tuple[str, int, str], Lead] = {}
-    for lead in field.whole():
+    for lead in table.whole():
         if lead.candidate.effect.possible(_values(lead)):
             _keep(best, lead, "whole")
     # a pattern may change in mid-recording as well, but then it is a pattern all the more
     chosen = [x.candidate for x in best.values() if not isinstance(x.candidate.effect, Pattern)]
-    for lead in field.timed(chosen):
+    for lead in table.timed(chosen):
         if lead.candidate.effect.possible(_values(lead)):
             _keep(best, lead, "timed")
-    for lead in field.passing([c for c in chosen if c.effect.passing]):
+    for lead in table.passing([c for c in chosen if c.effect.passing]):
         _keep(best, lead, "passing")
     return sorted(best.values(), key=lambda lead: -lead.log_evidence)
 
 
-def honest_moves(field: SignatureTable, refused: set[tuple[str, int]]) -> list[Move]:
+def honest_moves(table: SignatureTable, refused: set[tuple[str, int]]) -> list[Move]:
     """What is worth trying, under its own noise, in the order in which to try it.
 
     What is simpler goes first: always before from some time on, an effect before its finer
     form, unless the other explains clearly more. Friction and an offset can hide each other:
     they are also tried together.
     """
-    leads = [x for x in leads_of(field) if x.candidate.key not in refused]
-    found = [x for x in map(field.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
+    leads = [x for x in leads_of(table) if x.candidate.key not in refused]
+    found = [x for x in map(table.honest, _shortlist(leads)) if x.log_evidence > BELIEF]
     found = [x for x in found if x.chi2 > least_chi2(x.candidate.effect, x.interval_s)]
     found = [x for x in found if not any(outdone(x, y) for y in found)]
-    moves = [Move((x,), x.log_evidence) for x in found] + _bundles(field, leads, found)
+    moves = [Move((x,), x.log_evidence) for x in found] + _bundles(table, leads, found)
     return sorted(moves, key=lambda x: -x.log_evidence)
 
 
@@ -402,7 +402,7 @@ def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
     return chosen
 
 
-def _bundles(field: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
+def _bundles(table: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
     """Friction with an offset, on each joint where they say more together than one of them."""
     moves = []
     for joint in {x.candidate.joint for x in leads}:
@@ -413,7 +413,7 @@ def _bundles(field: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]
         ]
         if len(own) < 2 or max(x.log_evidence for x in own) < BELIEF:
             continue
-        worth_it = field.together(own).log_evidence + sum(x.odds for x in own)
+        worth_it = table.together(own).log_evidence + sum(x.odds for x in own)
         alone = max((x.log_evidence for x in found if x.candidate.joint == joint), default=BELIEF)
         if worth_it > alone + BELIEF:
             moves.append(Move(tuple(own), worth_it))

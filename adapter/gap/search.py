@@ -105,15 +105,15 @@ def _extended(
     """With all that pays of one kind of candidates."""
     refused: set[tuple[str, int]] = set()
     while budget.spend():
-        field = SignatureTable(fit, joints, kind)
-        fit, accepted = field.fit, False
-        moves = honest_moves(field, refused | {e.candidate.key for e in fit.named})
+        table = SignatureTable(fit, joints, kind)
+        fit, accepted = table.fit, False
+        moves = honest_moves(table, refused | {e.candidate.key for e in fit.named})
         for move in moves[:TRIED]:
-            trial = _with(fit, move, field.fit.noise, progress)
+            trial = _with(fit, move, table.fit.noise, progress)
             if trial is None:
                 refused |= {x.candidate.key for x in move.leads if len(move.leads) == 1}
                 continue
-            fit, accepted = _alongside(trial, move, moves, field, progress), True
+            fit, accepted = _alongside(trial, move, moves, table, progress), True
             break
         if not accepted:
             break
@@ -141,16 +141,16 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         bare, _ = refitted(bare)
         catalogued = SignatureTable(bare, joints, CATALOGUED)
         named = catalogued.together([catalogued.lead_of(e.candidate) for e in words])
-        field = SignatureTable(bare, joints, PATTERNS)
-        patterns = [field.lead_of(c) for c in field.candidates if c.joint == joint]
-        best = max(map(field.honest, patterns), key=lambda x: x.chi2)
+        table = SignatureTable(bare, joints, PATTERNS)
+        patterns = [table.lead_of(c) for c in table.candidates if c.joint == joint]
+        best = max(map(table.honest, patterns), key=lambda x: x.chi2)
         if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
-            fit = _with(bare, Move((best,), best.log_evidence), field.fit.noise) or fit
+            fit = _with(bare, Move((best,), best.log_evidence), table.fit.noise) or fit
     return fit
 
 
 def _alongside(
-    fit: Fit, first: Move, moves: Sequence[Move], field: SignatureTable, progress: Progress
+    fit: Fit, first: Move, moves: Sequence[Move], table: SignatureTable, progress: Progress
 ) -> Fit:
     """With the plain moves of other joints, which do not touch the first one."""
     taken = {first.joint, -1}
@@ -159,7 +159,7 @@ def _alongside(
             continue
         taken.add(move.joint)  # the best move of a joint decides, whatever it is
         if move.plain:
-            fit = _with(fit, move, field.fit.noise, progress) or fit
+            fit = _with(fit, move, table.fit.noise, progress) or fit
     return fit
 
 
@@ -199,8 +199,8 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         if bad is not None:
             fit = fit.without(bad)
             continue
-        field = SignatureTable(fit, joints, CATALOGUED, rich=False)
-        ranked = standings(fit, carried, field)
+        table = SignatureTable(fit, joints, CATALOGUED, rich=False)
+        ranked = standings(fit, carried, table)
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked)

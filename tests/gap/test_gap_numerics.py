@@ -654,7 +654,7 @@ def test_patterns_hold_every_smooth_curve_of_their_signal(signals: Signals):
         assert np.abs(left).max() < 0.02 * np.abs(shape).max()
 
 
-def test_pattern_fields_look_at_patterns_alone():
+def test_pattern_tables_look_at_patterns_alone():
     found = SignatureTable(fit_of(SHORT), (RUBS,), PATTERNS)
     assert {c.joint for c in found.candidates} == {RUBS}
     assert not {c.effect.name for c in found.candidates} & set(CATALOGUE)
