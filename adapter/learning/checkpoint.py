@@ -17,6 +17,7 @@ from adapter.errors import SettingsError
 from adapter.learning.learner import Change, OnlineLearner
 from adapter.learning.schema_kernels import MotionMoments
 from adapter.learning.theta_kernels import Moments
+from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
 VERSION = 2
@@ -55,7 +56,6 @@ def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = Tr
 
     With `sync` it is on the disk afterwards, safe from a power cut and not only from a kill.
     """
-    path = Path(path)
     arrays: dict[str, Any] = {"version": VERSION, "about": _about(learner)}
     for part, names in _STATE.items():
         owner = attrgetter(part)(learner) if part else learner
@@ -68,13 +68,11 @@ def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = Tr
     arrays[".held"] = learner._held[rows]
     arrays[".changes"] = np.array([change.stamp_ns for change in learner.changes], dtype=np.int64)
     arrays["adam.steps"] = learner.adam.steps
-    part_file = path.with_name(f"{path.name}.{os.getpid()}.part")
-    with part_file.open("wb") as file:
+    with whole_file(Path(path)) as place, place.open("wb") as file:
         np.savez(file, **arrays)
         file.flush()
         if sync:
             os.fsync(file.fileno())
-    part_file.replace(path)
 
 
 def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:

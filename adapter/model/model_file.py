@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,23 @@ VERSION = 1
 _REQUIRED = ("name", "tree", "lambda", "theta")
 
 
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file that is there whole or not at all: write to the path given, beside the final one."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def save_model(model: SelfModel, path: str | Path) -> Path:
-    """Write `model` to `path`, whole or not at all (written beside, then renamed)."""
+    """Write `model` to `path`, whole or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(dumps(model), encoding="utf-8")
-    os.replace(beside, path)
+    with whole_file(path) as part:
+        part.write_text(dumps(model), encoding="utf-8")
     return path
 
 

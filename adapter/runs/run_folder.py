@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.model.model_file import load_model, save_model
+from adapter.model.model_file import load_model, save_model, whole_file
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import base_parameters
@@ -206,16 +205,12 @@ def save_run(folder: str | Path, data: RunData) -> Path:
     if data.reference is not None:
         arrays["reference"] = data.reference
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         save_model(data.model, folder / MODEL)
         save_model(data.documented, folder / DOCUMENTED)
-        beside = folder / (FIGURES + ".part")
-        beside.write_text(json_text(data.figures), encoding="utf-8")
-        os.replace(beside, folder / FIGURES)
-        beside = folder / (TRACES + ".part")
-        with open(beside, "wb") as file:
+        with whole_file(folder / FIGURES) as part:
+            part.write_text(json_text(data.figures), encoding="utf-8")
+        with whole_file(folder / TRACES) as part, part.open("wb") as file:
             np.savez_compressed(file, **arrays)
-        os.replace(beside, folder / TRACES)
     except OSError as error:
         raise RunFolderError(f"{folder}: cannot be written: {error.strerror}") from error
     return folder
