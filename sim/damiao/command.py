@@ -4,34 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
-import threading
-import time
+from contextlib import ExitStack
 from typing import Any
 
 from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.options import check
 from sim.damiao.server import BoardOptions, Boards
+from sim.ending import Ending
 from sim.options import options_of
 from sim.scenarios import build
-
-_SIGNALS = (signal.SIGTERM, signal.SIGINT)
-
-
-class Ending:
-    """Ends at a signal or when the time is over."""
-
-    def __init__(self, duration_s: float | None) -> None:
-        self._event = threading.Event()
-        self._end = None if duration_s is None else time.monotonic() + duration_s
-
-    def on_signal(self, number: int, frame: object) -> None:
-        """Handler of SIGTERM and SIGINT."""
-        self._event.set()
-
-    def is_set(self) -> bool:
-        """Whether to end."""
-        return self._event.is_set() or (self._end is not None and time.monotonic() >= self._end)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,26 +22,16 @@ def run(args: argparse.Namespace) -> int:
     scenario = build(args.scenario, args.seed, **options)
     noise = scenario.noise if options.keys() & {"noise", "levels"} else None
     fd = bool(args.fd)
-    ending = Ending(args.duration)
-    before = {kind: signal.signal(kind, ending.on_signal) for kind in _SIGNALS}
-    try:
+    with Ending(args.duration) as ending, ExitStack() as stack:
         bus = open_bus(args.interface, args.channel, args.port, fd)
-        try:
-            chosen = BoardOptions(args.motors, noise)
-            boards = Boards(bus, scenario, chosen, args.fault)
-            try:
-                check_alone(bus, boards.motors[0].motor_id, boards.motors[0].reply_id, fd)
-                address = address_of(args.interface, args.channel, args.port, fd)
-                print(f"ready: a simulated arm on {address}", flush=True)
-                boards.serve(ending)
-                report = boards.report()
-            finally:
-                boards.close()
-        finally:
-            bus.shutdown()
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
+        stack.callback(bus.shutdown)
+        boards = Boards(bus, scenario, BoardOptions(args.motors, noise), args.fault)
+        stack.callback(boards.close)
+        check_alone(bus, boards.motors[0].motor_id, boards.motors[0].reply_id, fd)
+        address = address_of(args.interface, args.channel, args.port, fd)
+        print(f"ready: a simulated arm on {address}", flush=True)
+        boards.serve(ending)
+        report = boards.report()
     print(summary(report), flush=True)
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)

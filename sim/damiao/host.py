@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Protocol
 
 import can
 
 from drivers.interface import Array, Driver, Intake, JointSample
-from sim.damiao.faults import Faults
-from sim.damiao.line import Line, refuse
+from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario
 
@@ -68,23 +66,6 @@ class ServedBus(WrappedBus):
         if self.serving:
             self._boards.service()
         return self._bus.recv(timeout)
-
-
-class FailingBus(WrappedBus):
-    """Any bus, with fault `enobufs` on its sends."""
-
-    def __init__(
-        self, bus: can.BusABC, faults: Faults, now_ns: Callable[[], int] = time.monotonic_ns
-    ) -> None:
-        """Wrap a bus. The faults' time runs from here."""
-        super().__init__(bus)
-        self._faults, self._now_ns, self._begun_ns = faults, now_ns, now_ns()
-
-    def send(self, msg: can.Message, timeout: float | None = None) -> None:
-        """Send, or raise CanOperationError (ENOBUFS)."""
-        if self._faults.strikes("enobufs", (self._now_ns() - self._begun_ns) * 1e-9):
-            raise refuse()
-        self._bus.send(msg, timeout)
 
 
 class WrappedDriver:

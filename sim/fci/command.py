@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
-import time
-from collections.abc import Callable
 
+from sim.ending import Ending
 from sim.fci.codec import HOST
 from sim.fci.server import FciServer
 from sim.options import options_of
@@ -26,7 +24,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"error: {_sentence(error, args.port)}", file=sys.stderr)
         return EXIT_USAGE
     try:
-        run_server(server, args.duration)
+        with Ending(args.duration) as ending:
+            print(f"listening on {HOST}:{server.port} protocol {server.protocol}", flush=True)
+            server.serve(ending.is_set)
     finally:
         server.close()
     summary = server.summary()
@@ -35,22 +35,6 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         args.json.write_text(json.dumps(summary, indent=1) + "\n", "utf-8")
     return EXIT_OK
-
-
-def run_server(server: FciServer, duration_s: float | None = None) -> None:
-    """Say that it is ready and serve; to be called in the main thread."""
-    stop = _stopper(duration_s)
-    print(f"listening on {HOST}:{server.port} protocol {server.protocol}", flush=True)
-    server.serve(stop)
-
-
-def _stopper(duration_s: float | None) -> Callable[[], bool]:
-    """True after a signal or when the time is over."""
-    asked: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda got, frame: asked.append(got))
-    end = None if duration_s is None else time.monotonic() + duration_s
-    return lambda: bool(asked) or (end is not None and time.monotonic() > end)
 
 
 def _sentence(error: Exception, port: int) -> str:
