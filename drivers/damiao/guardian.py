@@ -1,6 +1,4 @@
-"""What the loop's process tells its guardian, in memory that both have mapped.
-
-A process of its own that brakes and holds the arm where the loop's process does not.
+"""A process of its own that brakes and holds the arm where the loop's process does not.
 
 These motors have no brakes. A motor that hears nothing keeps its last command until its time-out
 (register 9), and then lets go: after a `kill -9` of the loop the arm would first go on as it was

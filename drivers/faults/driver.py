@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from drivers.faults.alter import SIGNALS, blank, corrupt, corrupt_stamp, frozen, shifted, spike
 from drivers.faults.spec import KINDS, Fault, Faults
-from drivers.interface import Array, Driver, DriverError, EndOfStream, Intake, JointSample
+from drivers.interface import Array, Driver, DriverError, EndOfStream, JointSample
 
 SILENCE_LIMIT_S = 0.1  # an arm that is silent for longer is given up with a DriverError
 
@@ -43,6 +45,11 @@ class Account:
         return f"faults put into {self.taken} samples: {', '.join(counts) or 'none'}"
 
 
+def _of_driver(name: str) -> Any:
+    """An attribute that is the driver's own."""
+    return property(attrgetter(f"driver.{name}"))
+
+
 class FaultyDriver:
     """A driver with faults; names, period, intake and arrival instants are those of the driver.
 
@@ -65,6 +72,12 @@ class FaultyDriver:
         DriverError: a fault names a joint that the arm does not have.
     """
 
+    joint_names, link_names = _of_driver("joint_names"), _of_driver("link_names")
+    period_ns, delay_ns = _of_driver("period_ns"), _of_driver("delay_ns")
+    paced, can_move = _of_driver("paced"), _of_driver("can_move")
+    adds_gravity, intake = _of_driver("adds_gravity"), _of_driver("intake")
+    arrived_ns = _of_driver("arrived_ns")  # when the newest sample taken had arrived
+
     def __init__(self, driver: Driver, faults: Faults, seed: int = 0) -> None:
         faults.check_joints(len(driver.joint_names))
         self.driver, self.faults, self.seed = driver, faults, seed
@@ -83,51 +96,6 @@ class FaultyDriver:
         self._stuck: dict[Fault, tuple[float, float, float]] = {}
         self._reads = 0
         self._dead: str | None = None
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """As of the driver."""
-        return self.driver.joint_names
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """As of the driver."""
-        return self.driver.link_names
-
-    @property
-    def period_ns(self) -> int:
-        """As of the driver."""
-        return self.driver.period_ns
-
-    @property
-    def paced(self) -> bool:
-        """As of the driver."""
-        return self.driver.paced
-
-    @property
-    def can_move(self) -> bool:
-        """As of the driver."""
-        return self.driver.can_move
-
-    @property
-    def delay_ns(self) -> int:
-        """The driver's."""
-        return self.driver.delay_ns
-
-    @property
-    def adds_gravity(self) -> bool:
-        """As of the driver."""
-        return self.driver.adds_gravity
-
-    @property
-    def intake(self) -> Intake:
-        """As of the driver; what was put in here is in `account`."""
-        return self.driver.intake
-
-    @property
-    def arrived_ns(self) -> int:
-        """As of the driver: when the newest sample taken had arrived."""
-        return self.driver.arrived_ns
 
     def connect(self) -> None:
         """Connect the driver and begin the faults anew. Raises DriverError."""

@@ -192,9 +192,7 @@ class FciServer:
         self._model = self._model_reply()
         self._reporter = Reporter(self.robot)
         self._reporter.refresh()
-        self._reporter.fill(
-            0
-        )  # whatever is compiled on first use is compiled before a client comes
+        self._reporter.fill(0)  # what is compiled on first use is compiled before a client comes
         self._listener.setblocking(False)
         self._listener.listen()
         self.port: int = self._listener.getsockname()[1]
