@@ -7,6 +7,7 @@ import tempfile
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.progress import Progress
@@ -29,7 +30,7 @@ from adapter.runs.replay import (
     seconds,
 )
 from adapter.runs.replay import replay as learn_from
-from adapter.runs.score import Course, figures, reference_from
+from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, results_folder, warn
 from adapter.signals.matching import matching
 from adapter.signals.validation import validation_torque_rmse
@@ -55,25 +56,7 @@ def run(args: argparse.Namespace) -> int:
     compile_first(robot, config.pipeline, args.every, console.print)
     result = _learn(args, log, robot, config)
     front_end = result.pipeline.front_end
-    numbers = figures(
-        result.outcome,
-        robot,
-        reference,
-        Course(
-            result.samples,
-            front_end.refused,
-            front_end.first_moving_ns,
-            front_end.delay_s,
-            _percentiles(result),
-        ),
-        warnings=[*log.warnings, *front_end.messages],
-        recording=str(args.log),
-        robot=robot.name,
-        every=args.every,
-        times_real_time=result.span_s / max(result.wall_s, 1e-9),
-        noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
-        gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
-    )
+    numbers = _figures(args, log, robot, reference, result)
     if front_end.first_moving_ns is None:
         warn([f"{args.log}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
     held_out = _held_out(args, log, robot)
@@ -84,8 +67,34 @@ def run(args: argparse.Namespace) -> int:
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, str(args.log))
-    console.print(f"{result.span_s / max(result.wall_s, 1e-9):.1f} times faster than real time")
+    console.print(f"{numbers['times_real_time']:.1f} times faster than real time")
     return 0
+
+
+def _figures(
+    args: argparse.Namespace, log: Log, robot: SelfModel, reference: Reference, result: Replay
+) -> dict[str, Any]:
+    front_end = result.pipeline.front_end
+    course = Course(
+        result.samples,
+        front_end.refused,
+        front_end.first_moving_ns,
+        front_end.delay_s,
+        _percentiles(result),
+    )
+    return figures(
+        result.outcome,
+        robot,
+        reference,
+        course,
+        warnings=[*log.warnings, *front_end.messages],
+        recording=str(args.log),
+        robot=robot.name,
+        every=args.every,
+        times_real_time=result.span_s / max(result.wall_s, 1e-9),
+        noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
+        gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
+    )
 
 
 def _robot(args: argparse.Namespace, log: Log) -> SelfModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -223,11 +223,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     noise = noisy_trial(source, noisy_parts, truth.lam, args.seed)
     learners = [by_networks.learned, by_moments.learned]
     if not args.no_baselines:
-        joints = [tree.joint_names[j] for j in ARM]
-        carrier = tree.link_names[tree.parent[ARM[0]]]
-        tables = arm_tables(source, parts, joints, carrier)
-        chosen = choices(tree, truth.lam, joints, carrier, args.full, args.seed)
-        learners += compare(tables, chosen, args.seed, say)
+        learners += _baselines(args, source, parts, say)
     say("learning online, sample by sample")
     online = _online(source, parts.control)
     say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
@@ -260,6 +256,18 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         stated=atlas_stated(numbers),
         numbers=numbers,
     )
+
+
+def _baselines(
+    args: argparse.Namespace, source: Falls, parts: Split, say: Callable[[str], None]
+) -> list[LearnerScores]:
+    """The other learners, on the right arm alone."""
+    tree = source.tree
+    joints = [tree.joint_names[j] for j in ARM]
+    carrier = tree.link_names[tree.parent[ARM[0]]]
+    tables = arm_tables(source, parts, joints, carrier)
+    chosen = choices(tree, source.truth.lam, joints, carrier, args.full, args.seed)
+    return compare(tables, chosen, args.seed, say)
 
 
 def _online(source: Falls, control: Sequence[int]) -> dict[str, Any]:
