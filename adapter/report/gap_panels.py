@@ -9,7 +9,17 @@ import numpy as np
 
 from adapter.gap.result import GapResult
 from adapter.model.spatial import Array
-from adapter.report.style import ACCENT, GOAL, GRID, MUTED, Drawing, Panel, power_of_ten, time_axis
+from adapter.report.style import (
+    ACCENT,
+    GOAL,
+    GRID,
+    MUTED,
+    Drawing,
+    Panel,
+    categories,
+    power_of_ten,
+    time_axis,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,8 +47,6 @@ def _any(values: Array) -> bool:
 
 def _steps(before: Array, after: Array, noise: Array | None) -> Drawing:
     """An arrow per joint from its error before to that after, on a logarithmic scale."""
-    from matplotlib.ticker import FixedLocator, FuncFormatter
-
     drawing = Drawing("half")
     ax = drawing.axes[0]
     ax.set_yscale("log")
@@ -52,10 +60,7 @@ def _steps(before: Array, after: Array, noise: Array | None) -> Drawing:
             ax.plot([j, j], [first, last], color=GRID, linewidth=2.5, zorder=1)
             ax.plot([j], [last], "o", color=ACCENT, markersize=5)
     _log_scale(ax, [before, after, *([] if noise is None else [noise])])
-    ax.set_xlim(-0.6, len(before) - 0.4)
-    ax.xaxis.set_major_locator(FixedLocator(range(len(before))))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{round(x) + 1}"))
-    ax.grid(False, axis="x")
+    categories(ax, [str(j + 1) for j in range(len(before))])
     time_axis(drawing, "joint")
     return drawing
 

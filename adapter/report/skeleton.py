@@ -56,7 +56,7 @@ def skeleton_panels(data: RunData) -> list[Panel]:
     if has_reference(data):
         arms["reference"] = _arm(data, reference, q)
     views: tuple[tuple[str, Projection, str], ...] = (
-        ("Seen from a corner", _corner, "short ticks are the joint axes"),
+        ("Seen from a corner", from_a_corner, "short ticks are the joint axes"),
         ("Seen from the side", _side, "x to the right, z up"),
         ("Seen from the front", _front, "y to the right, z up"),
     )
@@ -100,11 +100,7 @@ def _arm(data: RunData, lam: Array, q: Array) -> Skeleton:
 
 def _skeleton(data: RunData, rotations: Array, shifts: Array, q: Array) -> Skeleton:
     tree = data.documented.tree
-    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
-    for j, i in enumerate(tree.parent):
-        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
-        R[j] = R_i @ rotations[j] @ rot_z(q[j])
-        p[j] = p_i + R_i @ shifts[j]
+    R, p = placed(tree, rotations @ rot_z(q), shifts)
     tips = {}
     for j in set(range(tree.n)) - set(tree.parent):
         riding = [f.position for f in data.documented.frames if f.parent == tree.link_names[j]]
@@ -113,9 +109,18 @@ def _skeleton(data: RunData, rotations: Array, shifts: Array, q: Array) -> Skele
     return Skeleton(p, R[:, :, 2], tips)
 
 
-def _corner(points: Array) -> Array:
-    """Parallel projection, seen from the right in front and from above."""
-    turn, lift = np.radians(-55.0), np.radians(18.0)
+def placed(tree: Tree, rotations: Array, shifts: Array) -> tuple[Array, Array]:
+    """R (n, 3, 3) and p (n, 3) of all joint frames in the base's, from those in their parents'."""
+    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
+    for j, i in enumerate(tree.parent):
+        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
+        R[j], p[j] = R_i @ rotations[j], p_i + R_i @ shifts[j]
+    return R, p
+
+
+def from_a_corner(points: Array, turn_deg: float = -55.0, lift_deg: float = 18.0) -> Array:
+    """Parallel projection of points (..., 3), by default from the right in front and from above."""
+    turn, lift = np.radians(turn_deg), np.radians(lift_deg)
     right = np.array([-np.sin(turn), np.cos(turn), 0.0])
     towards = np.array([np.cos(turn), np.sin(turn), 0.0])
     up = np.array([0.0, 0.0, np.cos(lift)]) - np.sin(lift) * towards

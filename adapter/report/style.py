@@ -145,6 +145,13 @@ def log_time(ax: Axes, first_s: float, last_s: float) -> None:
     ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
+def categories(ax: Axes, names: Sequence[str]) -> None:
+    """Names along x, at 0, 1, 2, ..."""
+    ax.set_xlim(-0.6, len(names) - 0.4)
+    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
+    ax.grid(False, axis="x")
+
+
 def power_of_ten(value: float) -> str:
     """10⁻³ below 0.001 and from 10 000 up, the plain number between."""
     if 0.99e-3 <= value < 1e4:

@@ -16,7 +16,7 @@ from adapter.experiments.page.words import grouped, with_unit
 from adapter.experiments.results import AtlasResults
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
-from adapter.report.skeleton import Skeleton
+from adapter.report.skeleton import Skeleton, from_a_corner, placed
 from adapter.report.style import (
     ACCENT,
     GOAL,
@@ -26,6 +26,7 @@ from adapter.report.style import (
     SIZES,
     Drawing,
     Panel,
+    categories,
     joint_color,
     log_axis,
     mark,
@@ -35,7 +36,7 @@ from adapter.report.style import (
 )
 from adapter.runs.outcome import frame_errors
 
-TURN, LIFT = np.radians(-28.0), np.radians(14.0)  # seen from the front, its right, and above
+VIEW_DEG = (-28.0, 14.0)  # seen from the front, its right, and above
 STRETCH = 1.3  # a skeleton's height, of the usual
 # The paper's letters, by label: a run too short for an epoch must not move the others' letters.
 EPOCH_LETTERS = {"epoch 0": "a", "epoch 50": "b", "epoch 100": "c", "final": "d"}
@@ -112,11 +113,7 @@ def skeleton(tree: Tree, lam: Array) -> Skeleton:
     lam = np.asarray(lam, dtype=float)
     if lam.shape != (tree.n, 6) or not np.isfinite(lam).all():
         raise ValueError(f"a skeleton needs finite λ ({tree.n}, 6), got shape {lam.shape}")
-    turns = matrix_from_zxz(lam[:, :3])
-    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
-    for j, i in enumerate(tree.parent):
-        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
-        R[j], p[j] = R_i @ turns[j], p_i + R_i @ lam[j, 3:]
+    R, p = placed(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:])
     return Skeleton(p, R[:, :, 2], {})
 
 
@@ -151,7 +148,7 @@ def draw_bones(
     """Lines from each parent's origin to the joint's, and a dot there."""
     color = {j: joint_color(limb.color) for limb in limbs(tree) for j in limb.joints}
     for j, line in enumerate(shown.bones(tree)):
-        ends = _projected(line).T
+        ends = from_a_corner(line, *VIEW_DEG).T
         if behind:
             ax.plot(*ends, color=MUTED, linewidth=6.0, alpha=0.25, solid_capstyle="round")
             continue
@@ -163,21 +160,14 @@ def draw_bones(
         dot = ends[:, 1:]
         ax.plot(*dot, color=stroke, marker="o", markersize=3.4, alpha=faint, linestyle="none")
     if not behind:
-        ax.plot(*_projected(np.zeros((1, 3))).T, color=INK, marker="s", markersize=4.4)
-
-
-def _projected(points: Array) -> Array:
-    """Points (..., 3) in the drawing plane (..., 2), by parallel projection."""
-    right = np.array([-np.sin(TURN), np.cos(TURN), 0.0])
-    towards = np.array([np.cos(TURN), np.sin(TURN), 0.0])
-    up = np.array([0.0, 0.0, np.cos(LIFT)]) - np.sin(LIFT) * towards
-    return np.stack([points @ right, points @ up], axis=-1)
+        base = from_a_corner(np.zeros((1, 3)), *VIEW_DEG).T
+        ax.plot(*base, color=INK, marker="s", markersize=4.4)
 
 
 def fit_to(drawing: Drawing, shown: Sequence[Skeleton]) -> None:
     """Limits that hold everything at equal scales, and how long a metre is."""
     ax = drawing.axes[0]
-    flat = _projected(np.vstack([np.zeros((1, 3)), *(x.p for x in shown)]))
+    flat = from_a_corner(np.vstack([np.zeros((1, 3)), *(x.p for x in shown)]), *VIEW_DEG)
     low, high = flat.min(axis=0), flat.max(axis=0)
     width, height, text = SIZES[drawing.size]
     ratio = width / (height * STRETCH)
@@ -317,10 +307,3 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
     categories(ax, [label for label, _ in atlas.snapshots])
     ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["third"][2], loc="best")
     return drawing.panel("Error of λ in the pictures", "rad, m", "one dot per joint")
-
-
-def categories(ax: Axes, names: Sequence[str]) -> None:
-    """Names along x, at 0, 1, 2, ..."""
-    ax.set_xlim(-0.5, len(names) - 0.5)
-    ax.set_xticks(range(len(names)), [str(name) for name in names], parse_math=False)
-    ax.grid(False, axis="x")

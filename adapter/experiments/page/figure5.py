@@ -6,13 +6,11 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from adapter.experiments.page.figure4 import (
     PERCENT,
     SMALLEST,
     STRETCH,
-    categories,
     draw_bones,
     fit_to,
     skeleton,
@@ -24,6 +22,7 @@ from adapter.report.style import (
     STAND_IN,
     Drawing,
     Panel,
+    categories,
     log_axis,
     time_axis,
 )
@@ -174,11 +173,7 @@ def _boxes(
         ax.bar(x, third - first, 0.82 * width, first, color=color, alpha=0.4, linewidth=0, zorder=2)
         ax.hlines(middle, x - 0.41 * width, x + 0.41 * width, color=color, linewidth=1.6, zorder=3)
     ax.set_ylim(*limits)
-    ax.set_xlim(-0.6, len(joints) - 0.4)
-    ax.xaxis.set_major_locator(FixedLocator(range(len(joints))))
-    names = [str(int(j) + 1) for j in joints]
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: names[round(x)]))
-    ax.grid(False, axis="x")
+    categories(ax, [str(int(j) + 1) for j in joints])
     for before, _ in itertools.pairwise(range(len(joints))):
         ax.axvline(before + 0.5, color=STAND_IN["grid"], linewidth=0.6, zorder=0)
     time_axis(drawing, "joint")
