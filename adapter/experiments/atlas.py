@@ -265,9 +265,9 @@ def _baselines(
     tree = source.tree
     joints = [tree.joint_names[j] for j in ARM]
     carrier = tree.link_names[tree.parent[ARM[0]]]
-    tables = arm_tables(source, parts, joints, carrier)
+    sets = arm_tables(source, parts, joints, carrier)
     chosen = choices(tree, source.truth.lam, joints, carrier, args.full, args.seed)
-    return compare(tables, chosen, args.seed, say)
+    return compare(sets, chosen, args.seed, say)
 
 
 def _online(source: Falls, control: Sequence[int]) -> dict[str, Any]:

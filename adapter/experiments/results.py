@@ -51,7 +51,8 @@ class LearnerScores:
         tuning: sentences.
         sizes: numbers of units, samples, ... by name.
         selection: how settings were chosen: chosen, candidates with their errors on a validation
-            part, its trajectories; empty where there was no choice to make.
+            part, its number of samples, sizes of the trials; empty where there was no choice to
+            make.
     """
 
     name: str

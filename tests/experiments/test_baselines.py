@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from adapter.errors import ModelError
-from adapter.experiments.baselines.compare import HeldOut, Tables, select
+from adapter.experiments.baselines.compare import ValidationPart, compare, select
 from adapter.experiments.baselines.elm import ElmCommittee
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
 from adapter.experiments.baselines.gaussian_process import GaussianProcess, negative_log_likelihood
@@ -325,28 +325,48 @@ class Echo(Baseline):
         return np.tile(self.mean, (len(x), 1)) + self.error
 
 
-def test_settings_are_chosen_on_trajectories_that_no_trial_saw_and_on_no_other_set() -> None:
-    """Test and control set would end it: they are not numbers."""
-    where = np.repeat(np.arange(10), 30)[np.random.default_rng(0).permutation(300)]
-    x = np.column_stack([where, np.arange(300.0)])
-    y = np.full((300, 2), 5.0)
-    broken = np.full((9, 2), np.nan)
-    sets = {"train": (x, y), "test": (broken, broken), "control": (broken, broken)}
-    held_out = HeldOut.of(Tables(sets, where), seed=3)
-    assert len(held_out.trajectories) == 2
-    assert set(held_out.judge[0][:, 0]) == set(held_out.trajectories)
-    assert len(held_out.judge[0]) == 60 and len(held_out.fit[0]) == 240
+def test_settings_are_chosen_on_samples_that_no_trial_saw() -> None:
+    """Held out as the test set is: a shuffled quarter, from every trajectory."""
+    trajectory = np.repeat(np.arange(10), 40)
+    x = np.column_stack([trajectory, np.arange(400.0)])
+    y = np.full((400, 2), 5.0)
+    part = ValidationPart.of((x, y), seed=3)
+    fit, judge = set(part.fit[0][:, 1]), set(part.judge[0][:, 1])
+    assert len(fit) == 300 and len(judge) == 100 and not fit & judge
+    assert set(part.judge[0][:, 0]) == set(range(10))
+    same, other = (ValidationPart.of((x, y), seed).judge[0] for seed in (3, 4))
+    assert np.array_equal(same, part.judge[0]) and not np.array_equal(other, part.judge[0])
+
     fitted: list[np.ndarray] = []
     errors = (2.0, -0.5, 3.0)
     choice = Choice("X", "X", partial(Echo, fitted=fitted), tuple({"error": e} for e in errors))
-    found = select(choice, held_out, lambda said: None)
+    found = select(choice, part, lambda said: None)
     assert found["chosen"] == {"error": -0.5}
     told = [row["validation_median"] for row in found["candidates"]]
     assert told == pytest.approx([2 / 7, 0.1, 3 / 8])
     for table in fitted:
-        assert not set(table[:, 0]) & set(held_out.trajectories)
+        assert set(table[:, 1]) == fit
     alone = Choice("Y", "Y", partial(Echo, fitted=fitted))
-    assert select(alone, held_out, lambda said: None) == {"chosen": {}, "candidates": []}
+    assert select(alone, part, lambda said: None) == {"chosen": {}, "candidates": []}
+
+
+def test_the_test_and_the_control_set_have_no_say_in_the_settings() -> None:
+    """Both replaced by sets in which another candidate is by far the best: the same bits."""
+    x, y = np.random.default_rng(0).normal(size=(400, 4)), np.full((400, 2), 5.0)
+    honest = {"train": (x, y), "test": (x[:90], y[:90]), "control": (x[90:], y[90:])}
+    poisoned = honest | {"test": (x[:90], y[:90] + 3.0), "control": (-x, 2.0 * y)}
+    candidates = ({"error": 2.0}, {"error": -0.5}, {"error": 3.0})
+    found = []
+    for sets in (honest, poisoned):
+        fitted: list[np.ndarray] = []
+        choice = Choice("X", "X", partial(Echo, fitted=fitted), candidates)
+        (learned,) = compare(sets, [choice], 3, lambda said: None)
+        assert len(fitted) == 4 and np.array_equal(fitted[-1], x)
+        found.append((learned.selection, fitted, learned.median))
+    (chosen, tables, median), (chosen_again, tables_again, median_again) = found
+    assert chosen == chosen_again and chosen["chosen"] == {"error": -0.5}
+    assert all(np.array_equal(*pair) for pair in zip(tables, tables_again, strict=True))
+    assert median["train"] == median_again["train"] and median["test"] != median_again["test"]
 
 
 def test_without_scikit_learn_the_error_says_what_to_install(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.experiments.baselines.compare import Errors, Tables, compare
+from adapter.experiments.baselines.compare import Errors, compare
 from adapter.experiments.baselines.elm import ElmCommittee
 from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
@@ -96,10 +96,11 @@ def test_learners_are_compared_on_every_set() -> None:
         ({"ridge": 1e-9}, {"ridge": 1e3}),
         {"units": 40},
     )
-    (learned,) = compare(Tables(sets, np.arange(200) // 50), [small], 0, said.append)
+    (learned,) = compare(sets, [small], 0, said.append)
     assert "training: A small committee" in said
     assert learned.selection["chosen"] == {"ridge": 1e-9}
-    assert "1 trajectories held out" in learned.tuning[-1] and "ridge 1e-09" in learned.tuning[-1]
+    assert "50 shuffled samples held out" in learned.tuning[-1]
+    assert "ridge 1e-09" in learned.tuning[-1]
     for name in sets:
         assert learned.boxes[name].shape == (2, 5)
         assert 1e-4 < learned.median[name] < 0.2

@@ -13,7 +13,7 @@ from adapter.experiments.baselines.learner import Baseline
 from adapter.experiments.baselines.presets import Choice, learners
 from adapter.experiments.falls import Falls, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
-from adapter.experiments.split import SETS, Split
+from adapter.experiments.split import SETS, TRAIN_SHARE, Split
 from adapter.learning.batch.prediction_errors import relative_errors
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
@@ -21,25 +21,12 @@ from adapter.model.tree import Tree
 Say = Callable[[str], None]
 Table = tuple[Array, Array]  # inputs X and torques Y
 JUDGED = 20_000  # random samples of each set; all of them would take a committee half an hour
-VALIDATION_SHARE = 0.2  # of the training part's trajectories, at least one
-TRIED = 20_000  # random samples that a trial learns from; half as many judge it
 
 
-@dataclass(frozen=True)
-class Tables:
-    """Samples of the arm.
-
-    Attributes:
-        sets: X and Y of each set; the training set in its shuffled order.
-        trajectory: (m,) number of the trajectory of each training sample.
-    """
-
-    sets: dict[str, Table]
-    trajectory: np.ndarray
-
-
-def arm_tables(source: Falls, parts: Split, joints: Sequence[str], carrier: str) -> Tables:
-    """Inputs and torques of the arm for every set."""
+def arm_tables(
+    source: Falls, parts: Split, joints: Sequence[str], carrier: str
+) -> dict[str, Table]:
+    """Inputs and torques of the arm for every set, the training set in its shuffled order."""
     found: dict[str, list[Table]] = {name: [] for name in SETS}
     for data, rows in sets_of(source, parts):
         x, y = arm_problem(data, joints, carrier)
@@ -52,8 +39,7 @@ def arm_tables(source: Falls, parts: Split, joints: Sequence[str], carrier: str)
     order = np.argsort(np.argsort(parts.train))
     x, y = sets["train"]
     sets["train"] = x[order], y[order]
-    ends = np.cumsum(parts.lengths)
-    return Tables(sets, np.searchsorted(ends, parts.train, side="right"))
+    return sets
 
 
 def choices(
@@ -64,24 +50,26 @@ def choices(
     return learners(Columns(len(index)), sub_parents(tree, index), lam[index], full, seed)
 
 
-def compare(tables: Tables, chosen: Sequence[Choice], seed: int, say: Say) -> list[LearnerScores]:
+def compare(
+    sets: dict[str, Table], chosen: Sequence[Choice], seed: int, say: Say
+) -> list[LearnerScores]:
     """Choose every learner's settings, train it on the training set, judge it on all three sets.
 
     Args:
-        tables: of `arm_tables`.
+        sets: of `arm_tables`.
         chosen: of `choices`.
-        seed: of the samples that are judged, and of what is held out to choose settings.
+        seed: of the samples that are judged, and of the validation part.
         say: takes a sentence on progress.
     """
-    judged = {name: _some(table, seed, JUDGED) for name, table in tables.sets.items()}
-    held_out = HeldOut.of(tables, seed)
+    judged = {name: _some(table, seed, JUDGED) for name, table in sets.items()}
+    validation = ValidationPart.of(sets["train"], seed)
     found = []
     for choice in chosen:
-        selection = select(choice, held_out, say)
+        selection = select(choice, validation, say)
         say(f"training: {choice.title}")
         learner = choice.make(**selection["chosen"])
-        learner.fit(*tables.sets["train"], progress=say)
-        errors = Errors(tables.sets["train"][1].shape[1])
+        learner.fit(*sets["train"], progress=say)
+        errors = Errors(sets["train"][1].shape[1])
         for name, (x, y) in judged.items():
             errors.add(name, y, learner.predict(x))
         facts = learner.facts()
@@ -99,43 +87,40 @@ def _some(table: Table, seed: int, most: int) -> Table:
     return table[0][rows], table[1][rows]
 
 
-# --- settings, chosen on trajectories of the training part that a trial does not learn from -----
+# --- settings, chosen on a part of the training set that no trial learns from -------------------
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Training samples parted by trajectory: to learn from, and to judge settings by.
+class ValidationPart:
+    """The training set parted once more: to learn from, and to judge settings by.
+
+    Drawn as the test set is drawn from all samples, shuffled and in the same share, so that it
+    asks of a learner what the test set will ask.
 
     Attributes:
-        fit, judge: X and Y.
-        trajectories: numbers of those held out to judge.
+        fit: X and Y of the samples that trials learn from.
+        judge: X and Y of the samples that trials are judged by; none of those in `fit`.
     """
 
     fit: Table
     judge: Table
-    trajectories: tuple[int, ...]
 
     @classmethod
-    def of(cls, tables: Tables, seed: int) -> HeldOut:
-        """Whole trajectories held out; of the test and control sets nothing is looked at."""
-        x, y = tables.sets["train"]
-        every = np.unique(tables.trajectory)
-        count = max(1, round(VALIDATION_SHARE * len(every)))
-        out = np.random.default_rng([seed, 1]).permutation(every)[:count]
-        held = np.isin(tables.trajectory, out)
-        return cls(
-            _some((x[~held], y[~held]), seed, TRIED),
-            _some((x[held], y[held]), seed, TRIED // 2),
-            tuple(sorted(out.tolist())),
-        )
+    def of(cls, train: Table, seed: int) -> ValidationPart:
+        """Of the training set alone: the test and the control set are not even handed over."""
+        x, y = train
+        order = np.random.default_rng([seed, 1]).permutation(len(x))
+        cut = round(TRAIN_SHARE * len(x))
+        fit, judge = order[:cut], order[cut:][:JUDGED]
+        return cls((x[fit], y[fit]), (x[judge], y[judge]))
 
 
-def select(choice: Choice, held_out: HeldOut, say: Say) -> dict[str, Any]:
-    """The candidate with the smallest median error by eq. 20 on the trajectories held out.
+def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
+    """The candidate with the smallest median error by eq. 20 on the validation part.
 
     Returns:
         chosen (settings), candidates (settings and validation_median of each; none where there
-        is nothing to choose), validation_trajectories, trial (the sizes of the learners compared).
+        is nothing to choose), validation_samples, trial (the sizes of the learners compared).
     """
     if len(choice.candidates) == 1:
         return {"chosen": dict(choice.candidates[0]), "candidates": []}
@@ -143,21 +128,21 @@ def select(choice: Choice, held_out: HeldOut, say: Say) -> dict[str, Any]:
     rows = []
     for candidate in choice.candidates:
         learner = choice.make(**{**(choice.trial or {}), **candidate})
-        learner.fit(*held_out.fit)
-        rows.append({**candidate, "validation_median": validation_error(learner, held_out)})
+        learner.fit(*part.fit)
+        rows.append({**candidate, "validation_median": validation_error(learner, part)})
     errors = [row["validation_median"] for row in rows]
     best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     return {
         "chosen": dict(choice.candidates[best]),
         "candidates": rows,
-        "validation_trajectories": held_out.trajectories,
-        "trial": {"samples": len(held_out.fit[0]), **(choice.trial or {})},
+        "validation_samples": len(part.judge[0]),
+        "trial": {"samples": len(part.fit[0]), **(choice.trial or {})},
     }
 
 
-def validation_error(learner: Baseline, held_out: HeldOut) -> float:
+def validation_error(learner: Baseline, part: ValidationPart) -> float:
     """Median relative error by eq. 20, of all joints."""
-    x, y = held_out.judge
+    x, y = part.judge
     return float(np.nanmedian(relative_errors(y, learner.predict(x))))
 
 
@@ -170,8 +155,8 @@ def _told(choice: Choice, selection: dict[str, Any]) -> str:
     best = min(row["validation_median"] for row in selection["candidates"])
     return (
         f"Chosen among {len(selection['candidates'])} settings by the error on "
-        f"{len(selection['validation_trajectories'])} trajectories held out of the training part "
-        f"(neither test nor control set): {own}, {best:.1%} there; compared with {sizes}."
+        f"{selection['validation_samples']} shuffled samples held out of the training set "
+        f"(neither test nor control set): {own}, {best:.2%} there; compared with {sizes}."
     )
 
 

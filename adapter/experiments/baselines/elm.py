@@ -16,9 +16,8 @@ from scipy import linalg
 from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import gram, solve_positive
 from adapter.experiments.baselines.learner import (
-    Baseline,
     Progress,
-    Scale,
+    ScaledBaseline,
     Told,
     at_least,
     positive,
@@ -41,7 +40,7 @@ class _Machine:
         return y
 
 
-class ElmCommittee(Baseline):
+class ElmCommittee(ScaledBaseline):
     """Committee of extreme learning machines on standardised inputs and outputs."""
 
     at_once = 5_000  # so that the hidden layer stays below 160 MB
@@ -76,17 +75,16 @@ class ElmCommittee(Baseline):
         self.spread, self.ridge, self.seed = spread, ridge, seed
         self._machines: list[_Machine] = []
 
-    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+    def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Train every member on its own part. Raises ModelError for too weak a ridge."""
-        self._in, self._out = Scale.of(X), Scale.of(Y)
         self._machines = []
-        points = min(self.points, len(X))
+        points = min(self.points, len(x))
         for member in range(self.members):
             rng = np.random.default_rng([self.seed, member])
-            rows = rng.choice(len(X), points, replace=False)
-            self._machines.append(self._machine(self._in(X[rows]), self._out(Y[rows]), rng))
+            rows = rng.choice(len(x), points, replace=False)
+            self._machines.append(self._machine(x[rows], y[rows], rng))
             progress(f"committee: machine {member + 1} of {self.members}")
-        return self._told(points, X.shape[1])
+        return self._told(points, x.shape[1])
 
     def _machine(self, x: Array, y: Array, rng: np.random.Generator) -> _Machine:
         weights = rng.normal(size=(x.shape[1], self.units)) * self.spread / np.sqrt(x.shape[1])
@@ -102,11 +100,12 @@ class ElmCommittee(Baseline):
             ) from None
         return _Machine(weights, biases, output)
 
-    def _answer(self, x: Array) -> Array:
+    def _answer_scaled(self, x: Array) -> Array:
         """The mean over the committee."""
-        scaled = self._in(x)
-        answers = (machine(scaled) for machine in self._machines)
-        return self._out.undo(np.asarray(sum(answers)) / len(self._machines))
+        mean: Array = np.asarray(sum(machine(x) for machine in self._machines)) / len(
+            self._machines
+        )
+        return mean
 
     def _told(self, points: int, inputs: int) -> Told:
         sizes = {

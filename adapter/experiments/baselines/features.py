@@ -43,6 +43,12 @@ class Columns:
         """Number of columns of X."""
         return 3 * self.n + 9 + 3 * int(self.velocity)
 
+    def check(self, x: Array, y: Array) -> None:
+        """Raises ModelError where X has other columns, or Y not one by joint."""
+        checked(x, width=self.width)
+        if y.shape[1] != self.n:
+            raise ModelError(f"Y must have {self.n} columns, got {y.shape[1]}")
+
     def joints(self, x: Array) -> tuple[Array, Array, Array]:
         """q, dq, ddq (m, n) of X."""
         n = self.n

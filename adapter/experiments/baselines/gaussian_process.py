@@ -14,9 +14,8 @@ from scipy import linalg, optimize
 from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import solve_positive
 from adapter.experiments.baselines.learner import (
-    Baseline,
     Progress,
-    Scale,
+    ScaledBaseline,
     Told,
     at_least,
 )
@@ -30,7 +29,7 @@ NOISES = (1e-9, 1.0)
 RAISE, RAISES = 10.0, 6
 
 
-class GaussianProcess(Baseline):
+class GaussianProcess(ScaledBaseline):
     """Gaussian process regression on standardised inputs and outputs."""
 
     at_once = 2_000  # so that their kernel stays below 160 MB
@@ -53,12 +52,11 @@ class GaussianProcess(Baseline):
         at_least(1, points=points, tuned_on=tuned_on, steps=steps)
         self.points, self.tuned_on, self.steps, self.seed = points, tuned_on, steps, seed
 
-    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+    def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Find length scales and noise on some points, then solve for all of them exactly."""
         rng = np.random.default_rng(self.seed)
-        rows = rng.choice(len(X), min(self.points, len(X)), replace=False)
-        self._in, self._out = Scale.of(X), Scale.of(Y)
-        x, y = self._in(X[rows]), self._out(Y[rows])
+        rows = rng.choice(len(x), min(self.points, len(x)), replace=False)
+        x, y = x[rows], y[rows]
         self._lengths, noise = self._tuned(x[: self.tuned_on], y[: self.tuned_on])
         progress(f"Gaussian process: share of noise {noise:.1e}; solving {len(x)} points")
         self._kept = x / self._lengths
@@ -80,9 +78,10 @@ class GaussianProcess(Baseline):
         )
         return np.exp(found.x[:-1]), float(np.exp(found.x[-1]))
 
-    def _answer(self, x: Array) -> Array:
+    def _answer_scaled(self, x: Array) -> Array:
         """The mean of the process."""
-        return self._out.undo(kernel(self._in(x) / self._lengths, self._kept) @ self._alpha)
+        mean: Array = kernel(x / self._lengths, self._kept) @ self._alpha
+        return mean
 
     def _told(self, points: int, noise: float) -> Told:
         tuned_on = min(self.tuned_on, points)

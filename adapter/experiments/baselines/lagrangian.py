@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import accelerator
 from adapter.experiments.baselines.features import Columns
 from adapter.experiments.baselines.learner import (
@@ -28,7 +27,6 @@ from adapter.experiments.baselines.learner import (
     Progress,
     Told,
     at_least,
-    checked,
     positive,
 )
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
@@ -148,9 +146,7 @@ class DeepLagrangian(Baseline):
 
         Raises ModelError where Y has not one column by joint.
         """
-        checked(X, width=self.columns.width)
-        if Y.shape[1] != self.columns.n:
-            raise ModelError(f"Y must have {self.columns.n} columns, got {Y.shape[1]}")
+        self.columns.check(X, Y)
         torque = np.maximum(np.sqrt(np.mean(Y**2, axis=0)), LEAST_TORQUE)
         weight = 1.0 / torque
         sizes = torch.from_numpy(self._sizes(X, torque)).float()

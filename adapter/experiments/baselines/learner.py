@@ -81,6 +81,25 @@ def _unheard(said: str) -> None:
     """Progress that nobody asked for."""
 
 
+class ScaledBaseline(Baseline):
+    """A learner of inputs and outputs at zero mean and unit deviation."""
+
+    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+        self._in, self._out = Scale.of(X), Scale.of(Y)
+        return self._learn_scaled(self._in(X), self._out(Y), progress)
+
+    def _answer(self, x: Array) -> Array:
+        return self._out.undo(self._answer_scaled(self._in(x)))
+
+    @abstractmethod
+    def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
+        """`_learn` from scaled samples."""
+
+    @abstractmethod
+    def _answer_scaled(self, x: Array) -> Array:
+        """`_answer` to scaled samples, itself scaled."""
+
+
 @dataclass(frozen=True)
 class Scale:
     """Columns brought to zero mean and unit deviation; constant ones only to zero mean.

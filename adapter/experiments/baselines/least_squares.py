@@ -13,7 +13,7 @@ import torch
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.learner import Baseline, Progress, Told, checked
+from adapter.experiments.baselines.learner import Baseline, Progress, Told
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import RANK_TOLERANCE
@@ -52,9 +52,7 @@ class RegressorLeastSquares(Baseline):
 
     def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
         """Solve with equal weights, then with each joint's rest as its noise."""
-        checked(X, width=self.columns.width)
-        if Y.shape[1] != self.tree.n:
-            raise ModelError(f"Y must have {self.tree.n} columns, got {Y.shape[1]}")
+        self.columns.check(X, Y)
         width = PER_BODY * self.tree.n + 1
         triangles: list[Array] = [np.zeros((0, width)) for _ in range(self.tree.n)]
         for k in range(0, len(X), self.at_once):

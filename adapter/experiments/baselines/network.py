@@ -9,9 +9,8 @@ import numpy as np
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.learner import (
-    Baseline,
     Progress,
-    Scale,
+    ScaledBaseline,
     Told,
     at_least,
     positive,
@@ -36,7 +35,7 @@ def _regressor_class() -> Any:
     return MLPRegressor
 
 
-class FeedForward(Baseline):
+class FeedForward(ScaledBaseline):
     """tanh units in one hidden layer, inputs and outputs standardised, trained by ADAM."""
 
     at_once = 20_000  # so that the hidden layer stays below 100 MB
@@ -69,11 +68,10 @@ class FeedForward(Baseline):
         self.rate = rate
         self._net: Any = None
 
-    def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:
+    def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Train on all samples in float32. Raises ModelError without scikit-learn."""
         make = _regressor_class()
-        self._in, self._out = Scale.of(X), Scale.of(Y)
-        x, y = (s(table).astype(np.float32) for s, table in ((self._in, X), (self._out, Y)))
+        x, y = x.astype(np.float32), y.astype(np.float32)
         self._net = make(
             hidden_layer_sizes=(self.units,),
             activation="tanh",
@@ -94,9 +92,9 @@ class FeedForward(Baseline):
             progress(f"network: {epochs} epochs at rate {rate:g}, loss {self._net.loss_:.2e}")
         return self._told(len(x), x.shape[1])
 
-    def _answer(self, x: Array) -> Array:
-        found = self._net.predict(self._in(x).astype(np.float32))
-        return self._out.undo(found.reshape(len(x), -1).astype(np.float64))
+    def _answer_scaled(self, x: Array) -> Array:
+        found = self._net.predict(x.astype(np.float32))
+        return np.asarray(found.reshape(len(x), -1), dtype=np.float64)
 
     def _told(self, samples: int, inputs: int) -> Told:
         sizes = {

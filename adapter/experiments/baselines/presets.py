@@ -3,8 +3,9 @@
 On what they are judged: the paper shuffles samples of the same trajectories into train and test
 set, at 1 kHz and with motion below some 2 Hz. A test sample then lies milliseconds from training
 samples, so that the test error shows interpolation in time. Only the control set, of other
-trajectories, shows what was learned of the arm. So settings are compared on whole trajectories of
-the training part that a trial does not learn from; test and control set have no say.
+trajectories, shows what was learned of the arm. Settings are chosen for what the test set asks: by
+the error on samples of the training set that are held out as the test set is, shuffled and in the
+same share. Test and control set have no say.
 """
 
 from __future__ import annotations
