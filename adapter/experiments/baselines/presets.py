@@ -28,8 +28,8 @@ from adapter.model.spatial import Array
 FULL_EPOCHS, DEFAULT_EPOCHS = 200, 40
 DEFAULT_MEMBERS = 20
 FULL_STEPS, DEFAULT_STEPS = 30_000, 6_000
-# Settings that are compared, and in which sizes: all of a trial's samples, everything else as in the
-# default size but for what is named here, about a tenth of the training's time each.
+# Settings that are compared, and what of the default size is cut down in such a trial: it then
+# takes about a tenth of the training's time, or less.
 NETWORK_RATES, NETWORK_TRIAL = (1e-3, 2e-3, 4e-3), {"epochs": 4}
 SPREADS, RIDGES, COMMITTEE_TRIAL = (0.1, 0.2, 0.3), (1e-9, 1e-7), {"members": 1}
 LAGRANGIAN_RATES, LAGRANGIAN_TRIAL = (1e-3, 2e-3), {"steps": 600}
