@@ -6,7 +6,11 @@ STAMP := $(VENV)/.ready
 # Folders whose tests answer in seconds: what a change breaks at once
 QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/report
 
-.PHONY: run test quick experiment setup lint trials soak bench clean
+# Files go to one of two processes whole: what a file's tests share is made once
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+SHARED := --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "not alone and not slow"
+
+.PHONY: run test quick experiment setup lint shared quick-tests trials soak bench clean
 
 run: $(STAMP)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
@@ -14,12 +18,19 @@ run: $(STAMP)
 experiment: $(STAMP)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
-test: $(STAMP) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m "not alone and not slow"
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "alone and not slow"
+# The lint beside the tests that judge no time: mypy alone would leave a processor idle
+test: $(STAMP)
+	$(MAKE) --jobs 2 lint shared
+	$(PYTEST) -m "alone and not slow"
 
-quick: $(STAMP) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m "not alone and not slow" $(QUICK)
+quick: $(STAMP)
+	$(MAKE) --jobs 2 lint quick-tests
+
+shared: $(STAMP)
+	$(PYTEST) $(SHARED)
+
+quick-tests: $(STAMP)
+	$(PYTEST) $(SHARED) $(QUICK)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
@@ -38,7 +49,7 @@ $(STAMP): pyproject.toml constraints.txt
 
 trials: $(STAMP)
 	mkdir -p runs
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 -m slow
+	$(PYTEST) --numprocesses 2 --dist loadfile -m slow
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/discover_trials.py --hard --json runs/discover_trials.json

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import resources
 
 import numpy as np
@@ -153,7 +154,7 @@ class Record:
             assert (factor * np.abs(table) <= limit).all(), order
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
     faults=faults,
     stop=st.one_of(st.none(), ANY_TICK),
@@ -181,7 +182,7 @@ def test_every_limit_holds_in_the_arm_s_own_time_whatever_arrives(faults, stop, 
     record.check(share=0.9)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(faults=faults, stop=st.one_of(st.none(), ANY_TICK), seed=st.integers(0, 1000))
 def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults, stop, seed):
     arm, line, record = Arm(), Line(faults), Record()
@@ -206,8 +207,14 @@ def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults
     record.check(share=1.0)
 
 
+@cache
+def _calm():
+    """Speeds of the arm without faults."""
+    return _run([])[0]
+
+
 def _run(faults: list[Fault], ticks: int = TICKS):
-    """The arm's own positions and speeds, and why the controller gave up."""
+    """The arm's own speeds, why the controller gave up, when, and the controller."""
     arm, line = Arm(), Line(faults)
     controller = ExcitationController(LIMITS, MOTION)
     controller.attend(arm)
@@ -229,9 +236,9 @@ def test_without_faults_nothing_is_refused():
     assert said is None and controller.tracking()["unusable"] == 0
 
 
-@pytest.mark.parametrize("size", [0.5, -0.3, 0.05])
+@pytest.mark.parametrize("size", [-0.3, 0.05])
 def test_a_jump_of_an_encoder_stops_the_arm_and_does_not_fling_it(size):
-    calm = _run([])[0]
+    calm = _calm()
     speeds, said, tick, _ = _run([Fault("jump", 700, TICKS, 1, size)])
     assert said is not None and "joint 2" in said and "encoder" in said and 700 < tick < 725
     np.testing.assert_array_equal(speeds[:700], calm[:700])
@@ -239,7 +246,7 @@ def test_a_jump_of_an_encoder_stops_the_arm_and_does_not_fling_it(size):
 
 
 def test_a_single_spike_changes_next_to_nothing():
-    calm = _run([])[0]
+    calm = _calm()
     speeds, said, _, controller = _run([Fault("spike", 700, 1, 1, 0.5)])
     assert said is None and controller.tracking()["unusable"] == 1
     assert np.abs(speeds - calm).max() < 0.02
@@ -251,16 +258,15 @@ def test_a_joint_that_reads_the_same_while_it_should_move_stops_the_arm():
     assert (np.abs(speeds) <= LIMITS.velocity).all()
 
 
-@pytest.mark.parametrize("length", [5, 15])
-def test_a_short_hole_is_bridged_and_a_long_one_stops(length):
-    assert _run([Fault("lost", 600, length)])[1] is None
+def test_a_short_hole_is_bridged_and_a_long_one_stops():
+    assert _run([Fault("lost", 600, 15)])[1] is None
     said = _run([Fault("lost", 600, 25)])[1]
     assert said is not None and "no usable joint reading for 0.02 s" in said
 
 
-@pytest.mark.parametrize("seconds", [3600.0, -3600.0, 0.5, -0.005, 0.005])
+@pytest.mark.parametrize("seconds", [3600.0, -3600.0, -0.005])
 def test_a_clock_that_is_set_is_no_hole(seconds):
-    calm = _run([])[0]
+    calm = _calm()
     speeds, said, _, _ = _run([Fault("clock", 600, TICKS, 0, seconds)])
     assert said is None
     assert np.abs(speeds - calm).max() < 0.1
@@ -284,12 +290,10 @@ class Lying(PyBulletArm):
 @pytest.mark.parametrize(
     "fault",
     [
-        Fault("jump", 2500, 10**6, 1, 0.5),
-        Fault("jump", 2500, 10**6, 3, -0.1),
-        Fault("jump", 2500, 10**6, 5, 0.05),
-        Fault("stuck", 2500, 10**6, 0),
-        Fault("stuck", 2500, 10**6, 4),
-        Fault("nan", 2500, 10**6),
+        Fault("jump", 1500, 10**6, 1, 0.5),
+        Fault("jump", 1500, 10**6, 5, 0.05),
+        Fault("stuck", 1500, 10**6, 4),
+        Fault("nan", 1500, 10**6),
     ],
     ids=lambda fault: f"{fault.kind} of joint {fault.joint + 1}",
 )

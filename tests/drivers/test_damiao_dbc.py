@@ -27,7 +27,7 @@ def test_ids():
     }
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(JOINTS, SHARES, SHARES, st.floats(0, 500), st.floats(0, 5), SHARES)
 def test_cantools_reads_our_commands(joint, q, dq, kp, kd, tau):
     limits = limits_of(joint)
@@ -46,7 +46,7 @@ def test_cantools_reads_our_commands(joint, q, dq, kp, kd, tau):
         assert -1e-9 <= value - said[name] <= 2.001 * step  # two: the all-FF trap
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     JOINTS,
     st.integers(0, 65535),
@@ -67,7 +67,7 @@ def test_we_read_cantools_states(joint, q, dq, tau, status, mosfet, rotor):
     assert ours.rotor_degc % 256 == theirs["Rotor"]
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(JOINTS, st.integers(0, 65535), *[st.integers(0, 4095)] * 4)
 def test_cantools_commands_are_ours_code_by_code(joint, q, dq, kp, kd, tau):
     codes = {"Q": q, "Dq": dq, "Kp": kp, "Kd": kd, "Tau": tau}

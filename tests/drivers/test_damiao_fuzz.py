@@ -50,7 +50,7 @@ def need_sound(said):
 
 
 @given(st.binary(max_size=16))
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=300, deadline=None)
 def test_states(data):
     if len(data) != 8:
         with pytest.raises(WireError, match="8 bytes"):
@@ -83,7 +83,7 @@ def test_many_states_and_register_replies():
 
 
 @given(*[st.floats(allow_nan=True, allow_infinity=True)] * 5)
-@settings(max_examples=1000, deadline=None)
+@settings(max_examples=300, deadline=None)
 def test_commands(q, dq, kp, kd, tau):
     values = (q, dq, kp, kd, tau)
     if any(math.isnan(value) for value in values):

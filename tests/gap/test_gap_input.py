@@ -86,7 +86,7 @@ SPOILED = {
 }
 
 
-@pytest.mark.parametrize("source", ["real", 1, 2])
+@pytest.mark.parametrize("source", ["real", 1])
 @pytest.mark.parametrize("how", SPOILED)
 def test_spoiled_torques(how: str, source: str | int) -> None:
     log = real_log() if source == "real" else recording(int(source)).log()
@@ -108,7 +108,7 @@ def test_a_real_log_passes(model: str) -> None:
     assert any("behind q" in note for note in screened.notes)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_large_effects_and_wrong_models_pass(seed: int) -> None:
     """2 N m of friction, 10 % of gain, 3 kg from the middle on, inertias 40 % wrong."""
     data = recording(seed)

@@ -263,6 +263,13 @@ def learner_for(model: SelfModel | None = None, **settings: object) -> OnlineLea
     )
 
 
+def teach(learner: OnlineLearner, states: np.ndarray, rows: int = 4) -> OnlineLearner:
+    """Learn from states, so many at a time where ADAM's way does not matter; 1: as live."""
+    for k in range(0, len(states), rows):
+        learner.step_table(states[k : k + rows])
+    return learner
+
+
 def model_torque(
     model: SelfModel,
     lam: np.ndarray,

@@ -22,10 +22,11 @@ from tests.helpers.arm_data import (
     record,
     rms,
     states_of,
+    teach,
 )
 
-AT_S = 20.0
-MASSES = (0.1, 0.3, 1.0)
+AT_S = 12.0
+MASSES = (0.1, pytest.param(0.3, marks=pytest.mark.slow), 1.0)
 
 
 @cache
@@ -48,12 +49,10 @@ class WithLoad:
         states = states_of(data)
         stamps = 1e-9 * stamps_of(states)
         split = int(np.searchsorted(stamps, AT_S - 0.05))
-        for state in states[:split]:
-            learner.step(state)
+        teach(learner, states[:split], rows=1)
         self.frames = learner.schema.R0.copy(), learner.schema.p.copy()
         self.theta = learner.theta.theta.copy()
-        for state in states[split:]:
-            learner.step(state)
+        teach(learner, states[split:], rows=1)
         rows = learner.score_trace.rows
         self.time_s, self.error = 1e-9 * rows[:, 0], rows[:, -7:]
 
@@ -130,10 +129,9 @@ def held_out_error_of(run: WithLoad, truth: Truth) -> np.ndarray:
     return rms(tau - model_torque(panda_model(), run.learner.schema.lam, run.theta, q, dq, ddq))
 
 
-@pytest.mark.parametrize("seed", range(11, 14))
-def test_no_false_alarm(seed: int) -> None:
-    learner = learner_for(seed=seed)
-    for state in states_of(record(arm(), Motion(14.0, seed))):
+def test_no_false_alarm() -> None:
+    learner = learner_for(seed=11)
+    for state in states_of(record(arm(), Motion(14.0, 11))):
         learner.step(state)
         assert not learner.change.waiting
     assert not learner.changes and learner.theta.payload is None
@@ -141,16 +139,13 @@ def test_no_false_alarm(seed: int) -> None:
 
 @pytest.mark.parametrize("joint", [0, 6])
 def test_directional_forgetting_does_not_wind_up(joint: int) -> None:
-    """All joints for 8 s, then one alone for 12 s while 2 s are remembered."""
-    motion = Motion(20.0, 5, alone=(joint, 8.0))
+    """All joints for 6 s, then one alone for 10 s while 2 s are remembered."""
+    motion = Motion(16.0, 5, alone=(joint, 6.0))
     states = states_of(record(arm(), motion))
     learner = learner_for(theta=ThetaSettings(forget_s=2.0))
-    stamps = 1e-9 * stamps_of(states)
-    middle = None
-    for stamp, state in zip(stamps, states, strict=True):
-        if middle is None and stamp > 8.0:
-            middle = held_out_error(learner, arm())
-        learner.step(state)
+    split = int(np.searchsorted(1e-9 * stamps_of(states), 6.0))
+    middle = held_out_error(teach(learner, states[:split]), arm())
+    teach(learner, states[split:])
     noise = np.sqrt(learner.theta.variance())
     end = held_out_error(learner, arm())
     assert np.linalg.norm(end / noise) < 1.5 * np.linalg.norm(middle / noise)
@@ -161,19 +156,15 @@ def test_directional_forgetting_does_not_wind_up(joint: int) -> None:
 
 @pytest.mark.parametrize("forget_s", [None, 2.0])
 def test_at_rest_nothing_moves(forget_s: float | None) -> None:
-    """A minute at rest; then the next motion starts where the last ended."""
-    data = record(arm(), Motion(68.0, 6, rests=((5.0, 66.0),)))
+    """Twenty seconds at rest; then the next motion starts where the last ended."""
+    data = record(arm(), Motion(28.0, 6, rests=((5.0, 26.0),)))
     states = states_of(data)
     stamps = 1e-9 * stamps_of(states)
-    assert not ((stamps > 6.1) & (stamps < 65.9)).any()
+    assert not ((stamps > 6.1) & (stamps < 25.9)).any()
     learner = learner_for(theta=ThetaSettings(forget_s=forget_s))
-    split = int(np.searchsorted(stamps, 30.0))
-    for state in states[:split]:
-        learner.step(state)
-    before, lam = held_out_error(learner, arm()), learner.schema.lam
-    for state in states[split:]:
-        learner.step(state)
-    after = held_out_error(learner, arm())
+    split = int(np.searchsorted(stamps, 15.0))
+    before, lam = held_out_error(teach(learner, states[:split]), arm()), learner.schema.lam
+    after = held_out_error(teach(learner, states[split:]), arm())
     noise = np.sqrt(learner.theta.variance())
     assert np.linalg.norm(after / noise) < 1.2 * np.linalg.norm(before / noise)
     assert np.abs(learner.schema.lam[1:, 3:] - lam[1:, 3:]).max() < 1e-4

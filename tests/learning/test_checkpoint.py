@@ -7,7 +7,10 @@ import pytest
 
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
+from adapter.learning.learner import OnlineLearner
 from tests.helpers.arm_data import Motion, arm, learner_for, record, states_of
+
+EFFECTS = ("viscous_friction", "coulomb_friction")
 
 
 @pytest.fixture(scope="module")
@@ -15,12 +18,18 @@ def states() -> np.ndarray:
     return states_of(record(arm(), Motion(3.0, seed=4)))
 
 
-@pytest.mark.parametrize("cut", [200, 1000, 2500])
-def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path: Path, states, cut: int) -> None:
-    effects = ("viscous_friction", "coulomb_friction")
-    whole, first, second = (learner_for(effects=effects) for _ in range(3))
+@pytest.fixture(scope="module")
+def whole(states) -> OnlineLearner:
+    """What never stopped."""
+    learner = learner_for(effects=EFFECTS)
     for state in states:
-        whole.step(state)
+        learner.step(state)
+    return learner
+
+
+@pytest.mark.parametrize("cut", [200, 1000, 2500])
+def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path: Path, states, whole, cut: int) -> None:
+    first, second = (learner_for(effects=EFFECTS) for _ in range(2))
     for state in states[:cut]:
         first.step(state)
     save_checkpoint(first, tmp_path / "c.npz")

@@ -25,7 +25,7 @@ from tests.helpers.arm_data import (
     states_of,
 )
 
-SEEDS = range(3)
+SEEDS = range(2)
 ROTATION_RAD, POSITION_M = 0.01, 0.005
 SECONDS = 4.0
 KINDS = ("synthesized", "measured")
@@ -93,10 +93,9 @@ def test_lambda_comes_back_and_stays(kind: str, within_s: float, seed: int) -> N
     assert found.learner.schema.rank == found.seen.rank
 
 
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_source_is_told(kind: str, seed: int) -> None:
-    learner = run(kind, seed).learner
+def test_the_source_is_told(kind: str) -> None:
+    learner = run(kind, 0).learner
     model = learned_model(collect(learner), panda_model())
     measured = kind == "measured"
     assert model.lambda_source == (LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED)
@@ -140,10 +139,9 @@ def test_standard_deviations_are_of_the_size_of_the_errors(seed: int) -> None:
     assert 0.5 < total / count < 1.6
 
 
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_mode_sample_runs_and_is_worse(kind: str, seed: int) -> None:
-    ours, theirs = run(kind, seed), run(kind, seed, "sample")
+def test_mode_sample_runs_and_is_worse(kind: str) -> None:
+    ours, theirs = run(kind, 0), run(kind, 0, "sample")
     lam = theirs.learner.schema.lam
     assert np.isfinite(lam).all()
     assert theirs.turn[-1].max() > 10.0 * ours.turn[-1].max()
@@ -162,27 +160,6 @@ def test_a_hole_in_the_data_is_not_taken_for_noise() -> None:
     assert found.turn[-1].max() < ROTATION_RAD and found.shift[-1].max() < POSITION_M
     w_noise = np.sqrt(found.learner.schema.noise_variance()[:-1, 1])
     assert (w_noise < 1.3 * LINK_TWIST_NOISE).all()
-
-
-@pytest.mark.parametrize("loud", range(3), ids=["v", "w", "a"])
-def test_each_channel_of_a_link_sensor_has_its_own_noise(loud: int) -> None:
-    """One of them much louder than the others: none is taken for another."""
-    clean = record(bent(0), Motion(SECONDS, 0), noisy=False, links=True)
-    noise = np.array([2e-3, 2e-3, 2e-2, 2e-2])  # v, w, a, dw
-    noise[loud] *= 20.0
-    rng = np.random.default_rng(5)
-    twists, accels = (
-        x + std * rng.normal(size=x.shape)
-        for x, std in (
-            (clean.twists, np.repeat(noise[:2], 3)),
-            (clean.accels, np.repeat(noise[2:], 3)),
-        )
-    )
-    found = np.sqrt(
-        learn(replace(clean, twists=twists, accels=accels)).learner.schema.noise_variance()
-    )
-    assert not found[0].any()  # the base rests
-    assert (found[1:] < 1.2 * noise).all() and (found[1:] > 0.6 * noise).all(), found / noise
 
 
 def test_measured_motion_counts_although_it_comes_late() -> None:

@@ -43,7 +43,7 @@ def test_a_base_is_not_driven_to_the_edge(how: dict[str, Any]) -> None:
         assert sum(stage.steps for stage in found.stages) < 500
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(0, 8, 2))
 def test_any_tree_from_few_samples(seed: int) -> None:
     truth = random_tree(5 + 2 * seed, 40 + seed)
     data, control = fall(truth, 120, seed), fall(truth, 100, seed + 100)

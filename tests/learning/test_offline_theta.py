@@ -137,7 +137,7 @@ def test_rows_are_weighed_by_what_is_left_of_them(solver: str) -> None:
     assert np.abs(error[:, 6::2]).mean() < 0.8 * np.abs(worse[:, 6::2]).mean()
 
 
-@pytest.mark.parametrize("seed", [17, 18])
+@pytest.mark.parametrize("seed", [17, pytest.param(18, marks=pytest.mark.slow)])
 def test_no_descent_gets_below_the_conic_solution(seed: int) -> None:
     """Noise puts bodies at the edge; scipy's Gauss-Newton and ADAM on log-Cholesky vectors, from
     random bodies, end there too or above."""
@@ -271,7 +271,7 @@ def arm_signals(model, rng, seconds: float):  # type: ignore[no-untyped-def]
     return q, dq, ddq, tau[..., 5].numpy(), k
 
 
-@pytest.mark.parametrize("seed", [21, 22])
+@pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
     """Control torque error of learned λ and θ against weighted least squares with the true λ."""
     model, _ = samples(random_urdf(5, seed), False, 2, seed)

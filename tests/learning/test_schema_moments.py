@@ -1,6 +1,7 @@
 """Cost, gradient and curvature of λ from second moments, against sums over samples."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,6 +10,8 @@ import torch
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.schema_kernels import (
     N_SIGNALS,
+    PRODUCTS,
+    Count,
     accumulate,
     channel_cost,
     signals,
@@ -241,6 +244,64 @@ def test_gradient_of_a_tree_is_autograds(parents, floating: bool, velocities: bo
     assert np.abs(schema.gradient - expected).max() < 1e-9 * np.abs(expected).max()
 
 
+# Standard deviations of v, w, a, dw of the base and of link 0, each another.
+STD = np.array([[0.02, 0.05, 0.3, 0.4], [0.03, 0.04, 0.2, 0.6]])
+SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))
+
+
+def moments_of(motion: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    """M (2, 3, 15, 15) of a chain of two joints, from motion (m, 3, 12) of base and links."""
+    M, s = np.zeros((2, 3, 15, 15)), np.zeros((3, 15))
+    for m in range(len(motion)):
+        for j in range(2):
+            signals(q[m, j], dq[m, j], motion[m, j], motion[m, j + 1], s)
+            accumulate(s, 1.0, M[j])
+    return M
+
+
+@pytest.mark.parametrize("velocities", [True, False])
+def test_moments_without_their_known_noise_are_those_of_the_exact_motion(velocities: bool) -> None:
+    """Every sample comes with each sign of the noise of each axis, so nothing is left to chance.
+
+    A product w_x w_y has noise of variance s² (w_x² + w_y²), a square w_x² of 4 s² w_x², beside
+    a constant s²; the constant is no noise and stays, which is 2 s² w_x² of the second moment.
+    """
+    rng = np.random.default_rng(6)
+    m, variance = 40, np.vstack([STD, np.zeros(4)]) ** 2
+    exact, (q, dq) = rng.normal(size=(m, 3, 12)), rng.normal(size=(2, m, 2))
+    if not velocities:
+        exact[:, :, :3], variance[:, 0] = 0.0, 0.0
+    noise = (SIGNS[:, None, None] * np.sqrt(variance)[..., None]).reshape(len(SIGNS), 3, 12)
+    motion = (exact[:, None] + noise).reshape(-1, 3, 12)
+    q, dq, exact = (np.repeat(x, len(SIGNS), axis=0) for x in (q, dq, exact))
+    M, true = moments_of(motion, q, dq), moments_of(exact, q, dq)
+    counts, clean = np.zeros(len(Count)), np.full_like(M, np.nan)
+    counts[Count.SAMPLES], counts[Count.VELOCITIES] = len(motion), velocities
+    without_noise(np.array([-1, 0]), M, counts, variance, clean)
+
+    def diagonal(x: np.ndarray, channel: int, part: slice) -> np.ndarray:
+        return np.diagonal(x[:, channel], axis1=1, axis2=2)[:, part]
+
+    linear = [(0, slice(3, 6)), (2, slice(3, 6))]
+    linear += [(1, slice(3, 9))] if velocities else [(2, slice(6, 9))]
+    for channel, part in linear:
+        theirs = diagonal(true, channel, part)
+        assert np.allclose(diagonal(clean, channel, part), theirs, rtol=1e-12)
+        assert not np.allclose(diagonal(M, channel, part), theirs, rtol=1e-6)
+    off = ~np.eye(15, dtype=bool)
+    kept = clean[:, 0][:, off], clean[:, 2, :6, :6][:, off[:6, :6]]
+    assert all(map(np.array_equal, kept, (M[:, 0][:, off], M[:, 2, :6, :6][:, off[:6, :6]])))
+    if velocities:
+        assert not clean[:, 2, 6:].any() and not clean[:, 2, :, 6:].any()
+        return
+    assert not clean[:, 1].any()
+    power, s2 = diagonal(true, 0, slice(3, 6)), variance[:2, 1]
+    for k, (x, y) in enumerate(PRODUCTS):
+        raw, ours, theirs = (z[:, 2, 9 + k, 9 + k] for z in (M, clean, true))
+        stays = 2.0 * s2 * power[:, x] if x == y else 0.0
+        assert np.allclose(ours - theirs, stays, atol=0.01 * (raw - theirs).min())
+
+
 NOISE = {"v": 6e-3, "w": 1e-3, "a": 8e-2, "dw": 2e-1}
 
 
@@ -282,31 +343,3 @@ def test_each_channels_own_noise_is_found_and_taken_out(channel: str, floating: 
             spread = 8.0 * np.sqrt(theirs * true[level]) + 0.2 * noise  # of motion times noise
             assert abs(ours - theirs) < spread
             assert raw - ours == pytest.approx(3 * schema.count * found[i + 1, level])
-
-
-def test_noise_without_velocities_leaves_accelerations_and_products_of_w() -> None:
-    """Where no velocity is measured, a frame's place shows in dw and products of w: noise out."""
-    model, data = in_motion(random_tree_text(4, 5), True, 2.0, 5)
-    rng = np.random.default_rng(4)
-    levels = {"w": 2e-2, "a": 8e-2, "dw": 2e-1}
-
-    def bare(motion: BodyMotion, scale: float) -> BodyMotion:
-        parts = {k: getattr(motion, k) for k in levels}
-        noisy = {k: x + scale * levels[k] * rng.normal(size=x.shape) for k, x in parts.items()}
-        return BodyMotion(**noisy)
-
-    exact, schema = (Schema(model.tree, None, SchemaSettings()) for _ in range(2))
-    for one, scale in ((exact, 0.0), (schema, 1.0)):
-        one.set_lam(model.lam)
-        blurred = replace(data, base=bare(data.base, scale), links=bare(data.links, scale))
-        one.absorb(blurred.states())
-    clean = np.empty_like(schema.moments.M)
-    found = schema.noise_variance()
-    without_noise(schema._parent, schema.moments.M, schema.moments.counts, found, clean)
-    assert not clean[:, 1].any()
-    for j in range(model.tree.n):
-        for k in (*range(6, 9), *range(9, 15)):
-            raw, ours, theirs = (x[j, 2, k, k] for x in (schema.moments.M, clean, exact.moments.M))
-            assert raw > ours
-            excess = raw - theirs
-            assert abs(ours - theirs) < 0.5 * abs(excess) + 0.05 * theirs

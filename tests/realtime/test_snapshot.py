@@ -97,7 +97,7 @@ def test_a_hammering_writer_is_never_read_torn(board):
     with SnapshotReader(board.name) as reader:
         while reader.read().version == 0:
             pass
-        for _ in range(20_000):
+        for _ in range(5_000):
             found = reader.read()
             values = np.concatenate(
                 [v.ravel() for v in (found.lam, found.theta_std, found.effects, found.effects_std)]

@@ -40,7 +40,10 @@ def integrate(truth, law, times, q0=READY, dq0=None):
     return found.y[:7].T, found.y[7:].T
 
 
-@pytest.mark.parametrize(("scenario", "most"), [("nominal", 1e-5), ("friction", 1e-4)])
+@pytest.mark.parametrize(
+    ("scenario", "most"),
+    [("nominal", 1e-5), pytest.param("friction", 1e-4, marks=pytest.mark.slow)],
+)
 def test_a_limp_arm_falls_as_the_equations_of_motion_say(scenario, most) -> None:
     with rig(scenario, stand=False) as bench:
         world, start_ns = bench.boards.world, bench.line.start_ns
@@ -196,7 +199,7 @@ def test_an_instant_inside_a_tick_lies_on_the_motion() -> None:
 def test_a_joint_stops_at_the_end_of_its_range() -> None:
     with rig(stand=False) as bench:
         bench.boards.service()
-        for _ in range(40):
+        for _ in range(20):
             bench.pass_ms(100.0)
             bench.boards.service()
         limits, (_, q, _) = bench.scenario.truth.limits, bench.boards.world.state()

@@ -138,7 +138,7 @@ def test_what_is_no_request_is_refused(version, wrong):
         RequestReader(version).feed(struct.pack("<III", number, 0, size))
 
 
-@settings(max_examples=500, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=600), st.sampled_from([5, 10]))
 def test_random_bytes_are_refused_or_read(data, version):
     try:
