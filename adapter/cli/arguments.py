@@ -278,11 +278,7 @@ def _discover(parser: argparse.ArgumentParser) -> None:
     )
     add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
     _add_json(parser)
-    parser.set_defaults(check=_check_log)
-
-
-def _check_log(args: argparse.Namespace) -> None:
-    _check_files(args.log)
+    parser.set_defaults(check=lambda args: _check_files(args.log))
 
 
 def _sim(parser: argparse.ArgumentParser) -> None:

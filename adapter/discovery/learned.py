@@ -19,9 +19,8 @@ from adapter.learning.batch.moments import LinkNoise
 from adapter.learning.batch.schema import BatchSchemaSettings, SchemaResult, schema_from_moments
 from adapter.learning.batch.theta_factors import row_factors, scales, system
 from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta
-from adapter.learning.theta import NEUTRAL_INERTIA, NEUTRAL_MASS, PRIOR_STD
+from adapter.learning.theta import PRIOR_STD, neutral_body
 from adapter.learning.tree_data import BodyMotion, TreeData
-from adapter.model.inertia import theta_from_body
 from adapter.model.self_model import LAMBDA_MEASURED, SelfModel, gravity_down
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
@@ -61,11 +60,7 @@ def learn(discovery: Discovery) -> LearnedTree:
     schema = schema_from_moments(data, BatchSchemaSettings(noise=LinkNoise(**noise)))
     # neighbouring samples share their noise: the filter leaves fewer independent ones
     gain = np.sqrt(max(1.0, log.samples / log.noise_samples))
-    return LearnedTree(data, _with_std(schema, gain))
-
-
-def _with_std(schema: SchemaResult, gain: float) -> SchemaResult:
-    return replace(schema, std=schema.std * gain)
+    return LearnedTree(data, replace(schema, std=schema.std * gain))
 
 
 def _in_joint_frames(discovery: Discovery) -> dict[str, Array]:
@@ -160,7 +155,7 @@ def self_model(
     tree = data.tree
     with_torque = discovery.log.tau is not None and "a" in discovery.bodies.motion
     left = None
-    theta = neutral_theta(tree.bodies)
+    theta = np.tile(neutral_body(), (tree.bodies, 1))
     if with_torque and np.abs(data.tau).max() > 0.0:
         theta, left = theta_of(data, schema.lam)
     gravity = gravity_down()
@@ -186,12 +181,6 @@ def self_model(
     ), left
 
 
-def neutral_theta(bodies: int) -> Array:
-    """θ (bodies, 10) of what is believed of a link before any data."""
-    body = theta_from_body(NEUTRAL_MASS, np.zeros(3), NEUTRAL_INERTIA * np.eye(3))
-    return np.tile(body, (bodies, 1))
-
-
 def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
     """θ (bodies, 10) and the torque (n,), N m rms, that it leaves unexplained.
 
@@ -205,13 +194,13 @@ def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
     rows = [row for row in row_factors(data, lam) if row.kind == "torque"]
     first = data.tree.bodies - data.tree.n
     bodies = tuple(range(first, data.tree.bodies))
-    theta = neutral_theta(data.tree.bodies)
+    theta = np.tile(neutral_body(), (data.tree.bodies, 1))
     std = scales(rows)
     for _ in range(ROUNDS):  # weighted by what the round before left
         r, b = system(rows, std, bodies)
         theta[first:] = least_squares_theta(r, b, theta[first:]).theta
         std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
-    r, b = _with_prior(*system(rows, std, bodies), neutral_theta(len(bodies)))
+    r, b = _with_prior(*system(rows, std, bodies), np.tile(neutral_body(), (len(bodies), 1)))
     theta[first:] = consistent_theta(r, b).theta
     return theta, np.array([row.residual(theta) for row in rows])
 

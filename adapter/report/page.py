@@ -61,7 +61,7 @@ def context(data: RunData) -> dict[str, Any]:
         "headline": words.headline(figures),
         "source": figures["lambda"].get("source") or data.model.lambda_source,
         "measured": data.model.lambda_source == LAMBDA_MEASURED,
-        "against": _against(data),
+        "against": "" if data.reference is None else words.against(figures),
         "live": words.is_live(figures),
         "tiles": shown,
         "columns": len(shown) if len(shown) <= MOST_TILES else (len(shown) + 1) // 2,
@@ -95,10 +95,6 @@ def context(data: RunData) -> dict[str, Any]:
         "schema_table": tables.schema_table(data),
         "provenance": tables.provenance_rows(data),
     }
-
-
-def _against(data: RunData) -> str:
-    return "" if data.reference is None else words.against(data.figures)
 
 
 def _warnings(figures: dict[str, Any]) -> list[str]:
