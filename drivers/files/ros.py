@@ -191,27 +191,6 @@ class MotionEncoder:
 
 
 @dataclass(frozen=True, slots=True)
-class JointState:
-    """One sensor_msgs/JointState; an absent quantity has length 0."""
-
-    stamp_ns: int
-    frame_id: str
-    names: tuple[str, ...]
-    position: Array
-    velocity: Array
-    effort: Array
-
-
-@dataclass(frozen=True, slots=True)
-class MotionMessage:
-    """One TwistStamped or AccelStamped: `vector` is (6,), linear part first."""
-
-    stamp_ns: int
-    frame_id: str
-    vector: Array
-
-
-@dataclass(frozen=True, slots=True)
 class Layout:
     """Where the numbers of a message lie: byte slices of its runs of doubles, and its texts."""
 
@@ -299,22 +278,6 @@ def parse_imu(data: Bytes) -> Layout:
     """Layout of a sensor_msgs/Imu: one run of `IMU_DOUBLES`. Raises CdrError."""
     cursor = _Cursor(data)
     return Layout(cursor.little, cursor.text(), (), (cursor.doubles(IMU_DOUBLES),))
-
-
-def decode_joint_state(data: Bytes) -> JointState:
-    """One JointState. Raises CdrError."""
-    block = _read(np.frombuffer(data, np.uint8)[None], np.zeros(1, int), parse_joint_state(data))
-    position, velocity, effort = (v[0] for v in block.values)
-    layout = block.layout
-    return JointState(
-        int(block.stamp_ns[0]), layout.frame_id, layout.names, position, velocity, effort
-    )
-
-
-def decode_motion(data: Bytes) -> MotionMessage:
-    """One TwistStamped or AccelStamped. Raises CdrError."""
-    block = _read(np.frombuffer(data, np.uint8)[None], np.zeros(1, int), parse_motion(data))
-    return MotionMessage(int(block.stamp_ns[0]), block.layout.frame_id, block.values[0][0])
 
 
 def decode_many(
