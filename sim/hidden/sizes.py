@@ -54,7 +54,6 @@ SATURATION = (0.6, 1.2)  # of the joint's effort limit
 
 Numbers = dict[str, float | list[float]]
 Maker = Callable[[np.random.Generator, int, Truth], Numbers]
-# Name -> (joints it may sit on, how its numbers are drawn); no joints: acts on the whole arm.
 ALL = (1, 2, 3, 4, 5, 6, 7)
 
 
@@ -180,6 +179,7 @@ def _saturation(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     return {"s": log_uniform(rng, SATURATION) * float(arm.limits.effort[joint - 1])}
 
 
+# Name -> (joints it may sit on, how its numbers are drawn); no joints: acts on the whole arm.
 CATALOGUE: dict[str, tuple[tuple[int, ...], Maker]] = {
     "viscous_friction": (ALL, _torque("Fv", VISCOUS)),
     "coulomb_friction": (ALL, _torque("Fc", COULOMB)),
