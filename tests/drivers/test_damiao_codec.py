@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from drivers.damiao import codec
+from drivers.damiao.bus_time import budget, classic_bits, fd_bits, frame_times
 from drivers.damiao.codec import Scales, WireError
 from drivers.damiao.limits import TORQUE_FRAMES
-from drivers.damiao.settings import BusSettings, budget, classic_bits, fd_bits, frame_times
+from drivers.damiao.settings import BusSettings
 from drivers.damiao.tables import FAULTS, MOTOR_TYPES, OPENARM, fault_of, type_of
 from drivers.interface import DriverError
 from tests.helpers.damiao_tools import reply_bytes
