@@ -15,10 +15,10 @@ from adapter.realtime.jobs import (
     Jobs,
     LearnerJob,
     LearnerTask,
-    RawLayout,
     RecorderTask,
     RecordingJob,
 )
+from adapter.realtime.raw_layout import RawLayout
 from adapter.realtime.real_time import split_cores
 from adapter.realtime.ring import Ring, affordable_rows
 from adapter.realtime.shared import SharedMemoryError

@@ -1,13 +1,9 @@
-"""The arm as clients get it: a model library (protocol 5) or URDF (protocol 10).
+"""The arm as a model library, for clients of protocol 5.
 
 The library's source is C with one arm's numbers, built once with the machine's own compiler. It has
 thirty functions by name (libfranka 0.9.2): `Ji_J_Jk` and `O_J_Jk`, Jacobians in the frame's own and
 in base axes; `O_T_Jk`, poses; k = 1..7 joints, 8 flange, 9 end effector; `M_NE`, `c_NE`, `g_NE`,
 mass matrix, Coriolis and gravity torques with a load. Matrices are column-major.
-
-libfranka 0.21 demands of the URDF seven movable joints with `joint1` to `joint7` in their names,
-each with its limits and with `position_based_velocity_limits`, and a link that is called exactly
-`link8`, the flange.
 """
 
 from __future__ import annotations
@@ -21,10 +17,9 @@ import tempfile
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
 
 from sim.scenarios import FLANGE_M
-from sim.truth import Array, Truth, body_of, to_rpy
+from sim.truth import Truth
 
 _HEAD = """#include <math.h>
 #include <string.h>
@@ -33,9 +28,6 @@ _HEAD = """#include <math.h>
 COMPILERS = ("cc", "gcc", "clang")
 OPTIONS = ("-O2", "-shared", "-fPIC", "-x", "c", "-", "-lm")
 TIMEOUT_S = 60.0
-NAME = "simulated_arm"
-# The margin by which the speed limit is lowered near a position limit: v <= sqrt(2 a d) + offset.
-VELOCITY_OFFSET = 0.0  # rad/s
 
 
 def model_source(truth: Truth) -> str:
@@ -105,49 +97,3 @@ def _cache_folder() -> Path:
     if folder.is_symlink() or facts.st_uid != os.getuid() or facts.st_mode & 0o077:
         return Path(tempfile.mkdtemp(prefix="simulated-fci-models-"))
     return folder
-
-
-def robot_urdf(truth: Truth) -> str:
-    """The arm without payloads and losses."""
-    parts = [f"<robot name={quoteattr(NAME)}>", '<link name="link0"/>']
-    for j in range(truth.n):
-        parts.append(_link(f"link{j + 1}", *body_of(truth.theta[j])))
-        parts.append(_joint(truth, j))
-    parts.append('<link name="link8"/>')
-    parts.append(
-        f'<joint name="joint8" type="fixed"><origin xyz="0 0 {FLANGE_M!r}" rpy="0 0 0"/>'
-        '<parent link="link7"/><child link="link8"/></joint>'
-    )
-    return "\n".join([*parts, "</robot>"])
-
-
-def _joint(truth: Truth, j: int) -> str:
-    limits = truth.limits
-    numbers = {
-        "lower": limits.lower[j],
-        "upper": limits.upper[j],
-        "velocity": limits.velocity[j],
-        "effort": limits.effort[j],
-    }
-    said = " ".join(f'{key}="{float(value)!r}"' for key, value in numbers.items())
-    slowing = float(limits.acceleration[j])
-    return (
-        f'<joint name="joint{j + 1}" type="revolute">'
-        f'<origin xyz="{_row(truth.p[j])}" rpy="{_row(to_rpy(truth.R[j]))}"/>'
-        f'<parent link="link{j}"/><child link="link{j + 1}"/><axis xyz="0 0 1"/><limit {said}/>'
-        f'<position_based_velocity_limits velocity_offset="{VELOCITY_OFFSET!r}"'
-        f' deceleration_limit="{slowing!r}"/></joint>'
-    )
-
-
-def _link(name: str, m: float, com: Array, inertia: Array) -> str:
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia.tolist()
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{_row(com)}" rpy="0 0 0"/>'
-        f'<mass value="{m!r}"/><inertia ixx="{xx!r}" ixy="{xy!r}" ixz="{xz!r}" iyy="{yy!r}"'
-        f' iyz="{yz!r}" izz="{zz!r}"/></inertial></link>'
-    )
-
-
-def _row(values: Array | tuple[float, ...]) -> str:
-    return " ".join(repr(float(x)) for x in values)

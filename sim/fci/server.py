@@ -26,8 +26,9 @@ from sim.fci.codec import (
     reply,
 )
 from sim.fci.faults import KINDS, Spoiler
-from sim.fci.model import model_library, robot_urdf
+from sim.fci.model import model_library
 from sim.fci.robot import Reporter, Robot
+from sim.fci.urdf import robot_urdf
 from sim.scenarios import Scenario
 
 CHUNK = 4096  # bytes at a time; the longest request has 428
