@@ -8,7 +8,8 @@ QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/re
 
 # Files go to one of two processes whole: what a file's tests share is made once
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
-SHARED := --numprocesses 2 --dist loadfile --no-loadscope-reorder -m "not alone and not slow"
+PAIRS := --numprocesses 2 --dist loadfile --no-loadscope-reorder
+SHARED := $(PAIRS) -m "not alone and not slow"
 
 .PHONY: run test quick experiment setup lint shared quick-tests trials soak bench clean
 
@@ -21,7 +22,7 @@ experiment: $(STAMP)
 # The lint beside the tests that judge no time: mypy alone would leave a processor idle
 test: $(STAMP)
 	$(MAKE) --jobs 2 lint shared
-	$(PYTEST) -m "alone and not slow"
+	$(PYTEST) $(PAIRS) -m "alone and not slow"
 
 quick: $(STAMP)
 	$(MAKE) --jobs 2 lint quick-tests

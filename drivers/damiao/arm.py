@@ -92,6 +92,7 @@ class DamiaoArm:
         """
         if self._bus is not None:
             raise DriverError("this CAN arm is connected already")
+        self.intake = Intake()
         self._bus = self._given_bus or open_bus(self.settings)
         self._wire: Wire = wire_of(self._bus)
         try:

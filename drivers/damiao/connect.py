@@ -57,8 +57,9 @@ class Dialogue:
             for j, (can_id, data) in enumerate(requests):
                 if j not in replies:
                     self.send(can_id, data)
-            end = time.monotonic() + REPLY_TIMEOUT_S
-            while len(replies) < len(requests) and time.monotonic() < end:
+            end, over = time.monotonic() + REPLY_TIMEOUT_S, False
+            while len(replies) < len(requests) and not over:
+                over = time.monotonic() >= end  # what came while this process was held up counts
                 self._take(index, replies, parse)
             if len(replies) == len(requests):
                 if attempt:  # a first reply may come after the second's and be taken for another

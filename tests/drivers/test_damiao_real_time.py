@@ -15,6 +15,7 @@ import pytest
 
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.bus import wire_of
+from tests.helpers.contract_suite import connect
 from tests.helpers.damiao_tools import Bank, Served
 
 pytestmark = pytest.mark.alone
@@ -28,7 +29,7 @@ def test_in_real_time_on_a_virtual_bus(fd):
     name = f"real-{os.getpid()}-{fd}"
     with Served(Bank(), can.Bus(name, interface="virtual")):
         arm = DamiaoArm(f"can://{name}?interface=virtual&fd={fd}&rate=200", allow_motion=True)
-        arm.connect()
+        connect(arm)
         whole = 0
         for _ in range(100):
             sample = arm.read()
@@ -55,7 +56,7 @@ def socketcan_reason():
 def test_on_vcan():
     with Served(Bank(), can.Bus("vcan0", interface="socketcan", fd=True)):
         arm = DamiaoArm("can://vcan0?guardian=0&rate=200", allow_motion=True)
-        arm.connect()
+        connect(arm)
         for _ in range(50):
             arm.read()
             arm.command(np.full(N, 2.0))
@@ -93,8 +94,9 @@ LOOP = """
 import sys, time
 import numpy as np
 from drivers.damiao.arm import DamiaoArm
+from tests.helpers.contract_suite import connect
 arm = DamiaoArm(sys.argv[1], allow_motion=True)
-arm.connect()
+connect(arm)
 print(arm.guardian_pid, flush=True)
 tau = 2.0
 while True:
@@ -145,10 +147,10 @@ def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
             loop.send_signal(signal.SIGKILL)
             loop.wait()
         wait_for(lambda: np.abs(bank.dq).max() < 0.02, "the guardian brakes the arm")
-        time.sleep(1.0)
+        time.sleep(0.5)
         assert (np.abs(bank.q - q0) < 0.5).all()
         q1 = bank.q.copy()
-        time.sleep(1.0)
+        time.sleep(0.6)
         assert np.abs(bank.q - q1).max() < 0.02
         assert not bank.limp
         assert bank.status == [1] * N
@@ -166,7 +168,7 @@ def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
 def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     address, bank = served
     arm = DamiaoArm(address, allow_motion=True)
-    arm.connect()
+    connect(arm)
     first = arm.guardian_pid
     assert any(f"kill {first}" in note for note in arm.intake.notes)
     for _ in range(100):
@@ -176,14 +178,14 @@ def test_a_new_driver_takes_the_arm_over_from_the_guardian(served):
     arm.close()
     assert not gone(first)
     q0 = bank.q.copy()
-    time.sleep(1.5)  # three of the motors' time-outs
+    time.sleep(1.1)  # two of the motors' time-outs
     assert bank.status == [1] * N
     listener = DamiaoArm(address)
-    listener.connect()
+    connect(listener)
     assert any(f"process {first} holds" in note for note in listener.intake.notes)
     assert np.isfinite(listener.read().q).all()
     listener.close()
-    arm.connect()
+    connect(arm)
     second = arm.guardian_pid
     assert second != first
     wait_for(lambda: gone(first), "the first guardian goes")
@@ -216,7 +218,7 @@ def test_garbage_between_processes_is_counted(served):
     address, _ = served
     port = int(address.split(":")[2].split("?")[0])
     arm = DamiaoArm(address + "&guardian=0", allow_motion=True)
-    arm.connect()
+    connect(arm)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         for k in range(100):

@@ -18,7 +18,7 @@ pytest.register_assert_rewrite("tests.helpers.contract_suite")
 from drivers.example_arm import ExampleArm  # noqa: E402
 from drivers.faults.driver import with_faults  # noqa: E402
 from drivers.files.log import LogArm  # noqa: E402
-from tests.helpers.contract_suite import CHECKS, Make, Rig, Tapped  # noqa: E402
+from tests.helpers.contract_suite import CHECKS, Make, Rig, Start, Tapped  # noqa: E402
 from tests.helpers.hardware_rigs import can_multicast, can_virtual, fci  # noqa: E402
 from tests.helpers.live_tools import simulated_arm  # noqa: E402
 from tests.helpers.mcap_tools import record, samples  # noqa: E402
@@ -28,7 +28,7 @@ FAULTS = ("lost", "late", "repeated", "reordered", "corrupt", "nan", "spike")
 
 
 @contextmanager
-def pybullet() -> Iterator[Make]:
+def pybullet() -> Iterator[Start]:
     with ExitStack() as stack:
 
         def make():
@@ -40,20 +40,20 @@ def pybullet() -> Iterator[Make]:
 
 
 @contextmanager
-def log() -> Iterator[Make]:
+def log() -> Iterator[Start]:
     with tempfile.TemporaryDirectory() as folder:
-        path = record(Path(folder) / "a.mcap", samples(500, links=True))
+        path = record(Path(folder) / "a.mcap", samples(1000, links=True))
         yield lambda: LogArm(path)
 
 
 @contextmanager
-def example() -> Iterator[Make]:
+def example() -> Iterator[Start]:
     with running(joints=6) as port:
         yield lambda: ExampleArm(f"udp://127.0.0.1:{port}?timeout_ms=500", allow_motion=True)
 
 
 @contextmanager
-def example_listening() -> Iterator[Make]:
+def example_listening() -> Iterator[Start]:
     """An arm whose wire loses, doubles and cuts datagrams, and a driver that may not move it."""
     with running(joints=3, bad=0.02) as port:
         yield lambda: ExampleArm(f"udp://127.0.0.1:{port}?joints=3&timeout_ms=500")
@@ -78,34 +78,66 @@ def with_trouble(rig: Rig) -> Rig:
     text = ",".join(f"{name}=0.05" for name in FAULTS)
 
     @contextmanager
-    def start() -> Iterator[Make]:
+    def start() -> Iterator[Start]:
         with rig.start() as make:
             yield lambda: with_faults(Tapped(make()), text, seed=3)
 
     return replace(rig, name=f"faulty_{rig.name}", start=start, steady=False, faulty=FAULTS)
 
 
+FAULTY_WIRE = "faulty_fci_5"
 ALL = [*RIGS, *map(with_trouble, RIGS)]
 
 
-@pytest.fixture(scope="module")
-def rigged(request: pytest.FixtureRequest) -> Iterator[tuple[Rig, Make]]:
-    """A driver, and what it speaks to, for all checks of this module."""
-    rig: Rig = request.param
-    with rig.start() as make:
-        yield rig, make
+def marks(rig: Rig) -> list[pytest.MarkDecorator]:
+    """Faults are put in alike whatever the driver; one wire is enough for every day."""
+    seldom = bool(rig.faulty) and rig.name != FAULTY_WIRE
+    return [pytest.mark.alone, *[pytest.mark.slow] * seldom] if rig.wire else []
 
 
 CASES = [
-    pytest.param(
-        rig, check, id=f"{rig.name}-{check.__name__}", marks=pytest.mark.alone if rig.wire else ()
-    )
+    pytest.param(rig, check, id=f"{rig.name}-{check.__name__}", marks=marks(rig))
     for rig in ALL
     for check in CHECKS
     if rig.takes(check)
 ]
 
 
-@pytest.mark.parametrize(("rigged", "check"), CASES, indirect=["rigged"])
-def test_contract(rigged: tuple[Rig, Make], check) -> None:
-    check(*rigged)
+class Bench:
+    """The rig that is open; another one takes its place."""
+
+    def __init__(self) -> None:
+        self._rig: Rig | None = None
+        self._open = ExitStack()
+
+    def make(self, rig: Rig) -> Make:
+        """What makes drivers of this rig, opened where it is not."""
+        if rig is not self._rig:
+            self.close()
+            self._make = Make(self._open.enter_context(rig.start()))
+            self._open.callback(self._make.let_go)
+            self._rig = rig
+        return self._make
+
+    def close(self) -> None:
+        """Close what is open."""
+        self._rig = None
+        self._open.close()
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """One rig after the other, each for all its checks."""
+    opened = Bench()
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize(("rig", "check"), CASES)
+def test_contract(bench: Bench, rig: Rig, check) -> None:
+    make = bench.make(rig)
+    try:
+        check(rig, make)
+    except BaseException:
+        make.let_go()  # in whatever state it is
+        raise

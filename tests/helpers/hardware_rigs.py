@@ -15,7 +15,7 @@ from drivers.interface import JointSample
 from sim.damiao.server import Boards
 from sim.scenarios import build
 from tests.helpers.board_tools import free_port
-from tests.helpers.contract_suite import Make
+from tests.helpers.contract_suite import Start
 
 SERVE_CAN = (
     "import argparse, sys; from sim.damiao.command import run; "
@@ -72,7 +72,7 @@ def fci(protocol: int, allow_motion: bool):
     """The FCI server of one protocol, and drivers that may move it or not."""
 
     @contextmanager
-    def start() -> Iterator[Make]:
+    def start() -> Iterator[Start]:
         server = process("-m", "sim.fci", "--port", "0", "--protocol", str(protocol))
         with server as line, closing() as arms:
             where = line.split()[2]
@@ -80,7 +80,7 @@ def fci(protocol: int, allow_motion: bool):
             def make() -> FciArm:
                 for arm in arms:
                     arm.close()  # the robot serves one client at a time
-                arms.append(FciArm(f"fci://{where}", allow_motion=allow_motion))
+                arms.append(FciArm(f"fci://{where}?recover=1", allow_motion=allow_motion))
                 return arms[-1]
 
             yield make
@@ -89,7 +89,7 @@ def fci(protocol: int, allow_motion: bool):
 
 
 @contextmanager
-def can_multicast() -> Iterator[Make]:
+def can_multicast() -> Iterator[Start]:
     """Boards in a process of their own, on UDP multicast."""
     options = ["--interface", "udp_multicast", "--port", str(free_port())]
     with process("-c", SERVE_CAN, *options) as line, closing() as arms:
@@ -98,7 +98,7 @@ def can_multicast() -> Iterator[Make]:
 
 
 @contextmanager
-def can_virtual() -> Iterator[Make]:
+def can_virtual() -> Iterator[Start]:
     """Boards in a thread of this process, on python-can's virtual bus."""
     import can
 
@@ -117,7 +117,7 @@ def can_virtual() -> Iterator[Make]:
         bus.shutdown()
 
 
-def _maker(arms: list, address: str) -> Make:
+def _maker(arms: list, address: str) -> Start:
     def make():
         for arm in arms:
             arm.close()

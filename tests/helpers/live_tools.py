@@ -1,13 +1,9 @@
-"""Arms and learners for tests of the live process; importable by its worker processes."""
+"""Arms, jobs and waiting for tests of the live process."""
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
-import signal
 import time
-from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 
@@ -17,102 +13,27 @@ from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.urdf import read_urdf
-from adapter.realtime.jobs import LearnerJob, RecordingJob, View
+from adapter.realtime.jobs import RecordingJob
 from adapter.realtime.loop import LiveOptions
-from adapter.realtime.snapshot import Snapshot, nothing_known
 from adapter.realtime.supervisor import SharedMemoryOptions
 from adapter.signals.front_end import FrontEnd
-from adapter.signals.records import stamp_of
 from drivers.interface import DriverError, Intake, JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
+from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' as well
+    Diary,
+    Digest,
+    Dying,
+    Failing,
+    Mortal,
+    die_once,
+    lasting_job,
+    learner_job,
+    no_learner,
+    save_count,
+)
 
 PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
-DYING_AT = 300
-
-
-class Digest:
-    """A learner that remembers what it was fed."""
-
-    def __init__(self) -> None:
-        self.count, self.last_ns, self.in_order = 0, -1, True
-        self._chain = b""
-
-    def step(self, record) -> None:
-        stamp_ns = stamp_of(record)
-        self.in_order = self.in_order and stamp_ns > self.last_ns
-        self.count, self.last_ns = self.count + 1, stamp_ns
-        self._chain = hashlib.sha256(self._chain + record.tobytes()).digest()
-
-    def summary(self) -> tuple[int, bool, str]:
-        return self.count, self.in_order, self._chain.hex()
-
-    def keep(self, folder: Path) -> None:
-        (folder / "state").write_bytes(pickle.dumps(self.__dict__))
-
-    def restore(self, folder: Path) -> None:
-        self.__dict__.update(pickle.loads((folder / "state").read_bytes()))
-
-
-class Dying(Digest):
-    """A learner whose process dies without a word."""
-
-    def step(self, record) -> None:
-        super().step(record)
-        if self.count == DYING_AT:
-            os._exit(3)
-
-
-class Mortal(Digest):
-    """A learner that is killed, once each, when it has learned as many states as TEST_DEATHS says.
-
-    Of those that died it is written in the folder TEST_GRAVES.
-    """
-
-    def step(self, record) -> None:
-        super().step(record)
-        if str(self.count) in os.environ["TEST_DEATHS"].split():
-            die_once(str(self.count))
-
-
-def die_once(name: str) -> None:
-    """kill -9 of this process, unless it happened before under this name."""
-    try:
-        (Path(os.environ["TEST_GRAVES"]) / name).touch(exist_ok=False)
-    except FileExistsError:
-        return
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-class Failing(Digest):
-    """A learner with a bug."""
-
-    def step(self, record) -> None:
-        raise ZeroDivisionError("a bug in the learner")
-
-
-def publish(learner: Digest) -> Snapshot:
-    known = nothing_known(7, 7, 0)
-    theta = np.full((7, 10), float(learner.count))
-    return replace(known, theta=theta, learned=learner.count, stamp_ns=learner.last_ns)
-
-
-class Diary:
-    """A display that writes what it saw to the file named in TEST_DIARY."""
-
-    def __call__(self, view: View) -> None:
-        learned = None if view.snapshot is None else view.snapshot.learned
-        with open(os.environ["TEST_DIARY"], "a") as file:
-            file.write(f"{view.samples} {view.waiting} {learned} {view.done}\n")
-
-
-def learner_job(kind: type[Digest] = Digest, save=None) -> LearnerJob:
-    return LearnerJob(kind, Digest.summary, publish, save, publish_s=0.01, save_s=0.5)
-
-
-def lasting_job(kind: type[Digest] = Digest) -> LearnerJob:
-    """The same with successors."""
-    return replace(learner_job(kind), keep=Digest.keep, restore=Digest.restore)
 
 
 def simulated_arm(seed: int = 5, scenario: str = "nominal") -> PyBulletArm:

@@ -22,8 +22,8 @@ from tests.helpers import live_tools as tools
 
 pytestmark = pytest.mark.alone
 
-ROOM = 200_000  # bytes, for a second or so of samples
-RUN_S = 4.0
+ROOM = 49 * 4096  # bytes, for a second or so of samples
+RUN_S = 2.5
 
 
 @pytest.fixture(autouse=True)
@@ -74,26 +74,22 @@ def _check_full(result, path: Path) -> None:
     assert "what was recorded before stays readable" in result.troubles[0]
     stamps = _stamps(path)
     assert stamps == [1_000_000 * k for k in range(1, len(stamps) + 1)]
-    assert 0 < result.recorded <= len(stamps) and result.unrecorded > 500
+    assert 0 < result.recorded <= len(stamps) and result.unrecorded > 0
     assert result.restarts == 0 and not list(path.parent.glob("*.part2*"))
 
 
-def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path):
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder on a disk of `ROOM` bytes, where this user may have one; None elsewhere."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={ROOM}", "tmpfs", str(disk)]
     try:
-        done = subprocess.run(mount, capture_output=True, text=True)
+        mounted = subprocess.run(mount, capture_output=True).returncode == 0
     except FileNotFoundError:
-        pytest.skip("no mount program here")
-    if done.returncode:
-        pytest.skip(f"no small disk to be had: {done.stderr.strip()}")
-    try:
-        path = disk / "a.mcap"
-        result = _run(path)
-        assert "No space left on device" in result.troubles[0]
-        _check_full(result, path)
-    finally:
+        mounted = False
+    yield disk if mounted else None
+    if mounted:
         subprocess.run(["umount", str(disk)], check=True)
 
 
@@ -103,9 +99,12 @@ def _little_room(snapshot):
     return describe_estimate(snapshot)
 
 
-def test_a_file_that_may_not_grow_stops_the_recording_and_nothing_else(tmp_path):
-    path = tmp_path / "a.mcap"
-    _check_full(_run(path, _little_room), path)
+def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
+    """Where there is no small disk to be had, a file that may not grow is as good."""
+    path = (small_disk or tmp_path) / "a.mcap"
+    result = _run(path, describe_estimate if small_disk else _little_room)
+    assert small_disk is None or "No space left on device" in result.troubles[0]
+    _check_full(result, path)
     assert path.stat().st_size <= ROOM
 
 
@@ -119,7 +118,7 @@ def _stop_once(snapshot):
     return describe_estimate(snapshot)
 
 
-@pytest.mark.parametrize(("hangs_s", "ring_s"), [(1.0, 5.0), (2.0, 1.0)])
+@pytest.mark.parametrize(("hangs_s", "ring_s"), [(0.7, 5.0), (2.0, 1.0)])
 def test_a_slow_disk_costs_what_the_ring_cannot_hold(tmp_path, hangs_s, ring_s):
     place, path = tmp_path / "hanging", tmp_path / "a.mcap"
 
@@ -130,15 +129,12 @@ def test_a_slow_disk_costs_what_the_ring_cannot_hold(tmp_path, hangs_s, ring_s):
 
     waker = threading.Thread(target=wake)
     waker.start()
-    result = _run(path, _stop_once, ring_s)
+    result = _run(path, _stop_once, ring_s, duration_s=3.5 if hangs_s > ring_s else RUN_S)
     waker.join()
     stamps = _stamps(path)
     assert result.troubles == [] and len(stamps) == result.recorded
     assert (np.diff(stamps) > 0).all()
-    if ring_s > hangs_s:
-        assert result.unrecorded == 0
-    else:
-        assert 300 < result.unrecorded < 2500
+    assert (result.unrecorded == 0) == (ring_s > hangs_s)
 
 
 def _die_once(snapshot):

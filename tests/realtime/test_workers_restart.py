@@ -21,7 +21,7 @@ from tests.helpers import live_tools as tools
 pytestmark = pytest.mark.alone
 
 # Some seconds, so that successors, who take seconds to start, take over while the arm moves.
-RUN_S = 5.0
+RUN_S = 3.5
 
 
 @pytest.fixture(autouse=True)
@@ -96,7 +96,7 @@ def test_one_that_always_dies_is_given_up(tmp_path):
         tools.Swinging(),
         tools.parts()[0],
         jobs=Jobs(learner=tools.lasting_job(tools.Dying), recording=tools.recording_job(path)),
-        options=tools.live_options(2.0),
+        options=tools.live_options(1.0),
     )
     assert result.restarts == 3 and result.collected is None
     assert len(result.troubles) == 4 and "nothing more is learned" in result.troubles[-1]

@@ -1,0 +1,116 @@
+"""Learners and a display for tests of the live process.
+
+Its worker processes import this file, and nothing that takes long.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from adapter.realtime.jobs import LearnerJob, View
+from adapter.realtime.snapshot import Snapshot, nothing_known
+from adapter.signals.records import stamp_of
+
+DYING_AT = 300
+
+
+class Digest:
+    """A learner that remembers what it was fed."""
+
+    def __init__(self) -> None:
+        self.count, self.last_ns, self.in_order = 0, -1, True
+        self._chain = b""
+
+    def step(self, record) -> None:
+        stamp_ns = stamp_of(record)
+        self.in_order = self.in_order and stamp_ns > self.last_ns
+        self.count, self.last_ns = self.count + 1, stamp_ns
+        self._chain = hashlib.sha256(self._chain + record.tobytes()).digest()
+
+    def summary(self) -> tuple[int, bool, str]:
+        return self.count, self.in_order, self._chain.hex()
+
+    def keep(self, folder: Path) -> None:
+        (folder / "state").write_bytes(pickle.dumps(self.__dict__))
+
+    def restore(self, folder: Path) -> None:
+        self.__dict__.update(pickle.loads((folder / "state").read_bytes()))
+
+
+class Dying(Digest):
+    """A learner whose process dies without a word."""
+
+    def step(self, record) -> None:
+        super().step(record)
+        if self.count == DYING_AT:
+            os._exit(3)
+
+
+class Mortal(Digest):
+    """A learner that is killed, once each, when it has learned as many states as TEST_DEATHS says.
+
+    Of those that died it is written in the folder TEST_GRAVES.
+    """
+
+    def step(self, record) -> None:
+        super().step(record)
+        if str(self.count) in os.environ["TEST_DEATHS"].split():
+            die_once(str(self.count))
+
+
+def die_once(name: str) -> None:
+    """kill -9 of this process, unless it happened before under this name."""
+    try:
+        (Path(os.environ["TEST_GRAVES"]) / name).touch(exist_ok=False)
+    except FileExistsError:
+        return
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Failing(Digest):
+    """A learner with a bug."""
+
+    def step(self, record) -> None:
+        raise ZeroDivisionError("a bug in the learner")
+
+
+def no_learner() -> Digest:
+    """In place of one that cannot be made."""
+    raise RuntimeError("no such model")
+
+
+def save_count(learner: Digest) -> None:
+    """A checkpoint in the file named in TEST_CHECKPOINT."""
+    Path(os.environ["TEST_CHECKPOINT"]).write_text(str(learner.count))
+
+
+def publish(learner: Digest) -> Snapshot:
+    known = nothing_known(7, 7, 0)
+    theta = np.full((7, 10), float(learner.count))
+    return replace(known, theta=theta, learned=learner.count, stamp_ns=learner.last_ns)
+
+
+class Diary:
+    """A display that writes what it saw to the file named in TEST_DIARY."""
+
+    def __call__(self, view: View) -> None:
+        learned = None if view.snapshot is None else view.snapshot.learned
+        with open(os.environ["TEST_DIARY"], "a") as file:
+            file.write(f"{view.samples} {view.waiting} {learned} {view.done}\n")
+
+
+def learner_job(kind: Callable[[], Digest] = Digest, save=None) -> LearnerJob:
+    return LearnerJob(kind, Digest.summary, publish, save, publish_s=0.01, save_s=0.5)
+
+
+def lasting_job(kind: type[Digest] = Digest) -> LearnerJob:
+    """The same with successors."""
+    return replace(learner_job(kind), keep=Digest.keep, restore=Digest.restore)
