@@ -126,7 +126,7 @@ def test_your_own_log(toured: Path) -> None:
 
 PORT = 14337  # instead of the usual ones, which something else may use
 HELD_UP_S = 2e-3  # a process or core that stands still for so long was held up by the machine
-BY_THE_MACHINE = r"missed 20 commands|silent for|no state|could not be sent"
+BY_THE_MACHINE = r"missed 20 commands|silent for|no usable joint reading|no state"
 
 
 def served(line: str, folder: Path) -> subprocess.Popen[str]:

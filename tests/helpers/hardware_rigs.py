@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 from drivers.damiao.arm import DamiaoArm
 from drivers.fci.arm import FciArm
 from drivers.interface import JointSample
+from sim.damiao.host import Lockstep
+from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import build
 from tests.helpers.board_tools import free_port
@@ -98,23 +99,22 @@ def can_multicast() -> Iterator[Start]:
 
 
 @contextmanager
-def can_virtual() -> Iterator[Start]:
-    """Boards in a thread of this process, on python-can's virtual bus."""
-    import can
+def can_line() -> Iterator[Start]:
+    """Boards in this process on a line in virtual time, where every bit takes what it takes."""
+    scenario = build("nominal")
+    names = scenario.truth.joint_names
+    with ExitStack() as stack:
 
-    channel, stop = "every_driver", threading.Event()
-    bus = can.Bus(channel, interface="virtual", protocol=can.CanProtocol.CAN_FD)
-    boards = Boards(bus, build("nominal"))
-    server = threading.Thread(target=boards.serve, args=(stop,))
-    server.start()
-    try:
-        with closing() as arms:
-            yield _maker(arms, f"can://{channel}?interface=virtual&guardian=0")
-    finally:
-        stop.set()
-        server.join(10.0)
-        boards.close()
-        bus.shutdown()
+        def make() -> Lockstep:
+            line = Line()
+            boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+            stack.callback(boards.close)
+            line.attach(boards)
+            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+            arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
+            return Lockstep(arm, line)
+
+        yield make
 
 
 def _maker(arms: list, address: str) -> Start:

@@ -24,23 +24,19 @@ from tests.helpers import live_tools as tools
 pytestmark = pytest.mark.alone
 
 SCRIPT = """
-import sys
-import time
-from pathlib import Path
-from tests.helpers import live_tools as tools
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
+if __name__ == "__main__":  # the workers load this file as well, and need none of it
+    import sys
+    from pathlib import Path
+    from tests.helpers import live_tools as tools
+    from adapter.realtime.jobs import Jobs
+    from adapter.realtime.loop import run_live
 
-if __name__ == "__main__":
     front_end, controller = tools.parts()
-    result = run_live(
+    run_live(
         tools.simulated_arm(), front_end, controller=controller,
         jobs=Jobs(learner=tools.learner_job(), recording=tools.recording_job(Path(sys.argv[1]))),
         options=tools.live_options(None),
-        say=lambda line: print(line, flush=True),
     )
-    print("RESULT", result.ended, result.samples, result.recorded, result.passed_on,
-          result.collected[0], flush=True)
 """
 
 

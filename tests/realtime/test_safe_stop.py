@@ -29,20 +29,21 @@ alone = pytest.mark.alone  # what kills processes of a live run, in real time
 
 SCRIPT = """
 import os, sys
-from dataclasses import replace
-from pathlib import Path
-from tests.helpers import live_tools as tools
-from adapter.realtime.jobs import Jobs
-from adapter.realtime.loop import run_live
 
-class Telling(tools.PyBulletArm):
-    def read(self):
-        sample = super().read()
-        if sample.stamp_ns % 20_000_000 == 0:
-            os.write(1, b"STAMP %d\\n" % sample.stamp_ns)
-        return sample
+if __name__ == "__main__":  # the workers load this file as well, and need none of it
+    from dataclasses import replace
+    from pathlib import Path
+    from tests.helpers import live_tools as tools
+    from adapter.realtime.jobs import Jobs
+    from adapter.realtime.loop import run_live
 
-if __name__ == "__main__":
+    class Telling(tools.PyBulletArm):
+        def read(self):
+            sample = super().read()
+            if sample.stamp_ns % 20_000_000 == 0:
+                os.write(1, b"STAMP %d\\n" % sample.stamp_ns)
+            return sample
+
     front_end, controller = tools.parts()
     arm = Telling(tools.build("nominal", 5).plant())
     result = run_live(
