@@ -15,8 +15,8 @@ import pytest
 
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.bus import wire_of
-from tests.helpers.contract_suite import connect
 from tests.helpers.damiao_tools import Bank, Served
+from tests.helpers.patience import connect
 
 pytestmark = pytest.mark.alone
 
@@ -94,7 +94,7 @@ LOOP = """
 import sys, time
 import numpy as np
 from drivers.damiao.arm import DamiaoArm
-from tests.helpers.contract_suite import connect
+from tests.helpers.patience import connect
 arm = DamiaoArm(sys.argv[1], allow_motion=True)
 connect(arm)
 print(arm.guardian_pid, flush=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -19,10 +19,10 @@ import pytest
 
 from drivers.faults.driver import Account, FaultyDriver
 from drivers.interface import Driver, DriverError, EndOfStream, Intake, JointSample
+from tests.helpers.patience import connect, patient_read, patiently
 
 READS = 200  # samples of a check
 STILL_READS = 15
-FIRST_WAIT_S = 60.0  # a simulated arm beside seven busy processes takes its time
 LONGEST_NOTE = 300  # characters
 
 Start = Callable[[], Driver]
@@ -86,31 +86,6 @@ class Make:
         shared, self._shared = self._shared, None
         if shared is not None:
             shared.close()
-
-
-def patiently(action: Callable[[], T], again: Callable[[], object]) -> T:
-    """What the action gives; where it raises DriverError, `again` and once more, for a while."""
-    end = time.monotonic() + FIRST_WAIT_S
-    while True:
-        try:
-            return action()
-        except EndOfStream:
-            raise
-        except DriverError:
-            if time.monotonic() > end:
-                raise
-        with suppress(DriverError):
-            again()
-
-
-def connect(arm: Driver) -> None:
-    """Connect, also where a motor's reply does not come in time at first."""
-    patiently(arm.connect, arm.close)
-
-
-def patient_read(arm: Driver) -> JointSample:
-    """The next sample, of a new connection where the old one broke."""
-    return patiently(arm.read, lambda: (arm.close(), arm.connect()))
 
 
 def fresh(make: Make) -> Driver:
