@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numba import njit
@@ -23,25 +24,46 @@ COULOMB_WIDTH = 0.01  # rad/s: Fc sign(dq) is simulated as Fc tanh(dq / COULOMB_
 NEWTON_ROUNDS = 8
 NEWTON_DONE = 1e-12  # rad/s
 
+
+class Row(IntEnum):
+    """Kinds of rows: kind, joint, other joint, three parameters, start and end."""
+
+    VISCOUS = 0
+    COULOMB = 1
+    STRIBECK = 2
+    LOAD_DEPENDENT = 3
+    DRIFT = 4
+    ARMATURE = 5
+    TORQUE_RIPPLE = 6
+    SPRING = 7
+    QUADRATIC_DRAG = 8
+    CUBIC_SPRING = 9
+    POSITION_FRICTION = 10
+    SINE = 11
+    VELOCITY_RIPPLE = 12
+    DAHL = 13
+    CROSS_VISCOUS = 14
+
+
+ROW = 8  # numbers
 KINDS = {
-    "viscous_friction": (0, ("Fv",)),
-    "coulomb_friction": (1, ("Fc", "Fc")),
-    "asymmetric_friction": (1, ("Fc_pos", "Fc_neg")),
-    "stribeck_friction": (2, ("Fc", "Fs", "vs")),
-    "load_dependent_friction": (3, ("Fl",)),
-    "friction_drift": (4, ("dFc",)),
-    "motor_inertia": (5, ("B",)),
-    "torque_ripple": (6, ("a", "n", "phase")),
-    "joint_spring": (7, ("k", "q0")),
-    "x_quadratic_drag": (8, ("c",)),
-    "x_cubic_spring": (9, ("c", "q0")),
-    "x_position_friction": (10, ("A", "phase")),
-    "x_sine_disturbance": (11, ("a", "f", "phase")),
-    "x_velocity_ripple": (12, ("a", "n", "phase")),
-    "x_hysteresis": (13, ("F", "sigma")),
-    "x_cross_viscous": (14, ("c",)),
+    "viscous_friction": (Row.VISCOUS, ("Fv",)),
+    "coulomb_friction": (Row.COULOMB, ("Fc", "Fc")),
+    "asymmetric_friction": (Row.COULOMB, ("Fc_pos", "Fc_neg")),
+    "stribeck_friction": (Row.STRIBECK, ("Fc", "Fs", "vs")),
+    "load_dependent_friction": (Row.LOAD_DEPENDENT, ("Fl",)),
+    "friction_drift": (Row.DRIFT, ("dFc",)),
+    "motor_inertia": (Row.ARMATURE, ("B",)),
+    "torque_ripple": (Row.TORQUE_RIPPLE, ("a", "n", "phase")),
+    "joint_spring": (Row.SPRING, ("k", "q0")),
+    "x_quadratic_drag": (Row.QUADRATIC_DRAG, ("c",)),
+    "x_cubic_spring": (Row.CUBIC_SPRING, ("c", "q0")),
+    "x_position_friction": (Row.POSITION_FRICTION, ("A", "phase")),
+    "x_sine_disturbance": (Row.SINE, ("a", "f", "phase")),
+    "x_velocity_ripple": (Row.VELOCITY_RIPPLE, ("a", "n", "phase")),
+    "x_hysteresis": (Row.DAHL, ("F", "sigma")),
+    "x_cross_viscous": (Row.CROSS_VISCOUS, ("c",)),
 }
-ROW = 8  # kind, joint, other joint, three parameters, start, end
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,43 +113,48 @@ def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array)
     """(5, n): explicit, viscous, positive, negative, armature; arguments as in `losses_at`."""
     out = np.zeros((5, len(q)))
     for r in range(len(rows)):
-        kind, j, other, a, b, c, start, end = rows[r]
+        _, j, other, a, b, c, start, end = rows[r]
         if t < start or t >= end:
             continue
-        i = int(j)
-        if kind == 0:
+        kind, i = int(rows[r, 0]), int(j)
+        if kind == Row.VISCOUS:
             out[1, i] += a
-        elif kind == 1:
+        elif kind == Row.COULOMB:
             out[2, i] += a
             out[3, i] += b
-        elif kind in (2, 3, 4, 10):
+        elif kind == Row.ARMATURE:
+            out[4, i] += a
+        elif kind == Row.QUADRATIC_DRAG:
+            out[1, i] += a * abs(v[i])
+        elif kind == Row.VELOCITY_RIPPLE:
+            out[1, i] += a * np.sin(b * q[i] + c)
+        elif kind == Row.DAHL:
+            out[0, i] += bent[r]
+        elif kind == Row.CROSS_VISCOUS:
+            out[0, i] += a * v[int(other)]
+        elif (
+            kind == Row.TORQUE_RIPPLE
+            or kind == Row.SPRING
+            or kind == Row.CUBIC_SPRING
+            or kind == Row.SINE
+        ):
+            out[0, i] += _torque(rows[r], q[i], t)
+        else:
             level = _level(rows[r], q[i], v[i], rigid[i], t)
             out[2, i] += level
             out[3, i] += level
-        elif kind == 5:
-            out[4, i] += a
-        elif kind == 8:
-            out[1, i] += a * abs(v[i])
-        elif kind == 12:
-            out[1, i] += a * np.sin(b * q[i] + c)
-        elif kind == 13:
-            out[0, i] += bent[r]
-        elif kind == 14:
-            out[0, i] += a * v[int(other)]
-        else:
-            out[0, i] += _torque(rows[r], q[i], t)
     return out
 
 
 @njit(cache=True)
 def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
     """Level of a friction that is alike in both directions, N m."""
-    kind, a, b, c = row[0], row[3], row[4], row[5]
-    if kind == 2:
+    kind, a, b, c = int(row[0]), row[3], row[4], row[5]
+    if kind == Row.STRIBECK:
         return a + (b - a) * np.exp(-((v / c) ** 2))
-    if kind == 3:
+    if kind == Row.LOAD_DEPENDENT:
         return a * abs(rigid)
-    if kind == 4:
+    if kind == Row.DRIFT:
         return a * (t - max(row[6], 0.0))
     return a * (1.0 + np.sin(q + b))
 
@@ -135,12 +162,12 @@ def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
 @njit(cache=True)
 def _torque(row: Array, q: float, t: float) -> float:
     """Torque of position or time alone, N m."""
-    kind, a, b, c = row[0], row[3], row[4], row[5]
-    if kind == 6:
+    kind, a, b, c = int(row[0]), row[3], row[4], row[5]
+    if kind == Row.TORQUE_RIPPLE:
         return a * np.sin(b * q + c)
-    if kind == 7:
+    if kind == Row.SPRING:
         return a * (q - b)
-    if kind == 9:
+    if kind == Row.CUBIC_SPRING:
         return a * (q - b) ** 3
     return a * np.sin(2 * np.pi * b * t + c)
 
@@ -149,7 +176,7 @@ def _torque(row: Array, q: float, t: float) -> float:
 def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
     """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,): dz/dq = sigma (1 - z/F s)."""
     for r in range(len(rows)):
-        if rows[r, 0] == 13:
+        if int(rows[r, 0]) == Row.DAHL:
             speed, F, sigma = v[int(rows[r, 1])], rows[r, 3], rows[r, 4]
             goal = F if speed > 0 else -F
             bent[r] = goal + (bent[r] - goal) * np.exp(-sigma * abs(speed) * h / F)
