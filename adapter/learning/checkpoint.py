@@ -20,7 +20,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
-VERSION = 2
+VERSION = 3
 
 # What each part would not be the same learner without. Everything else follows from the settings.
 _STATE = {

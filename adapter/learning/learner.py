@@ -163,7 +163,7 @@ class OnlineLearner:
         self._judged = -1
         self._shadow: Moments | None = None
         self._shadow_at = 0
-        self.schema_trace = Trace(1 + 6 * tree.n)
+        self.schema_trace = Trace(1 + 12 * tree.n)
         self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
         self.score_trace = Trace(1 + 3 * tree.n + 2 * tree.rows, capacity=12_000)
 
@@ -209,8 +209,7 @@ class OnlineLearner:
         if updating:
             self._update(theta_too)
         self.learned += len(table)
-        if self.schema_trace.wants(len(table)):
-            self.schema_trace.keep(self.stamp_ns, self.schema.lam)
+        self._trace_schema(table)
         if self.watch is not None:
             self.watch(self, table)
         return len(table)
@@ -255,8 +254,8 @@ class OnlineLearner:
             self.schema.compute_gradient()
             self._adam_step(theta_too=False)
         self.learned += len(table)
-        if updates and self.schema_trace.wants(len(table)):
-            self.schema_trace.keep(stamp_of(table[-1]), self.schema.lam)
+        if updates:
+            self._trace_schema(table)
 
     def learn_theta(self, table: Array, updates: int = 1) -> None:
         """θ's half of `step_table`, λ standing still; on states as in `learn_schema`."""
@@ -297,6 +296,10 @@ class OnlineLearner:
         self.schema.apply_step(self.adam.rate)
         if theta_too:
             self.theta.after_step(self.theta_converged, self._states_per_update)
+
+    def _trace_schema(self, table: Array) -> None:
+        if self.schema_trace.due(len(table)):
+            self.schema_trace.keep(stamp_of(table[-1]), self.schema.R0, self.schema.p)
 
     def _theta_is_due(self, table: Array) -> bool:
         """Whether θ is being learned; sees to it that its moments follow λ."""
@@ -347,16 +350,16 @@ class OnlineLearner:
 
     def _look_on(self, table: Array, error: Array) -> None:
         """Keep the scores, and notice a change."""
-        state, at = table[-1], self.layout
-        if self.score_trace.wants(len(table)):
-            self.score_trace.keep(stamp_of(state), state[at.signals], error[-1])
-        if self.theta_trace.wants(len(table)):
-            self.theta_trace.keep(stamp_of(state), self.theta.th)
+        for k in self.score_trace.due(len(table)):
+            state = table[k]
+            self.score_trace.keep(stamp_of(state), state[self.layout.signals], error[k])
+        if self.theta_trace.due(len(table)):
+            self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
         alarmed_before = self.change.waiting
         if self.change.look(error[:, self.tree.rows - self.tree.n :]):
             self._start_change(self._alarm_ns)
         elif self.change.waiting and not alarmed_before:
-            self._alarm_ns = stamp_of(state)
+            self._alarm_ns = stamp_of(table[-1])
 
     def _start_change(self, stamp_ns: int) -> None:
         self.changes.append(Change(stamp_ns))

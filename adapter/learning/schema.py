@@ -278,10 +278,10 @@ class Schema:
         Steps keep out of such directions, but while noise still tilts the picture of what is
         shown, a little leaks into them.
         """
-        for j in range(len(self.p)):
-            unshown = np.eye(6) - self.identifiable[j]
-            if np.abs(unshown[:3, 3:]).max() < PURE_SHIFT:
-                self.p[j] -= unshown[3:, 3:] @ (self.p[j] - self.start_lam[j, 3:])
+        unshown = self._everything - self.identifiable
+        pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < PURE_SHIFT
+        leaked = np.einsum("jab,jb->ja", unshown[:, 3:, 3:], self.p - self.start_lam[:, 3:])
+        self.p -= pure[:, None] * leaked
 
     def covariance(self) -> Array:
         """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""

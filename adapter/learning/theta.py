@@ -13,6 +13,7 @@ links that hang on it).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,6 +51,7 @@ REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.025, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
+SPREAD_STEPS = 50  # at each look at how large the effects are
 
 # A step of friction that has gone through the filter looks like tanh over this share of its delay
 # (fitted on simulated reversals; 1 for a tanh as wide as the delay).
@@ -143,8 +145,7 @@ class Theta:
         self.effect_spread = np.array([effect.prior_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
         self._believed, self._belief_std = known.believed or (nothing, nothing)
-        self.prior, self.prior_rhs = self._neutral_prior()
-        self._ranges = ranges_of(self.prior)
+        self._set_prior(*self._neutral_prior())
         self.x, self.gradient = self._neutral(), np.zeros(self.P)
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
         values(self.mean, self.bodies, self.th)
@@ -251,6 +252,7 @@ class Theta:
 
     def _set_prior(self, H: Array, rhs: Array) -> None:
         self.prior, self.prior_rhs, self._ranges = H, rhs, ranges_of(H)
+        self._before = tuple(Prior(H, rhs, self._ranges, 1.0))
 
     def compute_gradient(self) -> bool:
         """Fill the gradient of one ADAM step; False while there is too little to step on."""
@@ -259,15 +261,16 @@ class Theta:
             return False
         data, count = self.moments[:2], self.count
         floor, floor_count, least = self.floor, self.floor_count, self.model_variance
-        prior = Prior(self.prior, self.prior_rhs, self._ranges, 1.0)
+        prior = self._before
         if self.each_sample:  # plain squared error of the newest sample, priors next to none
             data, count = self.newest[:2], 1.0
             floor, floor_count = np.ones_like(floor), 1e9
-            prior = Prior(1e-6 * self.prior, 1e-6 * self.prior_rhs, self._ranges, 1e-6)
+            H, rhs = 1e-6 * self.prior, 1e-6 * self.prior_rhs
+            prior = tuple(Prior(H, rhs, self._ranges, 1e-6))
         base = self.base_weights()
         weighing = Weighing(count, self.noise_gain, floor, floor_count, least, base, self.share)
         out = *self._work, self.gradient
-        gradient(self.x, self._rows, data, tuple(prior), tuple(weighing), out)
+        gradient(self.x, self._rows, data, prior, tuple(weighing), out)
         return True
 
     def base_weights(self) -> Array:
@@ -351,20 +354,19 @@ class Theta:
     def adapt_effects(self) -> None:
         """Let the data say how large each effect is: the spread of its prior follows.
 
-        One step of empirical Bayes a call: the square of the spread becomes the mean over the
-        joints of estimate² + variance. An effect that is not there fades away, instead of taking
-        a share of the data for itself; and where none is left, the model is trusted as that of
-        an ideal arm. What a model told of keeps the spread that the model gave it.
+        Empirical Bayes, see `likely_spread`. An effect that is not there fades away, instead of
+        taking a share of the data for itself; and where none is left, the model is trusted as
+        that of an ideal arm. What a model told of keeps the spread that the model gave it.
         """
         if not self.effects:
             return
         n = self.tree.n
         variance = self.covariance().diagonal()[self._effects_from :].reshape(-1, n)
         widest = np.array([effect.prior_std for effect in self.effects])
-        square = self.effect_values**2 + variance
-        free = np.isnan(self._believed)
+        values, free = self.effect_values, np.isnan(self._believed)
         found = [
-            np.sqrt(np.mean(s[f])) if f.any() else 0.0 for s, f in zip(square, free, strict=True)
+            likely_spread(x[f], v[f], before) if f.any() else 0.0
+            for x, v, f, before in zip(values, variance, free, self.effect_spread, strict=True)
         ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
@@ -372,7 +374,7 @@ class Theta:
         self.prior[at, at] += np.where(free.ravel(), change, 0.0)
         self.effect_spread[:] = spread
         if self.settings.model_error is None:
-            size = np.sqrt(np.mean(square, axis=1))
+            size = np.sqrt(np.mean(values**2 + variance, axis=1))
             real = bool((np.where(free.all(axis=1), spread, size) > REAL_EFFECT).any())
             self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
 
@@ -467,6 +469,25 @@ class Theta:
 
 _NOTHING = np.empty(0)
 _NO_LEVEL = _NOTHING, _NOTHING
+
+
+def likely_spread(x: Array, variance: Array, spread: float) -> float:
+    """Spread under which numbers that are zero but for it are most likely, from a wider one.
+
+    Steps of expectation maximisation: the square becomes the mean of estimate² + variance, what
+    the data alone say of each number being kept. Few of them leave an absent effect a share of
+    the data for seconds, since it then falls with the root of their count; where no data speak,
+    the spread stays.
+
+    Args:
+        x, variance: (k,) estimates and variances under the present `spread`.
+    """
+    data = np.maximum(1.0 / variance - 1.0 / spread**2, 0.0)
+    told, square = x / variance, spread**2
+    for _ in range(SPREAD_STEPS):
+        variance = 1.0 / (1.0 / square + data)
+        square = float(np.mean((variance * told) ** 2 + variance))
+    return math.sqrt(square)
 
 
 def rows_of(tree: Tree, effects: int) -> Rows:

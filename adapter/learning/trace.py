@@ -22,9 +22,9 @@ class Trace:
         self._offers = 0
         self.stride = stride
 
-    def wants(self, offers: int = 1) -> bool:
-        """Count so many offers; whether the row of one of them is to be kept."""
-        due = -self._offers % self.stride < offers
+    def due(self, offers: int = 1) -> range:
+        """Count so many offers; which of them, from 0, are to be kept."""
+        due = range(-self._offers % self.stride, offers, self.stride)
         self._offers += offers
         return due
 
@@ -34,12 +34,7 @@ class Trace:
             half = self._rows[::2].copy()
             self._rows[: len(half)] = half
             self._used, self.stride = len(half), 2 * self.stride
-        at = 0
-        row = self._rows[self._used]
-        for part in parts:
-            flat = np.ravel(part)
-            row[at : at + flat.size] = flat
-            at += flat.size
+        self._rows[self._used] = np.concatenate(parts, axis=None)
         self._used += 1
 
     @property

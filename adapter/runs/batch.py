@@ -2,7 +2,7 @@
 
 λ takes all states first, then θ takes them all with the λ they led to; live, θ has to do
 without the states before λ had converged. Moments need no steps to be complete, so as many steps
-as live are taken until λ and θ have converged, and few from there on.
+as live are taken until λ and θ have converged, and few from there on, for many states at once.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ from adapter.signals.records import stamp_of
 
 SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
 SCHEMA_POLISH = 300  # more of them, to the optimum
-SETTLED_EVERY = 5  # batches for each step of λ, once it has converged
+# States taken at once where few steps are; more, and a change at the hand would be seen late.
+SETTLED = 100
 # θ takes as many steps as states at first, at a higher rate, then while that gains more than this
 # share of the joints' error variances, as a look at every so many batches tells; else a few.
 FIRST_STEPS, FIRST_RATE = 2000, 1.75
-GAIN, LOOK_EVERY, FEW_STEPS = 0.001, 4, 2
+GAIN, LOOK_EVERY, FEW_STEPS = 0.003, 4, 4
 # (steps, share of the usual rate) at the end, to the optimum
 THETA_POLISH = ((250, 1.0), (250, 0.3))
 
@@ -56,17 +57,19 @@ def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -
     Returns:
         What θ needs of them (m, columns `before_links`), and how many came before λ had converged.
     """
-    kept, waiting, done, number = [], 0, 0, 0
+    kept, waiting, before = [], 0, 0
     for table in tables:
         states = learner.without_known(table)
         kept.append(states[:, learner.layout.before_links].copy())
-        for start in range(0, len(states), every):
-            batch = states[start : start + every]
-            steps = int(number % SETTLED_EVERY == 0) if learner.schema.converged else every
-            done, number = done + len(batch), number + 1
-            if not learner.schema.converged:
-                waiting = done
-            learner.learn_schema(batch, steps)
+        done = 0
+        while done < len(states):
+            settled = learner.schema.converged
+            batch = states[done : done + (SETTLED if settled else every)]
+            done += len(batch)
+            if not settled:
+                waiting = before + done
+            learner.learn_schema(batch, 1 if settled else every)
+        before += len(states)
     for _ in range(SCHEMA_STEPS):
         if learner.schema.converged:
             break
@@ -79,18 +82,18 @@ def _learn_theta(
 ) -> None:
     """Let θ take all states; it begins to step behind the first `waiting` of them, as live."""
     theta, usual = learner.theta, learner.settings.theta.rate
-    moving = True
-    for number, start in enumerate(range(0, len(torque), every)):
-        batch = torque[start : start + every]
+    for start in range(0, waiting, SETTLED):
+        learner.learn_theta(torque[start : min(start + SETTLED, waiting)], 0)
+    moving, start, number = True, waiting, 0
+    while start < len(torque):
         progress(start)
-        if start < waiting:
-            learner.learn_theta(batch, 0)
-            continue
+        batch = torque[start : start + (every if moving else SETTLED)]
         learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
         before = theta.th.copy()
         learner.learn_theta(batch, every if moving else FEW_STEPS)
-        if number % LOOK_EVERY == 0:
+        if not moving or number % LOOK_EVERY == 0:
             moving = theta.updates < FIRST_STEPS or _gain(learner, before) > GAIN
+        start, number = start + len(batch), number + 1
 
 
 def _gain(learner: OnlineLearner, before: Array) -> float:

@@ -14,7 +14,7 @@ from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
-from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
+from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.physics.identifiability import base_parameters
 from adapter.signals.records import LinkMotionKind
 
@@ -99,7 +99,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         payload=theta.payload,
         changes_ns=tuple(change.stamp_ns for change in learner.changes),
         rebuilds=learner.rebuilds,
-        schema_trace=learner.schema_trace.rows.copy(),
+        schema_trace=_course_of_lam(learner),
         theta_trace=learner.theta_trace.rows.copy(),
         score_trace=learner.score_trace.rows.copy(),
         min_eigenvalue=float(np.min(eigenvalues)),
@@ -107,6 +107,14 @@ def collect(learner: OnlineLearner) -> Outcome:
         smoothing_s=theta.smoothing_s,
         disagreements=None if learner.watch is None else tuple(learner.watch.reports),
     )
+
+
+def _course_of_lam(learner: Learner) -> Array:
+    """Rows [stamp ns, λ]; the learner keeps frames, since reading λ off them takes longer."""
+    n, rows = learner.tree.n, learner.schema_trace.rows
+    angles = zxz_from_matrix(rows[:, 1 : 1 + 9 * n].reshape(-1, n, 3, 3))
+    lam = np.concatenate([angles, rows[:, 1 + 9 * n :].reshape(-1, n, 3)], axis=2)
+    return np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
 
 
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:

@@ -16,6 +16,7 @@ so jitter, missing and dropped samples need no grid. All joints go through one c
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ SETTLING_DELAYS = 4  # after so many delays a start has faded to 1e-2
 NEVER = -(2**62)  # a stamp before all others
 
 
+@cache
 def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     """(k1, k2) of L from filterpy's Kalman filter in its steady state, 1/s and 1/s²."""
     # Brings scipy.stats, a second of processor time, which the learner's process has no use for.

@@ -9,6 +9,7 @@ from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
+from adapter.learning.theta import likely_spread
 from tests.helpers.arm_data import (
     Motion,
     arm,
@@ -56,3 +57,36 @@ def test_what_is_there_stays() -> None:
     assert 0.2 < theta.effect_spread[1] < 0.5
     assert np.allclose(theta.effect_values[1], 0.3, atol=0.05)
     assert theta.model_variance > 0.001**2
+
+
+def under(spread: float, x: np.ndarray, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates and variances of numbers that data alone say are x, with so much information."""
+    variance = 1.0 / (1.0 / spread**2 + data)
+    return x * data * variance, variance
+
+
+@pytest.mark.parametrize("true", [0.3, 0.1])
+def test_the_spread_is_the_likeliest(true: float) -> None:
+    rng = np.random.default_rng(4)
+    data = rng.uniform(200.0, 2000.0, 40)
+    x = rng.normal(size=40) * np.hypot(true, 1.0 / np.sqrt(data))
+    found = 1.0
+    for _ in range(3):
+        found = likely_spread(*under(found, x, data), found)
+    grid = np.geomspace(1e-3, 1.0, 2000)
+    level = grid[:, None] ** 2 + 1.0 / data
+    cost = (np.log(level) + x**2 / level).sum(axis=1)
+    assert found == pytest.approx(grid[np.argmin(cost)], rel=0.01)
+
+
+def test_one_look_takes_most_of_its_share_from_an_absent_effect() -> None:
+    """It was a standard deviation of the data wide after the first look, and a second later 0.7."""
+    data = np.full(7, 1e4)
+    assert likely_spread(*under(1.0, np.zeros(7), data), 1.0) < 0.15 / 100.0
+
+
+def test_what_begins_after_it_faded_is_found() -> None:
+    data, x, found = np.full(7, 1e4), np.full(7, 0.3), 1e-3
+    for _ in range(2):
+        found = likely_spread(*under(found, x, data), found)
+    assert found == pytest.approx(0.3, rel=0.01)
