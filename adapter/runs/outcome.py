@@ -109,7 +109,7 @@ def collect(learner: OnlineLearner) -> Outcome:
     )
 
 
-def _course_of_lam(learner: Learner) -> Array:
+def _course_of_lam(learner: OnlineLearner) -> Array:
     """Rows [stamp ns, λ]; the learner keeps frames, since reading λ off them takes longer."""
     n, rows = learner.tree.n, learner.schema_trace.rows
     angles = zxz_from_matrix(rows[:, 1 : 1 + 9 * n].reshape(-1, n, 3, 3))
