@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,11 @@ def no_leftovers():
     assert tools.wait_for(lambda: tools.shared_memory() <= before)
 
 
+def _wait_for_display(diary: Path) -> None:
+    """Nobody else does, and it yields to whatever runs."""
+    assert tools.wait_for(lambda: diary.exists() and diary.stat().st_size > 0, 120.0)
+
+
 def _diary(path: Path) -> list[list[str]]:
     """What a display saw: samples, waiting, learned, done; all but the last of a run under way."""
     lines = [line.split() for line in path.read_text().splitlines()]
@@ -60,10 +66,6 @@ def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch
     monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
     front_end, controller = tools.parts()
     path, diary = tmp_path / "a.mcap", tmp_path / "diary"
-
-    def see_the_display() -> None:  # nobody else waits for it
-        assert tools.wait_for(lambda: diary.exists() and diary.stat().st_size > 0)
-
     result = run_live(
         tools.simulated_arm(),
         front_end,
@@ -73,7 +75,7 @@ def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch
             recording=tools.recording_job(path),
             display=DisplayJob(tools.Diary, period_s=0.05),
         ),
-        options=replace(tools.live_options(2.0), before_motion=see_the_display),
+        options=replace(tools.live_options(2.0), before_motion=partial(_wait_for_display, diary)),
     )
     print("\n".join(result.timing.lines()))
     assert (result.ended, result.fault, result.troubles) == ("duration", None, [])
@@ -176,23 +178,25 @@ def test_a_motion_starts_with_the_first_whole_sample():
 def test_a_learner_that_dies_stops_neither_arm_nor_display(tmp_path, monkeypatch, kind, said):
     monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
     lines: list[str] = []
-    arm, path = tools.Swinging(), tmp_path / "a.mcap"
+    path, diary = tmp_path / "a.mcap", tmp_path / "diary"
+    front_end, controller = tools.parts()
     result = run_live(
-        arm,
-        tools.parts()[0],
+        tools.Swinging(),
+        front_end,
+        controller,
         jobs=Jobs(
             learner=tools.learner_job(kind),
             recording=tools.recording_job(path) if kind is tools.Dying else None,
             display=DisplayJob(tools.Diary, period_s=0.05),
         ),
-        options=tools.live_options(1.5),
+        options=replace(tools.live_options(1.0), before_motion=partial(_wait_for_display, diary)),
         say=lines.append,
     )
-    assert result.ended == "duration" and result.samples == 1501
-    assert result.collected is None and result.passed_on + result.unlearned > 1000
+    assert result.ended == "duration" and result.samples > 1000
+    assert result.collected is None and result.passed_on + result.unlearned > 500
     assert len(result.troubles) == 1 and said in result.troubles[0]
     assert "the arm goes on" in result.troubles[0] and result.troubles[0] in lines
-    assert _diary(tmp_path / "diary")
+    assert len(_diary(diary)) > 1
     assert kind is not tools.Dying or len(read_log(path)) == result.samples
 
 
