@@ -239,9 +239,13 @@ class SignatureTable:
     def whole(self) -> list[Lead]:
         """Every candidate, acting all the time."""
         leads = []
+        C = self.X @ self.carried.N.T
+        solved = self.carried.solved(C)
+        g = self.X @ self.carried.data - solved @ self.carried.g
         for c in self.candidates:
-            found = score(*self.carried.without(self.X[list(c.columns)]), c.prior_std)
-            odds = log_odds(c)
+            k = list(c.columns)
+            G = self.X[k] @ self.X[k].T - solved[k] @ C[k].T
+            found, odds = score(G, g[k], c.prior_std), log_odds(c)
             leads.append(Lead(c, found.log_evidence + odds, found.chi2, found.x, odds=odds))
         return leads
 
