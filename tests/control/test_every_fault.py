@@ -1,4 +1,8 @@
-"""What the loop does upon each fault of single samples: one test for each row of the README."""
+"""What the loop does upon each fault of single samples: one test for each row of the README.
+
+Faults that cost samples alone are put into a recording, those that end a run into the simulated
+arm under its controller; `test_parameters_under_faults` has all of the first there, too.
+"""
 
 import numpy as np
 import pytest
@@ -10,22 +14,25 @@ from drivers.faults.driver import with_faults
 from drivers.files.log import LogArm
 from drivers.files.mcap import McapWriter
 from tests.helpers.arm_data import Motion, arm, panda_model, record
-from tests.helpers.fault_runs import FaultRun, clean_run, run_faulty
+from tests.helpers.fault_runs import FaultRun, clean_run, heard, run_faulty
 from tests.helpers.live_tools import simulated_arm
 
-SECONDS = 4.0
+SECONDS = 3.5  # of a recording
+MOVING_S = 3.0  # of the simulated arm
 USUAL = ("filter_settling", "at_rest")
 
 
 def unusual(run: FaultRun) -> dict[str, int]:
-    """What was refused beside what every start refuses."""
-    return {name: count for name, count in run.refused.items() if name not in USUAL}
+    """What was refused beside what every start refuses, and the recording without faults."""
+    own = heard("", SECONDS).refused
+    more = {name: count - own.get(name, 0) for name, count in run.refused.items()}
+    return {name: count for name, count in more.items() if name not in USUAL and count}
 
 
 def went_on(text: str) -> FaultRun:
     """A run that a fault does not end."""
-    run = run_faulty(text, SECONDS)
-    assert (run.result.ended, run.result.fault) == ("duration", None)
+    run = heard(text, SECONDS)
+    assert (run.result.ended, run.result.fault) == ("end_of_stream", None)
     run.check_balance()
     assert run.finite and not run.learner.changes
     return run
@@ -33,7 +40,7 @@ def went_on(text: str) -> FaultRun:
 
 def ended(text: str, *said: str) -> FaultRun:
     """A run that ends with one sentence which contains all that was said."""
-    run = run_faulty(text, SECONDS)
+    run = run_faulty(text, MOVING_S)
     assert run.result.ended == "driver_error" and run.result.fault is not None
     assert all(part in run.result.fault for part in said), run.result.fault
     assert "\n" not in run.result.fault
@@ -43,16 +50,15 @@ def ended(text: str, *said: str) -> FaultRun:
     return run
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1])
-def test_lost(share: float) -> None:
-    run = went_on(f"lost={share}")
+def test_lost() -> None:
+    run = went_on("lost=0.1")
     assert run.driver.account.injected["lost"] > 0 and not unusual(run)
     # each hole costs the samples in it and nothing else
     assert run.result.samples + run.driver.account.injected["lost"] == run.driver.account.taken
-    assert run.learner.learned > 0.9 * (1.0 - share) * clean_run(SECONDS).learner.learned
+    assert run.learner.learned > 0.81 * heard("", SECONDS).learner.learned
 
 
-@pytest.mark.parametrize("text", ["late=0.01", "late=0.1", "reordered=0.01", "reordered=0.1"])
+@pytest.mark.parametrize("text", ["late=0.1", "reordered=0.01"])
 def test_late_and_reordered(text: str) -> None:
     run = went_on(text)
     assert set(unusual(run)) <= {"time_backwards", "implausible_step"}
@@ -61,41 +67,40 @@ def test_late_and_reordered(text: str) -> None:
     assert any("time does not increase" in said for said in run.front_end.messages)
 
 
-def test_repeated() -> None:
-    run = went_on("repeated=0.01")
+def test_repeated_samples_change_nothing_at_all() -> None:
+    run, clean = went_on("repeated=0.1"), heard("", SECONDS)
     assert unusual(run) == {"repeated": run.driver.account.injected["repeated"]}
+    assert run.refused["repeated"] > 100
+    assert np.array_equal(run.learner.theta.theta, clean.learner.theta.theta)
+    assert np.array_equal(run.learner.schema.lam, clean.learner.schema.lam)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1])
-def test_corrupt(share: float) -> None:
-    run = went_on(f"corrupt={share}")
+def test_corrupt() -> None:
+    run = went_on("corrupt=0.1")
     known = {"non_finite", "out_of_range", "implausible_step", "repeated"}
     assert set(unusual(run)) <= known
     # what is not refused changed a number by less than noise does
     assert sum(unusual(run).values()) <= 1.2 * run.driver.account.injected["corrupt"] + 3
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1])
-def test_nan(share: float) -> None:
-    run = went_on(f"nan={share}")
+def test_nan() -> None:
+    run = went_on("nan=0.1")
     assert unusual(run) == {"non_finite": run.driver.account.injected["nan"]}
 
 
-@pytest.mark.parametrize("share", [0.01, 0.1])
-def test_spike(share: float) -> None:
-    run = went_on(f"spike={share}")
+def test_spike() -> None:
+    run = went_on("spike=0.1")
     refused = unusual(run)
     hit = run.driver.account.injected["spike"]
     assert set(refused) <= {"implausible_step", "out_of_range"}
     assert 0.8 * hit - 1 <= sum(refused.values()) <= 1.4 * hit + 3
 
 
-@pytest.mark.parametrize("size", ["0.1", "0.03"])
-def test_a_jump_of_an_encoder_ends_the_run_with_the_last_good_parameters(size: str) -> None:
-    run = ended(f"jump:3@2.5+{size}", "joint 3")
+def test_a_jump_of_an_encoder_ends_the_run_with_the_last_good_parameters() -> None:
+    run = ended("jump:3@2.5+0.03", "joint 3")
     assert run.refused["encoder_jump"] > 0
     assert any("panda_joint3 jumped" in said for said in run.front_end.messages)
-    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    before = clean_run(MOVING_S).history[run.learner.learned - 1]
     assert np.array_equal(run.learner.theta.theta, before)
     assert 2500 - 260 < run.learner.learned < 2500
 
@@ -149,21 +154,18 @@ def test_a_joint_stuck_for_a_moment_is_left_out() -> None:
 def test_a_stuck_joint_ends_the_run_with_the_last_good_parameters() -> None:
     run = ended("stuck:2@2.5+1", "joint")
     assert run.refused["stuck_joint"] > 0
-    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    before = clean_run(MOVING_S).history[run.learner.learned - 1]
     std = np.sqrt(run.learner.theta.covariance().diagonal()[:70]).reshape(7, 10)
     assert (np.abs(run.learner.theta.theta - before) < std).all()
 
 
-@pytest.mark.parametrize("offset", ["+3600", "+1", "-0.05", "-3600"])
+@pytest.mark.parametrize("offset", ["+3600", "-0.05"])
 def test_a_clock_jump(offset: str) -> None:
     """Stamps that go on from elsewhere cost a restart of the filter, not the run."""
-    run = run_faulty(f"clock@2{offset}", SECONDS)
-    run.check_balance()
-    assert (run.result.ended, run.result.fault) == ("duration", None), run.result
-    assert run.finite and not run.learner.changes
+    run = went_on(f"clock@2{offset}")
     assert set(unusual(run)) <= {"time_ahead", "time_backwards", "implausible_step"}
     assert sum(unusual(run).values()) <= 110
-    assert run.refused["filter_settling"] > clean_run(SECONDS).refused["filter_settling"]
+    assert run.refused["filter_settling"] > heard("", SECONDS).refused["filter_settling"]
 
 
 def test_a_single_wrong_stamp() -> None:
@@ -182,12 +184,12 @@ def test_a_short_silence_is_bridged() -> None:
 )
 def test_a_silent_or_dead_connection_ends_the_run(text: str, said: str) -> None:
     run = ended(text, said)
-    before = clean_run(SECONDS).history[run.learner.learned - 1]
+    before = clean_run(MOVING_S).history[run.learner.learned - 1]
     assert np.array_equal(run.learner.theta.theta, before)
 
 
 def test_a_slow_read_in_lockstep_changes_nothing() -> None:
-    run = run_faulty("slow=0.01+0.002", SECONDS)
+    run = went_on("slow=0.01+0.002")
     assert run.driver.account.injected["slow"] > 10
-    assert np.array_equal(run.learner.theta.theta, clean_run(SECONDS).learner.theta.theta)
+    assert np.array_equal(run.learner.theta.theta, heard("", SECONDS).learner.theta.theta)
     assert with_faults(simulated_arm(), "slow=0.5").faults.items[0].amount == 0.005

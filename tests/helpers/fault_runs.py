@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -17,6 +20,9 @@ from adapter.runs.outcome import collect, frame_errors
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.front_end import FrontEnd
 from drivers.faults.driver import FaultyDriver, with_faults
+from drivers.files.log import LogArm
+from drivers.files.mcap import McapWriter
+from drivers.interface import Driver
 from tests.helpers.arm_data import Motion, arm, model_torque, panda_model, record, rms
 from tests.helpers.live_tools import simulated_arm
 
@@ -39,7 +45,8 @@ class Watched:
         self.learner.step(state)
         theta = self.learner.theta.theta
         self.history.append(theta.copy())
-        known = theta, self.learner.schema.lam, self.learner.theta.effect_values
+        schema = self.learner.schema
+        known = theta, schema.R0, schema.p, self.learner.theta.effect_values
         self.finite = self.finite and all(np.isfinite(x).all() for x in known)
 
 
@@ -72,12 +79,12 @@ class FaultRun:
         assert self.learner.learned == self.result.passed_on
 
 
-def run_faulty(text: str, seconds: float, seed: int = SEED) -> FaultRun:
-    """The simulated Panda in motion, behind these faults, for so long on its own stamps."""
+def _run(
+    arm: Driver, text: str, controller: ExcitationController | None, seconds: float
+) -> FaultRun:
     settings, robot = PipelineSettings(), panda_model()
     front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
-    controller = ExcitationController(MotionLimits.of(robot), ExcitationSettings(seed=seed))
-    driver, watched = with_faults(simulated_arm(seed), text, FAULT_SEED), Watched(learner)
+    driver, watched = with_faults(arm, text, FAULT_SEED), Watched(learner)
     try:
         result = run_lockstep(driver, front_end, watched, controller, seconds)
     finally:
@@ -85,10 +92,33 @@ def run_faulty(text: str, seconds: float, seed: int = SEED) -> FaultRun:
     return FaultRun(text, driver, front_end, learner, result, watched.finite, watched.history)
 
 
+def run_faulty(text: str, seconds: float, seed: int = SEED) -> FaultRun:
+    """The simulated Panda in motion, behind these faults, for so long on its own stamps."""
+    limits = MotionLimits.of(panda_model())
+    controller = ExcitationController(limits, ExcitationSettings(seed=seed))
+    return _run(simulated_arm(seed), text, controller, seconds)
+
+
 @cache
 def clean_run(seconds: float) -> FaultRun:
     """The same without faults."""
     return run_faulty("", seconds)
+
+
+@cache
+def _recording(seconds: float) -> LogArm:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "motion.mcap"
+        with McapWriter(path, panda_model().tree.joint_names) as writer:
+            for sample in record(arm(), Motion(seconds, SEED)).samples():
+                writer.write(sample)
+        return LogArm(path)
+
+
+@cache
+def heard(text: str, seconds: float) -> FaultRun:
+    """An arm that somebody else moves, behind these faults: nothing is commanded."""
+    return _run(copy(_recording(seconds)), text, None, 2.0 * seconds)
 
 
 @dataclass(frozen=True)
