@@ -12,19 +12,14 @@ from adapter.cli.main import main
 
 
 def warm_up() -> int:
-    """Short runs, replays and a search for the gap, on the simulated arm; nothing is kept."""
+    """A short run on the simulated arm, its replay and a search for the gap; nothing is kept."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        recording = str(folder / "warm.mcap")
+        recording = str(Path(name) / "warm.mcap")
         common = ["--quiet", "--no-report", "--out", name]
-        live = ["run", "--duration", "3", "--scenario", "bent_link", "--record", recording]
+        live = ["run", "--duration", "6", "--scenario", "friction", "--record", recording]
         code = main([*live, *common])
-        for every in ("1", "10"):
-            code = code or main(["replay", recording, "--every", every, *common])
-        rubbing = str(folder / "rubbing.mcap")
-        live = ["run", "--duration", "6", "--scenario", "friction", "--record", rubbing]
-        code = code or main([*live, *common])
-        return code or main(["gap", rubbing, "--model", "panda", *common])
+        code = code or main(["replay", recording, "--every", "10", *common])
+        return code or main(["gap", recording, "--model", "panda", *common])
 
 
 if __name__ == "__main__":
