@@ -12,7 +12,6 @@ from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.model.robots import documented
 from adapter.runs.config import Config, config_from, config_table, read_config
-from adapter.runs.pipeline import make_learner
 
 WHOLE = """
 gravity = [9.81, 0, 0.0]
@@ -169,10 +168,9 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
         read_config(tmp_path / "nowhere.toml")
 
 
-def test_what_only_the_parts_know_is_refused_by_them() -> None:
-    config = config_from({"pipeline": {"learner": {"effects": ["stiction"]}}})
+def test_what_only_the_parts_know_is_refused_too() -> None:
     with pytest.raises(SettingsError, match="no effect 'stiction'; have: viscous_friction"):
-        make_learner(documented("panda"), config.pipeline)
+        config_from({"pipeline": {"learner": {"effects": ["stiction"]}}})
     with pytest.raises(ModelError, match="gravity holds a value that is not finite"):
         config_from({"gravity": [0.0, 0.0, np.nan]}).apply(documented("panda"))
 
