@@ -16,7 +16,7 @@ import pytest
 
 from tests.helpers.fault_runs import FaultRun, clean_run, difference, run_faulty
 
-SECONDS = 10.0
+SECONDS = 8.0
 THETA_STD, TORQUE_STD, ERROR_RATIO = 2.0, 0.6, 1.6
 ROTATION_RAD, POSITION_M = 1e-3, 1e-3
 EACH = ("lost=0.1", "reordered=0.1", "corrupt=0.01", "late=0.1", "nan=0.1", "spike=0.01")
@@ -50,7 +50,7 @@ def test_parameters_agree_with_every_fault_at_once() -> None:
 
 
 def test_the_check_can_fail() -> None:
-    """A run of two seconds is not taken for one of ten."""
+    """A run of two seconds is not taken for one of eight."""
     clean = clean_run(SECONDS).learner
     other = run_faulty("", 2.0).learner
     assert difference(clean, other).error_ratio > ERROR_RATIO

@@ -53,7 +53,7 @@ def over_a_wide_range(trial: Trial) -> bool:
 
 SINGLES = {
     "coulomb_friction": Rule(20, mujoco_recording, on_a_heavy_joint),
-    "payload": Rule(40, pybullet_recording, in_mid_recording),
+    "payload": Rule(40, holds=in_mid_recording),
     "motor_inertia": Rule(100),
     "viscous_friction": Rule(30),
     "base_tilt": Rule(50),
@@ -63,7 +63,7 @@ SINGLES = {
     "signal_delay": Rule(90),
     "encoder_offset": Rule(110),
     "torque_offset": Rule(120),
-    "joint_spring": Rule(130),
+    "joint_spring": Rule(130, pybullet_recording),
     "external_wrench": Rule(140),
 }
 OUTSIDE = {"x_sine_disturbance": Rule(170), "x_quadratic_drag": Rule(170)}
