@@ -119,8 +119,8 @@ def one_run(address: str, minutes: float, folder: Path) -> tuple[int, dict[str, 
         sys.exit(code)
     figures = json.loads(path.read_text())
     steady = [(t, kb) for t, kb in memory if SETTLED_S + 10 < t < ended_s - EVERY_S]
-    shown = ("samples", "learned", "refused", "missed_deadlines", "recorded", "unrecorded")
-    shown += ("tick_us", "timing", "ended", "fault", "restarts")
+    shown = ["samples", "learned", "refused", "missed_deadlines", "recorded", "unrecorded"]
+    shown += ["tick_us", "timing", "ended", "fault", "restarts"]
     return code, {
         "seconds": ended_s,
         "memory_mb": steady[-1][1] / 1024 if steady else None,

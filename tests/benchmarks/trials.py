@@ -258,9 +258,8 @@ def payload_trial(job: tuple[int, float]) -> Row:
         t = 1e-9 * stamp_of(record) + 0.0375  # the sample that completed the state
         if t < 18.0:
             return
-        at, theta = learner.layout, learner.theta
-        q, dq, ddq, tau = (record[None, s] for s in (at.q, at.dq, at.ddq, at.tau))
-        errors.append((t, theta.errors(learner._R0, learner._p, q, dq, ddq, tau)[0]))
+        theta = learner.theta
+        errors.append((t, theta.errors(learner.frames, record[None])[0]))
         if t < 20.0:
             marks["before"] = (learner.schema.R0.copy(), learner.schema.p.copy())
             marks["noise"] = np.sqrt(theta.variance())
@@ -309,11 +308,10 @@ def rest_trial(job: tuple[int]) -> Row:
 
     def look(learner: OnlineLearner, record: np.ndarray) -> None:
         t = 1e-9 * stamp_of(record)
-        at, theta = learner.layout, learner.theta
+        theta = learner.theta
         if not theta.updates:
             return
-        q, dq, ddq, tau = (record[None, s] for s in (at.q, at.dq, at.ddq, at.tau))
-        error = theta.errors(learner._R0, learner._p, q, dq, ddq, tau)[0]
+        error = theta.errors(learner.frames, record[None])[0]
         errors.append((t, float(np.mean((error / np.sqrt(theta.variance())) ** 2))))
         key = "before" if t < 50.0 else "after"
         if key == "before" or "after" not in marks:
