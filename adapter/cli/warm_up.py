@@ -12,13 +12,17 @@ from adapter.cli.main import main
 
 
 def warm_up() -> int:
-    """A short run on the simulated arm, its replay and a search for the gap; nothing is kept."""
+    """Short runs on the simulated arm, a replay and a search for the gap; nothing is kept.
+
+    While the first run compiles, the arm's log gets holes; the search needs one without.
+    """
     with tempfile.TemporaryDirectory() as name:
-        recording = str(Path(name) / "warm.mcap")
+        compiling, recording = (str(Path(name) / f"{n}.mcap") for n in ("compiling", "warm"))
         common = ["--quiet", "--no-report", "--out", name]
-        live = ["run", "--duration", "6", "--scenario", "friction", "--record", recording]
-        code = main([*live, *common])
-        code = code or main(["replay", recording, "--every", "10", *common])
+        live = ["run", "--scenario", "friction", *common]
+        code = main([*live, "--duration", "3", "--record", compiling])
+        code = code or main(["replay", compiling, "--every", "10", *common])
+        code = code or main([*live, "--duration", "6", "--record", recording])
         return code or main(["gap", recording, "--model", "panda", *common])
 
 
