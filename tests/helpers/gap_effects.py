@@ -197,7 +197,8 @@ def torque_sensor(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
     read = _odd_sensor(effects, tau)
     for name in ("signal_delay", "torque_gain", "torque_offset"):
         for effect in (e for e in effects if e.name == name):
-            on, p = effect.acts(t), dict(effect.parameters)
+            p: dict[str, Any] = dict(effect.parameters)
+            on = effect.acts(t)
             for j in effect.columns(tau.shape[1]):
                 late = np.interp(t - p.get("d", 0.0), t, read[:, j])
                 changed = (1 + p.get("g", 0.0)) * late + p.get("o", 0.0)

@@ -164,11 +164,7 @@ def free_keys(effect: Effect) -> list[tuple[str, int | None]]:
 
 def _numbers(effects: Sequence[Effect]) -> Array:
     return np.array(
-        [
-            e.parameters[key] if i is None else e.parameters[key][i]
-            for e in effects
-            for key, i in free_keys(e)
-        ],
+        [np.atleast_1d(e.parameters[key])[i or 0] for e in effects for key, i in free_keys(e)],
         float,
     )
 

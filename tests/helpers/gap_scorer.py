@@ -61,7 +61,7 @@ def parameters_right(finding: Entry, effect: Entry) -> bool:
     """Every number within a tenth of its size or three of its standard deviations."""
     truth, found = dict(effect["parameters"]), dict(finding["parameters"])
     std = dict(finding.get("std") or {})
-    groups = [keys for keys in VECTORS if keys[0] in truth]
+    groups: list[tuple[str, ...]] = [keys for keys in VECTORS if keys[0] in truth]
     grouped = {key for keys in groups for key in keys}
     groups += [(key,) for key in truth if key not in grouped and key not in SKIPPED]
     for keys in groups:
