@@ -15,6 +15,7 @@ from adapter.control.settings import ExcitationSettings
 from adapter.model.urdf import read_urdf
 from adapter.realtime.jobs import RecordingJob
 from adapter.realtime.loop import LiveOptions
+from adapter.realtime.shared import SharedBlock
 from adapter.realtime.supervisor import SharedMemoryOptions
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import DriverError, Intake, JointSample
@@ -103,6 +104,25 @@ def shared_memory() -> set[str]:
             continue
         names -= {name for name in names if f"/dev/shm/{name}" in used}
     return names
+
+
+def created_blocks(monkeypatch) -> list[str]:
+    """Names of the blocks that this process creates from here on, as they come."""
+    names: list[str] = []
+    create = SharedBlock.create
+
+    def noted(size: int, name: str | None = None) -> SharedBlock:
+        block = create(size, name)
+        names.append(block.name)
+        return block
+
+    monkeypatch.setattr(SharedBlock, "create", noted)
+    return names
+
+
+def left_behind(names: list[str]) -> list[str]:
+    """Those of some blocks that are still there."""
+    return [name for name in names if (Path("/dev/shm") / name.lstrip("/")).exists()]
 
 
 def wait_for(condition, timeout_s: float = 30.0) -> bool:

@@ -29,9 +29,9 @@ RUN_S = 2.5
 @pytest.fixture(autouse=True)
 def no_leftovers(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_GRAVES", str(tmp_path))
-    before = tools.shared_memory()
+    blocks = tools.created_blocks(monkeypatch)
     yield
-    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+    assert not tools.left_behind(blocks)
 
 
 class Shaky(tools.Swinging):

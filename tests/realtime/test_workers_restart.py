@@ -29,9 +29,9 @@ def no_leftovers(tmp_path, monkeypatch):
     monkeypatch.setenv("TEST_GRAVES", str(tmp_path))
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    before = tools.shared_memory()
+    blocks = tools.created_blocks(monkeypatch)
     yield
-    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+    assert not tools.left_behind(blocks)
     assert not list(tmp_path.glob("adapter-learner-*"))
 
 
