@@ -8,7 +8,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from sim import joint_effects
 from sim.effects import SPECS, Effect, effect_from
+from sim.joint_effects import Row
 from sim.noise import levels_of
 from sim.plant import Plant
 from sim.truth import panda
@@ -407,3 +409,10 @@ def test_every_effect_of_the_catalogue_is_tested_here():
     tested = {row[0] for row in TORQUES} | {row[0].name for row in BODIES + SENSORS}
     tested |= {"x_cross_viscous", "x_hysteresis", "external_wrench", "backlash", "x_sensor_lowpass"}
     assert tested == set(SPECS)
+
+
+@pytest.mark.parametrize(("start_s", "level"), [(2.0, 2.4), (-np.inf, 4.0)])
+def test_a_drift_grows_from_its_own_start(start_s, level):
+    row = np.zeros(8)
+    row[0], row[3], row[6] = Row.DRIFT, 0.8, start_s
+    assert joint_effects._level(row, 0.0, 0.0, 0.0, 5.0) == pytest.approx(level)
