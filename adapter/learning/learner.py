@@ -19,10 +19,7 @@ from adapter.learning.adam import FlatAdam
 from adapter.learning.change import ChangeDetector
 from adapter.learning.known_effects import KnownEffects, believed
 from adapter.learning.schema import RestingBase, Schema
-from adapter.learning.settings import (
-    LearnerSettings,
-    Mode,
-)
+from adapter.learning.settings import LearnerSettings, Mode
 from adapter.learning.theta import Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import Moments
 from adapter.learning.trace import Trace

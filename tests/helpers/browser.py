@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
@@ -30,6 +31,17 @@ class Links(HTMLParser):
                 self.found.append(value)
         if tag in ("script", "link", "iframe", "object", "embed", "base"):
             self.found.append(tag)
+
+
+def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
+    """Assert that a page needs nothing but itself and that its ids are unique; its ids."""
+    links = Links()
+    links.feed(page)
+    assert [link for link in links.found if not link.startswith("#")] == []
+    assert not re.search(r"https?:|url\((?!#)|@import", page)
+    assert "default-src 'none'" in page
+    assert len(links.ids) == len(set(links.ids))
+    return links.ids
 
 
 def screenshot(

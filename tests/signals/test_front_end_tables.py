@@ -10,18 +10,10 @@ from hypothesis import strategies as st
 
 from adapter.model.self_model import Limits
 from adapter.signals.front_end import FrontEnd
-from adapter.signals.records import LinkMotionKind, StateLayout, stamps_of
+from adapter.signals.records import LinkMotionKind, stamps_of
 from drivers.interface import JointSample
-from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
-
-N = 7
-MS = 1_000_000
-LAYOUT = StateLayout(N)
-SIGNALS = slice(LAYOUT.q.start, LAYOUT.tau.stop)
-
-
-def moving(links: bool = False) -> ArmData:
-    return record(arm(), Motion(3.0, seed=1), links=links)
+from tests.helpers.arm_data import ArmData, panda_model
+from tests.signals.test_front_end import LAYOUT, MS, SIGNALS, N, moving
 
 
 def run(samples: list[JointSample], known: bool = True) -> tuple[np.ndarray, FrontEnd]:
