@@ -312,6 +312,7 @@ def settings(arm) -> dict:
     after = arm.state()
     return {
         "raised": float(after.O_T_EE[14] - before.O_T_EE[14]),
+        "upward": float(before.O_T_EE[10]),
         "load": [float(after.m_load), *map(float, after.F_x_Cload), *map(float, after.I_load)],
         "bad_load": _failure(lambda: robot.set_load(-1.0, [0.0] * 3, ball)),
         "bad_frame": _failure(lambda: set_ee([2.0, *shifted[1:]])),

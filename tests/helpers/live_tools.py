@@ -91,19 +91,10 @@ class Swinging:
         self.closes += 1
 
 
-def shared_memory() -> set[str]:
-    """Names of the blocks that no other process uses: ours, and what was left behind."""
-    folder = Path("/dev/shm")
-    names = {p.name for p in folder.iterdir()} if folder.is_dir() else set()
-    for maps in Path("/proc").glob("[0-9]*/maps"):
-        if not names or maps.parent.name == str(os.getpid()):
-            continue
-        try:
-            used = maps.read_text(errors="replace")
-        except OSError:  # it ended, or is somebody else's
-            continue
-        names -= {name for name in names if f"/dev/shm/{name}" in used}
-    return names
+def mapped_blocks(pid: int) -> list[str]:
+    """Names of the blocks of shared memory that a process uses now."""
+    lines = Path(f"/proc/{pid}/maps").read_text(errors="replace").splitlines()
+    return sorted({line.partition("/dev/shm/")[2] for line in lines if "/dev/shm/" in line})
 
 
 def created_blocks(monkeypatch) -> list[str]:

@@ -44,9 +44,9 @@ if __name__ == "__main__":  # the workers load this file as well, and need none 
 @pytest.fixture(autouse=True)
 def no_leftovers(monkeypatch):
     monkeypatch.setattr("adapter.realtime.loop.WALL_EXTRA_S", 60.0)  # a busy machine is no end
-    before = tools.shared_memory()
+    blocks = tools.created_blocks(monkeypatch)
     yield
-    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+    assert tools.wait_for(lambda: not tools.left_behind(blocks))
 
 
 def _wait_for_display(diary: Path) -> None:
@@ -239,10 +239,13 @@ def running(tmp_path):
         start_new_session=True,
     )
     assert tools.wait_for(lambda: path.exists() and path.stat().st_size > 60_000, 120.0)
+    blocks = tools.mapped_blocks(process.pid)
+    assert blocks
     yield process, path
     if process.poll() is None:
         process.kill()
     process.communicate()
+    assert tools.wait_for(lambda: not tools.left_behind(blocks))
 
 
 def test_after_kill_9_the_workers_close_the_recording_and_go(running):

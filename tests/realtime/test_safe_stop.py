@@ -63,9 +63,9 @@ RUNNING = 60_000  # bytes of a recording that is well under way
 @pytest.fixture(autouse=True)
 def no_leftovers(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    before = tools.shared_memory()
+    blocks = tools.created_blocks(monkeypatch)
     yield
-    assert tools.wait_for(lambda: tools.shared_memory() <= before)
+    assert tools.wait_for(lambda: not tools.left_behind(blocks))
     assert tools.wait_for(lambda: not list(tmp_path.glob("adapter-learner-*")))
 
 
@@ -76,6 +76,7 @@ def start(tmp_path):
     script.write_text(SCRIPT)
     environment = {**os.environ, "PYTHONPATH": ROOT}
     started: list[subprocess.Popen] = []
+    blocks: list[str] = []
 
     def go(*arguments: str, size: int = RUNNING, **how):
         with (tmp_path / "out").open("wb") as out, (tmp_path / "err").open("wb") as err:
@@ -87,6 +88,8 @@ def start(tmp_path):
                 signal.signal(signal.SIGHUP, before)
         started.append(process)
         assert tools.wait_for(lambda: path.exists() and path.stat().st_size > size, 120.0)
+        blocks.extend(tools.mapped_blocks(process.pid))
+        assert blocks
         return process
 
     yield go, path, tmp_path / "out", tmp_path / "err"
@@ -94,6 +97,7 @@ def start(tmp_path):
         if process.poll() is None:
             process.kill()
         process.wait()
+    assert tools.wait_for(lambda: not tools.left_behind(blocks))
 
 
 def _check_ended_well(process, path: Path, out: Path, err: Path, why: str) -> None:
@@ -162,6 +166,7 @@ def test_the_end_of_the_program_that_started_it_is_a_safe_stop(start, tmp_path):
     )
     try:
         assert tools.wait_for(lambda: path.exists() and path.stat().st_size > RUNNING, 120.0)
+        blocks = tools.mapped_blocks(int((tmp_path / "number").read_text()))
         shell.kill()
         shell.wait()
         assert tools.wait_for(lambda: b"RESULT" in out.read_bytes(), 60.0)
@@ -169,6 +174,7 @@ def test_the_end_of_the_program_that_started_it_is_a_safe_stop(start, tmp_path):
         if b"RESULT" not in out.read_bytes():
             os.kill(int((tmp_path / "number").read_text()), signal.SIGKILL)
     assert b"RESULT operator_gone" in out.read_bytes()
+    assert blocks and tools.wait_for(lambda: not tools.left_behind(blocks))
     log = read_log(path)
     assert not log.truncated and abs(log.dq[-1]).max() < 0.1
 
