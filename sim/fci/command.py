@@ -19,7 +19,7 @@ def run(args: argparse.Namespace) -> int:
     """Serve until SIGTERM, SIGINT or the end of the duration; the process's exit code."""
     try:
         scenario = build(args.scenario, args.seed, **options_of(args.set))
-        server = FciServer(scenario, args.port, args.protocol, args.fault, args.core)
+        server = FciServer(scenario, args.port, args.protocol, args.fault, args.core, args.patience)
     except (ValueError, OSError) as error:
         print(f"error: {_sentence(error, args.port)}", file=sys.stderr)
         return EXIT_USAGE

@@ -22,12 +22,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scenario(parser)
     add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
     add("--core", type=int, default=None, help="processor to stay on")
+    words = "wait so long for a late command while the world stands still; no robot does"
+    add("--patience", type=float, default=0.0, metavar="S", help=words)
     add("--duration", type=float, default=None, metavar="S", help="stop after so many seconds")
     add("--json", type=Path, default=None, metavar="FILE", help="write the summary there as well")
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises ValueError for an arm or a fault that does not exist."""
+    """Raises ValueError for an arm or a fault that does not exist, or for no patience at all."""
+    if not 0.0 <= args.patience < float("inf"):
+        raise ValueError(f"--patience takes seconds from 0 up, got {args.patience}")
     check_scenario(args.scenario, options_of(args.set))
     for text in args.fault:
         read_fault(text, KINDS)

@@ -104,6 +104,10 @@ class ClientSession:
         with suppress(OSError):  # buffer full, or nobody listens at that port (any more)
             self._udp.send(state)
 
+    def wait_for_command(self, patience_s: float) -> bool:
+        """Whether the client said something in so many seconds."""
+        return bool(select.select([self._tcp, self._udp], [], [], patience_s)[0])
+
     def command(self, message_id: int) -> RobotCommand | None:
         """The command that answers the last state, if it is there."""
         found = None
@@ -156,6 +160,8 @@ class FciServer:
         protocol: 5 (FER/Panda) or 10 (FR3).
         faults: texts, see `sim.faults`.
         core: processor to stay on; None leaves it to the system.
+        patience_s: so long the world stands still for a command that a client owes, once until
+            the next one comes. No robot does: for clients on a busy machine.
 
     Attributes:
         port: the TCP port.
@@ -174,12 +180,13 @@ class FciServer:
         protocol: int = 5,
         faults: Sequence[str] = (),
         core: int | None = None,
+        patience_s: float = 0.0,
     ) -> None:
         if protocol not in VERSIONS:
             raise ValueError(f"no protocol {protocol}; have: 5, 10")
         asked = [read_fault(text, KINDS) for text in faults]
         self.protocol = self._version = protocol
-        self._core = core
+        self._core, self._patience_s, self._patient = core, patience_s, patience_s > 0.0
         self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)
         self._spoiler = Spoiler(asked, scenario.seed)
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -200,6 +207,7 @@ class FciServer:
         self._session: ClientSession | None = None
         self._ticks = Ticks()
         self._tick = self._id = self._silent_until = 0
+        self._owed = False
         self._sent = self._clients = self._refused = 0
         self._foreign = self._stale = 0
 
@@ -214,6 +222,8 @@ class FciServer:
                     self._accept()
                     continue
                 self._ticks.wait()
+                if self._owed and self._patient:
+                    self._wait_for_client()
                 self._one_tick()
                 self._talk()
 
@@ -241,6 +251,11 @@ class FciServer:
         self._listener.close()
         self.robot.arm.close()
 
+    def _wait_for_client(self) -> None:
+        """Let the world slip until the client answers the last state, or leaves it owing."""
+        assert self._session is not None
+        self._patient = self._session.wait_for_command(self._patience_s)
+
     def _one_tick(self) -> None:
         """Command in, world on, state out."""
         self._tick += 1
@@ -250,8 +265,11 @@ class FciServer:
             command = session.command(self._id)
             if command is not None and self._spoiler.loses_command(self._tick):
                 command = None
+        if command is not None or robot.motion is None:
+            self._patient = self._patience_s > 0.0
         robot.tick(command)
         self._id += 1
+        self._owed = False
         if session is None or not session.connected:
             return
         if self._tick >= self._silent_until:
@@ -259,6 +277,7 @@ class FciServer:
             self._spoiler.spoil_values(self._reporter.frame, self._tick)
             for data in self._spoiler.deliver(self._reporter.frame.data, self._tick):
                 session.send(data)
+                self._owed = robot.motion is not None and robot.motion.begun
             self._sent += 1
         for data in robot.take_replies():
             session.reply(data)
@@ -299,7 +318,7 @@ class FciServer:
         self._session = ClientSession(tcp, self._version)
 
     def _drop(self) -> None:
-        session, self._session = self._session, None
+        session, self._session, self._owed = self._session, None, False
         if session is None:
             return
         session.close()

@@ -128,14 +128,16 @@ def test_your_own_log(toured: Path) -> None:
 PORT = 14337  # instead of the usual ones, which something else may use
 HELD_UP_S = 2e-3  # a process or core that stands still for so long was held up by the machine
 BY_THE_MACHINE = (
-    r"missed 20 commands|silent for|answers? on|not answer|no usable joint reading|no state"
+    r"missed 20 commands|silent for|answers? on|not answer|no usable joint reading|no state|"
+    r"communication lost"
 )
 
 
 def served(line: str, folder: Path) -> subprocess.Popen[str]:
     """A simulated arm started as the README says, on a port of its own, once it is ready."""
+    more = ["--patience", "5"] if "fci" in line else []  # with a client that the machine holds up
     arm = subprocess.Popen(
-        [*shlex.split(line), "--port", str(PORT), "--json", "arm.json"],
+        [*shlex.split(line), "--port", str(PORT), "--json", "arm.json", *more],
         cwd=folder,
         env={**environment(folder), "PYTHONUNBUFFERED": "1"},
         stdout=subprocess.PIPE,

@@ -28,6 +28,8 @@ HERE = Path(__file__).resolve()
 PACKAGES = {5: "panda_py", 10: "pylibfranka"}
 PORT = 1337  # the clients know no other
 PORT_S, READY_S, CLIENT_S = 240.0, 120.0, 120.0
+PATIENCE_S = 1.0  # of the robot with a client that the machine holds up
+LATE_ONCE_S = 0.3
 LATE_S, LONGEST_GAP_MS = 3e-3, 1000
 DAMPING = np.array([4.0, 4.0, 4.0, 4.0, 0.5, 0.5, 0.1])  # N m s/rad
 
@@ -53,7 +55,7 @@ def robot(protocol: int, *faults: str, seed: int = 3):
         options = [word for fault in faults for word in ("--fault", fault)]
         command = [
             sys.executable, "-m", "sim.fci", "--protocol", str(protocol), "--seed", str(seed),
-            "--json", str(summary), *options,
+            "--json", str(summary), "--patience", str(PATIENCE_S), *options,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
         try:
@@ -219,7 +221,9 @@ class FR3:
 
 
 def swing(k: int, state) -> np.ndarray:
-    """Small torques to and fro, damped."""
+    """Small torques to and fro, damped; once late, which a patient robot waits for."""
+    if k == 500:
+        time.sleep(LATE_ONCE_S)
     return 0.025 * DAMPING * np.sin(k / 200) - DAMPING * np.array(state.dq)
 
 
@@ -234,9 +238,9 @@ def step(k: int, state) -> np.ndarray:
 
 
 def pause(k: int, state) -> np.ndarray:
-    """A client that does not answer for 0.2 s."""
+    """A client that leaves the robot without an answer."""
     if k == 50:
-        time.sleep(0.2)
+        time.sleep(PATIENCE_S + 0.5)
     return hold(k, state)
 
 

@@ -24,6 +24,8 @@ SERVE_CAN = (
     "p = argparse.ArgumentParser(); add_arguments(p); sys.exit(run(p.parse_args()))"
 )
 
+PATIENCE_S = "5"  # of a simulated robot with a process that this machine holds up
+
 
 class OnTime:
     """A driver that does not pace itself, read once a period as the loop does."""
@@ -74,7 +76,8 @@ def fci(protocol: int, allow_motion: bool):
 
     @contextmanager
     def start() -> Iterator[Start]:
-        server = process("-m", "sim.fci", "--port", "0", "--protocol", str(protocol))
+        options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
+        server = process("-m", "sim.fci", *options)
         with server as line, closing() as arms:
             where = line.split()[2]
 

@@ -60,6 +60,11 @@ def oracle(q, dq, load=None):
     return gravity, columns, pin.rnea(model, data, q, dq, still) - gravity
 
 
+def test_a_robot_with_patience_waits_for_a_late_client(visited):
+    visited.seen("torque")
+    assert visited.summary["stalled_ms"] > 900 * fci_clients.LATE_ONCE_S
+
+
 def skipped(seen):
     ids = seen["ids"]
     return ids[-1] - ids[0] + 1 - len(ids)
