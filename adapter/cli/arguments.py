@@ -320,10 +320,25 @@ def _check_import(args: argparse.Namespace) -> None:
 
 
 def _export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("model", type=Path, metavar="MODEL", help="model file (.json)")
-    parser.add_argument("--urdf", type=Path, required=True, metavar="FILE", help="to write")
+    parser.description = (
+        "Write a model as URDF. Where it came from a URDF, or with --onto, that file is written "
+        "again with the learned inertials, joint origins and <dynamics> in it; every other byte "
+        "stays as it is."
+    )
+    add = parser.add_argument
+    add("model", type=Path, metavar="MODEL", help="model file (.json)")
+    add("--urdf", type=Path, metavar="FILE", help="to write; default: INPUT.learned.urdf")
+    onto = parser.add_mutually_exclusive_group()
+    onto.add_argument("--onto", type=Path, metavar="INPUT", help="the robot's file (.urdf)")
+    onto.add_argument("--alone", action="store_true", help="the arm alone, without pictures")
     _add_json(parser)
-    parser.set_defaults(check=lambda args: _check_files(args.model))
+    parser.set_defaults(check=_check_export)
+
+
+def _check_export(args: argparse.Namespace) -> None:
+    if args.urdf is None and args.onto is None:
+        raise UsageError("nothing to write; have: --urdf FILE, --onto INPUT")
+    _check_files(args.model, args.onto)
 
 
 def _report(parser: argparse.ArgumentParser) -> None:

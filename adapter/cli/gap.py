@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
+from adapter.cli.results import write_urdf
 from adapter.cli.rollouts import Rollouts
 from adapter.effects.active import check_effects
-from adapter.effects.export import left_out_of_urdf, to_urdf
 from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.screen import RecordingRefused
@@ -108,13 +108,10 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
 def _write_urdf(model: SelfModel, path: Path) -> str | None:
     """The new model as URDF; None where a body of it cannot exist."""
     try:
-        path.write_text(to_urdf(model))
+        write_urdf(model, path)
     except ModelError as error:
         warn([f"no URDF: {error}"])
         return None
-    left_out = left_out_of_urdf(model)
-    if left_out:
-        warn([f"{path}: a URDF has no full place for {', '.join(left_out)}; the model file has"])
     return str(path)
 
 

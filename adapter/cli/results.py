@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from adapter.effects.active import check_effects
-from adapter.effects.export import left_out_of_urdf, to_urdf
+from adapter.effects.export import RobotText, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
@@ -53,7 +53,8 @@ def conclude(
         robot=robot.name,
     )
     try:
-        (folder / "model.urdf").write_text(to_urdf(data.model))
+        urdf = robot_urdf(data.model)
+        (folder / "model.urdf").write_bytes(urdf.text.encode())
     except ModelError as error:
         warn([f"no URDF: {error}"])
     save_run(folder, data)
@@ -112,22 +113,35 @@ def _seconds(value: float | None) -> str:
     return "not converged" if value is None else f"converged {value:.2f} s after the first motion"
 
 
+def write_urdf(
+    model: SelfModel, path: Path, onto: Path | None = None, alone: bool = False
+) -> RobotText:
+    """Write a model as URDF; warns of what it lacks. Raises ModelError."""
+    written = robot_urdf(model, onto, alone)
+    path.write_bytes(written.text.encode())
+    if written.onto is None and written.left_out:
+        listed = ", ".join(written.left_out)
+        warn([f"{path}: a URDF has no full place for {listed}; a comment in it lists what"])
+    warn([f"{path}: {note}" for note in written.notes])
+    return written
+
+
 def run_export(args: argparse.Namespace) -> int:
     """Carry `export` out."""
     model = check_effects(load_model(args.model), args.model)
-    args.urdf.write_text(to_urdf(model))
-    left_out = left_out_of_urdf(model)
-    if left_out:
-        listed = ", ".join(left_out)
-        warn([f"a URDF has no full place for {listed}; a comment in it lists what is missing"])
+    path = args.urdf or args.onto.with_suffix(".learned.urdf")
+    written = write_urdf(model, path, args.onto, args.alone)
     facts = {
         "model": str(args.model),
-        "urdf": str(args.urdf),
+        "urdf": str(path),
+        "onto": written.onto,
         "lambda_source": model.lambda_source,
-        "left_out": left_out,
+        "left_out": written.left_out,
+        "notes": written.notes,
     }
     write_json(args.json, facts)
-    console.print(f"{args.urdf}: {model.name}, λ {model.lambda_source}")
+    onto = "" if written.onto is None else f" onto {written.onto}"
+    console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     return 0
 
 

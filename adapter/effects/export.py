@@ -8,11 +8,15 @@ model's; what has no place in a format is said in words.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from adapter.effects.active import Active, active_effects
 from adapter.model.self_model import SelfModel
+from adapter.model.urdf import file_text
+from adapter.model.urdf_onto import urdf_onto
 from adapter.model.urdf_text import (
     ARMATURE,
     DAMPING,
@@ -20,6 +24,7 @@ from adapter.model.urdf_text import (
     STIFFNESS,
     URDF_PLACES,
     Additions,
+    unplaced,
     urdf_text,
 )
 
@@ -32,18 +37,54 @@ MJCF_ATTRIBUTES = {
 }
 
 
+@dataclass(frozen=True)
+class RobotText:
+    """A robot's file with a learned model in it.
+
+    Attributes:
+        text: of the file.
+        onto: the file it was written onto, None where the arm stands alone.
+        left_out: names of the effects that the format has no place for, or not for all of them.
+        notes: what a user should know of it, in words.
+    """
+
+    text: str
+    onto: str | None
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = False) -> RobotText:
+    """URDF of a model with its effects: written onto the robot's file, or the arm alone.
+
+    Args:
+        model: with its effects.
+        onto: a URDF; where None, the one that the model came from, if it did.
+        alone: the arm alone, whatever it came from.
+
+    Raises:
+        ModelError: a URDF that is not the model's, or where a body is physically impossible.
+    """
+    more, source = additions(model, URDF_PLACES), model.source
+    left_out = tuple(more.names)
+    if onto is not None:
+        text, file = file_text(onto), str(onto)
+    elif source is not None and source.text is not None and not alone:
+        text, file = source.text, source.file
+    else:
+        return RobotText(urdf_text(model, more), None, left_out, ())
+    written, notes = urdf_onto(model, more, text, file)
+    lacking = [f"a URDF has no place for {what}" for what in unplaced(model, more)]
+    return RobotText(written, file, left_out, (*notes, *lacking))
+
+
 def to_urdf(model: SelfModel) -> str:
-    """URDF text of a model with its effects, as far as a URDF goes (see `model.urdf_text`).
+    """URDF text of the arm alone with its effects, as far as a URDF goes (see `model.urdf_text`).
 
     Raises:
         ModelError: where a body is physically impossible; names the link and the eigenvalue.
     """
     return urdf_text(model, additions(model, URDF_PLACES))
-
-
-def left_out_of_urdf(model: SelfModel) -> list[str]:
-    """Names of the effects that a URDF has no place for, or not for all of them."""
-    return additions(model, URDF_PLACES).names
 
 
 def mjcf_joints(model: SelfModel) -> tuple[dict[str, float], ...]:

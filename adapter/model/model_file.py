@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.model.self_model import LIMITS, FixedFrame, Limits, SelfModel, Tool
+from adapter.model.self_model import LIMITS, MJCF, URDF, FixedFrame, Limits, SelfModel, Source, Tool
 from adapter.model.tree import Tree
 
 FORMAT = "panda-adapter/self-model"
@@ -117,6 +117,7 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         "limits": {key: _numbers(getattr(model.limits, key)) for key in LIMITS},
         "axis": _numbers(model.axis),
         "frames": [_plain(asdict(frame)) for frame in model.frames],
+        "source": None if model.source is None else _source_to_json(model.source),
     }
 
 
@@ -145,6 +146,7 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
         tool=_tool(_part(data, "tool", dict)) if data.get("tool") else None,
         effects=tuple(_part(data, "effects", list, [])),
         lambda_source=_part(data, "lambda_source", str, "documentation"),
+        source=_source(_part(data, "source", dict), n) if data.get("source") else None,
         provenance=_part(data, "provenance", dict, {}),
         **{key: value for key, value in optional.items() if value is not None},
     )
@@ -183,6 +185,22 @@ def _tool(data: Mapping[str, Any]) -> Tool:
     mass = float(_needed(data, "mass", (), "tool"))
     com, inertia = _needed(data, "com", (3,), "tool"), _needed(data, "inertia", (3, 3), "tool")
     return Tool(mass, com, inertia, data.get("link"))
+
+
+def _source_to_json(source: Source) -> dict[str, Any]:
+    text = None if source.text is None else source.text.splitlines(keepends=True)
+    lam = _numbers(source.lam)
+    return {"format": source.format, "file": source.file, "lambda": lam, "text": text}
+
+
+def _source(data: Mapping[str, Any], n: int) -> Source:
+    kind, file = _part(data, "format", str), _part(data, "file", str)
+    if kind not in (URDF, MJCF):
+        raise ModelError(f"no source format '{kind}'; have: {URDF}, {MJCF}")
+    lines = _part(data, "text", list) if data.get("text") is not None else []
+    if not all(isinstance(line, str) for line in lines):
+        raise ModelError("'text' in 'source' must be a list of lines")
+    return Source(kind, file, "".join(lines) or None, _needed(data, "lambda", (n, 6), "source"))
 
 
 def _needed(data: Mapping[str, Any], key: str, shape: tuple[int, ...], where: str) -> Any:
@@ -242,12 +260,14 @@ def _flags(array: np.ndarray | None) -> Any:
 
 
 def _text(value: Any, indent: int) -> str:
-    """JSON with one line for each list of plain values, so that λ and θ read as tables."""
+    """JSON with one line for each list of numbers or names, so that λ and θ read as tables."""
     pad = " " * (indent + 1)
     if isinstance(value, Mapping) and value:
         items = [f"{pad}{json.dumps(str(k))}: {_text(v, indent + 1)}" for k, v in value.items()]
         return "{\n" + ",\n".join(items) + "\n" + " " * indent + "}"
-    if isinstance(value, list | tuple) and any(isinstance(v, list | tuple | dict) for v in value):
+    if isinstance(value, list | tuple) and any(
+        isinstance(v, list | tuple | dict) or str(v).endswith("\n") for v in value
+    ):
         rows = [f"{pad}{_text(v, indent + 1)}" for v in value]
         return "[\n" + ",\n".join(rows) + "\n" + " " * indent + "]"
     return json.dumps(value, ensure_ascii=False, allow_nan=False)

@@ -18,6 +18,7 @@ LAMBDA_DOCUMENTATION = "documentation"
 LAMBDA_REPRODUCED = "reproduces the documentation"
 LAMBDA_MEASURED = "measured"
 LAMBDA_SOURCES = (LAMBDA_DOCUMENTATION, LAMBDA_REPRODUCED, LAMBDA_MEASURED)
+URDF, MJCF = "urdf", "mjcf"
 LIMITS = ("lower", "upper", "velocity", "effort")
 
 
@@ -67,6 +68,23 @@ class Tool:
 
 
 @dataclass(frozen=True)
+class Source:
+    """The file that describes the robot: what the model is written back onto.
+
+    Attributes:
+        format: `URDF` or `MJCF`.
+        file: its name; of an MJCF, which may take in other files, the whole path.
+        text: of a URDF; an MJCF is read from its file again.
+        lam: (n, 6) λ as documented there, row by row as in the model.
+    """
+
+    format: str
+    file: str
+    text: str | None = None
+    lam: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+
+@dataclass(frozen=True)
 class Limits:
     """Joint limits, (n,) each, NaN where unknown: rad, rad, rad/s, N m."""
 
@@ -109,6 +127,7 @@ class SelfModel:
             std, units, evidence, ...}), JSON values only; what they mean, and whether they are
             right, `effects.active` knows.
         lambda_source: one of `LAMBDA_SOURCES`; λ from synthesized twists is never "measured".
+        source: the robot's file, None where there is none.
         provenance: where the model came from, JSON values only.
 
     Raises:
@@ -131,6 +150,7 @@ class SelfModel:
     theta_identifiable: np.ndarray | None = None
     effects: tuple[Mapping[str, Any], ...] = ()
     lambda_source: str = LAMBDA_DOCUMENTATION
+    source: Source | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -150,6 +170,8 @@ class SelfModel:
             choices = ", ".join(f"'{s}'" for s in LAMBDA_SOURCES)
             raise ModelError(f"no lambda_source '{self.lambda_source}'; have: {choices}")
         self._check_names()
+        if self.source is not None and np.shape(self.source.lam) != (n, 6):
+            raise ModelError(f"source.lam must have shape {(n, 6)}, got {self.source.lam.shape}")
 
     def __repr__(self) -> str:
         return f"SelfModel({self.name}: {self.tree.n} joints, λ {self.lambda_source})"

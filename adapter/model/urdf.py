@@ -1,30 +1,21 @@
-"""URDF into a self model: frames turned to their axes, fixed links merged, the rest locked.
-
-The rule of the axes: the frame of a link that turns about axis u of its URDF frame is that
-frame, turned by the smallest rotation Q that takes z to u (`spatial.z_to_axis`; by π about x for
-u = -z). Then Rot(u, q) = Q Rz(q) Qᵀ, and the joint turns about its own z as eq. 9 of the paper
-wants it: R_ij = Q_iᵀ R_urdf Q_j Rz(q), p = Q_iᵀ p_urdf. `urdf_text` undoes it.
-"""
+"""URDF into a self model (see `robot_file` for the rule of the axes)."""
 
 from __future__ import annotations
 
 import math
-import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adapter.errors import ModelError, ModelWarning
+from adapter.errors import ModelError
 from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
-from adapter.model.self_model import FixedFrame, Limits, SelfModel, gravity_down, turned_theta
-from adapter.model.spatial import Array, matrix_from_rpy, vector3, z_to_axis, zxz_from_matrix
-from adapter.model.tree import BASE, Tree
+from adapter.model.robot_file import TURNING, FileJoint, FileRobot, Merged
+from adapter.model.self_model import URDF, SelfModel, Source, gravity_down
+from adapter.model.spatial import Array, matrix_from_rpy, vector3
 
-TURNING = ("revolute", "continuous")
 JOINT_TYPES = (*TURNING, "fixed", "prismatic", "planar", "floating")
 _SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
@@ -48,11 +39,7 @@ def read_urdf(
     Raises:
         ModelError: one sentence naming the file, the element and the choices.
     """
-    path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: cannot be read as a URDF ({error})") from None
+    text = file_text(path)
     return model_from_urdf(text, str(path), joints, floating, gravity)
 
 
@@ -64,199 +51,20 @@ def model_from_urdf(
     gravity: ArrayLike | None = None,
 ) -> SelfModel:
     """As `read_urdf`, from the text; `file` is what errors and provenance call it."""
-    robot = parse_urdf(text, file)
-    root = _root(robot)
-    moving = _moving(robot, joints)
-    merged = _Merge(robot, moving)
-    merged.walk(root)
-    if not merged.order:
-        raise ModelError(f"{file}: no joint is left to move; have: {_names(robot.joints)}")
-    merged.check_masses(floating)
+    merged = Merged(parse_urdf(text, file), joints)
     down = gravity_down() if gravity is None else vector3(gravity)
     return merged.model(floating, down)
 
 
-def _names(joints: dict[str, UrdfJoint]) -> str:
-    return ", ".join(f"{j.name} ({j.kind})" for j in joints.values()) or "no joints"
+def file_text(path: str | Path) -> str:
+    """A file's text, its line ends as they are. Raises ModelError."""
+    try:
+        return Path(path).read_bytes().decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: cannot be read as text ({error})") from None
 
 
-def _root(robot: UrdfRobot) -> str:
-    """The one link that is nobody's child; every link must hang on it, by one joint."""
-    parent_of: dict[str, UrdfJoint] = {}
-    for joint in robot.joints.values():
-        if joint.child in parent_of:
-            both = f"'{parent_of[joint.child].name}' and '{joint.name}'"
-            raise ModelError(
-                f"{robot.file}: link '{joint.child}' is the child of joints {both}; a loop can't "
-                "be read, remove one of them"
-            )
-        parent_of[joint.child] = joint
-    roots = [name for name in robot.links if name not in parent_of]
-    if len(roots) > 1:
-        raise ModelError(
-            f"{robot.file}: {len(roots)} root links ({', '.join(roots)}); a robot has one, join "
-            "them with fixed joints"
-        )
-    for name in robot.links:
-        seen = [name]
-        while seen[-1] in parent_of:
-            seen.append(parent_of[seen[-1]].parent)
-            if seen[-1] in seen[:-1]:
-                raise ModelError(
-                    f"{robot.file}: links {' -> '.join(reversed(seen))} form a loop; a tree is "
-                    "needed"
-                )
-    return roots[0]
-
-
-def _moving(robot: UrdfRobot, wanted: Sequence[str] | None) -> set[str]:
-    """Names of the joints that move in the model; warns about each that is locked."""
-    turning = {j.name for j in robot.joints.values() if j.kind in TURNING}
-    free = {name for name in turning if not robot.joints[name].mimic}
-    chosen = free if wanted is None else set(wanted)
-    for name in sorted(chosen):
-        joint = robot.joints.get(name)
-        if joint is None or joint.kind not in TURNING:
-            fault = "is not there" if joint is None else f"is {joint.kind}"
-            raise ModelError(
-                f"{robot.file}: joint '{name}', asked for, {fault}; have turning joints: "
-                f"{', '.join(j for j in robot.joints if j in turning)}"
-            )
-    for joint in robot.joints.values():
-        if joint.name not in chosen and joint.kind != "fixed":
-            follows = " and mimics another" if joint.mimic else ""
-            warnings.warn(
-                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}; locked at zero",
-                ModelWarning,
-                stacklevel=4,
-            )
-    return chosen
-
-
-@dataclass
-class _Body:
-    """A moving link (or the base) while the file is walked; frames turned as the rule says."""
-
-    name: str
-    parent: int
-    joint: UrdfJoint | None
-    rotation: Array
-    position: Array
-    theta: Array
-    merged: list[str] = field(default_factory=list)
-
-
-class _Merge:
-    """Walks the links depth first, in the file's order, and merges what does not move."""
-
-    def __init__(self, robot: UrdfRobot, moving: set[str]) -> None:
-        self.robot = robot
-        self.moving = moving
-        self.base: _Body | None = None
-        self.order: list[_Body] = []
-        self.frames: list[FixedFrame] = []
-        self.children: dict[str, list[UrdfJoint]] = {name: [] for name in robot.links}
-        for joint in robot.joints.values():
-            self.children[joint.parent].append(joint)
-
-    def walk(self, root: str) -> None:
-        """Fill `base`, `order` and `frames` from the root link on."""
-        eye, zero = np.eye(3), np.zeros(3)
-        self.base = _Body(root, BASE, None, eye, zero, self.robot.links[root])
-        # Joints still to visit, the number of the body they hang on, and the placement in it of
-        # the URDF frame of the link they hang on.
-        todo = [(joint, BASE, eye, zero) for joint in reversed(self.children[root])]
-        while todo:
-            joint, number, rotation, position = todo.pop()
-            rotation, position = rotation @ joint.rotation, position + rotation @ joint.position
-            number, rotation, position = self._visit(joint, number, rotation, position)
-            below = reversed(self.children[joint.child])
-            todo += [(child, number, rotation, position) for child in below]
-
-    def _visit(self, joint: UrdfJoint, number: int, r: Array, p: Array) -> tuple[int, Array, Array]:
-        """Take in the child of a joint at (r, p) in body `number`: its body and placement there."""
-        theta = self.robot.links[joint.child]
-        if joint.name in self.moving:
-            turn = z_to_axis(joint.axis)
-            turned = turned_theta(theta, turn.T)
-            self.order.append(_Body(joint.child, number, joint, r @ turn, p, turned))
-            return len(self.order) - 1, turn.T, np.zeros(3)
-        body = self._body(number)
-        body.theta = body.theta + move_theta(theta, r, p)
-        body.merged.append(joint.child)
-        self.frames.append(FixedFrame(joint.child, joint.name, body.name, r, p))
-        return number, r, p
-
-    def _body(self, number: int) -> _Body:
-        assert self.base is not None
-        return self.base if number == BASE else self.order[number]
-
-    def check_masses(self, floating: bool) -> None:
-        """Refuse a moving body without mass: no motion of it could be explained."""
-        for body in [self._body(BASE), *self.order] if floating else self.order:
-            if body.theta[0] <= 0.0:
-                rest = f" (with {', '.join(body.merged)})" if body.merged else ""
-                joint = f"leave joint '{body.joint.name}' out" if body.joint else "fix the base"
-                raise ModelError(
-                    f"{self.robot.file}: moving link '{body.name}'{rest} has no mass; give it an "
-                    f"<inertial> or {joint}"
-                )
-
-    def model(self, floating: bool, gravity: Array) -> SelfModel:
-        """The self model of what was walked."""
-        base, order = self._body(BASE), self.order
-        joints = [body.joint for body in order if body.joint is not None]
-        tree = Tree(
-            tuple(body.parent for body in order),
-            floating,
-            tuple(joint.name for joint in joints),
-            tuple(body.name for body in order),
-            base.name,
-        )
-        theta = np.stack([body.theta for body in order])
-        return SelfModel(
-            name=self.robot.name,
-            tree=tree,
-            lam=np.stack([np.r_[zxz_from_matrix(b.rotation), b.position] for b in order]),
-            theta=np.vstack([base.theta, theta]) if floating else theta,
-            base_theta=np.zeros(10) if floating else base.theta,
-            limits=Limits(*np.stack([joint.limits for joint in joints], axis=1)),
-            axis=np.stack([joint.axis for joint in joints]),
-            frames=tuple(self.frames),
-            gravity=gravity,
-            provenance={"urdf": Path(self.robot.file).name},
-        )
-
-
-@dataclass(frozen=True)
-class UrdfJoint:
-    """A joint as written: placement in the parent link's frame, axis in its own.
-
-    `limits` are [lower upper velocity effort], NaN where not given.
-    """
-
-    name: str
-    kind: str
-    parent: str
-    child: str
-    rotation: Array
-    position: Array
-    axis: Array
-    limits: Array
-    mimic: bool
-
-
-@dataclass(frozen=True)
-class UrdfRobot:
-    """A file's content: θ (10,) of each link in its own frame, and the joints, as written."""
-
-    file: str
-    name: str
-    links: dict[str, Array]
-    joints: dict[str, UrdfJoint]
-
-
-def parse_urdf(text: str, file: str) -> UrdfRobot:
+def parse_urdf(text: str, file: str) -> FileRobot:
     """Links and joints of a URDF; `file` is what errors call it.
 
     Raises:
@@ -274,7 +82,7 @@ def parse_urdf(text: str, file: str) -> UrdfRobot:
         if name in links:
             raise ModelError(f"{file}: link '{name}' appears twice")
         links[name] = _link_theta(element, f"{file}: link '{name}'")
-    joints: dict[str, UrdfJoint] = {}
+    joints: dict[str, FileJoint] = {}
     for element in root.findall("joint"):
         joint = _joint(element, links, file)
         if joint.name in joints:
@@ -282,7 +90,8 @@ def parse_urdf(text: str, file: str) -> UrdfRobot:
         joints[joint.name] = joint
     if not links:
         raise ModelError(f"{file}: no <link> in it")
-    return UrdfRobot(file, root.get("name", "robot"), links, joints)
+    source = Source(URDF, Path(file).name, text)
+    return FileRobot(file, root.get("name", "robot"), links, joints, source)
 
 
 def _attribute(element: ET.Element, key: str, file: str, what: str) -> str:
@@ -336,7 +145,7 @@ def _link_theta(element: ET.Element, where: str) -> Array:
     return move_theta(theta_from_body(kilograms, np.zeros(3), about_com), rotation, com)
 
 
-def _joint(element: ET.Element, links: dict[str, Array], file: str) -> UrdfJoint:
+def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint:
     name = _attribute(element, "name", file, "a <joint>")
     where = f"{file}: joint '{name}'"
     kind = _attribute(element, "type", file, f"joint '{name}'")
@@ -353,7 +162,7 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> UrdfJoint
         ends[end] = link
     rotation, position = _origin(element, where)
     axis = _axis(element, where) if kind in TURNING else np.array([1.0, 0.0, 0.0])
-    return UrdfJoint(
+    return FileJoint(
         name, kind, ends["parent"], ends["child"], rotation, position, axis,
         _limits(element, kind, where), element.find("mimic") is not None,
     )  # fmt: skip

@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError
 from adapter.model.inertia import (
@@ -33,6 +35,10 @@ from adapter.model.tree import BASE
 DAMPING, FRICTION, ARMATURE, STIFFNESS = "damping", "friction", "armature", "stiffness"
 URDF_PLACES = (DAMPING, FRICTION)
 NO_PLACE = ""
+NO_INERTIA = """<inertial>
+  <mass value="0"/>
+  <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
+</inertial>"""
 
 
 @dataclass(eq=False)
@@ -48,6 +54,7 @@ class Additions:
         dtheta: (n, 10) what links weigh more than the model's θ, in their frames.
         loads: (10,) each, bodies that the last link carries, in its frame.
         tilt: (3, 3) how the base stands, None where upright.
+        told: places and joints that an effect spoke of, be it by zero.
         left_out: what has no place, in words; names: of the effects in it, sorted.
     """
 
@@ -57,6 +64,7 @@ class Additions:
     left_out: list[str] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
     loads: list[Array] = field(default_factory=list)
+    told: set[tuple[str, int]] = field(default_factory=set)
     tilt: Array | None = None
 
     def __post_init__(self) -> None:
@@ -74,6 +82,7 @@ class Additions:
         if place not in self.joint:
             return NO_PLACE
         self.joint[place][joint] += value
+        self.told.add((place, joint))
         return part
 
     def carry(self, theta: Array) -> bool:
@@ -102,8 +111,8 @@ def urdf_text(model: SelfModel, more: Additions) -> str:
     """URDF text of a model; the inverse of `urdf.read_urdf` up to rounding.
 
     Each link frame is turned back to its original axis, frames that ride on links come out as
-    massless links on fixed joints, a tool and loads as links of their own. A fixed base may be
-    massless. A comment lists what has no place.
+    links of no mass on fixed joints (said in numbers: to a link without <inertial> PyBullet gives
+    1 kg), a tool and loads as links of their own. A comment lists what has no place.
 
     Args:
         model: the arm; more: what it has beside, `places` being `URDF_PLACES`.
@@ -112,19 +121,21 @@ def urdf_text(model: SelfModel, more: Additions) -> str:
         ModelError: where a body is physically impossible; names the link and the eigenvalue.
     """
     tree, robot = model.tree, ET.Element("robot", name=model.name)
-    missing = [*_gravity(model), *more.left_out]
+    missing = unplaced(model, more)
     if missing:
         robot.append(ET.Comment(_comment(missing)))
     turns = {tree.base_name: np.eye(3)}
     turns.update({name: z_to_axis(model.axis[k]) for k, name in enumerate(tree.link_names)})
     base = base_inertia(model)
-    massless_base = not tree.floating and not np.any(base)
-    _add_link(robot, tree.base_name, None if massless_base else base)
+    if tree.floating or np.any(base):
+        _add_link(robot, tree.base_name, base)
+    else:
+        _add_massless(robot, tree.base_name)
     for k, name in enumerate(tree.link_names):
         _add_link(robot, name, turned_theta(link_theta(model)[k] + more.dtheta[k], turns[name]))
         _add_joint(robot, model, k, turns, more)
     for frame in model.frames:
-        _add_link(robot, frame.name, None)
+        _add_massless(robot, frame.name)
         turn = turns[frame.parent]
         joint = _joint(robot, frame.joint, "fixed", frame.parent, frame.name)
         _add_origin(joint, turn @ frame.rotation, turn @ frame.position)
@@ -137,16 +148,19 @@ def urdf_text(model: SelfModel, more: Additions) -> str:
         _add_load(robot, last, what, turned_theta(load, turns[last]))
     if more.tilt is not None:
         upright = f"{tree.base_name}_upright"
-        _add_link(robot, upright, None)
+        _add_massless(robot, upright)
         _add_origin(_joint(robot, f"{upright}_joint", "fixed", upright, tree.base_name), more.tilt)
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def _gravity(model: SelfModel) -> list[str]:
-    """A simulator's gravity is upright; say so where the model's is not."""
+def unplaced(model: SelfModel, more: Additions) -> list[str]:
+    """What a URDF has no place for, in words; its gravity is upright."""
     upright = np.array_equal(model.gravity, gravity_down())
-    return [] if upright else [f"gravity {model.gravity.tolist()} m/s2 in base axes"]
+    return [
+        *([] if upright else [f"gravity {model.gravity.tolist()} m/s2 in base axes"]),
+        *more.left_out,
+    ]
 
 
 def _comment(left_out: list[str]) -> str:
@@ -155,34 +169,47 @@ def _comment(left_out: list[str]) -> str:
     return text.replace("--", "- -")
 
 
-def _text(values: Array) -> str:
+def number_text(values: ArrayLike) -> str:
     """Numbers that read back unchanged; a negative zero loses its sign."""
     return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
 
 
 def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:
-    xyz = _text(np.zeros(3) if position is None else position)
-    ET.SubElement(element, "origin", xyz=xyz, rpy=_text(rpy_from_matrix(rotation)))
+    xyz = number_text(np.zeros(3) if position is None else position)
+    ET.SubElement(element, "origin", xyz=xyz, rpy=number_text(rpy_from_matrix(rotation)))
 
 
-def _add_link(robot: ET.Element, name: str, theta: Array | None) -> None:
-    """A link with its inertia (10,) in its URDF frame; without any where None."""
+def _add_link(robot: ET.Element, name: str, theta: Array) -> None:
+    """A link with its inertia (10,) in its URDF frame."""
     link = ET.SubElement(robot, "link", name=name)
-    if theta is None:
-        return
+    check_possible(theta, name)
+    mass, com, tensor = body_from_theta(theta)
+    inertial = ET.SubElement(link, "inertial")
+    _add_origin(inertial, np.eye(3), com)
+    ET.SubElement(inertial, "mass", value=number_text(mass))
+    six = {key: number_text(value) for key, value in six_named(tensor).items()}
+    ET.SubElement(inertial, "inertia", six)
+
+
+def _add_massless(robot: ET.Element, name: str) -> None:
+    """A link that rides on another and weighs nothing."""
+    robot.append(ET.fromstring(f"<link name={quoteattr(name)}>{NO_INERTIA}</link>"))
+
+
+def check_possible(theta: Array, name: str) -> None:
+    """Refuse (ModelError) a body that cannot exist."""
     smallest = float(min_eigenvalue(theta))
     if not smallest > CONSISTENCY_TOLERANCE * float(np.max(np.abs(theta))):
         raise ModelError(
             f"link '{name}' is physically impossible: its pseudo-inertia has an eigenvalue of "
             f"{smallest:.3g}, all must be positive; learn or set its inertia before exporting"
         )
-    mass, com, tensor = body_from_theta(theta)
-    inertial = ET.SubElement(link, "inertial")
-    _add_origin(inertial, np.eye(3), com)
-    ET.SubElement(inertial, "mass", value=_text(mass))
+
+
+def six_named(tensor: Array) -> dict[str, float]:
+    """The elements of a tensor (3, 3) by the names that URDF's <inertia> has for them."""
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    six = {key: _text(value) for key, value in zip(keys, six_from_tensor(tensor), strict=True)}
-    ET.SubElement(inertial, "inertia", six)
+    return dict(zip(keys, six_from_tensor(tensor).tolist(), strict=True))
 
 
 def _add_load(robot: ET.Element, link: str, what: str, theta: Array) -> None:
@@ -213,8 +240,10 @@ def _add_joint(
     zero = model.joint_rotation()[k] @ rot_z(-more.offset[k])  # q = q_measured - offset
     rotation = turns[parent] @ zero @ turns[child].T
     _add_origin(joint, rotation, turns[parent] @ model.lam[k, 3:])
-    ET.SubElement(joint, "axis", xyz=_text(model.axis[k]))
-    losses = {place: _text(more.joint[place][k]) for place in more.places if more.joint[place][k]}
+    ET.SubElement(joint, "axis", xyz=number_text(model.axis[k]))
+    losses = {
+        place: number_text(more.joint[place][k]) for place in more.places if more.joint[place][k]
+    }
     if losses:
         ET.SubElement(joint, "dynamics", losses)
     values = {
@@ -223,6 +252,6 @@ def _add_joint(
         "velocity": limits.velocity[k],
         "effort": limits.effort[k],
     }
-    known = {key: _text(value) for key, value in values.items() if math.isfinite(value)}
+    known = {key: number_text(value) for key, value in values.items() if math.isfinite(value)}
     if known:
         ET.SubElement(joint, "limit", known)

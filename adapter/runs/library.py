@@ -14,7 +14,7 @@ from adapter.discovery import Discovery
 from adapter.discovery import discover as discover_tree
 from adapter.effects.active import check_effects
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.export import to_urdf
+from adapter.effects.export import robot_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, SettingsError
 from adapter.gap.result import GapResult
@@ -432,13 +432,14 @@ def discover(log: Log | str | Path, *, base: str | None = None) -> Discovery:
     return discover_tree(log if isinstance(log, Log) else read_mcap(log, sensors=True), base=base)
 
 
-def export(model: SelfModel, path: str | Path) -> Path:
+def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -> Path:
     """Write a model as URDF (.urdf), or whole as a model file of ours (.json).
 
     Args:
-        model: in a URDF friction and damping stand in their place; what has none is listed in
-            a comment.
+        model: in a URDF friction and damping stand in their place; what has none is left out.
         path: its suffix decides.
+        onto: a URDF whose inertials, joint origins and <dynamics> alone are to change; where
+            None, the one that the model came from.
 
     Raises:
         ModelError: another suffix, or a body that cannot exist.
@@ -454,7 +455,7 @@ def export(model: SelfModel, path: str | Path) -> Path:
         raise ModelError(f"{path}: no such format; have: {', '.join(EXPORTED)}")
     if path.suffix == ".json":
         return save_model(model, path)
-    path.write_text(to_urdf(model), encoding="utf-8")
+    path.write_bytes(robot_urdf(model, onto).text.encode())
     return path
 
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from adapter.effects.active import with_bodies
-from adapter.effects.export import left_out_of_urdf, mjcf_joints, to_urdf
+from adapter.effects.export import mjcf_joints, robot_urdf, to_urdf
 from adapter.effects.torque import ModelTorque
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -173,7 +173,7 @@ def test_what_has_no_place_is_in_one_comment() -> None:
         assert part in said
     assert "coulomb_friction" not in said
     names = ["asymmetric_friction", "motor_inertia", "signal_delay", "stribeck_friction"]
-    assert left_out_of_urdf(carrying(*LOSSES, *left)) == [*names, "torque_offset"]
+    assert robot_urdf(carrying(*LOSSES, *left)).left_out == (*names, "torque_offset")
     assert comments(to_urdf(carrying(*BODIES, *LOSSES[:2]))) == []
     assert comments(to_urdf(documented("panda"))) == []
 

@@ -11,7 +11,7 @@ import pytest
 from adapter.cli.rollouts import Rollouts
 from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.catalogue import CATALOGUE, registered
-from adapter.effects.export import left_out_of_urdf, to_urdf
+from adapter.effects.export import robot_urdf, to_urdf
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, experiments
 from adapter.gap.held_out import DrivenMotion
@@ -116,4 +116,4 @@ def test_it_is_exported() -> None:
     text = to_urdf(with_drag())
     assert f'<dynamics damping="{C}" />' in text and text.count("<dynamics") == 1
     assert "drag of panda_joint2" in text and "its slope at 0.5 rad/s is damping" in text
-    assert left_out_of_urdf(with_drag()) == ["drag"]
+    assert robot_urdf(with_drag()).left_out == ("drag",)

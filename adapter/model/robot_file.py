@@ -1,0 +1,235 @@
+"""A robot as a file describes it, and the self model in it: fixed links merged, the rest locked.
+
+The rule of the axes: the frame of a link that turns about axis u of its file's frame is that
+frame, turned by the smallest rotation Q that takes z to u (`spatial.z_to_axis`; by π about x for
+u = -z). Then Rot(u, q) = Q Rz(q) Qᵀ, and the joint turns about its own z as eq. 9 of the paper
+wants it: R_ij = Q_iᵀ R_file Q_j Rz(q), p = Q_iᵀ p_file. `urdf_text` undoes it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from adapter.errors import ModelError, ModelWarning
+from adapter.model.inertia import move_theta
+from adapter.model.self_model import FixedFrame, Limits, SelfModel, Source, turned_theta
+from adapter.model.spatial import Array, z_to_axis, zxz_from_matrix
+from adapter.model.tree import BASE, Tree
+
+TURNING = ("revolute", "continuous")
+
+
+@dataclass(frozen=True)
+class FileJoint:
+    """A joint as written: placement in the parent link's frame, axis in its own.
+
+    `limits` are [lower upper velocity effort], NaN where not given.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    rotation: Array
+    position: Array
+    axis: Array
+    limits: Array
+    mimic: bool
+
+
+@dataclass(frozen=True)
+class FileRobot:
+    """A file's content: θ (10,) of each link in its own frame, and the joints, as written.
+
+    `source` is what a model remembers of it, but for λ, which it does not know yet.
+    """
+
+    file: str
+    name: str
+    links: dict[str, Array]
+    joints: dict[str, FileJoint]
+    source: Source
+
+
+def _names(joints: dict[str, FileJoint]) -> str:
+    return ", ".join(f"{j.name} ({j.kind})" for j in joints.values()) or "no joints"
+
+
+def _root(robot: FileRobot) -> str:
+    """The one link that is nobody's child; every link must hang on it, by one joint."""
+    parent_of: dict[str, FileJoint] = {}
+    for joint in robot.joints.values():
+        if joint.child in parent_of:
+            both = f"'{parent_of[joint.child].name}' and '{joint.name}'"
+            raise ModelError(
+                f"{robot.file}: link '{joint.child}' is the child of joints {both}; a loop can't "
+                "be read, remove one of them"
+            )
+        parent_of[joint.child] = joint
+    roots = [name for name in robot.links if name not in parent_of]
+    if len(roots) > 1:
+        raise ModelError(
+            f"{robot.file}: {len(roots)} root links ({', '.join(roots)}); a robot has one, join "
+            "them with fixed joints"
+        )
+    for name in robot.links:
+        seen = [name]
+        while seen[-1] in parent_of:
+            seen.append(parent_of[seen[-1]].parent)
+            if seen[-1] in seen[:-1]:
+                raise ModelError(
+                    f"{robot.file}: links {' -> '.join(reversed(seen))} form a loop; a tree is "
+                    "needed"
+                )
+    return roots[0]
+
+
+def _moving(robot: FileRobot, wanted: Sequence[str] | None) -> set[str]:
+    """Names of the joints that move in the model; warns about each that is locked."""
+    turning = {j.name for j in robot.joints.values() if j.kind in TURNING}
+    free = {name for name in turning if not robot.joints[name].mimic}
+    chosen = free if wanted is None else set(wanted)
+    for name in sorted(chosen):
+        joint = robot.joints.get(name)
+        if joint is None or joint.kind not in TURNING:
+            fault = "is not there" if joint is None else f"is {joint.kind}"
+            raise ModelError(
+                f"{robot.file}: joint '{name}', asked for, {fault}; have turning joints: "
+                f"{', '.join(j for j in robot.joints if j in turning)}"
+            )
+    for joint in robot.joints.values():
+        if joint.name not in chosen and joint.kind != "fixed":
+            follows = " and mimics another" if joint.mimic else ""
+            warnings.warn(
+                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}; locked at zero",
+                ModelWarning,
+                stacklevel=6,
+            )
+    return chosen
+
+
+@dataclass
+class Body:
+    """A moving link (or the base) while the file is walked; frames turned as the rule says."""
+
+    name: str
+    parent: int
+    joint: FileJoint | None
+    rotation: Array
+    position: Array
+    theta: Array
+    merged: list[str] = field(default_factory=list)
+
+
+class Merged:
+    """A robot's links walked depth first, in the file's order, what does not move merged.
+
+    Attributes:
+        robot: the file's content; order: bodies that move, parents first.
+        place: of each link of the file the body it belongs to (-1 for the base) and its frame
+            (R, p) in that of the body.
+
+    Raises:
+        ModelError: one sentence naming the file, the element and the choices.
+    """
+
+    def __init__(self, robot: FileRobot, joints: Sequence[str] | None = None) -> None:
+        self.robot = robot
+        self.moving = _moving(robot, joints)
+        self.place: dict[str, tuple[int, Array, Array]] = {}
+        self.order: list[Body] = []
+        self.frames: list[FixedFrame] = []
+        self.children: dict[str, list[FileJoint]] = {name: [] for name in robot.links}
+        for joint in robot.joints.values():
+            self.children[joint.parent].append(joint)
+        root = _root(robot)
+        self.base = Body(root, BASE, None, np.eye(3), np.zeros(3), robot.links[root])
+        self._walk(root)
+        if not self.order:
+            have = _names(robot.joints)
+            raise ModelError(f"{robot.file}: no joint is left to move; have: {have}")
+
+    def _walk(self, root: str) -> None:
+        """Fill `order`, `frames` and `place` from the root link on."""
+        eye, zero = np.eye(3), np.zeros(3)
+        self.place[root] = BASE, eye, zero
+        # Joints still to visit, the number of the body they hang on, and the placement in it of
+        # the URDF frame of the link they hang on.
+        todo = [(joint, BASE, eye, zero) for joint in reversed(self.children[root])]
+        while todo:
+            joint, number, rotation, position = todo.pop()
+            rotation, position = rotation @ joint.rotation, position + rotation @ joint.position
+            number, rotation, position = self._visit(joint, number, rotation, position)
+            self.place[joint.child] = number, rotation, position
+            below = reversed(self.children[joint.child])
+            todo += [(child, number, rotation, position) for child in below]
+
+    def _visit(self, joint: FileJoint, number: int, r: Array, p: Array) -> tuple[int, Array, Array]:
+        """Take in the child of a joint at (r, p) in body `number`: its body and placement there."""
+        theta = self.robot.links[joint.child]
+        if joint.name in self.moving:
+            turn = z_to_axis(joint.axis)
+            turned = turned_theta(theta, turn.T)
+            self.order.append(Body(joint.child, number, joint, r @ turn, p, turned))
+            return len(self.order) - 1, turn.T, np.zeros(3)
+        body = self.body(number)
+        body.theta = body.theta + move_theta(theta, r, p)
+        body.merged.append(joint.child)
+        self.frames.append(FixedFrame(joint.child, joint.name, body.name, r, p))
+        return number, r, p
+
+    def body(self, number: int) -> Body:
+        """The body of that number, -1 for the base."""
+        return self.base if number == BASE else self.order[number]
+
+    def _check_masses(self, floating: bool) -> None:
+        """Refuse a moving body without mass: no motion of it could be explained."""
+        for body in [self.body(BASE), *self.order] if floating else self.order:
+            if body.theta[0] <= 0.0:
+                rest = f" (with {', '.join(body.merged)})" if body.merged else ""
+                joint = f"leave joint '{body.joint.name}' out" if body.joint else "fix the base"
+                raise ModelError(
+                    f"{self.robot.file}: moving link '{body.name}'{rest} has no mass; give it an "
+                    f"<inertial> or {joint}"
+                )
+
+    def model(self, floating: bool, gravity: Array) -> SelfModel:
+        """The self model of what was walked.
+
+        Args:
+            floating: whether the base is free.
+            gravity: (3,) in base axes, m/s².
+
+        Raises:
+            ModelError: a moving body without mass.
+        """
+        self._check_masses(floating)
+        base, order = self.body(BASE), self.order
+        joints = [body.joint for body in order if body.joint is not None]
+        tree = Tree(
+            tuple(body.parent for body in order),
+            floating,
+            tuple(joint.name for joint in joints),
+            tuple(body.name for body in order),
+            base.name,
+        )
+        theta = np.stack([body.theta for body in order])
+        lam = np.stack([np.r_[zxz_from_matrix(b.rotation), b.position] for b in order])
+        return SelfModel(
+            name=self.robot.name,
+            tree=tree,
+            lam=lam,
+            theta=np.vstack([base.theta, theta]) if floating else theta,
+            base_theta=np.zeros(10) if floating else base.theta,
+            limits=Limits(*np.stack([joint.limits for joint in joints], axis=1)),
+            axis=np.stack([joint.axis for joint in joints]),
+            frames=tuple(self.frames),
+            gravity=gravity,
+            source=replace(self.robot.source, lam=lam),
+            provenance={self.robot.source.format: Path(self.robot.file).name},
+        )
