@@ -106,7 +106,8 @@ class ClientSession:
 
     def wait_for_command(self, patience_s: float) -> bool:
         """Whether the client said something in so many seconds."""
-        return bool(select.select([self._tcp, self._udp], [], [], patience_s)[0])
+        said_at = [end for end in (self._tcp, self._udp) if end is not None]
+        return bool(select.select(said_at, [], [], patience_s)[0])
 
     def command(self, message_id: int) -> RobotCommand | None:
         """The command that answers the last state, if it is there."""
