@@ -97,6 +97,8 @@ def _print_lambda(learned: LearnedTree) -> None:
         spread = " ".join(_worst(part) for part in _halves(_known(learned)[j]))
         table.add_row(name, turn, place, f"{schema.ranks[j]}/6", spread)
     console.print(table)
+    for sentence in schema.freedom.words(tree):
+        console.print(f"arbitrary, as no motion shows it: {sentence}", soft_wrap=True)
 
 
 def _print_mountings(found: Discovery) -> None:
@@ -133,6 +135,7 @@ def _lambda_figures(learned: LearnedTree) -> dict[str, Any]:
         "lam": schema.lam,
         "std": _known(learned),
         "shown": list(schema.ranks),
+        "arbitrary": schema.freedom.words(tree),
     }
 
 

@@ -78,6 +78,8 @@ def print_figures(figures: dict[str, Any]) -> None:
         f"{max(lam['position_error_m']):.2g} m against {lam['reference']}; "
         f"{lam['identifiable_rank']} directions shown",
     )
+    for words in lam["filled"]:
+        table.add_row("  from the documentation", words)
     rmse = theta["torque_rmse_nm"]
     fit = f"; fit {max(rmse):.3f} N m on the worst joint" if rmse else ""
     table.add_row("θ", _seconds(theta["converged_s"]) + fit)
@@ -138,10 +140,13 @@ def run_export(args: argparse.Namespace) -> int:
         "lambda_source": model.lambda_source,
         "left_out": written.left_out,
         "notes": written.notes,
+        "lambda_filled": list(model.provenance.get("lambda_filled", ())),
     }
     write_json(args.json, facts)
     onto = "" if written.onto is None else f" onto {written.onto}"
     console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+    for words in facts["lambda_filled"]:
+        console.print(f"  from the documentation, as no data showed it: {words}", soft_wrap=True)
     return 0
 
 

@@ -175,6 +175,7 @@ def self_model(
                 "confidence": {e.link: e.confidence for e in discovery.edges},
                 "undecided": list(discovery.undecided),
                 "mounting": {k: m.as_dict() for k, m in discovery.mountings.items()},
+                "lambda_arbitrary": schema.freedom.words(tree),
                 "theta": "learned from joint torques" if left is not None else "not learned",
             }
         },

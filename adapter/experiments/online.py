@@ -107,7 +107,7 @@ def online_trial(
             learner.step(state)
             times_ns.append(time.perf_counter_ns() - before)
             if learner.learned % LOOK_EVERY == 0 and learner.theta_started_ns is not None:
-                turn, shift = frame_errors(learner.schema.lam[None], true_lam, seen.projectors)
+                turn, shift = frame_errors(learner.schema.lam[None], true_lam, seen.freedom)
                 where = {
                     "seconds": 1e-3 * learner.learned,
                     "turn_rad": float(turn.max()),

@@ -25,6 +25,10 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import Frames, jit, link_spin
 from adapter.signals.records import KIND, columns
 
+# What a link measures, in the order of the moments (the online ones end with a), and the channel
+# that has the same algebra.
+CHANNELS = ("w", "v", "a", "dw")
+KERNELS = (0, 1, 2, 0)
 N_SIGNALS = (3, 6, 12)  # length of s by channel
 WIDTH = 15  # y and the longest s
 # Products of w in s of channel 2, which axes they multiply.

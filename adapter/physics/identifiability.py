@@ -14,6 +14,7 @@ import numpy as np
 
 from adapter.model.spatial import Array, matrix_from_zxz, skew
 from adapter.model.tree import BASE, Tree
+from adapter.physics.freedom import Freedom
 from adapter.physics.kernels import (
     JointMotion,
     base_at_rest,
@@ -25,6 +26,10 @@ from adapter.physics.kernels import (
 # Singular values below this, relative to the largest, count as zero. Random motion leaves a gap
 # of many decades: true ones stay above 1e-6 on arms, rounding below 1e-14.
 RANK_TOLERANCE = 1e-10
+
+# Turns and shifts that change a link's motion by less than this share do not count as shown: axes
+# that a URDF has upright to five digits, and no more, show nothing that a sensor could tell.
+LEAST_SHOWN = 1e-4
 
 # Appends columns to the regressor: (q, dq, ddq), each (m, n), to (m, rows, k).
 ExtraColumns = Callable[[Array, Array, Array], Array]
@@ -64,6 +69,7 @@ class FrameObservability:
         bases: for each joint (6, rank_j), orthonormal, spanning its observable directions.
         projectors: (n, 6, 6) onto the observable directions.
         flags: (n, 6) bool, whether the single turn or shift is observable on its own.
+        freedom: how far the frames may go and links still move the same.
     """
 
     rank: int
@@ -71,6 +77,7 @@ class FrameObservability:
     bases: tuple[Array, ...]
     projectors: Array
     flags: np.ndarray
+    freedom: Freedom
 
 
 def numerical_rank(matrix: Array, tolerance: float = RANK_TOLERANCE) -> tuple[int, Array]:
@@ -156,7 +163,8 @@ def frame_observability(
     projectors = np.stack([b @ b.T for b in bases])
     ranks = tuple(b.shape[1] for b in bases)
     flags = np.diagonal(projectors, axis1=1, axis2=2) > 1.0 - 1e-6
-    return FrameObservability(sum(ranks), ranks, tuple(bases), projectors, flags)
+    freedom = Freedom.of(np.eye(6) - projectors, np.asarray(lam)[:, 3:])
+    return FrameObservability(sum(ranks), ranks, tuple(bases), projectors, flags, freedom)
 
 
 def _frame_basis(matrix: Array) -> Array:
@@ -164,7 +172,7 @@ def _frame_basis(matrix: Array) -> Array:
     _, values, rows = np.linalg.svd(matrix, full_matrices=False)
     if values[0] < 1e-9:
         return np.zeros((6, 0))
-    return np.asarray(rows[values > 1e-9 * values[0]].T, dtype=np.float64)
+    return np.asarray(rows[values > LEAST_SHOWN * values[0]].T, dtype=np.float64)
 
 
 def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) -> Array:

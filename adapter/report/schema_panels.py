@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
-from adapter.physics.identifiability import FrameObservability, frame_observability
+from adapter.physics.identifiability import frame_observability
 from adapter.report.style import (
     Drawing,
     Panel,
@@ -52,19 +52,14 @@ def schema_panels(data: RunData) -> list[Panel]:
     ]
     if data.reference is None:
         return panels
-    seen = observable(data, data.reference)
-    turn, shift = frame_errors(lam, data.reference, seen.projectors)
+    seen = frame_observability(data.documented.tree, data.reference, data.documented.gravity)
+    turn, shift = frame_errors(lam, data.reference, seen.freedom)
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
     titles = "Orientation error", "Position error"
     for title, error, (goal, unit) in zip(titles, (turn, shift), goals, strict=True):
         drawing = _errors(t, error, goal, unit, converged)
         panels.append(drawing.panel(title, unit, "in the directions that motion shows"))
     return panels
-
-
-def observable(data: RunData, lam: Array) -> FrameObservability:
-    """The directions of λ that any motion of this arm shows."""
-    return frame_observability(data.documented.tree, lam, data.documented.gravity)
 
 
 def rotation_path(lam: Array) -> Array:

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adapter.model.spatial import Array, exp_rotation, log_rotation, matrix_from_zxz, rot_z
+from adapter.model.spatial import Array, matrix_from_zxz, rot_z
 from adapter.model.tree import BASE, Tree
-from adapter.report.schema_panels import observable
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 from adapter.runs.run_folder import RunData
 
@@ -51,7 +50,7 @@ def skeleton_panels(data: RunData) -> list[Panel]:
     arms = {
         "documented": _arm(data, data.documented.lam, q),
         "initial": replace(_arm(data, data.start_lam, q), tips={}),  # all in one place
-        "learned": _skeleton(data, *completed(data, data.model.lam, reference), q),
+        "learned": _arm(data, data.model.lam, q),
     }
     if has_reference(data):
         arms["reference"] = _arm(data, reference, q)
@@ -83,24 +82,9 @@ def posture(data: RunData) -> Array:
     return np.asarray(some[int(np.argmax([s[min(1, len(s) - 1)] for s in spread]))])
 
 
-def completed(data: RunData, lam: Array, reference: Array) -> tuple[Array, Array]:
-    """Learned frames (R0, p), in the directions that nothing shows as the reference has them."""
-    turn = log_rotation(
-        matrix_from_zxz(lam[:, :3]) @ np.swapaxes(matrix_from_zxz(reference[:, :3]), 1, 2)
-    )
-    error = np.concatenate([turn, lam[:, 3:] - reference[:, 3:]], axis=1)
-    seen = np.einsum("jab,jb->ja", observable(data, reference).projectors, error)
-    turned = np.stack([exp_rotation(phi) for phi in seen[:, :3]])
-    return turned @ matrix_from_zxz(reference[:, :3]), reference[:, 3:] + seen[:, 3:]
-
-
 def _arm(data: RunData, lam: Array, q: Array) -> Skeleton:
-    return _skeleton(data, matrix_from_zxz(lam[:, :3]), lam[:, 3:], q)
-
-
-def _skeleton(data: RunData, rotations: Array, shifts: Array, q: Array) -> Skeleton:
     tree = data.documented.tree
-    R, p = placed(tree, rotations @ rot_z(q), shifts)
+    R, p = placed(tree, matrix_from_zxz(lam[:, :3]) @ rot_z(q), lam[:, 3:])
     tips = {}
     for j in set(range(tree.n)) - set(tree.parent):
         riding = [f.position for f in data.documented.frames if f.parent == tree.link_names[j]]

@@ -20,6 +20,7 @@ LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
 HIDDEN = 1e-6  # a share below it is none
+DOCUMENTED, PRIOR = "taken from the documentation", "held at its prior"
 
 TIMES = {
     "tick_us": "Compute: driver, filter, synthesis",
@@ -123,8 +124,8 @@ def schema_matrix(data: RunData) -> Matrix:
     std, names = data.model.lam_std, data.documented.tree.joint_names
     rank = data.figures["lambda"].get("identifiable_rank")
     rows = [
-        (name, [_cell(data.lam_shown[j, k], std[j, k], LAMBDA_UNITS[k], "start") for k in range(6)])
-        for j, name in enumerate(names)
+        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k], DOCUMENTED) for k in range(6)])
+        for name, shown, spread in zip(names, data.lam_shown, std, strict=True)
     ]
     summary = f"{rank} of {6 * data.n} directions"
     return Matrix("Body schema λ", summary, LAMBDA_NAMES, rows)
@@ -138,7 +139,7 @@ def theta_matrix(data: RunData) -> Matrix:
     rows = []
     for j, name in enumerate(names):
         shares = data.theta_shown[j] if started else np.zeros(10)
-        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], "prior") for k in range(10)]
+        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], PRIOR) for k in range(10)]
         rows.append((name, cells))
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
@@ -146,12 +147,12 @@ def theta_matrix(data: RunData) -> Matrix:
     return Matrix("Dynamics θ", summary, THETA_NAMES, rows)
 
 
-def _cell(share: float, std: float, unit: str, held_at: str) -> Cell:
+def _cell(share: float, std: float, unit: str, instead: str) -> Cell:
     if share > SHARE_ALONE:
         return Cell("alone", f"identifiable, standard deviation {number(std, 2)} {unit}")
     if share > HIDDEN:
         return Cell("mixed", "identifiable only in combination with others")
-    return Cell("hidden", f"not identifiable, held at its {held_at}")
+    return Cell("hidden", f"not identifiable, {instead}")
 
 
 def timing_table(figures: Mapping[str, Any]) -> Table | None:
@@ -219,7 +220,7 @@ def schema_table(data: RunData) -> Table:
             rows.append([f"{name}, {what}", *(f"{x:.4f}".replace("-", "−") for x in lam[j])])
     note = (
         "R = Rz(α) Rx(β) Rz(γ). Angles of one frame may differ and mean the same frame; "
-        "directions that motion does not show keep their start."
+        "what motion does not show is taken from the documentation."
     )
     units = ["", "rad", "rad", "rad", "m", "m", "m"]
     return Table(["Joint", "α", "β", "γ", "pₓ", "p_y", "p_z"], rows, units, note)

@@ -10,11 +10,13 @@ import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
+from adapter.learning.frame_fit import Frame, nearest, profiled_weights
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
+from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import base_parameters
 from adapter.signals.records import LinkMotionKind
 
@@ -30,6 +32,7 @@ class Outcome:
         start_lam, lam: (n, 6) λ at first and at last.
         lam_covariance, lam_identifiable: (n, 6, 6) of (turn, shift) in the parents' axes.
         lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
+        lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
         theta: (n, 10); effects: (e, n); variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
@@ -51,6 +54,8 @@ class Outcome:
     lam_rank: int
     lam_converged: bool
     lam_measured: bool
+    lam_moments: Array
+    lam_count: float
     theta: Array
     effects: Array
     variance: Array
@@ -89,6 +94,8 @@ def collect(learner: OnlineLearner) -> Outcome:
         lam_rank=schema.rank,
         lam_converged=schema.converged,
         lam_measured=schema.kind == LinkMotionKind.MEASURED,
+        lam_moments=schema.moments.M.copy(),
+        lam_count=schema.count,
         theta=theta.theta,
         effects=theta.effect_values.copy(),
         variance=theta.variance(),
@@ -117,8 +124,44 @@ def _course_of_lam(learner: OnlineLearner) -> Array:
     return np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
 
 
+@dataclass(frozen=True)
+class CompletedLambda:
+    """λ as it leaves the house.
+
+    Attributes:
+        lam: (n, 6), of all that explain the data as the learned one does the nearest to the
+            documented one.
+        filled: what of it the data do not show, so that the documentation says it; a sentence by
+            joint.
+    """
+
+    lam: Array
+    filled: list[str]
+
+
+def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda:
+    """The learned λ with what no data showed taken from the documentation, by a finite motion.
+
+    Torques stay what they were with θ as it is: what changes no link's motion changes no torque
+    (virtual work).
+    """
+    R, p = matrix_from_zxz(outcome.lam[:, :3]), outcome.lam[:, 3:]
+    told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
+    freedom = Freedom.of(np.eye(6) - outcome.lam_identifiable, p)
+    moved = freedom.nearest(R, p, *told)
+    found = [Frame(*x) for x in zip(*moved, strict=True)]
+    if outcome.lam_converged:  # else what moments say is not what was learned
+        for j, (sums, frame) in enumerate(zip(outcome.lam_moments, found, strict=True)):
+            weights = profiled_weights(sums, outcome.lam_count, Frame(R[j], p[j]))
+            to = Frame(told[0][j], told[1][j])
+            found[j] = nearest(sums, weights, frame, to, freedom.joint(j))
+    lam = np.array([np.r_[zxz_from_matrix(frame.R0), frame.p] for frame in found])
+    return CompletedLambda(lam, freedom.words(documented.tree))
+
+
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
-    """The self model a run ends with: what was learned in, what was not shown held and said so.
+    """The self model a run ends with, as it leaves the house: what was learned, and what no data
+    showed as the documentation has it, which is said.
 
     Effects of the documented model that were not learned stay in it as they are; those that
     ended with the recording they were found in are left out.
@@ -126,7 +169,8 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     documented, n = with_bodies(documented), documented.tree.n
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
-    base = base_parameters(documented.tree, outcome.lam, documented.gravity)
+    completed = completed_lambda(outcome, documented)
+    base = base_parameters(documented.tree, completed.lam, documented.gravity)
     share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
     known = outcome.theta_started_ns is not None
     body = outcome.covariance.diagonal()[: 10 * (n + 1)].reshape(-1, 10)
@@ -134,7 +178,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     return replace(
         documented,
         name=f"{documented.name} (learned)",
-        lam=outcome.lam,
+        lam=completed.lam,
         theta=outcome.theta,
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
@@ -145,6 +189,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={
             **provenance,
+            "lambda_filled": completed.filled,
             "theta_source": "learned" if known else "neutral prior: λ had not converged",
             "changes": changes(outcome),
         },
@@ -194,13 +239,15 @@ def changes(outcome: Outcome) -> list[dict[str, Any]]:
     return found
 
 
-def frame_errors(lam: Array, reference: Array, projectors: Array) -> tuple[Array, Array]:
-    """Rotation (…, n) rad and position (…, n) m errors in the observable directions.
+def frame_errors(lam: Array, reference: Array, freedom: Freedom) -> tuple[Array, Array]:
+    """Rotation (…, n) rad and position (…, n) m errors in what link motion shows.
+
+    The reference is moved to where it is nearest to λ among all frames that move alike.
 
     Args:
-        lam: (..., n, 6); reference: (n, 6); projectors: (n, 6, 6) in the parents' axes.
+        lam: (..., n, 6); reference: (n, 6); freedom: of its frames.
     """
-    turn = matrix_from_zxz(lam[..., :3]) @ np.swapaxes(matrix_from_zxz(reference[:, :3]), 1, 2)
-    error = np.concatenate([log_rotation(turn), lam[..., 3:] - reference[:, 3:]], axis=-1)
-    seen = np.einsum("jab,...jb->...ja", projectors, error)
-    return np.linalg.norm(seen[..., :3], axis=-1), np.linalg.norm(seen[..., 3:], axis=-1)
+    R, p = matrix_from_zxz(lam[..., :3]), lam[..., 3:]
+    R0, p0 = freedom.nearest(matrix_from_zxz(reference[:, :3]), reference[:, 3:], R, p)
+    turn = log_rotation(R @ np.swapaxes(R0, -1, -2))
+    return np.linalg.norm(turn, axis=-1), np.linalg.norm(p - p0, axis=-1)

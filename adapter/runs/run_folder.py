@@ -170,7 +170,7 @@ def run_data(
         effects = best[10 * (n + 1) :].reshape(-1, n)
         batch = rows.torque(best[: 10 * n].reshape(n, 10), effects)
     model = learned_model(outcome, documented)
-    basis = base_parameters(documented.tree, outcome.lam, documented.gravity).basis
+    basis = base_parameters(documented.tree, model.lam, documented.gravity).basis
     return RunData(
         figures=dict(figures),
         model=replace(model, provenance={**provenance, **model.provenance}),

@@ -20,7 +20,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import base_parameters, frame_observability
 from adapter.physics.rigid_arm import RigidArm
-from adapter.runs.outcome import Outcome, changes, frame_errors
+from adapter.runs.outcome import Outcome, changes, completed_lambda, frame_errors
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_GOAL = 1.1  # times the final batch least squares
@@ -83,13 +83,14 @@ def settled_at(times: Array, good: Any) -> float | None:
 def schema_score(
     outcome: Outcome, documented: SelfModel, reference: Reference, start_s: float | None
 ) -> dict[str, Any]:
-    """The `lambda` part of the figures; errors per joint in the observable directions."""
+    """The `lambda` part of the figures; errors per joint in what any link motion shows."""
+    completed = completed_lambda(outcome, documented)
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
     lam = outcome.schema_trace[:, 1:].reshape(-1, documented.tree.n, 6)
-    turn, shift = frame_errors(lam, reference.lam, seen.projectors)
+    turn, shift = frame_errors(lam, reference.lam, seen.freedom)
     inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
     at = settled_at(stamps_s(outcome.schema_trace), inside)
-    last_turn, last_shift = frame_errors(outcome.lam, reference.lam, seen.projectors)
+    last_turn, last_shift = frame_errors(completed.lam, reference.lam, seen.freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
         "converged_s": None if at is None or start_s is None else at - start_s,
@@ -104,7 +105,8 @@ def schema_score(
         "settled": outcome.lam_converged,
         "source": "measured" if outcome.lam_measured else "reproduces the documentation",
         "reference": reference.source,
-        "values": outcome.lam.tolist(),
+        "values": completed.lam.tolist(),
+        "filled": completed.filled,
     }
 
 
@@ -150,7 +152,8 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     the batch solution's on the same samples, joints in units of their noise.
     """
     n = documented.tree.n
-    base = base_parameters(documented.tree, outcome.lam, documented.gravity)
+    lam = completed_lambda(outcome, documented).lam
+    base = base_parameters(documented.tree, lam, documented.gravity)
     score: dict[str, Any] = {
         "converged_s": None,
         "base_parameters": base.rank,

@@ -14,6 +14,7 @@ from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.learning.learner import OnlineLearner
+from adapter.physics.freedom import Freedom
 from adapter.realtime.session import LockstepResult, run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, frame_errors
@@ -166,7 +167,8 @@ def difference(a: OnlineLearner, b: OnlineLearner) -> Difference:
     columns = np.array([_torque(a, unit.reshape(N, 10)) for unit in np.eye(10 * N)])
     spread = np.sqrt(np.einsum("amj,ab,bmj->mj", columns, covariance, columns))
     torque = np.einsum("a,amj->mj", apart, columns)
-    rotation, position = frame_errors(two.lam, one.lam, one.lam_identifiable)
+    freedom = Freedom.of(np.eye(6) - one.lam_identifiable, one.lam[:, 3:])
+    rotation, position = frame_errors(two.lam, one.lam, freedom)
     tau = _held_out()[3]
     errors = [np.linalg.norm(rms(tau - _torque(x, x.theta.theta))) for x in (a, b)]
     return Difference(

@@ -74,7 +74,7 @@ def learn(data: ArmData, mode: str = "moments", seed: int = 0) -> Run:
         values.append(learner.schema.lam if len(times) % 10 == 0 else None)
     kept = [(t, v) for t, v in zip(times, values, strict=True) if v is not None]
     seen = frame_observability(model.tree, truth.lam, model.gravity)
-    turn, shift = frame_errors(np.array([v for _, v in kept]), truth.lam, seen.projectors)
+    turn, shift = frame_errors(np.array([v for _, v in kept]), truth.lam, seen.freedom)
     return Run(learner, truth, seen, np.array([t for t, _ in kept]), turn, shift)
 
 
@@ -145,7 +145,7 @@ def test_mode_sample_runs_and_is_worse(kind: str) -> None:
     lam = theirs.learner.schema.lam
     assert np.isfinite(lam).all()
     assert theirs.turn[-1].max() > 10.0 * ours.turn[-1].max()
-    start, *_ = frame_errors(theirs.learner.schema.start_lam, ours.truth.lam, ours.seen.projectors)
+    start, *_ = frame_errors(theirs.learner.schema.start_lam, ours.truth.lam, ours.seen.freedom)
     assert theirs.turn[-1].mean() < start.mean()
 
 
@@ -189,6 +189,6 @@ def test_on_a_wall_and_under_a_ceiling(gravity: tuple[float, float, float]) -> N
     for state in states_of(record(truth, Motion(2.5, 3)), model):
         learner.learn_schema(state[None])
     seen = frame_observability(model.tree, model.lam, model.gravity)
-    turn, shift = frame_errors(learner.schema.lam, model.lam, seen.projectors)
+    turn, shift = frame_errors(learner.schema.lam, model.lam, seen.freedom)
     assert learner.schema.rank == seen.rank
     assert turn.max() < ROTATION_RAD and shift.max() < POSITION_M

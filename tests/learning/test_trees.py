@@ -54,7 +54,7 @@ def test_a_falling_tree_is_learned(seed: int, kind: str) -> None:
         for state in states_of(data, k):
             assert learner.step(state)
     seen = frame_observability(model.tree, model.lam, model.gravity)
-    turn, shift = frame_errors(learner.schema.lam[None], model.lam, seen.projectors)
+    turn, shift = frame_errors(learner.schema.lam[None], model.lam, seen.freedom)
     assert learner.theta_started_ns is not None and learner.theta_started_ns < 4e9
     assert turn.max() < 2e-3 and shift.max() < 3e-3
     error = (learner.predict(states_of(test)) - test.tau)[:, 6:]

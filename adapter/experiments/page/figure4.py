@@ -16,6 +16,7 @@ from adapter.experiments.page.words import grouped, with_unit
 from adapter.experiments.results import AtlasResults
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
+from adapter.physics.freedom import Freedom
 from adapter.report.skeleton import Skeleton, from_a_corner, placed
 from adapter.report.style import (
     ACCENT,
@@ -282,8 +283,8 @@ def _epoch_errors(atlas: AtlasResults) -> Panel:
     """One dot per joint: how far its frame is from the actual one in its parent's."""
     n = atlas.tree.n
     lam = np.stack([lam for _, lam in atlas.snapshots])
-    every = np.tile(np.eye(6), (n, 1, 1))
-    kinds = zip(("turn, rad", "shift, m"), frame_errors(lam, atlas.true_lam, every), strict=True)
+    off = frame_errors(lam, atlas.true_lam, Freedom.none(n))
+    kinds = zip(("turn, rad", "shift, m"), off, strict=True)
     drawing = Drawing("third", stretch=STRETCH)
     ax = drawing.axes[0]
     at = np.arange(len(lam))[:, None] + np.linspace(-0.13, 0.13, n)

@@ -12,15 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.learning.schema_kernels import WIDTH, accumulate, signals
+from adapter.learning.schema_kernels import CHANNELS, WIDTH, accumulate, signals
 from adapter.learning.tree_data import TreeData, check_motion
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, jit
 
-# What a link measures, in the order of the moments, and the kernel that knows its algebra.
-CHANNELS = ("w", "v", "a", "dw")
-KERNELS = (0, 1, 2, 0)
 # Which of the parent's signals stand in s, three numbers each; products of w_i come last in a's.
 _PARENT_SIGNALS = (("w",), ("v", "w"), ("a", "dw"), ("dw",))
 

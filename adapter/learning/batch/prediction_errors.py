@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.learning.batch.moments import CHANNELS
+from adapter.learning.schema_kernels import CHANNELS
 from adapter.learning.tree_data import (
     TreeData,
     check_dynamics,

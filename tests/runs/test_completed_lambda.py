@@ -1,0 +1,79 @@
+"""λ as it leaves the house: what no data showed is the documentation's, by a finite motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.effects.export import to_urdf
+from adapter.learning.learner import OnlineLearner
+from adapter.model.model_file import dumps, loads
+from adapter.model.spatial import matrix_from_zxz, rot_z, zxz_from_matrix
+from adapter.physics.freedom import Freedom
+from adapter.physics.identifiability import random_motion
+from adapter.physics.rigid_arm import RigidArm
+from adapter.runs.outcome import collect, completed_lambda, frame_errors, learned_model
+from adapter.runs.score import Reference, schema_score
+from sim.scenarios import build
+from tests.helpers.arm_data import Motion, arm, learner_for, panda_model, record, states_of, teach
+
+
+def taught(kind: str, seed: int) -> OnlineLearner:
+    truth = arm() if kind == "synthesized" else build("bent_link", seed).truth
+    data = record(truth, Motion(4.0, seed), links=kind == "measured")
+    return teach(learner_for(seed=seed), states_of(data))
+
+
+def places(text: str, q: np.ndarray) -> np.ndarray:
+    """Every joint's frame (n, 4, 4) in the base, by Pinocchio."""
+    model = pin.buildModelFromXML(text)
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    return np.array([data.oMi[k].homogeneous for k in range(1, model.njoints)])
+
+
+def test_the_exported_arm_stands_where_the_documented_one_does() -> None:
+    documented = panda_model()
+    model = learned_model(collect(taught("synthesized", 0)), documented)
+    for q in random_motion(documented.tree, 5, 1).q:
+        ours, theirs = (places(to_urdf(x), q) for x in (model, documented))
+        assert np.abs(ours - theirs).max() < 1e-6
+    filled = loads(dumps(model)).provenance["lambda_filled"]
+    assert [text.split(":")[0] for text in filled] == ["panda_joint1", "panda_joint2"]
+
+
+def test_a_finite_motion_costs_no_torque_and_counts_as_no_error() -> None:
+    """Joint 2 documented 86 degrees further about joint 1's axis, as on a UR."""
+    documented, outcome = panda_model(), collect(taught("synthesized", 1))
+    far = documented.lam.copy()
+    far[1, :3] = zxz_from_matrix(rot_z(1.5) @ matrix_from_zxz(far[1:2, :3]))[0]
+    far[1, 5] += 0.3
+    elsewhere = replace(documented, lam=far)
+    lam = completed_lambda(outcome, elsewhere).lam
+    np.testing.assert_allclose(lam, far, atol=1e-7)
+    motion = random_motion(documented.tree, 20, 2)
+    before, after = (
+        RigidArm.of(replace(documented, lam=x)).torque(*motion) for x in (outcome.lam, lam)
+    )
+    assert np.abs(after - before).max() < 1e-3  # N m, of 80; λ itself is learned to 1e-6
+    score = schema_score(outcome, elsewhere, Reference(documented.lam, None, "there"), 0.0)
+    assert max(score["rotation_error_rad"]) < 1e-6 and max(score["position_error_m"]) < 1e-6
+    assert score["converged_s"] is not None and len(score["filled"]) == 2
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_measured_frames_keep_what_the_data_show(seed: int) -> None:
+    documented, learner = panda_model(), taught("measured", seed)
+    outcome = collect(learner)
+    lam = completed_lambda(outcome, documented).lam
+    np.testing.assert_allclose(lam[0, 3:], documented.lam[0, 3:], atol=1e-9)
+    seen = build("bent_link", seed).truth.lam
+    projected = np.eye(6) - outcome.lam_identifiable
+    assert np.abs(np.einsum("jaa->j", projected) - [4, 1, 0, 0, 0, 0, 0]).max() < 1e-6
+    turn, shift = (x[2:] for x in frame_errors(lam, seen, Freedom.none(7)))
+    std = np.sqrt(np.einsum("jaa->ja", outcome.lam_covariance))[2:]
+    assert (turn < 5.0 * np.linalg.norm(std[:, :3], axis=1)).all()
+    assert (shift < 5.0 * np.linalg.norm(std[:, 3:], axis=1)).all()
