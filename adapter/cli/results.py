@@ -133,6 +133,7 @@ def run_export(args: argparse.Namespace) -> int:
     model = check_effects(load_model(args.model), args.model)
     path = args.urdf or args.onto.with_suffix(".learned.urdf")
     written = write_urdf(model, path, args.onto, args.alone)
+    filled = list(model.provenance.get("lambda_filled", ()))
     facts = {
         "model": str(args.model),
         "urdf": str(path),
@@ -140,12 +141,12 @@ def run_export(args: argparse.Namespace) -> int:
         "lambda_source": model.lambda_source,
         "left_out": written.left_out,
         "notes": written.notes,
-        "lambda_filled": list(model.provenance.get("lambda_filled", ())),
+        "lambda_filled": filled,
     }
     write_json(args.json, facts)
     onto = "" if written.onto is None else f" onto {written.onto}"
     console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
-    for words in facts["lambda_filled"]:
+    for words in filled:
         console.print(f"  from the documentation, as no data showed it: {words}", soft_wrap=True)
     return 0
 
