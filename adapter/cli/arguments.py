@@ -6,6 +6,7 @@ Nothing here brings a library that takes long to load: wrong use is answered at 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -129,6 +130,7 @@ def _add_learning(parser: argparse.ArgumentParser) -> None:
     """Options of everything that learns."""
     add = parser.add_argument
     add("--robot", metavar="NAME|FILE", help="documented robot: panda (default), .urdf or .json")
+    _add_joints(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--mode", choices=MODES, help="moments (default) or the paper's sample")
     add(
@@ -150,6 +152,40 @@ def _add_learning(parser: argparse.ArgumentParser) -> None:
     add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
 
 
+def _add_joints(parser: argparse.ArgumentParser) -> None:
+    """Which joints of the model move; those that a recording lacks are locked at zero."""
+    add = parser.add_argument
+    add("--joints", metavar="A,B,C", help="joints of the model that move; the others are locked")
+    add(
+        "--lock",
+        action="append",
+        default=[],
+        metavar="JOINT=VALUE",
+        help="lock a joint at a value, rad or m (default: zero where a recording lacks it)",
+    )
+
+
+def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
+    """Names given to `--joints`."""
+    if args.joints is None:
+        return None
+    return tuple(name.strip() for name in args.joints.split(",") if name.strip())
+
+
+def locks_of(args: argparse.Namespace) -> dict[str, float]:
+    """Values given to `--lock` by joint. Raises UsageError."""
+    values = {}
+    for option in args.lock:
+        name, _, text = option.rpartition("=")
+        try:
+            values[name.strip()] = float(text)
+        except ValueError:
+            name = ""
+        if not name.strip() or not math.isfinite(values[name.strip()]):
+            raise UsageError(f"--lock '{option}' is not JOINT=VALUE, a number in rad or m")
+    return values
+
+
 def _add_results(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     _add_json(parser)
@@ -163,6 +199,7 @@ def _add_json(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_learning(args: argparse.Namespace) -> None:
+    locks_of(args)
     if args.robot is not None:
         _check_robot(args.robot)
     _check_files(args.config, args.truth, args.resume)
@@ -230,6 +267,7 @@ def _gap(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL",
         help="self model (.json), .urdf, or a robot known by name: panda",
     )
+    _add_joints(parser)
     add(
         "--inertia-prior",
         type=float,
@@ -251,6 +289,7 @@ def _gap(parser: argparse.ArgumentParser) -> None:
 def _check_gap(args: argparse.Namespace) -> None:
     if args.validate_from is not None and len(args.logs) > 1:
         raise UsageError("--validate-from splits one LOG; of several the last one is held out")
+    locks_of(args)
     _check_robot(args.model)
     _check_files(*args.logs)
 

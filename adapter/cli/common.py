@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 from typing import Any
 
+from adapter.cli.arguments import joints_of, locks_of
 from adapter.cli.names import effects_named
 from adapter.effects.active import check_effects
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
@@ -16,9 +17,11 @@ from adapter.runs.config import Config, config_from, config_table, read_config
 from adapter.runs.terminal import program_version, warn
 
 
-def robot_of(name: str | None) -> SelfModel:
-    """The documented robot by name or file."""
-    return check_effects(documented(name or "panda"), name or "panda")
+def robot_of(args: argparse.Namespace, name: str | None) -> SelfModel:
+    """The documented robot by name or file, with the joints that the command line asks for."""
+    name = name or "panda"
+    model = documented(name, joints=joints_of(args), lock=locks_of(args))
+    return check_effects(model, name)
 
 
 def configure(

@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
+from adapter.cli.common import robot_of
 from adapter.cli.results import write_urdf
 from adapter.cli.rollouts import Rollouts
-from adapter.effects.active import check_effects
 from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.screen import RecordingRefused
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap
 from adapter.model.model_file import load_model
-from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
 from adapter.runs.compiling import announce_compiling
@@ -38,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     if args.rounds is not None:
         settings = replace(settings, rounds=args.rounds)
     announce_compiling(console.print)
-    nominal = check_effects(documented(args.model), args.model)
+    nominal = robot_of(args, args.model)
     folder = results_folder(args.out, "gap")
     model_out = _new_model(folder, args.model)
     rollouts = None if args.no_simulation else Rollouts()

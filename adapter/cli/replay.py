@@ -16,7 +16,6 @@ from adapter.cli.common import configure, robot_of
 from adapter.cli.results import Learned, conclude
 from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
-from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config
@@ -32,7 +31,7 @@ from adapter.runs.replay import (
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, results_folder, warn
-from adapter.signals.matching import matching
+from adapter.signals.matching import matching, present
 from adapter.signals.validation import validation_torque_rmse
 from drivers.files.mcap import Log, read_log
 
@@ -46,9 +45,10 @@ def run(args: argparse.Namespace) -> int:
     robot = _robot(args, whole)
     recorded = recorded if isinstance(recorded, dict) else None
     config = configure(args, recorded, robot)
-    robot = config.apply(robot)
+    robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
     log = matching(whole, robot)
+    log.warnings.extend(locked)
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
     warn(notes)
@@ -101,11 +101,11 @@ def _robot(args: argparse.Namespace, log: Log) -> SelfModel:
     """The robot asked for, else the one that the recording carries, else the Panda."""
     carried = log.attachments.get("documented.json")
     if args.robot is not None or carried is None:
-        return robot_of(args.robot)
+        return robot_of(args, args.robot)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "documented.json"
         path.write_bytes(carried)
-        return load_model(path)
+        return robot_of(args, str(path))
 
 
 def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:

@@ -32,7 +32,9 @@ from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
 from adapter.runs.terminal import console, program_version, results_folder, warn
 from adapter.signals.front_end import FrontEnd
+from adapter.signals.matching import present
 from drivers.faults.driver import FaultyDriver, with_faults
+from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import HARDWARE, open_driver, split_address
 
@@ -78,12 +80,14 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     Raises:
         UsageError, SettingsError, ModelError, ValueError: what is asked for does not exist.
     """
-    robot = robot_of(args.robot)
+    robot = robot_of(args, args.robot)
     scheme, _ = split_address(args.driver)
     world = None
     if simulated(args.driver):
         builder = import_module(SIMULATED_BY)
         world = builder.simulation(args.driver, args.scenario, args.set, args.seed or 0)
+    robot, locked = present(robot, _joints_of_arm(args.driver, world), args.driver)
+    warn(locked)
     config = configure(args, None, robot)
     maybe_real = world is None and scheme in HARDWARE
     if maybe_real and _may_move(args) and not config.excitation.slow_s:
@@ -91,6 +95,14 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
         gentle = dataclasses.replace(config.excitation, slow_s=SLOW_S, share=share)
         config = dataclasses.replace(config, excitation=gentle)
     return RunPlan(config.apply(robot), config, world, maybe_real)
+
+
+def _joints_of_arm(address: str, world: SimulationLike | None) -> tuple[str, ...]:
+    """Names of the arm's joints; () where it has none of its own and takes those of the model."""
+    scheme, rest = split_address(address)
+    if world is not None:
+        return tuple(world.scenario.truth.joint_names)
+    return read_log(rest).joint_names if scheme == "log" else ()
 
 
 def open_arm(args: argparse.Namespace, plan: RunPlan) -> Driver:

@@ -30,6 +30,7 @@ from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.matching import present
 from drivers.files.mcap import Log, read_log
 
 SIGNIFICANT = 3.0  # standard deviations
@@ -102,7 +103,7 @@ def find_gap(
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
     result = replace(_result(task, measured), model_in=name)
     if model_out is not None:
-        save_model(model_of(nominal, measured.found.fit), model_out)
+        save_model(model_of(task.model, measured.found.fit), model_out)
         result = replace(result, model_out=str(model_out))
     return replace(result, wall_s=time.monotonic() - begun)
 
@@ -111,11 +112,14 @@ def _task(
     logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
 ) -> GapTask:
     """Read and screen. Raises Refusal."""
-    arm = RigidArm.of(model)
-    screened: list[Screened] = []
+    read, locked = [], []
     for log in logs:
         progress(f"reading {_name(log)}")
-        screened.append(refuse(log if isinstance(log, Log) else read_log(Path(log)), model, arm))
+        read.append(log if isinstance(log, Log) else read_log(Path(log)))
+        model, said = present(model, read[-1].joint_names, read[-1].path.name)
+        locked += said
+    arm = RigidArm.of(model)
+    screened: list[Screened] = [refuse(log, model, arm) for log in read]
     recordings = tuple(Recorded.of(x.log, _lateness(x.timing)) for x in screened)
     if len(recordings) > 1:
         fitted, scored = recordings[:-1], recordings[-1:]
@@ -130,7 +134,8 @@ def _task(
         moving=tuple(x.moving for x in screened[: len(fitted)]),
         period_s=max(x.timing.period_s for x in screened),
         one_clock=len(logs) == 1,
-        notes=tuple(
+        notes=tuple(locked)
+        + tuple(
             f"{x.log.path.name}: {note}" if len(logs) > 1 else note
             for x in screened
             for note in x.notes

@@ -19,6 +19,7 @@ from adapter.model.inertia import (
     move_theta,
     pseudo_inertia,
 )
+from adapter.model.locking import LOCKED
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz, rot_z, rotation_angle
@@ -62,7 +63,9 @@ def changes_onto(model: SelfModel, more: Additions, robot: FileRobot) -> Changes
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # what is locked was said at reading
-        merged = Merged(robot, model.tree.joint_names)
+        lock = model.provenance.get(LOCKED, {})
+        lock = {name: value for name, value in lock.items() if name in robot.joints}
+        merged = Merged(robot, model.tree.joint_names, lock)
     read = merged.model(model.tree.floating, model.gravity)
     found = differences(model, read)
     if found:

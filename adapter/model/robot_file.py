@@ -9,7 +9,7 @@ wants it: R_ij = Q_iᵀ R_file Q_j Rz(q), p = Q_iᵀ p_file. `urdf_text` undoes 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,18 +17,21 @@ import numpy as np
 
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import move_theta
+from adapter.model.locking import LOCKED
 from adapter.model.self_model import FixedFrame, Limits, SelfModel, Source, turned_theta
-from adapter.model.spatial import Array, z_to_axis, zxz_from_matrix
+from adapter.model.spatial import Array, exp_rotation, z_to_axis, zxz_from_matrix
 from adapter.model.tree import BASE, Tree
 
 TURNING = ("revolute", "continuous")
+SLIDING = ("prismatic",)
 
 
 @dataclass(frozen=True)
 class FileJoint:
     """A joint as written: placement in the parent link's frame, axis in its own.
 
-    `limits` are [lower upper velocity effort], NaN where not given.
+    `limits` are [lower upper velocity effort], NaN where not given; `mimic` is the name of the
+    joint that it follows, the factor and the offset.
     """
 
     name: str
@@ -39,7 +42,7 @@ class FileJoint:
     position: Array
     axis: Array
     limits: Array
-    mimic: bool
+    mimic: tuple[str, float, float] | None
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,18 @@ class FileRobot:
     links: dict[str, Array]
     joints: dict[str, FileJoint]
     source: Source
+
+    def value(self, joint: FileJoint, moving: set[str], lock: Mapping[str, float]) -> float:
+        """Where a joint that does not move stands, rad or m: as told, after its leader, or 0."""
+        seen, factor, offset = {joint.name}, 1.0, 0.0
+        while joint.name not in lock and joint.mimic is not None:
+            leader, times, plus = joint.mimic
+            factor, offset = factor * times, offset + factor * plus
+            if leader in moving or leader in seen or leader not in self.joints:
+                return 0.0
+            seen.add(leader)
+            joint = self.joints[leader]
+        return factor * lock.get(joint.name, 0.0) + offset
 
 
 def _names(joints: dict[str, FileJoint]) -> str:
@@ -89,28 +104,38 @@ def _root(robot: FileRobot) -> str:
     return roots[0]
 
 
-def _moving(robot: FileRobot, wanted: Sequence[str] | None) -> set[str]:
-    """Names of the joints that move in the model; warns about each that is locked."""
-    turning = {j.name for j in robot.joints.values() if j.kind in TURNING}
-    free = {name for name in turning if not robot.joints[name].mimic}
-    chosen = free if wanted is None else set(wanted)
-    for name in sorted(chosen):
-        joint = robot.joints.get(name)
-        if joint is None or joint.kind not in TURNING:
-            fault = "is not there" if joint is None else f"is {joint.kind}"
-            raise ModelError(
-                f"{robot.file}: joint '{name}', asked for, {fault}; have turning joints: "
-                f"{', '.join(j for j in robot.joints if j in turning)}"
-            )
+def _moving(robot: FileRobot, wanted: Sequence[str] | None, lock: Mapping[str, float]) -> set[str]:
+    """Names of the joints that move in the model; warns about each that is locked unasked."""
+    free = [j.name for j in robot.joints.values() if j.kind in TURNING and j.mimic is None]
+    chosen = {name for name in free if name not in lock} if wanted is None else set(wanted)
+    _check_joints(robot, chosen, TURNING, "turning joints")
+    _check_joints(robot, lock, (*TURNING, *SLIDING), "joints that can be locked")
+    if chosen & lock.keys():
+        both = min(chosen & lock.keys())
+        raise ModelError(f"{robot.file}: joint '{both}' cannot be learned and locked; do one")
     for joint in robot.joints.values():
-        if joint.name not in chosen and joint.kind != "fixed":
+        if joint.name not in (*chosen, *lock) and joint.kind != "fixed":
+            value = robot.value(joint, chosen, lock)
             follows = " and mimics another" if joint.mimic else ""
+            at = "zero" if value == 0.0 else f"{value:.6g}"
             warnings.warn(
-                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}; locked at zero",
+                f"{robot.file}: joint '{joint.name}' is {joint.kind}{follows}; locked at {at}",
                 ModelWarning,
                 stacklevel=6,
             )
     return chosen
+
+
+def _check_joints(robot: FileRobot, names: Iterable[str], kinds: Sequence[str], what: str) -> None:
+    """Refuse a name without a joint of these kinds."""
+    for name in sorted(names):
+        joint = robot.joints.get(name)
+        if joint is None or joint.kind not in kinds:
+            fault = "is not there" if joint is None else f"is {joint.kind}"
+            have = ", ".join(j.name for j in robot.joints.values() if j.kind in kinds)
+            raise ModelError(
+                f"{robot.file}: joint '{name}', asked for, {fault}; have {what}: {have}"
+            )
 
 
 @dataclass
@@ -138,9 +163,14 @@ class Merged:
         ModelError: one sentence naming the file, the element and the choices.
     """
 
-    def __init__(self, robot: FileRobot, joints: Sequence[str] | None = None) -> None:
-        self.robot = robot
-        self.moving = _moving(robot, joints)
+    def __init__(
+        self,
+        robot: FileRobot,
+        joints: Sequence[str] | None = None,
+        lock: Mapping[str, float] | None = None,
+    ) -> None:
+        self.robot, self.lock = robot, lock or {}
+        self.moving = _moving(robot, joints, self.lock)
         self.place: dict[str, tuple[int, Array, Array]] = {}
         self.order: list[Body] = []
         self.frames: list[FixedFrame] = []
@@ -177,6 +207,11 @@ class Merged:
             turned = turned_theta(theta, turn.T)
             self.order.append(Body(joint.child, number, joint, r @ turn, p, turned))
             return len(self.order) - 1, turn.T, np.zeros(3)
+        value = self.robot.value(joint, self.moving, self.lock)
+        if joint.kind in TURNING:
+            r = r @ exp_rotation(joint.axis * value)
+        else:
+            p = p + r @ joint.axis * value
         body = self.body(number)
         body.theta = body.theta + move_theta(theta, r, p)
         body.merged.append(joint.child)
@@ -219,6 +254,7 @@ class Merged:
             base.name,
         )
         theta = np.stack([body.theta for body in order])
+        locked = {LOCKED: dict(self.lock)} if self.lock else {}
         lam = np.stack([np.r_[zxz_from_matrix(b.rotation), b.position] for b in order])
         return SelfModel(
             name=self.robot.name,
@@ -231,5 +267,5 @@ class Merged:
             frames=tuple(self.frames),
             gravity=gravity,
             source=replace(self.robot.source, lam=lam),
-            provenance={self.robot.source.format: Path(self.robot.file).name},
+            provenance={self.robot.source.format: Path(self.robot.file).name, **locked},
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError
 from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
-from adapter.model.robot_file import TURNING, FileJoint, FileRobot, Merged
+from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
 from adapter.model.self_model import URDF, SelfModel, Source, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, vector3
 
@@ -25,6 +25,7 @@ def read_urdf(
     joints: Sequence[str] | None = None,
     floating: bool = False,
     gravity: ArrayLike | None = None,
+    lock: Mapping[str, float] | None = None,
 ) -> SelfModel:
     """The self model of a URDF file.
 
@@ -35,12 +36,14 @@ def read_urdf(
             warning). The model's order is that of the tree, parents first.
         floating: whether the base is free.
         gravity: (3,) acceleration of gravity in base axes, m/s²; [0 0 -9.81] where None.
+        lock: values of joints to be locked, rad, and m of prismatic ones; those that mimic a
+            locked joint follow it.
 
     Raises:
         ModelError: one sentence naming the file, the element and the choices.
     """
     text = file_text(path)
-    return model_from_urdf(text, str(path), joints, floating, gravity)
+    return model_from_urdf(text, str(path), joints, floating, gravity, lock)
 
 
 def model_from_urdf(
@@ -49,9 +52,10 @@ def model_from_urdf(
     joints: Sequence[str] | None = None,
     floating: bool = False,
     gravity: ArrayLike | None = None,
+    lock: Mapping[str, float] | None = None,
 ) -> SelfModel:
     """As `read_urdf`, from the text; `file` is what errors and provenance call it."""
-    merged = Merged(parse_urdf(text, file), joints)
+    merged = Merged(parse_urdf(text, file), joints, lock)
     down = gravity_down() if gravity is None else vector3(gravity)
     return merged.model(floating, down)
 
@@ -161,11 +165,22 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint
             raise ModelError(f"{where} names {end} '{link}'; have links: {', '.join(links)}")
         ends[end] = link
     rotation, position = _origin(element, where)
-    axis = _axis(element, where) if kind in TURNING else np.array([1.0, 0.0, 0.0])
+    axis = _axis(element, where) if kind in (*TURNING, *SLIDING) else np.array([1.0, 0.0, 0.0])
     return FileJoint(
         name, kind, ends["parent"], ends["child"], rotation, position, axis,
-        _limits(element, kind, where), element.find("mimic") is not None,
+        _limits(element, kind, where), _mimic(element, where),
     )  # fmt: skip
+
+
+def _mimic(element: ET.Element, where: str) -> tuple[str, float, float] | None:
+    found = element.find("mimic")
+    if found is None:
+        return None
+    numbers = {"multiplier": 1.0, "offset": 0.0}
+    for key in numbers:
+        if found.get(key) is not None:
+            numbers[key] = _number(found, key, where)
+    return found.get("joint", ""), numbers["multiplier"], numbers["offset"]
 
 
 def _axis(element: ET.Element, where: str) -> Array:

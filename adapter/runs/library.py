@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from adapter.effects.active import check_effects
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import robot_urdf
 from adapter.effects.torque import ModelTorque
-from adapter.errors import ModelError, SettingsError
+from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult
 from adapter.gap.workflow import GapSettings
 from adapter.gap.workflow import find_gap as gap_of
@@ -31,7 +32,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
-from adapter.signals.matching import matching
+from adapter.signals.matching import matching, present
 from adapter.signals.validation import validation_torque_rmse
 from drivers.files.mcap import Log
 from drivers.files.mcap import read_log as read_mcap
@@ -41,12 +42,17 @@ HELD_OUT_SHARE = 0.25  # of a recording, at its end
 EXPORTED = (".urdf", ".json")
 
 
-def load_model(name: str | Path, joints: Sequence[str] | None = None) -> SelfModel:
+def load_model(
+    name: str | Path,
+    joints: Sequence[str] | None = None,
+    lock: Mapping[str, float] | None = None,
+) -> SelfModel:
     """The model of an arm: S = {N, A, λ, θ} (paper, eq. 1), with limits, effects and gravity.
 
     Args:
         name: a robot known by name (`panda`), a .urdf file, or a model file (.json) of ours.
-        joints: which joints of a URDF are wanted; all revolute ones where None.
+        joints: which joints are wanted; all revolute ones where None. The others are locked.
+        lock: values of joints to be locked, by name, rad or (a finger's) m.
 
     Returns:
         The model. `lam` (n, 6) holds each joint frame in its parent's, [α β γ px py pz], rad and
@@ -63,7 +69,7 @@ def load_model(name: str | Path, joints: Sequence[str] | None = None) -> SelfMod
     >>> panda.lam.shape, panda.theta.shape
     ((7, 6), (7, 10))
     """
-    return check_effects(documented(name, joints), name)
+    return check_effects(documented(name, joints, lock=lock), name)
 
 
 def read_log(path: str | Path, joint_names: Sequence[str] | None = None) -> Log:
@@ -186,8 +192,7 @@ def learn(
     >>> bool((found.held_out_rmse_nm < 0.2).all())
     True
     """
-    arm, whole = _model(model), _log(log)
-    own = matching(whole, arm)
+    arm, own = _fitting(model, log)
     end_s = float(seconds(own)[-1]) if len(own) else 0.0
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
@@ -360,8 +365,7 @@ def filtered(log: Log | str | Path, model: SelfModel | str | Path = "panda") -> 
     >>> adapter.filtered("recordings/panda_nominal_6s.mcap")
     FilteredSignals(5777 instants of 7 joints)
     """
-    arm = _model(model)
-    own = matching(_log(log), arm)
+    arm, own = _fitting(model, log)
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)
     front_end = make_front_end(arm, PipelineSettings(filter=filter_settings))
     states = front_end.step_table(own.stamp_ns, own.q, own.dq, own.tau)
@@ -461,6 +465,15 @@ def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -
 
 def _model(model: SelfModel | str | Path) -> SelfModel:
     return model if isinstance(model, SelfModel) else documented(model)
+
+
+def _fitting(model: SelfModel | str | Path, log: Log | str | Path) -> tuple[SelfModel, Log]:
+    """Model and recording with the same joints; a warning where the recording lacks some."""
+    whole = _log(log)
+    arm, locked = present(_model(model), whole.joint_names, whole.path)
+    for sentence in locked:
+        warnings.warn(sentence, ModelWarning, stacklevel=3)
+    return arm, matching(whole, arm)
 
 
 def _log(log: Log | str | Path) -> Log:

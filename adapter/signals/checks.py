@@ -21,6 +21,9 @@ from adapter.signals.settings import FrontEndSettings
 
 # What no joint of an arm does, where its documentation is silent: rad, rad/s, N m.
 Q_CAP, DQ_CAP, TAU_CAP = 1e4, 1e3, 1e5
+# A documented speed is the maker's, or what somebody typed: readings beyond its range are believed
+# up to the fastest joint there is, where the positions between two samples move so.
+SLOWEST, FASTEST, SO_ALIKE = 2.0, 30.0, 0.5  # rad/s, rad/s, share of the speed
 RESYNC_AFTER = 100  # stamps in a row that lie before the newest: the newest was wrong
 STREAK = 10  # so many old stamps in a row are a clock put back, not late samples
 # From one sample to the next a reading may change by so many times its usual change, plus, for
@@ -78,8 +81,9 @@ class Memory(NamedTuple):
         usual: (3, n) squares of the readings' usual changes.
         since: (n,) int64 stamps at which the joints' readings last changed.
         ahead: (3 n,) the reading whose stamp lay far ahead.
-        marks: (9,) int64, see `Mark`.
+        marks: (10,) int64, see `Mark`.
         filter: of the filter.
+        fastest: (n,) highest filtered |dq|, rad/s.
     """
 
     last: Array
@@ -90,6 +94,7 @@ class Memory(NamedTuple):
     ahead: Array
     marks: NDArray[np.int64]
     filter: FilterState
+    fastest: Array
 
 
 class Mark(IntEnum):
@@ -104,25 +109,31 @@ class Mark(IntEnum):
     CONFIRMED = 6  # how many samples in a row confirm it
     JUMPED = 7  # joint whose encoder jumped
     USUAL_DT = 8  # ns between samples
+    LAST = 9  # stamp of `Memory.last`
 
 
 def rules_of(limits: Limits, settings: FrontEndSettings, joint_filter: JointFilter) -> Rules:
-    """Where the documentation is silent the caps above hold, and every step is believed."""
+    """Where the documentation is silent the caps above hold, and every step is believed.
+
+    An effort of zero is what exporters write where nobody said.
+    """
+    velocity = np.maximum(limits.velocity, SLOWEST)
+    known_effort = np.where(limits.effort > 0.0, limits.effort, np.nan)
     allowed = [
         np.nan_to_num(limits.lower - settings.q_margin, nan=-Q_CAP),
         np.nan_to_num(limits.upper + settings.q_margin, nan=Q_CAP),
-        np.nan_to_num(limits.velocity * settings.range_factor, nan=DQ_CAP),
-        np.nan_to_num(limits.effort * settings.range_factor, nan=TAU_CAP),
+        np.nan_to_num(velocity * settings.range_factor, nan=DQ_CAP),
+        np.nan_to_num(known_effort * settings.range_factor, nan=TAU_CAP),
     ]
     floor = np.array(
         [
-            Q_STEP * joint_filter.settings.period_s * limits.velocity,
-            DQ_STEP * limits.velocity,
-            TAU_STEP * limits.effort,
+            Q_STEP * joint_filter.settings.period_s * velocity,
+            DQ_STEP * velocity,
+            TAU_STEP * known_effort,
         ]
     )
     floor[np.isnan(floor)] = np.inf
-    effort, gap_ns = limits.effort * settings.saturation, round(1e9 * settings.max_gap_s)
+    effort, gap_ns = known_effort * settings.saturation, round(1e9 * settings.max_gap_s)
     return Rules(np.array(allowed), effort, floor, settings.rest_dq, gap_ns, joint_filter.gains)
 
 
@@ -134,7 +145,7 @@ def packed(rules: Rules) -> Array:
 
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 6,), (8, 3, n) and (n + 11,)."""
+    """`Rules` and `Memory` as views of (8 n + 6,), (9, 3, n) and (n + 12,)."""
     n = memory.shape[2]
     at = 8 * n
     rest_dq, gap_ns, k1, k2 = rules[at], rules[at + 1], rules[at + 2], rules[at + 3]
@@ -142,7 +153,7 @@ def unpacked(rules, memory, whole):
     gains = Gains(k1, k2, int(delay_ns), int(settle_ns))
     allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
     own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, int(gap_ns), gains)
-    since, marks, times = whole[:n], whole[n : n + 9], whole[n + 9 :]
+    since, marks, times = whole[:n], whole[n : n + 10], whole[n + 10 :]
     ahead, old, y, dy = (
         memory[4].reshape(3 * n),
         memory[5].reshape(3 * n),
@@ -151,28 +162,39 @@ def unpacked(rules, memory, whole):
     )
     state = FilterState(times, old, y, dy)
     last, good, doubted, usual = memory[0], memory[1], memory[2], memory[3]
-    return own, Memory(last, good, doubted, usual, since, ahead, marks, state)
+    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, memory[8, 0])
 
 
 @jit
-def judge(q, dq, tau, allowed, last):
+def moves_so(moved, dq, dt_s):
+    """Whether a joint that moved so far, rad, within dt_s has the speed that it reads."""
+    return dt_s > 0.0 and abs(dq) < FASTEST and abs(moved - dq * dt_s) < SO_ALIKE * abs(dq) * dt_s
+
+
+@jit
+def judge(stamp, q, dq, tau, rules, memory):
     """Verdict on raw readings: GOOD, NON_FINITE, OUT_OF_RANGE or REPEATED, all those of `last`.
 
-    `last` (3, n) is overwritten with good readings.
+    `memory.last` is overwritten with readings whose positions and torques are in range.
     """
+    allowed, last, marks = rules.range, memory.last, memory.marks
     lower, upper, dq_max, tau_max = allowed[0], allowed[1], allowed[2], allowed[3]
-    same = True
+    dt_ns = stamp - marks[Mark.LAST] if marks[Mark.LAST] != NEVER else 0
+    dt_s = 1e-9 * dt_ns if dt_ns <= rules.gap_ns else 0.0
+    same, fast = True, False
     for j in range(q.shape[0]):
         if not (np.isfinite(q[j]) and np.isfinite(dq[j]) and np.isfinite(tau[j])):
             return Verdict.NON_FINITE
     for j in range(q.shape[0]):
-        if q[j] < lower[j] or q[j] > upper[j] or abs(dq[j]) > dq_max[j] or abs(tau[j]) > tau_max[j]:
+        if q[j] < lower[j] or q[j] > upper[j] or abs(tau[j]) > tau_max[j]:
             return Verdict.OUT_OF_RANGE
+        fast = fast or (abs(dq[j]) > dq_max[j] and not moves_so(q[j] - last[0, j], dq[j], dt_s))
         same = same and q[j] == last[0, j] and dq[j] == last[1, j] and tau[j] == last[2, j]
-    if same:
+    if same and not fast:
         return Verdict.REPEATED
     last[0], last[1], last[2] = q, dq, tau
-    return Verdict.GOOD
+    marks[Mark.LAST] = stamp
+    return Verdict.OUT_OF_RANGE if fast else Verdict.GOOD
 
 
 @jit

@@ -38,6 +38,16 @@ NOTEWORTHY = (
     Verdict.ENCODER_JUMP,
 )
 
+UNSEEN = (
+    Mark.SATURATED_UNTIL,
+    Mark.FIRST_MOVING,
+    Mark.SEEN,
+    Mark.AHEAD,
+    Mark.DOUBTED,
+    Mark.LAST,
+)  # stamps of what has not been yet
+FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
+
 
 class Samples(NamedTuple):
     """Raw samples: stamps (m,) int64 ns; q, dq, tau (m, n)."""
@@ -67,7 +77,7 @@ def taken(samples, i, rules, memory, answers):
     """Verdict on sample i; filtered into its record where it teaches something."""
     stamp, dq, tau, marks = samples.stamps[i], samples.dq[i], samples.tau[i], memory.marks
     times, gains = memory.filter.times, rules.gains
-    verdict = judge(samples.q[i], dq, tau, rules.range, memory.last)
+    verdict = judge(stamp, samples.q[i], dq, tau, rules, memory)
     seen, ahead_ns = marks[Mark.SEEN], marks[Mark.AHEAD]
     if verdict == Verdict.GOOD:
         verdict = in_order(stamp, rules.gap_ns, times, marks)
@@ -117,6 +127,8 @@ def worth(stamp, x, settled, rules, memory):
         marks[Mark.FIRST_MOVING] = stamp
     if not settled:
         return Verdict.FILTER_SETTLING
+    for j in range(n):
+        memory.fastest[j] = max(memory.fastest[j], abs(memory.filter.y[n + j]))
     if not moving:
         return Verdict.AT_REST
     if stamp <= marks[Mark.SATURATED_UNTIL]:
@@ -132,7 +144,7 @@ def process(signals, rules, memory, whole, records, answers):
 
     Args:
         signals: (m, 3, n) q, dq, tau.
-        rules: as packed by `packed`; memory: (8, 3, n) and whole: (n + 11,) int64, see `unpacked`.
+        rules: as packed by `packed`; memory: (9, 3, n) and whole: (n + 12,) int64, see `unpacked`.
         records: (m, size), filled where the verdict is GOOD.
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
@@ -162,7 +174,6 @@ class FrontEnd:
     Attributes:
         refused: how many samples were not passed on, by reason.
         gaps: (stamp_ns, seconds) of each hole that restarted the filter.
-        messages: one sentence for each kind of trouble, at its first occurrence.
     """
 
     def __init__(
@@ -179,18 +190,19 @@ class FrontEnd:
         self.twist = TwistSynthesis(documented)
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
-        self._kept, self._whole = np.zeros((8, 3, n)), np.zeros(n + 11, dtype=np.int64)
+        self._kept, self._whole = np.zeros((9, 3, n)), np.zeros(n + 12, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
         self._memory.filter.times[:] = NEVER
-        for mark in (Mark.SATURATED_UNTIL, Mark.FIRST_MOVING, Mark.SEEN, Mark.AHEAD, Mark.DOUBTED):
+        for mark in UNSEEN:
             self._memory.marks[mark] = NEVER
         self.filter.use(self._memory.filter)
         self._signals, self._answers = np.empty((1, 3, n)), np.zeros((1, 4), dtype=np.int64)
         self._records = self.layout.new(1)
         self.refused: Counter[str] = Counter()
         self.gaps: list[tuple[int, float]] = []
-        self.messages: list[str] = []
+        self._told: list[str] = []
+        self._velocity = documented.limits.velocity
 
     @property
     def delay_s(self) -> float:
@@ -202,6 +214,17 @@ class FrontEnd:
         """Stamp of the first sample with any measured |dq| above `rest_dq`."""
         stamp = int(self._memory.marks[Mark.FIRST_MOVING])
         return None if stamp == NEVER else stamp
+
+    @property
+    def messages(self) -> list[str]:
+        """One sentence for each kind of trouble, in the order of first occurrence."""
+        fastest, known = self._memory.fastest, self._velocity
+        fast = [j for j, v in enumerate(known) if v > 0.0 and fastest[j] > FASTER * v]
+        if not fast:
+            return list(self._told)
+        told = ", ".join(f"{self.names[j]} {fastest[j]:.3g} ({known[j]:.3g})" for j in fast)
+        said = f"faster than documented, and learned from: {told} rad/s; the limits of another arm?"
+        return [*self._told, said]
 
     @property
     def fault(self) -> str | None:
@@ -266,7 +289,7 @@ class FrontEnd:
             before_ns, behind_ns = int(hole[0]), int(hole[1])
             gap_s = 1e-9 * (behind_ns - before_ns)
             if not self.gaps:
-                self.messages.append(
+                self._told.append(
                     f"at {1e-9 * before_ns:.3f} s: {gap_s:.3f} s without a sample; the filter "
                     "starts anew"
                 )
@@ -274,7 +297,7 @@ class FrontEnd:
         reason = Verdict(verdict)
         name = reason.name.lower()
         if reason in NOTEWORTHY and not self.refused[name]:
-            self.messages.append(self._sentence(reason, sample))
+            self._told.append(self._sentence(reason, sample))
         self.refused[name] += 1
 
     def _sentence(self, reason: Verdict, sample: JointSample) -> str:

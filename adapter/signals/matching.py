@@ -2,9 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from adapter.model.locking import locked
 from adapter.model.self_model import SelfModel
 from drivers.files.mcap import Log
 from drivers.interface import DriverError
+
+
+def present(
+    documented: SelfModel, names: Sequence[str], source: object
+) -> tuple[SelfModel, list[str]]:
+    """The robot with the joints that a recording or an arm lacks (a gripper's) locked at zero.
+
+    Args:
+        names: joints of the recording or the arm; where it has none of the robot's, nothing is
+            locked: it may be the same arm under other names, or another arm.
+        source: what lacks them, for the sentence.
+
+    Returns:
+        The robot, and a sentence where joints were locked.
+    """
+    absent = [name for name in documented.tree.joint_names if name not in names]
+    if not absent or len(absent) == documented.tree.n:
+        return documented, []
+    said = (
+        f"{source}: has no joint {', '.join(absent)}; locked at zero in {documented.name} "
+        "(--lock JOINT=VALUE gives another value)"
+    )
+    return locked(documented, dict.fromkeys(absent, 0.0)), [said]
 
 
 def matching(log: Log, documented: SelfModel) -> Log:

@@ -70,7 +70,10 @@ class FciArm:
         names = _NAMES[self._target.version or tables.PANDA] if joint_names is None else joint_names
         self.joint_names: tuple[str, ...] = tuple(names)
         if len(self.joint_names) != JOINTS:
-            raise DriverError(f"the robot has {JOINTS} joints, got {len(self.joint_names)} names")
+            raise DriverError(
+                f"the robot has {JOINTS} joints, got {len(self.joint_names)} names "
+                f"({', '.join(self.joint_names)}); leave out (--joints) what it does not have"
+            )
         self.can_move = allow_motion
         self.version: int | None = None
         self.arrived_ns = 0

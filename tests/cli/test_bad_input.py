@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
+from adapter.effects.export import to_urdf
+from adapter.model.model_file import load_model
 from adapter.model.robots import documented
 from drivers.files.mcap import McapWriter, read_log
 from drivers.interface import JointSample
@@ -58,6 +60,44 @@ def test_missing_joint(tmp_path, capsys) -> None:
     names = ("a", "b", "c", "d", "e", "f", "g")
     said = refused(capsys, "replay", record(tmp_path / "log.mcap", motion(20), names))
     assert "log.mcap" in said and "panda_joint1" in said and "a, b, c" in said
+
+
+def with_gripper(tmp_path: Path) -> Path:
+    """The Panda with a gripper of one turning joint behind its last link."""
+    body = LINK.format("finger", 0.5, INERTIA)
+    joint = (
+        '<joint name="finger_joint" type="revolute"><parent link="panda_link8"/>'
+        '<child link="finger"/><origin xyz="0 0 0.1"/><axis xyz="1 0 0"/></joint>'
+    )
+    text = to_urdf(ROBOT).replace("</robot>", f"{body}{joint}</robot>")
+    path = tmp_path / "gripper.urdf"
+    path.write_text(text)
+    return path
+
+
+def test_a_gripper_that_the_log_lacks_is_locked(tmp_path, capsys) -> None:
+    log, robot, out = tmp_path / "log.mcap", with_gripper(tmp_path), tmp_path / "out"
+    record(log, motion())
+    replay = ["replay", str(log), "--robot", str(robot), "--quiet", "--no-report"]
+    lengths = []
+    for more in ([], ["--lock", "finger_joint=1.5"]):
+        assert main([*replay, *more, "--out", str(out)]) == 0
+        said = " ".join(capsys.readouterr().err.split())
+        assert ("log.mcap: has no joint finger_joint; locked at zero" in said) == (not more)
+        model = load_model(out / "model.json")
+        assert model.tree.joint_names == ROBOT.tree.joint_names
+        lengths.append(next(f.rotation for f in model.frames if f.name == "finger"))
+    assert not np.allclose(*lengths)
+    chosen = ",".join(ROBOT.tree.joint_names)
+    assert main([*replay, "--joints", chosen, "--out", str(out)]) == 0
+    assert "has no joint" not in capsys.readouterr().err
+    still = record(tmp_path / "still.mcap", motion(20) * 3)
+    said = refused(capsys, "gap", still, "--model", robot, "--out", out)  # too short, not foreign
+    assert "usable samples" in said
+    said = refused(capsys, "replay", log, "--robot", robot, "--lock", "thumb=1")
+    assert "'thumb'" in said and "finger_joint" in said
+    said = refused(capsys, "run", "--driver", f"log:{log}", "--joints", "thumb", "--robot", robot)
+    assert "'thumb'" in said and "finger_joint" in said
 
 
 def test_degrees(tmp_path, capsys) -> None:
@@ -138,6 +178,8 @@ def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> 
         (["run", "--scenario", "payload_at_20s", "--set", "weight=1"], "mass"),
         (["run", "--duration", "-1"], "--duration"),
         (["run", "--effects", "magic"], "coulomb_friction"),
+        (["run", "--lock", "panda_joint7"], "JOINT=VALUE"),
+        (["run", "--lock", "panda_joint7=nan"], "JOINT=VALUE"),
         (["run", "--truth", "nowhere.json"], "nowhere.json"),
         (["run", "--config", "nowhere.toml"], "nowhere.toml"),
         (["export", "nowhere.json", "--urdf", "x.urdf"], "nowhere.json"),

@@ -87,6 +87,7 @@ def test_readings_that_are_no_numbers_are_refused(signal: str, value: float) -> 
         ("dq", 60.0, "dq of panda_joint4 is 60, outside [-6.525, 6.525]; degrees instead"),
         ("tau", 400.0, "tau of panda_joint4 is 400, outside [-261, 261]; N m?"),
         ("tau", -400.0, "tau of panda_joint4 is -400"),
+        ("dq", 25.0, "dq of panda_joint4 is 25, outside"),
     ],
 )
 def test_readings_out_of_range_are_refused_with_a_hint(
@@ -116,6 +117,25 @@ def test_unknown_limits_allow_anything() -> None:
     data = moving()
     states = feed(front_end, replace(data, q=100 * data.q, tau=1e3 * data.tau).samples())
     assert len(states) > 2600 and front_end.refused["out_of_range"] == 0
+
+
+@pytest.mark.parametrize(("share", "stretch"), [(0.1, 1), (0.0, 1), (0.02, 4)])
+def test_an_arm_faster_than_documented_is_said_and_learned_from(share: float, stretch: int) -> None:
+    """Its positions move as fast as its speeds say; three times the documented speed or not."""
+    whole = moving()
+    data = replace(whole, stamp_ns=whole.stamp_ns[::stretch] // stretch, q=whole.q[::stretch])
+    data = replace(data, dq=stretch * whole.dq[::stretch], tau=whole.tau[::stretch])
+    documented = panda_model()
+    slow = replace(documented.limits, velocity=share * documented.limits.velocity)
+    front_end = FrontEnd(replace(documented, limits=slow))
+    feed(front_end, data.samples())
+    refused = refused_beside(front_end, "filter_settling")
+    assert refused["implausible_step"] < 10  # while nothing is known yet of its usual steps
+    assert not refused - Counter(implausible_step=10)
+    assert np.abs(data.dq).max() > (6.0 if stretch > 1 else 0.5)
+    said = [m for m in front_end.messages if "faster than documented" in m]
+    assert len(said) == (share > 0.0)
+    assert not said or "panda_joint1" in said[0]
 
 
 def test_a_refused_reading_leaves_no_trace() -> None:

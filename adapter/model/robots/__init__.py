@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError
+from adapter.model.locking import restricted
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import vector3
@@ -27,29 +28,29 @@ def documented(
     joints: Sequence[str] | None = None,
     floating: bool = False,
     gravity: ArrayLike | None = None,
+    lock: Mapping[str, float] | None = None,
 ) -> SelfModel:
     """The documented model of a robot: by name, from a .urdf file or from a model file (.json).
 
     Args:
         name: one of `names()`, or the path of a file.
-        joints: which joints of a URDF are wanted (see `urdf.read_urdf`).
+        joints: which joints are wanted, all where None; the others are locked.
         floating: whether the base is free.
         gravity: (3,) acceleration of gravity in base axes, m/s²; the file's own where None.
+        lock: values of joints to be locked, rad, and m of prismatic ones (see `urdf.read_urdf`).
 
     Raises:
         ModelError: unknown name (names the choices), or a file that can't be read.
     """
     text = str(name)
     if text in names():
-        return read_urdf(_FOLDER / f"{text}.urdf", joints, floating, gravity)
+        return read_urdf(_FOLDER / f"{text}.urdf", joints, floating, gravity, lock)
     suffix = Path(text).suffix.lower()
     if suffix not in (".urdf", ".json"):
         raise ModelError(
             f"no robot '{text}'; have: {', '.join(names())}, a .urdf file or a .json model file"
         )
     if suffix == ".urdf":
-        return read_urdf(text, joints, floating, gravity)
-    model = load_model(text).with_base(floating)
-    if joints is not None and set(joints) != set(model.tree.joint_names):
-        raise ModelError(f"{text}: its joints are {', '.join(model.tree.joint_names)}")
+        return read_urdf(text, joints, floating, gravity, lock)
+    model = restricted(load_model(text).with_base(floating), joints, lock or {})
     return model if gravity is None else replace(model, gravity=vector3(gravity))

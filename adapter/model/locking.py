@@ -1,0 +1,181 @@
+"""A model with some of its joints locked: the links behind them become part of those before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.inertia import move_theta
+from adapter.model.self_model import LIMITS, FixedFrame, Limits, SelfModel, Tool
+from adapter.model.spatial import Array, matrix_from_zxz, rot_z, z_to_axis, zxz_from_matrix
+from adapter.model.tree import BASE, Tree
+
+LOCKED = "locked"  # entry of `SelfModel.provenance`: values of locked joints by name, rad or m
+
+
+def restricted(
+    model: SelfModel, joints: Sequence[str] | None, lock: Mapping[str, float]
+) -> SelfModel:
+    """The model with these joints (all where None), the others locked: at zero, or as `lock` says.
+
+    Raises:
+        ModelError: a joint that is not there (names the choices), or that is named in both.
+    """
+    names = model.tree.joint_names
+    for name in joints or ():
+        model.tree.joint_index(name)
+        if name in lock:
+            raise ModelError(f"joint '{name}' cannot be learned and locked; do one of them")
+    left = [] if joints is None else [name for name in names if name not in joints]
+    return locked(model, {**dict.fromkeys(left, 0.0), **lock})
+
+
+def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
+    """The model with joints locked at values, rad.
+
+    Links and tool ride on as frames where they were, effects of locked joints are left out;
+    bodies that become one have the standard deviation of their sum.
+
+    Raises:
+        ModelError: a joint that is not there (names the choices), none is left to move, or the
+            last link would be locked where effects of the whole arm (a payload) refer to it.
+    """
+    if not values:
+        return model
+    at = {model.tree.joint_index(name): float(value) for name, value in values.items()}
+    kept = [k for k in range(model.tree.n) if k not in at]
+    if not kept:
+        raise ModelError(f"{model.name}: no joint is left to move; locked: {', '.join(values)}")
+    of_arm = [str(entry["effect"]) for entry in model.effects if not entry.get("joints")]
+    if of_arm and kept[-1] != model.tree.n - 1:
+        last = f"{model.tree.link_names[-1]}, the last link"
+        raise ModelError(f"{model.name}: {', '.join(of_arm)} may act on {last}, which stays free")
+    whole = model.with_base(True)  # the base is a body like the others meanwhile
+    carrier, placement = _carriers(whole.tree, whole.lam, at)
+    theta, std = _bodies(whole, carrier, placement, at)
+    lam, moved = _joint_frames(whole.tree, whole.lam, at)
+    lam_std = whole.lam_std[kept]
+    lam_std[moved] = np.nan  # two frames became one
+    source = whole.source
+    if source is not None:
+        source = replace(source, lam=_joint_frames(whole.tree, source.lam, at)[0])
+    rows = [0, *(k + 1 for k in kept)]
+    names = {whole.tree.joint_names[k]: value for k, value in at.items()}
+    changed = replace(
+        whole,
+        tree=_tree(whole.tree, carrier, kept),
+        lam=lam,
+        lam_std=lam_std,
+        theta=theta[rows],
+        theta_std=std[rows],
+        limits=Limits(*(getattr(whole.limits, key)[kept] for key in LIMITS)),
+        axis=whole.axis[kept],
+        frames=_frames(whole, carrier, placement, at),
+        source=source,
+        tool=_tool(whole, carrier, placement),
+        effects=tuple(e for entry in whole.effects for e in _effect(entry, kept)),
+        provenance={**whole.provenance, LOCKED: {**whole.provenance.get(LOCKED, {}), **names}},
+        lam_identifiable=None,
+        theta_identifiable=None,
+    )
+    return changed.with_base(model.tree.floating)
+
+
+Placement = dict[int, tuple[Array, Array]]  # of each link, and of the base, in what carries it
+
+
+def _carriers(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[dict[int, int], Placement]:
+    """The link (or base) that carries each link now, and the link's rotation and position in it."""
+    carrier, placement = {BASE: BASE}, {BASE: (np.eye(3), np.zeros(3))}
+    for k, parent in enumerate(tree.parent):
+        carrier[k], placement[k] = k, (np.eye(3), np.zeros(3))
+        if k in at:
+            r, p = placement[parent]
+            turn = matrix_from_zxz(lam[k, :3]) @ rot_z(at[k])
+            carrier[k], placement[k] = carrier[parent], (r @ turn, p + r @ lam[k, 3:])
+    return carrier, placement
+
+
+def _tree(tree: Tree, carrier: Mapping[int, int], kept: Sequence[int]) -> Tree:
+    number = {BASE: BASE, **{k: i for i, k in enumerate(kept)}}
+    return replace(
+        tree,
+        parent=tuple(number[carrier[tree.parent[k]]] for k in kept),
+        joint_names=tuple(tree.joint_names[k] for k in kept),
+        link_names=tuple(tree.link_names[k] for k in kept),
+    )
+
+
+def _joint_frames(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[Array, list[int]]:
+    """λ of the joints that are left, and those of them (numbered anew) whose frame it changed."""
+    carrier, placement = _carriers(tree, lam, at)
+    kept, changed, moved = [k for k in range(tree.n) if k not in at], lam.copy(), []
+    for k in kept:
+        parent = tree.parent[k]
+        if carrier[parent] != parent:
+            r, p = placement[parent]
+            turn = zxz_from_matrix(r @ matrix_from_zxz(lam[k, :3]))
+            changed[k] = np.r_[turn, p + r @ lam[k, 3:]]
+            moved.append(kept.index(k))
+    return changed[kept], moved
+
+
+def _bodies(
+    model: SelfModel, carrier: Mapping[int, int], placement: Placement, at: Mapping[int, float]
+) -> tuple[Array, Array]:
+    """θ and its standard deviations, locked links added to what carries them."""
+    theta, variance = model.theta.copy(), model.theta_std**2
+    for k in at:
+        moved = move_theta(np.eye(10), *placement[k])  # row i: of a unit of parameter i
+        theta[carrier[k] + 1] += model.theta[k + 1] @ moved
+        variance[carrier[k] + 1] += variance[k + 1] @ moved**2
+    return theta, np.sqrt(variance)
+
+
+def _frames(
+    model: SelfModel, carrier: Mapping[int, int], placement: Placement, at: Mapping[int, float]
+) -> tuple[FixedFrame, ...]:
+    names = {BASE: model.tree.base_name, **dict(enumerate(model.tree.link_names))}
+    number = {name: k for k, name in names.items()}
+    riding = []
+    for frame in model.frames:
+        r, p = placement[number[frame.parent]]
+        parent = names[carrier[number[frame.parent]]]
+        rotation, position = r @ frame.rotation, p + r @ frame.position
+        riding.append(FixedFrame(frame.name, frame.joint, parent, rotation, position))
+    for k in at:
+        joint = model.tree.joint_names[k]
+        r, p = placement[k]
+        r = r @ z_to_axis(model.axis[k]).T  # as the file has it, not turned to the axis
+        riding.append(FixedFrame(names[k], joint, names[carrier[k]], r, p))
+    return tuple(riding)
+
+
+def _tool(model: SelfModel, carrier: Mapping[int, int], placement: Placement) -> Tool | None:
+    if model.tool is None:
+        return None
+    names = (*model.tree.link_names, model.tree.base_name)  # index -1 is the base
+    k = names.index(model.tool_link)
+    k = BASE if names[k] == model.tree.base_name else k
+    r, p = placement[k]
+    com, inertia = p + r @ model.tool.com, r @ model.tool.inertia @ r.T
+    return Tool(model.tool.mass, com, inertia, names[carrier[k]])
+
+
+def _effect(entry: Mapping[str, Any], kept: Sequence[int]) -> list[dict[str, Any]]:
+    """An effect's entry with the joints that are left, renumbered; [] where none of its is."""
+    joints = [int(joint) - 1 for joint in entry.get("joints") or ()]
+    if not joints:
+        return [dict(entry)]
+    places = [i for i, joint in enumerate(joints) if joint in kept]
+    changed = {**entry, "joints": [kept.index(joints[i]) + 1 for i in places]}
+    for key in ("parameters", "std"):
+        changed[key] = {
+            name: [value[i] for i in places] if np.shape(value)[:1] == (len(joints),) else value
+            for name, value in (entry.get(key) or {}).items()
+        }
+    return [changed] if places else []
