@@ -22,7 +22,7 @@ MODES = ("moments", "sample")  # of `adapter.learning.learner`
 FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
 NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
-MODEL_FILES = (".urdf", ".json")
+MODEL_FILES = (".urdf", ".xml", ".json")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -129,7 +129,7 @@ def simulated(address: str) -> bool:
 def _add_learning(parser: argparse.ArgumentParser) -> None:
     """Options of everything that learns."""
     add = parser.add_argument
-    add("--robot", metavar="NAME|FILE", help="documented robot: panda (default), .urdf or .json")
+    add("--robot", metavar="NAME|FILE", help="panda (default), .urdf, .xml (MJCF) or .json")
     _add_joints(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--mode", choices=MODES, help="moments (default) or the paper's sample")
@@ -212,8 +212,8 @@ def _check_robot(name: str) -> None:
         return
     if Path(name).suffix.lower() not in MODEL_FILES:
         raise UsageError(
-            f"no robot '{name}'; have: {', '.join(robot_names())}, a .urdf file or a .json "
-            "model file"
+            f"no robot '{name}'; have: {', '.join(robot_names())}, a .urdf file, an MJCF file "
+            "(.xml) or a .json model file"
         )
     _check_files(Path(name))
 
@@ -265,7 +265,7 @@ def _gap(parser: argparse.ArgumentParser) -> None:
         "--model",
         required=True,
         metavar="MODEL",
-        help="self model (.json), .urdf, or a robot known by name: panda",
+        help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
     )
     _add_joints(parser)
     add(
@@ -360,23 +360,39 @@ def _check_import(args: argparse.Namespace) -> None:
 
 def _export(parser: argparse.ArgumentParser) -> None:
     parser.description = (
-        "Write a model as URDF. Where it came from a URDF, or with --onto, that file is written "
-        "again with the learned inertials, joint origins and <dynamics> in it; every other byte "
-        "stays as it is."
+        "Write a model as URDF or MJCF. Onto the robot's file (INPUT, or by default the one that "
+        "the model came from) only what was learned is written: inertials, places of joints, "
+        "friction; every other byte stays as it is."
     )
     add = parser.add_argument
     add("model", type=Path, metavar="MODEL", help="model file (.json)")
-    add("--urdf", type=Path, metavar="FILE", help="to write; default: INPUT.learned.urdf")
+    add("--urdf", type=Path, metavar="FILE", help="to write")
+    add("--mjcf", type=Path, metavar="FILE", help="to write")
     onto = parser.add_mutually_exclusive_group()
-    onto.add_argument("--onto", type=Path, metavar="INPUT", help="the robot's file (.urdf)")
+    onto.add_argument(
+        "--onto",
+        type=Path,
+        metavar="INPUT",
+        help="the robot's file, .urdf or .xml (MJCF); written to INPUT.learned.urdf (.xml) where "
+        "neither --urdf nor --mjcf is given",
+    )
     onto.add_argument("--alone", action="store_true", help="the arm alone, without pictures")
     _add_json(parser)
     parser.set_defaults(check=_check_export)
 
 
 def _check_export(args: argparse.Namespace) -> None:
-    if args.urdf is None and args.onto is None:
-        raise UsageError("nothing to write; have: --urdf FILE, --onto INPUT")
+    if args.onto is None:
+        if args.urdf is None and args.mjcf is None:
+            raise UsageError("nothing to write; have: --urdf FILE, --mjcf FILE, --onto INPUT")
+    elif args.onto.suffix not in (".urdf", ".xml"):
+        raise UsageError(f"--onto {args.onto}: have: a .urdf file, an MJCF file (.xml)")
+    elif args.urdf is None and args.mjcf is None:
+        path = args.onto.with_suffix(f".learned{args.onto.suffix}")
+        args.urdf, args.mjcf = (path, None) if path.suffix == ".urdf" else (None, path)
+    elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:
+        other = "--urdf" if args.onto.suffix == ".urdf" else "--mjcf"
+        raise UsageError(f"--onto {args.onto} is written by {other} FILE")
     _check_files(args.model, args.onto)
 
 

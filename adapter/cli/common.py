@@ -8,10 +8,9 @@ from typing import Any
 
 from adapter.cli.arguments import joints_of, locks_of
 from adapter.cli.names import effects_named
-from adapter.effects.active import check_effects
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.robots import read_robot
 from adapter.learning.known_effects import learnable, not_taken_off
-from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_from, config_table, read_config
 from adapter.runs.terminal import program_version, warn
@@ -19,9 +18,7 @@ from adapter.runs.terminal import program_version, warn
 
 def robot_of(args: argparse.Namespace, name: str | None) -> SelfModel:
     """The documented robot by name or file, with the joints that the command line asks for."""
-    name = name or "panda"
-    model = documented(name, joints=joints_of(args), lock=locks_of(args))
-    return check_effects(model, name)
+    return read_robot(name or "panda", joints=joints_of(args), lock=locks_of(args))
 
 
 def configure(

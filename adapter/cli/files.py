@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from adapter.effects.active import check_effects
+from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
-from adapter.model.robots import documented
 from adapter.runs.terminal import console, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table
 from adapter.signals.recording import describe
@@ -19,7 +19,7 @@ def run_import(args: argparse.Namespace) -> int:
     """Carry `import` out."""
     joints = tuple(name for name in args.joints.split(",") if name)
     if args.robot is not None:
-        joints = documented(args.robot).tree.joint_names
+        joints = read_robot(args.robot).tree.joint_names
     spec = ImportSpec.from_options(
         args.sources,
         args.columns,

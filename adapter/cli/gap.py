@@ -13,8 +13,9 @@ import numpy as np
 from rich.markup import escape
 
 from adapter.cli.common import robot_of
-from adapter.cli.results import write_urdf
+from adapter.cli.results import write_robot
 from adapter.cli.rollouts import Rollouts
+from adapter.effects.export import robot_urdf
 from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.screen import RecordingRefused
@@ -107,7 +108,7 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
 def _write_urdf(model: SelfModel, path: Path) -> str | None:
     """The new model as URDF; None where a body of it cannot exist."""
     try:
-        write_urdf(model, path)
+        write_robot(path, robot_urdf(model))
     except ModelError as error:
         warn([f"no URDF: {error}"])
         return None

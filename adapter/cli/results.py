@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from adapter.effects.active import check_effects
-from adapter.effects.export import RobotText, robot_urdf
+from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
@@ -115,37 +115,40 @@ def _seconds(value: float | None) -> str:
     return "not converged" if value is None else f"converged {value:.2f} s after the first motion"
 
 
-def write_urdf(
-    model: SelfModel, path: Path, onto: Path | None = None, alone: bool = False
-) -> RobotText:
-    """Write a model as URDF; warns of what it lacks. Raises ModelError."""
-    written = robot_urdf(model, onto, alone)
+def write_robot(path: Path, written: RobotText) -> None:
+    """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
     if written.onto is None and written.left_out:
         listed = ", ".join(written.left_out)
-        warn([f"{path}: a URDF has no full place for {listed}; a comment in it lists what"])
+        warn([f"{path} has no full place for {listed}; a comment in it lists what is missing"])
     warn([f"{path}: {note}" for note in written.notes])
-    return written
 
 
 def run_export(args: argparse.Namespace) -> int:
     """Carry `export` out."""
     model = check_effects(load_model(args.model), args.model)
-    path = args.urdf or args.onto.with_suffix(".learned.urdf")
-    written = write_urdf(model, path, args.onto, args.alone)
     filled = list(model.provenance.get("lambda_filled", ()))
-    facts = {
+    facts: dict[str, Any] = {
         "model": str(args.model),
-        "urdf": str(path),
-        "onto": written.onto,
         "lambda_source": model.lambda_source,
-        "left_out": written.left_out,
-        "notes": written.notes,
         "lambda_filled": filled,
     }
+    for kind, path, text_of in (
+        ("urdf", args.urdf, robot_urdf),
+        ("mjcf", args.mjcf, robot_mjcf),
+    ):
+        if path is None:
+            continue
+        fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")
+        written = text_of(model, args.onto if fits else None, args.alone)
+        write_robot(path, written)
+        facts[kind] = str(path)
+        facts["onto"] = written.onto
+        facts["left_out"] = written.left_out
+        facts["notes"] = written.notes
+        onto = "" if written.onto is None else f" onto {written.onto}"
+        console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     write_json(args.json, facts)
-    onto = "" if written.onto is None else f" onto {written.onto}"
-    console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     for words in filled:
         console.print(f"  from the documentation, as no data showed it: {words}", soft_wrap=True)
     return 0

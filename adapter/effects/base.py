@@ -154,6 +154,7 @@ class Effect(ABC):
         prior_std: how large its coefficient may well be, or each of several; the prior's mean is
             zero. One prior for the search, the learner and the monitor.
         phrase: how to say that it is there.
+        place: what a joint of a robot's file calls it (`urdf_text`), if it has a name for it.
         shows: what it shows in the experiments of `splits` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
@@ -177,6 +178,7 @@ class Effect(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     prior_std: ClassVar[float | tuple[float, ...]]
     phrase: ClassVar[Phrase] = Phrase()
+    place: ClassVar[str] = NO_PLACE
     shows: ClassVar[tuple[tuple[DecidingExperiment, str], ...]] = ()
     positive: ClassVar[tuple[str, ...]] = ()
     log_odds: ClassVar[float] = 0.0
@@ -394,6 +396,10 @@ class LinearEffect(JointTorque):
     def law(self, at: JointSignals, values: Values) -> Array:
         """Parameter times column."""
         return np.asarray(values[self.key] * self.column(at))
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """The parameter, in the place that a joint has for it."""
+        return more.at_joint(self.place, joint, values[self.key])
 
 
 def polar(x: Array) -> tuple[float, float]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import LEVEL, Array, JointSignals, LinearEffect, Parameter, Values
+from adapter.effects.base import LEVEL, Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL
-from adapter.model.urdf_text import FRICTION, Additions
+from adapter.model.urdf_text import FRICTION
 
 
 class CoulombFriction(LinearEffect):
@@ -15,6 +15,7 @@ class CoulombFriction(LinearEffect):
     title = "Coulomb friction"
     parameters = (Parameter("Fc", "N m"),)
     prior_std = 1.0  # published Panda values are 0.2 to 0.5 (Knezevic)
+    place = FRICTION
     positive = ("Fc",)
     inexact = 0.02
     phrase = Phrase.lacks("Fc", "Coulomb friction")
@@ -27,7 +28,3 @@ class CoulombFriction(LinearEffect):
     def column(self, at: JointSignals) -> Array:
         """tanh(dq / w) with w = 0.01 rad/s, or as far as dq goes within the smoothing time."""
         return at.direction
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """Dry friction."""
-        return more.at_joint(FRICTION, joint, values["Fc"])

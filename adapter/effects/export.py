@@ -14,27 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from adapter.effects.active import Active, active_effects
-from adapter.model.self_model import SelfModel
+from adapter.model.mjcf import mjcf_onto
+from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
+from adapter.model.self_model import MJCF, SelfModel
 from adapter.model.urdf import file_text
 from adapter.model.urdf_onto import urdf_onto
-from adapter.model.urdf_text import (
-    ARMATURE,
-    DAMPING,
-    FRICTION,
-    STIFFNESS,
-    URDF_PLACES,
-    Additions,
-    unplaced,
-    urdf_text,
-)
-
-# MuJoCo's names of what a joint has: <joint damping=... frictionloss=... armature=...>.
-MJCF_ATTRIBUTES = {
-    DAMPING: "damping",
-    FRICTION: "frictionloss",
-    ARMATURE: "armature",
-    STIFFNESS: "stiffness",
-}
+from adapter.model.urdf_text import URDF_PLACES, Additions, unplaced, urdf_text
 
 
 @dataclass(frozen=True)
@@ -87,16 +72,24 @@ def to_urdf(model: SelfModel) -> str:
     return urdf_text(model, additions(model, URDF_PLACES))
 
 
-def mjcf_joints(model: SelfModel) -> tuple[dict[str, float], ...]:
-    """Attributes of each <joint> in MJCF, SI units: angle="radian" in the file's <compiler>."""
-    more = additions(model, tuple(MJCF_ATTRIBUTES))
-    joints = []
-    for j in range(model.tree.n):
-        own = {MJCF_ATTRIBUTES[place]: float(x[j]) for place, x in more.joint.items() if x[j]}
-        if more.joint[STIFFNESS][j]:  # -stiffness (q - springref) is what MuJoCo adds
-            own["springref"] = float(more.pull[j] / -more.joint[STIFFNESS][j])
-        joints.append(own)
-    return tuple(joints)
+def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = False) -> RobotText:
+    """MJCF of a model with its effects, as `robot_urdf`.
+
+    Raises:
+        ModelError: as there, and where MuJoCo, which reads an MJCF, is not installed.
+    """
+    more, source = additions(model, tuple(MJCF_PLACES)), model.source
+    left_out, notes = tuple(more.names), list[str]()
+    if onto is None and source is not None and source.format == MJCF and not alone:
+        onto = source.file
+        if not Path(onto).exists():
+            notes = [f"{onto}, which the model came from, is not there; this is the arm alone"]
+            onto = None
+    if onto is None:
+        return RobotText(mjcf_text(model, more), None, left_out, tuple(notes))
+    written, notes = mjcf_onto(model, more, onto)
+    lacking = [f"an MJCF has no place for {what}" for what in more.left_out]
+    return RobotText(written, str(onto), left_out, (*notes, *lacking))
 
 
 def additions(model: SelfModel, places: Sequence[str]) -> Additions:

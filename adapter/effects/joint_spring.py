@@ -25,6 +25,7 @@ class JointSpring(JointTorque):
     title = "joint spring"
     parameters = (Parameter("k", "N m/rad"), Parameter("q0", "rad"))
     prior_std = (1.0, 1.0)
+    place = STIFFNESS
     phrase = Phrase(
         "a spring of {x} pulls {who} towards {q0}", "k", "{who} {is} pushed away from {q0} by {x}"
     )
@@ -47,7 +48,7 @@ class JointSpring(JointTorque):
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Stiffness, which MJCF has and URDF has not."""
-        part = more.at_joint(STIFFNESS, joint, values["k"])
+        part = more.at_joint(self.place, joint, values["k"])
         if part is None:
             more.pull[joint] -= values["k"] * values["q0"]
         return part

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL
-from adapter.model.urdf_text import ARMATURE, Additions
+from adapter.model.urdf_text import ARMATURE
 
 
 class MotorInertia(LinearEffect):
@@ -15,6 +15,7 @@ class MotorInertia(LinearEffect):
     title = "reflected motor inertia"
     parameters = (Parameter("B", "kg m2"),)
     prior_std = 0.1  # a link-side sensor should see none; catalogue sizes are 0.05 to 0.3
+    place = ARMATURE  # which MJCF has and URDF has not
     positive = ("B",)
     phrase = Phrase.lacks("B", "reflected motor inertia")
     shows = ((SPEEDS, "is gone"), (STILL, "is gone"))
@@ -23,7 +24,3 @@ class MotorInertia(LinearEffect):
     def column(self, at: JointSignals) -> Array:
         """ddq."""
         return at.ddq
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """Armature, which MJCF has and URDF has not."""
-        return more.at_joint(ARMATURE, joint, values["B"])

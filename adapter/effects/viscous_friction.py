@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
+from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL
-from adapter.model.urdf_text import DAMPING, Additions
+from adapter.model.urdf_text import DAMPING
 
 
 class ViscousFriction(LinearEffect):
@@ -15,6 +15,7 @@ class ViscousFriction(LinearEffect):
     title = "viscous friction"
     parameters = (Parameter("Fv", "N m s/rad"),)
     prior_std = 1.0  # published Panda values are 0.03 to 0.09 (Knezevic)
+    place = DAMPING
     positive = ("Fv",)
     inexact = 0.02
     phrase = Phrase.lacks("Fv", "viscous friction")
@@ -26,7 +27,3 @@ class ViscousFriction(LinearEffect):
     def column(self, at: JointSignals) -> Array:
         """dq."""
         return at.dq
-
-    def export(self, more: Additions, joint: int, values: Values) -> str | None:
-        """Damping."""
-        return more.at_joint(DAMPING, joint, values["Fv"])

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from adapter.effects.active import active_effects
+from adapter.effects.robots import read_robot
 from adapter.gap.findings import disagreement, noise_floor, told_of
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
@@ -27,7 +28,6 @@ from adapter.gap.search import ROUNDS, search
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.timing import RecordingClock
 from adapter.model.model_file import save_model
-from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
@@ -88,7 +88,7 @@ def find_gap(
     settings = settings or GapSettings()
     name = model.name if isinstance(model, SelfModel) else str(model)
     # dates of an earlier recording mean nothing in this one
-    nominal = lasting(model if isinstance(model, SelfModel) else documented(str(model)))
+    nominal = lasting(model if isinstance(model, SelfModel) else read_robot(str(model)))
     try:
         task = _task(logs, nominal, settings, progress)
     except RecordingRefused as refusal:

@@ -8,7 +8,7 @@ so that together they are what was learned.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from adapter.model.inertia import (
     is_consistent,
     move_theta,
     pseudo_inertia,
+    theta_from_body,
 )
 from adapter.model.locking import LOCKED
 from adapter.model.robot_file import FileJoint, FileRobot, Merged
@@ -31,6 +32,7 @@ SAME = 1e-12  # of a number's scale: rounding
 # Of what it was in the file, or else of the whole body: what a link keeps at least when links
 # that move with it take their share.
 KEPT_SHARE = 0.1
+FINGER = theta_from_body(1e-3, np.zeros(3), 1e-7 * np.eye(3))  # a gram, 1 cm across
 
 
 @dataclass
@@ -50,12 +52,15 @@ class Changes:
     notes: list[str] = field(default_factory=list)
 
 
-def changes_onto(model: SelfModel, more: Additions, robot: FileRobot) -> Changes:
+def changes_onto(
+    model: SelfModel, more: Additions, robot: FileRobot, same: float = SAME
+) -> Changes:
     """What of a robot's file changes.
 
     Args:
         model: the arm; more: what it has beside.
         robot: the file's content.
+        same: of a number's scale, what counts as no change.
 
     Raises:
         ModelError: the file is not the one that the model was learned with (names the
@@ -65,6 +70,7 @@ def changes_onto(model: SelfModel, more: Additions, robot: FileRobot) -> Changes
         warnings.simplefilter("ignore", ModelWarning)  # what is locked was said at reading
         lock = model.provenance.get(LOCKED, {})
         lock = {name: value for name, value in lock.items() if name in robot.joints}
+        robot = _with_fingers(robot, set(model.tree.joint_names))
         merged = Merged(robot, model.tree.joint_names, lock)
     read = merged.model(model.tree.floating, model.gravity)
     found = differences(model, read)
@@ -78,11 +84,21 @@ def changes_onto(model: SelfModel, more: Additions, robot: FileRobot) -> Changes
         out.notes.append(
             f"the model does not know its file, so {robot.file} was compared by its joints alone"
         )
-    _joint_places(model, more, merged, out)
-    _bodies(model, more, merged, out)
+    _joint_places(model, more, merged, out, same)
+    _bodies(model, more, merged, out, same)
     for (place, k), name in ((key, model.tree.joint_names[key[1]]) for key in sorted(more.told)):
         out.joints.setdefault(name, {})[place] = float(more.joint[place][k])
     return out
+
+
+def _with_fingers(robot: FileRobot, moving: set[str]) -> FileRobot:
+    """The robot with a gram in each link that moves without a mass, but not in the model.
+
+    A simulator moves it, which takes a mass; PyBullet would take 1 kg.
+    """
+    loose = [j.child for j in robot.joints.values() if j.kind != "fixed" and j.name not in moving]
+    bare = {name: FINGER for name in loose if not robot.links[name].any()}
+    return replace(robot, links=robot.links | bare)
 
 
 def differences(model: SelfModel, read: SelfModel) -> list[str]:
@@ -132,7 +148,9 @@ def _moved(what: str, before: Array, after: Array, shift: Array) -> list[str]:
     return [f"the origin of {what} is turned by {turn:.3g} rad and moved by {way:.3g} m"]
 
 
-def _joint_places(model: SelfModel, more: Additions, merged: Merged, out: Changes) -> None:
+def _joint_places(
+    model: SelfModel, more: Additions, merged: Merged, out: Changes, same: float
+) -> None:
     """Origins of moving joints from λ; those on the base with how the base stands."""
     robot, tilt = merged.robot, more.tilt
     turned = model.joint_rotation() @ rot_z(-more.offset)  # q = q_measured - offset
@@ -145,16 +163,16 @@ def _joint_places(model: SelfModel, more: Additions, merged: Merged, out: Change
             rotation, position = r.T @ turned[k] @ own, r.T @ (model.lam[k, 3:] - p)
         if tilt is not None and joint.parent == merged.base.name:
             rotation, position = tilt @ rotation, tilt @ position
-        if not _same_origin(joint, rotation, position):
+        if not _same_origin(joint, rotation, position, same):
             out.origins[joint.name] = rotation, position
 
 
-def _same_origin(joint: FileJoint, rotation: Array, position: Array) -> bool:
+def _same_origin(joint: FileJoint, rotation: Array, position: Array, same: float) -> bool:
     worst = np.abs(rotation - joint.rotation).max(), np.abs(position - joint.position).max()
-    return bool(max(worst) <= SAME)
+    return bool(max(worst) <= same)
 
 
-def _bodies(model: SelfModel, more: Additions, merged: Merged, out: Changes) -> None:
+def _bodies(model: SelfModel, more: Additions, merged: Merged, out: Changes, same: float) -> None:
     """Bodies of the links of the file, so that together they are the model's."""
     whole = model.theta_with_tool()
     whole[-model.tree.n :] += more.dtheta
@@ -172,12 +190,12 @@ def _bodies(model: SelfModel, more: Additions, merged: Merged, out: Changes) -> 
         frames = [merged.place[name][1:] for name in members]
         file = merged.robot.links
         placed = [move_theta(file[x], r, p) for x, (r, p) in zip(members, frames, strict=True)]
-        if np.abs(sum(placed) - whole[row]).max() <= SAME * np.abs(whole[row]).max():
+        if np.abs(sum(placed) - whole[row]).max() <= same * np.abs(whole[row]).max():
             continue
         check_possible(whole[row], body)
         shared, factor = _shared(whole[row], np.stack(placed))
         for name, (r, p), before, now in zip(members, frames, placed, shared, strict=True):
-            if not np.array_equal(before, now):
+            if not np.array_equal(before, now) or file[name] is FINGER:
                 out.bodies[name] = move_theta(now, r.T, -r.T @ p)
         if factor < 1.0:
             out.notes.append(

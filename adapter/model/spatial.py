@@ -101,6 +101,21 @@ def log_rotation(rotation: ArrayLike) -> Array:
     return out
 
 
+def quaternion_from_matrix(rotation: ArrayLike) -> Array:
+    """The unit quaternion [w x y z] (4,) of a rotation (3, 3), w not below zero."""
+    turn = log_rotation(rotation)
+    half = 0.5 * float(np.linalg.norm(turn))
+    return np.r_[np.cos(half), 0.5 * np.sinc(half / np.pi) * turn]
+
+
+def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
+    """The rotation (3, 3) of a quaternion [w x y z] (4,) of any length."""
+    w, *xyz = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(quaternion)
+    k = skew(xyz)
+    out: Array = np.eye(3) + 2.0 * w * k + 2.0 * (k @ k)
+    return out
+
+
 def rotation_angle(first: ArrayLike, second: ArrayLike) -> Array:
     """Angle (...) between two sets of (..., 3, 3) rotations, rad."""
     relative = np.swapaxes(np.asarray(first, dtype=np.float64), -1, -2) @ np.asarray(second)

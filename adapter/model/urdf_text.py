@@ -123,7 +123,7 @@ def urdf_text(model: SelfModel, more: Additions) -> str:
     tree, robot = model.tree, ET.Element("robot", name=model.name)
     missing = unplaced(model, more)
     if missing:
-        robot.append(ET.Comment(_comment(missing)))
+        robot.append(ET.Comment(comment_text(missing)))
     turns = {tree.base_name: np.eye(3)}
     turns.update({name: z_to_axis(model.axis[k]) for k, name in enumerate(tree.link_names)})
     base = base_inertia(model)
@@ -163,7 +163,7 @@ def unplaced(model: SelfModel, more: Additions) -> list[str]:
     ]
 
 
-def _comment(left_out: list[str]) -> str:
+def comment_text(left_out: list[str]) -> str:
     """Text of the comment; XML forbids two hyphens in a row in one."""
     text = " This file has no place for: " + "; ".join(left_out) + " "
     return text.replace("--", "- -")
@@ -171,7 +171,9 @@ def _comment(left_out: list[str]) -> str:
 
 def number_text(values: ArrayLike) -> str:
     """Numbers that read back unchanged; a negative zero loses its sign."""
-    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
+    return " ".join(
+        repr(float(value) + 0.0) for value in np.atleast_1d(np.asarray(values, dtype=np.float64))
+    )
 
 
 def _add_origin(element: ET.Element, rotation: Array, position: Array | None = None) -> None:

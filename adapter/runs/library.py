@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from adapter.discovery import Discovery
 from adapter.discovery import discover as discover_tree
-from adapter.effects.active import check_effects
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
-from adapter.effects.export import robot_urdf
+from adapter.effects.export import robot_mjcf, robot_urdf
+from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult
@@ -24,7 +24,6 @@ from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
 from adapter.learning.settings import LearnerSettings
 from adapter.model.model_file import save_model
-from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -39,7 +38,7 @@ from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
 
 HELD_OUT_SHARE = 0.25  # of a recording, at its end
-EXPORTED = (".urdf", ".json")
+EXPORTED = (".urdf", ".xml", ".json")
 
 
 def load_model(
@@ -50,7 +49,8 @@ def load_model(
     """The model of an arm: S = {N, A, λ, θ} (paper, eq. 1), with limits, effects and gravity.
 
     Args:
-        name: a robot known by name (`panda`), a .urdf file, or a model file (.json) of ours.
+        name: a robot known by name (`panda`), a .urdf or MJCF (.xml) file, or a model file
+            (.json) of ours.
         joints: which joints are wanted; all revolute ones where None. The others are locked.
         lock: values of joints to be locked, by name, rad or (a finger's) m.
 
@@ -69,7 +69,7 @@ def load_model(
     >>> panda.lam.shape, panda.theta.shape
     ((7, 6), (7, 10))
     """
-    return check_effects(documented(name, joints, lock=lock), name)
+    return read_robot(name, joints, lock=lock)
 
 
 def read_log(path: str | Path, joint_names: Sequence[str] | None = None) -> Log:
@@ -437,12 +437,12 @@ def discover(log: Log | str | Path, *, base: str | None = None) -> Discovery:
 
 
 def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -> Path:
-    """Write a model as URDF (.urdf), or whole as a model file of ours (.json).
+    """Write a model as URDF (.urdf), MJCF (.xml), or whole as a model file of ours (.json).
 
     Args:
         model: in a URDF friction and damping stand in their place; what has none is left out.
         path: its suffix decides.
-        onto: a URDF whose inertials, joint origins and <dynamics> alone are to change; where
+        onto: a robot's file of that format, of which only what was learned is to change; where
             None, the one that the model came from.
 
     Raises:
@@ -459,12 +459,13 @@ def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -
         raise ModelError(f"{path}: no such format; have: {', '.join(EXPORTED)}")
     if path.suffix == ".json":
         return save_model(model, path)
-    path.write_bytes(robot_urdf(model, onto).text.encode())
+    text_of = robot_urdf if path.suffix == ".urdf" else robot_mjcf
+    path.write_bytes(text_of(model, onto).text.encode())
     return path
 
 
 def _model(model: SelfModel | str | Path) -> SelfModel:
-    return model if isinstance(model, SelfModel) else documented(model)
+    return model if isinstance(model, SelfModel) else read_robot(model)
 
 
 def _fitting(model: SelfModel | str | Path, log: Log | str | Path) -> tuple[SelfModel, Log]:

@@ -65,7 +65,8 @@ DRESSED = """<?xml version="1.0" encoding="utf-8"?>
     <origin xyz="0 0 .1"/></joint>
   <link name="left"><inertial><mass value="0.1"/>
     <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
-  <link name="right"/>
+  <link name="right"><inertial><mass value="0.1"/>
+    <inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial></link>
   <joint name="grip" type="prismatic"><parent link="flange"/><child link="left"/>
     <axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="10"/></joint>
   <joint name="follow" type="revolute"><parent link="flange"/><child link="right"/>
@@ -137,7 +138,7 @@ def test_a_robot_keeps_all_but_the_numbers_that_were_learned(crlf: bool) -> None
 def test_what_was_not_learned_anew_is_not_written_anew() -> None:
     """The documented model onto its file: every byte, but for links that PyBullet would load."""
     written = robot_urdf(read_quietly(DRESSED)).text
-    assert written.count('<mass value="0"/>') == 2  # of the flange and of the right finger
+    assert written.count('<mass value="0"/>') == 1  # of the flange
     nothing = re.compile(r"\s*<inertial>\s*<mass value=\"0\"/>.*?</inertial>", re.DOTALL)
     assert EMPTY.sub(r"<link \1>", nothing.sub("", written)) == EMPTY.sub(r"<link \1>", DRESSED)
     whole = read_quietly(DRESSED)
@@ -181,6 +182,16 @@ def test_tool_load_encoder_and_tilt_are_in_the_numbers() -> None:
     assert relative(ModelTorque(back)(*moved), ModelTorque(model)(*moved)) < 1e-9
     assert skeleton(written.text) == skeleton(DRESSED)
     assert "the tool of 0.8 kg is in link 'b'" in written.notes
+
+
+def test_a_finger_without_a_mass_gets_a_gram_of_its_carrier() -> None:
+    """A simulator moves it, and PyBullet would take 1 kg for it."""
+    right = DRESSED[DRESSED.index('<link name="right">') :].partition("</link>")[0] + "</link>"
+    text = DRESSED.replace(right, '<link name="right"/>')
+    model = learned(read_quietly(text))
+    written = robot_urdf(model).text
+    assert '<mass value="0.001"/>' in written
+    same_arm(written, model)
 
 
 @pytest.mark.parametrize("mass", [0.2, 1.2, 2.8])

@@ -32,6 +32,8 @@ def documented(
 ) -> SelfModel:
     """The documented model of a robot: by name, from a .urdf file or from a model file (.json).
 
+    `effects.robots.read_robot` takes an MJCF, too.
+
     Args:
         name: one of `names()`, or the path of a file.
         joints: which joints are wanted, all where None; the others are locked.
@@ -48,7 +50,8 @@ def documented(
     suffix = Path(text).suffix.lower()
     if suffix not in (".urdf", ".json"):
         raise ModelError(
-            f"no robot '{text}'; have: {', '.join(names())}, a .urdf file or a .json model file"
+            f"no robot '{text}'; have: {', '.join(names())}, a .urdf file, an MJCF file (.xml) or "
+            "a .json model file"
         )
     if suffix == ".urdf":
         return read_urdf(text, joints, floating, gravity, lock)

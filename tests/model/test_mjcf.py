@@ -1,0 +1,210 @@
+"""MJCF in, and a learned model back onto it, judged by MuJoCo."""
+
+from __future__ import annotations
+
+import re
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from adapter.effects.export import robot_mjcf
+from adapter.effects.robots import read_robot
+from adapter.effects.torque import ModelTorque
+from adapter.errors import ModelError, ModelWarning
+from adapter.model.model_file import load_model, save_model
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import exp_rotation, matrix_from_zxz, zxz_from_matrix
+
+# Degrees, defaults, joints beside their body's origin, a zero elsewhere, bodies whose mass comes
+# from their shape, a finger on a tendon, and things that lie about.
+ARM = """<mujoco model="bench arm">
+  <!-- kept -->
+  <compiler angle="degree"/>
+  <include file="defaults.xml"/>
+  <option gravity="0 0 -9.8"/>
+  <worldbody>
+    <light pos="0 0 2"/>
+    <body name="stand" pos="0 0 1" euler="20 0 0">
+      <geom type="box" size="0.1 0.1 0.1"/>
+      <body name="upper" pos="0 0.1 0.2" euler="10 20 30" childclass="arm">
+        <inertial pos="0.01 0 0.1" mass="2" fullinertia="0.02 0.018 0.01 0.001 0 0.002"/>
+        <joint name="shoulder" axis="0 1 0" pos="0.02 0 -0.05" ref="15" range="-90 120"/>
+        <geom type="capsule" size="0.03 0.1" rgba="1 0 0 1"/>
+        <body name="bracket" pos="0.1 0 0"><geom type="sphere" size="0.03"/>
+          <body name="lower" pos="0 0 0.3">
+            <joint name="elbow" axis="0.6 0 0.8" armature="0.3" stiffness="2" springref="30"/>
+            <geom type="capsule" size="0.03 0.1" pos="0 0 0.1"/>
+            <body name="finger" pos="0 0 0.2">
+              <joint name="grip" type="slide" axis="1 0 0" ref="0.01" range="0 0.02"/>
+              <geom type="sphere" size="0.02"/>
+            </body>
+          </body>
+        </body>
+      </body>
+    </body>
+    <body name="cube" pos="1 0 0"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body>
+  </worldbody>
+  <tendon><fixed name="cord"><joint joint="grip" coef="1"/></fixed></tendon>
+  <actuator><motor joint="elbow" forcerange="-30 30" gear="2"/></actuator>
+</mujoco>
+"""
+DEFAULTS = """<mujocoinclude><default><default class="arm">
+<joint damping="0.4" frictionloss="0.2"/></default></default></mujocoinclude>"""
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    (tmp_path / "defaults.xml").write_text(DEFAULTS)
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    return path
+
+
+def quietly(path: Path) -> SelfModel:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        return read_robot(path)
+
+
+def judged(path: Path, model: SelfModel) -> None:
+    """MuJoCo's torques and places of links are the model's; what is locked stands still."""
+    oracle = mujoco.MjModel.from_xml_path(str(path))
+    off = mujoco.mjtDisableBit
+    oracle.opt.disableflags |= off.mjDSBL_LIMIT | off.mjDSBL_CONTACT
+    data, n, rng = mujoco.MjData(oracle), model.tree.n, np.random.default_rng(0)
+    dofs = [oracle.joint(name).dofadr[0] for name in model.tree.joint_names]
+    at = [oracle.joint(name).qposadr[0] for name in model.tree.joint_names]
+    for joint in range(oracle.njnt):  # all else at zero
+        if oracle.jnt_type[joint] != 0:
+            data.qpos[oracle.jnt_qposadr[joint]] = 0.0
+    for _ in range(8):
+        q, dq, ddq = rng.uniform(-1, 1, (3, n))
+        dq += np.sign(dq)  # where dry friction slides
+        data.qpos[at], data.qvel[dofs], data.qacc[dofs] = q, dq, ddq
+        mujoco.mj_inverse(oracle, data)
+        ours = ModelTorque(model)(q[None], dq[None], ddq[None])[0]
+        np.testing.assert_allclose(ours, data.qfrc_inverse[dofs], atol=1e-6)
+        mujoco.mj_kinematics(oracle, data)
+        base = data.body(model.tree.base_name)
+        place = pose(base.xmat.reshape(3, 3), base.xpos)
+        for k, name in enumerate(model.tree.joint_names):  # a chain
+            turn = matrix_from_zxz(model.lam[k, :3]) @ exp_rotation([0, 0, q[k]])
+            place = place @ pose(turn, model.lam[k, 3:])
+            joint = data.joint(name)
+            np.testing.assert_allclose(place[:3, 3], joint.xanchor, atol=1e-9)
+            np.testing.assert_allclose(place[:3, 2], joint.xaxis, atol=1e-9)
+
+
+def pose(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    return np.block([[rotation, position[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def test_an_arm_is_read_as_mujoco_means_it(arm: Path) -> None:
+    with pytest.warns(ModelWarning) as caught:
+        model = read_robot(arm)
+    said = " ".join(str(w.message) for w in caught)
+    for part in ("tendon 'cord'", "free body 'cube'"):
+        assert f"{part} is not used" in said
+    assert "joint 'grip' is prismatic; locked at zero" in said
+    assert model.name == "bench arm" and model.tree.base_name == "stand"
+    assert model.tree.joint_names == ("shoulder", "elbow")
+    assert model.tree.link_names == ("upper", "lower")
+    assert [frame.name for frame in model.frames] == ["bracket", "finger"]
+    np.testing.assert_allclose(model.limits.lower[0], -np.pi / 2)
+    assert np.isnan(model.limits.lower[1]) and model.limits.effort[1] == 60.0
+    assert np.linalg.norm(model.gravity) == pytest.approx(9.8)
+    assert {e["effect"] for e in model.effects} == {
+        *("viscous_friction", "coulomb_friction", "motor_inertia", "joint_spring")
+    }
+    judged(arm, model)
+
+
+def test_a_learned_arm_goes_back_into_its_file(arm: Path, tmp_path: Path) -> None:
+    model = quietly(arm)
+    rng = np.random.default_rng(3)
+    turns = exp_rotation(rng.normal(size=(2, 3)) * 0.02) @ matrix_from_zxz(model.lam[:, :3])
+    lam = np.c_[zxz_from_matrix(turns), model.lam[:, 3:] + rng.normal(size=(2, 3)) * 0.01]
+    effects = (
+        {"effect": "viscous_friction", "joints": [1, 2], "parameters": {"Fv": [0.7, 0.4]}},
+        {"effect": "motor_inertia", "joints": [1, 2], "parameters": {"B": [0.05, 0.3]}},
+        {"effect": "coulomb_friction", "joints": [1, 2], "parameters": {"Fc": 0.2}},
+        {"effect": "joint_spring", "joints": [2], "parameters": {"k": 1.5, "q0": 0.3}},
+    )
+    learned = replace(model, lam=lam, theta=model.theta * 1.1, effects=effects)
+    written = robot_mjcf(load_model(save_model(learned, tmp_path / "model.json")))
+    assert written.onto == str(arm) and not written.notes
+    new = tmp_path / "new.xml"
+    new.write_text(written.text)
+    judged(new, learned)
+    number = re.compile(
+        r'\n\s*<inertial.*/>|(armature|damping|springref|stiffness|pos|quat|euler)="[^"]*"|[ ]'
+    )
+    assert number.sub("", written.text) == number.sub("", ARM)
+    assert 'frictionloss="0.2"' not in written.text  # the default says it
+
+
+def test_what_was_not_learned_anew_is_not_written_anew(arm: Path) -> None:
+    assert robot_mjcf(quietly(arm)).text == ARM
+
+
+def test_a_file_that_changed_is_refused_and_one_that_is_gone_is_said(arm: Path) -> None:
+    model = quietly(arm)
+    arm.write_text(ARM.replace('pos="0 0 0.3"', 'pos="0 0 0.35"'))
+    with pytest.raises(ModelError, match=r"origin of joint 'elbow' is .* moved by 0.05 m"):
+        robot_mjcf(model)
+    arm.unlink()
+    written = robot_mjcf(model)
+    assert written.onto is None and "is not there" in written.notes[0]
+    with pytest.raises(ModelError, match=r"arm\.xml: MuJoCo cannot read it"):
+        robot_mjcf(model, onto=arm)
+
+
+def test_a_compiler_that_overrides_inertias_is_refused(arm: Path) -> None:
+    arm.write_text(ARM.replace('angle="degree"', 'angle="degree" inertiafromgeom="true"'))
+    model = quietly(arm)
+    with pytest.raises(ModelError, match="inertiafromgeom"):
+        robot_mjcf(replace(model, theta=model.theta * 1.1))
+
+
+BAD = {
+    "two joints": ('<joint name="shoulder"', '<joint name="x"/><joint name="shoulder"', "2 joints"),
+    "not MJCF": ("<mujoco ", "<robot ", "MuJoCo cannot read it"),
+    "no hinge": ('name="elbow"', 'name="elbow" type="ball"', "joint 'elbow'.* is ball"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_what_cannot_be_read_is_said_in_one_sentence(what: str, arm: Path) -> None:
+    before, after, message = BAD[what]
+    arm.write_text(ARM.replace(before, after))
+    joints = ["shoulder", "elbow"]
+    with pytest.raises(ModelError, match=message) as caught, warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        read_robot(arm, joints)
+    assert "arm.xml" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_floating_robot_is_the_free_body_that_carries_joints(arm: Path) -> None:
+    arm.write_text(
+        ARM.replace(
+            '<body name="stand" pos="0 0 1" euler="20 0 0">',
+            '<body name="stand" pos="0 0 1"><freejoint/>',
+        )
+    )
+    with pytest.warns(ModelWarning, match="free body 'cube' is not used"):
+        model = read_robot(arm, floating=True)
+    assert model.tree.floating and model.tree.base_name == "stand" and model.tree.n == 2
+    with pytest.raises(ModelError, match="no joint is left to move"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)
+        read_robot(arm)
+
+
+def test_without_mujoco_the_extra_is_named(arm: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ModelError, match=r"panda-adapter\[mujoco\]"):
+        read_robot(arm)
