@@ -143,9 +143,9 @@ def run_export(args: argparse.Namespace) -> int:
         written = text_of(model, args.onto if fits else None, args.alone)
         write_robot(path, written)
         facts[kind] = str(path)
-        facts["onto"] = written.onto
-        facts["left_out"] = written.left_out
-        facts["notes"] = written.notes
+        facts["onto"] = facts.get("onto") or written.onto
+        facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
+        facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
         console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     write_json(args.json, facts)

@@ -151,13 +151,14 @@ class MjcfFile:
         self.unused: list[str] = []
         for i in range(compiled.nbody):
             joints = self._joints_in(i)
-            if len(joints) > 1:
+            hinges = [j for j in joints if compiled.jnt_type[j] == HINGE]
+            if len(joints) > 1 and hinges:
                 raise ModelError(
                     f"{path}: body '{self._name(i)}' has {len(joints)} joints; an arm's body has "
                     "one, put the others into bodies of their own"
                 )
-            if joints and compiled.jnt_type[joints[0]] == HINGE:
-                self.anchor[i] = compiled.jnt_pos[joints[0]]
+            if hinges:
+                self.anchor[i] = compiled.jnt_pos[hinges[0]]
         self._numbers = {self._joint_name(j): j for j in range(compiled.njnt)}
         self._parents = compiled.body_parentid.tolist()
         self.root, self._bodies = self._choose(floating)
