@@ -21,7 +21,7 @@ catalogue: what is to be said of them is that something is unexplained.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,12 +30,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Number = float | list[float]
-JointLaw = Callable[[float, float, float, float], float]
 
 # Where an effect acts: on the motion of a joint, on the rigid bodies, at the flange, on what an
 # encoder or a torque sensor says. Name -> (place, needed keys, keys with a default).
 MOTION, BODY, WRENCH, ENCODER, TORQUE = "motion", "body", "wrench", "encoder", "torque"
-LAW = "law"  # in the motion of a joint too, but by a law that came with the entry
 SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "viscous_friction": (MOTION, ("Fv",), ()),
     "coulomb_friction": (MOTION, ("Fc",), ()),
@@ -86,35 +84,31 @@ class Effect:
     """One effect of a simulated arm.
 
     Attributes:
-        name: one of `SPECS`, or any other where a law comes with it.
+        name: one of `SPECS`.
         joints: counted from 1; what acts on the whole arm needs none, `signal_delay` without
             joints acts on all.
         parameters: by key; SI.
         interval_s: [from, to) in seconds of plant time, `to` None to the end; None for always.
-        law: of an effect that has no place in `SPECS`: q, dq, ddq and rigid torque of a joint
-            (rad, rad/s, rad/s², N m) to the torque that the effect takes there, N m.
     """
 
     name: str
     joints: tuple[int, ...]
     parameters: Mapping[str, Number] = field(hash=False)
     interval_s: tuple[float, float | None] | None = None
-    law: JointLaw | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        if self.name not in SPECS and self.law is None:
+        if self.name not in SPECS:
             raise ValueError(f"no effect {self.name!r}; have: {', '.join(SPECS)}")
         object.__setattr__(self, "joints", tuple(int(j) for j in self.joints))
-        if self.name in SPECS:
-            _check_keys(self)
+        _check_keys(self)
         _check_joints(self)
         if self.interval_s is not None and not self.start_s < self.end_s:
             raise ValueError(f"{self.name}: interval {self.interval_s} ends before it starts")
 
     @property
     def place(self) -> str:
-        """Where it acts: motion, body, wrench, encoder, torque, or by its own law."""
-        return SPECS[self.name][0] if self.name in SPECS else LAW
+        """Where it acts: motion, body, wrench, encoder or torque."""
+        return SPECS[self.name][0]
 
     @property
     def start_s(self) -> float:
@@ -185,7 +179,7 @@ def payload(
 def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
     """The effect of a canonical entry: effect, joints, interval_s, parameters.
 
-    A `law` counts where the name is in no catalogue, and no other key does.
+    No other key counts.
 
     Raises:
         ValueError: unknown name, a key that is missing, unknown or not a number.
@@ -196,9 +190,8 @@ def effect_from(entry: Effect | Mapping[str, Any]) -> Effect:
         raise ValueError(f"an effect entry has {sorted(entry)}; needs: effect, parameters")
     span = entry.get("interval_s")
     interval = None if span is None else (float(span[0] or 0.0), span[1])
-    law = None if entry["effect"] in SPECS else entry.get("law")
     joints = tuple(entry.get("joints") or ())
-    return Effect(entry["effect"], joints, entry["parameters"], interval, law)
+    return Effect(entry["effect"], joints, entry["parameters"], interval)
 
 
 def _check_keys(effect: Effect) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import pybullet as bullet
 
 from sim.dynamics import end_effector
-from sim.effects import LAW, WRENCH
+from sim.effects import WRENCH
 from sim.joint_effects import Losses, add_up, bend, losses_at, rows_of, step
 from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
@@ -31,7 +31,6 @@ SUBSTEPS = 4  # of 0.25 ms
 FORCES = ("fx", "fy", "fz", "mx", "my", "mz")
 # End stops, our choice: a falling arm (50 J) gives them 0.14 rad and comes to rest there.
 STOP_STIFFNESS = 5000.0  # N m/rad
-SLOPE_RAD_S = 1e-3  # over which the slope of a law is taken
 STOP_DAMPING = 50.0  # N m s/rad
 
 
@@ -97,12 +96,6 @@ class Engine:
             for effect in truth.effects
             if effect.place == WRENCH
         ]
-        self._laws = [
-            (effect, j)
-            for effect in truth.effects
-            if effect.place == LAW
-            for j in effect.columns(truth.n)
-        ]
         self._stages: list[ArmClient] = []
         clients: list[int] = []
         self._close = weakref.finalize(self, disconnect, clients)
@@ -153,7 +146,7 @@ class Engine:
         stage, ahead = self._stage, self._coriolis_ahead(self._ddq)
         self.stopped, self._mass = False, None
         # Where nothing depends on the motion the state is only asked for at the tick's end.
-        acting = len(self._rows) or self._laws or self._wrenches or self._end_stops
+        acting = len(self._rows) or self._wrenches or self._end_stops
         free = not acting and not law.kp.any() and not law.kd.any()
         for i in range(self._substeps):
             part = (i + 0.5) / self._substeps
@@ -212,21 +205,7 @@ class Engine:
     def _losses(self, t: float, q: Array, dq: Array, rigid: Array) -> Losses:
         losses = losses_at(self._rows, t, q, dq, rigid, self._bent)
         losses.explicit[:] -= self._contact(t, q)
-        for effect, j in self._laws:
-            if effect.law is not None and effect.acts(t):
-                losses.explicit[j] += effect.law(q[j], dq[j], 0.0, rigid[j])
         return losses
-
-    def _add_laws(self, t: float, q: Array, v: Array, ddq: Array, rigid: Array, out: Array) -> None:
-        """Torques of laws about the velocity v (n,), added to the parts (5, n) of a step."""
-        for effect, j in self._laws:
-            if effect.law is not None and effect.acts(t):
-                here, there = (
-                    effect.law(q[j], x, ddq[j], rigid[j]) for x in (v[j], v[j] + SLOPE_RAD_S)
-                )
-                slope = max((there - here) / SLOPE_RAD_S, 0.0)  # what opposes motion is implicit
-                out[0, j] += here - slope * v[j]
-                out[1, j] += slope
 
     def _contact(self, t: float, q: Array) -> Array:
         """J^T wrench (n,) N m of what touches the last link at its origin."""
@@ -258,7 +237,7 @@ class Engine:
         touching = beyond != 0.0
         self.stopped |= bool(touching.any())
         push = law.kp * (law.q_des - q) + law.kd * law.dq_des + ff
-        if not len(self._rows) and not self._laws and not law.kd.any() and not touching.any():
+        if not len(self._rows) and not law.kd.any() and not touching.any():
             got = np.minimum(np.maximum(push, -law.most), law.most)
             return np.asarray(got + self._contact(t, q))
         stage = self._stage
@@ -269,7 +248,6 @@ class Engine:
         middle = dq + self._h / 2 * ddq
         rigid = bias + M @ ddq
         parts = add_up(self._rows, t, q, middle, rigid, self._bent)
-        self._add_laws(t, q, middle, ddq, rigid, parts)
         parts[0] += STOP_STIFFNESS * beyond - self._contact(t, q)
         parts[1] += STOP_DAMPING * touching
         drive = np.array([push, law.kd, law.most])

@@ -16,7 +16,6 @@ from sim.truth import Truth
 
 CROSSING_S = 0.01  # the motor crosses the gear's play in this time
 DIRECTION_WIDTH = 0.01  # rad/s, below it the motor pushes neither way in full
-RIPPLE_ROUNDS = 30  # of the fixed point for q + a sin(q + phase), a below 0.1 rad
 
 
 def encoded(
@@ -44,30 +43,6 @@ def encoded(
             add_q[..., j] += on * effect.number("a") * np.sin(angle)
             add_dq[..., j] += on * effect.number("a") * np.cos(angle) * dq[..., j]
     return q + add_q, dq + add_dq
-
-
-def decoded(
-    effects: Sequence[Effect], t: Array | float, q: Array, dq: Array, twisting: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """The opposite of `encoded`: link angle plus play, and its velocity, from measured ones."""
-    true = q.copy()
-    terms = list(_encoder_terms(effects, t, q.shape[-1]))
-    for _ in range(RIPPLE_ROUNDS if terms else 0):
-        guess, true = true, q.copy()
-        for effect, j, on in terms:
-            if effect.name == "encoder_offset":
-                true[..., j] -= on * effect.number("o")
-            else:
-                sine = np.sin(guess[..., j] + effect.number("phase"))
-                true[..., j] -= on * effect.number("a") * sine
-        if np.abs(true - guess).max() < 1e-12:
-            break
-    slope = np.ones_like(q)
-    for effect, j, on in terms:
-        if effect.name == "encoder_ripple":
-            slope[..., j] += on * effect.number("a") * np.cos(true[..., j] + effect.number("phase"))
-    twist, twist_rate = _twist(effects, t, twisting[0]), _twist(effects, t, twisting[1])
-    return true - twist, dq / slope - twist_rate
 
 
 def _twist(effects: Sequence[Effect], t: Array | float, tau: Array) -> Array:
@@ -119,15 +94,6 @@ class Play:
         way = np.clip(dq / DIRECTION_WIDTH, -1.0, 1.0)
         moved = np.clip(self.gap + way * width * period_s / CROSSING_S, -width / 2, width / 2)
         self.rate, self.gap = (moved - self.gap) / period_s, moved
-
-    def along(self, t: Array, dq: Array, period_s: float) -> tuple[Array, Array]:
-        """Play and its rate (m, n) along a motion dq (m, n) at t (m,)."""
-        out = np.zeros((2, *dq.shape))
-        if self.exists:
-            for k, row in enumerate(dq):
-                self.move(float(t[k]), row, period_s)
-                out[:, k] = self.gap, self.rate
-        return out[0], out[1]
 
 
 class Sensors:
@@ -223,24 +189,3 @@ _TORQUE_CHAIN = {
     "torque_offset": _offset,
     "x_torque_deadband": _deadband,
 }
-
-
-def freed(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
-    """Driving torque (m, n) from what the sensors read at t (m,): delay, offset, gain taken out."""
-    m, n = tau.shape
-    d, gain, offset = np.zeros((m, n)), np.ones((m, n)), np.zeros((m, n))
-    for effect in effects:
-        if effect.name not in ("signal_delay", "torque_gain", "torque_offset"):
-            continue
-        on = _on(effect, t[:, None])
-        for j in effect.columns(n):
-            if effect.name == "signal_delay":
-                d[:, j] += on * effect.number("d")
-            elif effect.name == "torque_gain":
-                gain[:, j] *= 1.0 + on * effect.number("g")
-            else:
-                offset[:, j] += on * effect.number("o")
-    out = (tau - offset) / gain
-    for j in np.flatnonzero(d.any(axis=0)).tolist():
-        out[:, j] = np.interp(t + d[:, j], t, out[:, j])
-    return out

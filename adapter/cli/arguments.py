@@ -281,6 +281,12 @@ def _gap(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="rounds of the search, in each of which something may be named (default 24)",
     )
+    add(
+        "--simulator",
+        default="pybullet",
+        choices=("pybullet", "mujoco"),
+        help="of the forward simulation (default pybullet; mujoco is the extra [mujoco])",
+    )
     add("--no-simulation", action="store_true", help="compare torques only")
     _add_results(parser)
     parser.set_defaults(check=_check_gap)

@@ -14,7 +14,6 @@ from rich.markup import escape
 
 from adapter.cli.common import robot_of
 from adapter.cli.results import write_robot
-from adapter.cli.rollouts import Rollouts
 from adapter.effects.export import robot_urdf
 from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
@@ -26,6 +25,7 @@ from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, results_folder, warn, write_json
+from adapter.simulate import Rollouts
 
 EXIT_REFUSED = 2
 
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     nominal = robot_of(args, args.model)
     folder = results_folder(args.out, "gap")
     model_out = _new_model(folder, args.model)
-    rollouts = None if args.no_simulation else Rollouts()
+    rollouts = None if args.no_simulation else Rollouts(args.simulator)
     try:
         with _progress(args.quiet) as tell:
             result = find_gap(args.logs, nominal, settings, rollouts, model_out, tell)
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     result = replace(result, model_in=args.model)
     if rollouts is not None:
         notes = (*result.notes, *rollouts.troubles)
-        result = replace(_without_empty_rollouts(result), notes=notes)
+        result = replace(_without_empty_rollouts(result), notes=notes, simulator=args.simulator)
     _conclude(args, folder, result)
     return 0
 

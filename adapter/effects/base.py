@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import EffectSums, JointSignals
+from adapter.effects.by_joint import EffectSums, JointSignals, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import DecidingExperiment
 from adapter.errors import ModelError
@@ -97,6 +97,11 @@ class Motion:
     ddq: Array
     arm: ArmDynamics
     band_hz: float = math.inf
+
+    @property
+    def direction(self) -> Array:
+        """sign(dq) (m, n), smoothed around rest."""
+        return smooth_sign(self.dq)
 
     def moved(self, joint: int, q: Array, dq: Array, ddq: Array) -> Motion:
         """The same with the joint (from 0) displaced by q, dq, ddq (m,)."""
@@ -227,10 +232,6 @@ class Effect(ABC):
         """
         return False
 
-    def simulated(self, values: Values) -> dict[str, Any]:
-        """What a simulator that does not know the name needs beside the entry."""
-        return {}
-
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """Put itself into what a simulator's file holds (joint from 0, -1 without one).
 
@@ -353,14 +354,6 @@ class JointTorque(TorqueEffect):
         assert isinstance(joint, int)
         sums.add_law(self, joint, values)
         return True
-
-    def simulated(self, values: Values) -> dict[str, Any]:
-        """The law on one joint."""
-
-        def law(q: Array, dq: Array, ddq: Array, tau: Array) -> float:
-            return float(self.law(JointSignals(q, dq, ddq, tau), values))
-
-        return {"law": law}
 
     def absent(self, n: int) -> dict[str, Array]:
         """Parameters (n,) each of joints without it; what may not be zero stands at its least."""

@@ -10,7 +10,6 @@ from adapter.effects.base import (
     Values,
     on_joint,
 )
-from adapter.effects.by_joint import smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LATER, STILL
 
@@ -37,5 +36,5 @@ class FrictionDrift(TorqueEffect):
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """dFc t sign(dq), t since the effect began, or the recording."""
-        column = motion.t * smooth_sign(motion.dq[:, joint])
+        column = motion.t * motion.direction[:, joint]
         return on_joint(motion, joint, float(values["dFc"]) * column)

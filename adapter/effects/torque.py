@@ -30,9 +30,12 @@ def sensed_torque(motion: Motion, effects: Sequence[Active]) -> Array:
     return sensors(motion, added(motion, tau, effects), effects)
 
 
-def moved_links(motion: Motion, effects: Sequence[Active]) -> Motion:
-    """Stage 1: motion of the links behind the measured one."""
-    guess = None
+def moved_links(motion: Motion, effects: Sequence[Active], tau: Array | None = None) -> Motion:
+    """Stage 1: motion of the links behind the measured one.
+
+    The gears are twisted by `tau` (m, n) N m; by the rigid torque where None.
+    """
+    guess = tau
     for active in effects:
         if isinstance(active.effect, MotionEffect):
             if guess is None:
@@ -61,17 +64,19 @@ def bodies(motion: Motion, effects: Sequence[Active]) -> Array:
     spans = pairwise([-np.inf, *switches, np.inf])
     for (begin, end), (first, last) in zip(spans, pairwise(cuts), strict=True):
         if first < last:
-            arm, part = _arm_with(motion.arm, own, begin, end), slice(first, last)
+            arm, part = arm_between(motion.arm, own, begin, end), slice(first, last)
             tau[part] = arm.torque(motion.q[part], motion.dq[part], motion.ddq[part])
     return tau
 
 
-def _arm_with(arm: ArmDynamics, own: Sequence[Active], begin_s: float, end_s: float) -> ArmDynamics:
-    """The arm with those of its effects that act all the time between two instants."""
+def arm_between(
+    arm: ArmDynamics, effects: Sequence[Active], begin_s: float, end_s: float
+) -> ArmDynamics:
+    """The arm with those effects on its bodies that act all the time between two instants."""
     theta, gravity = arm.theta, arm.gravity
-    for active in own:
-        assert isinstance(active.effect, BodyEffect)
-        if active.interval_s[0] <= begin_s and end_s <= active.interval_s[1]:
+    for active in effects:
+        whole = active.interval_s[0] <= begin_s and end_s <= active.interval_s[1]
+        if isinstance(active.effect, BodyEffect) and whole:
             theta, gravity = active.effect.body(theta, gravity, active.joint, active.values)
     return arm.changed(theta, gravity)
 

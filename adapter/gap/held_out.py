@@ -22,31 +22,12 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
 from adapter.signals.validation import smooth
+from adapter.simulate import DrivenMotion, Simulate
 
 SEGMENT_S = 0.5
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
-
-
-class DrivenMotion(NamedTuple):
-    """How an arm moved and what drove it.
-
-    Attributes:
-        t: (m,) s, uniform.
-        q, dq: (m, n) measured, smoothed, rad and rad/s.
-        u: (m, n) driving torque, N m.
-    """
-
-    t: Array
-    q: Array
-    dq: Array
-    u: Array
-
-
-# (model, motion, segments, drive) -> simulated q, dq (m, n), NaN outside the segments and all
-# over where the model cannot be simulated
-Simulate = Callable[[SelfModel, DrivenMotion, Sequence[tuple[int, int]], str], tuple[Array, Array]]
 
 
 def model_of(model: SelfModel, fit: Fit) -> SelfModel:

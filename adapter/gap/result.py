@@ -21,6 +21,7 @@ IN_FILE = (
     "model_out",
     "where",
     "what_next",
+    "simulator",
     "stopped_after_rounds",
     "notes",
     "recordings",
@@ -153,6 +154,7 @@ class GapResult:
         model_out: where the new model is.
         what_next: experiments worth making, best first.
         where: what the nominal model's residual follows, one entry a joint.
+        simulator: in which was simulated; None where it was not.
         stopped_after_rounds: the search had to stop then, and might have found more; None where
             it came to its end.
         wall_s: how long all that took.
@@ -176,6 +178,7 @@ class GapResult:
     model_out: str | None = None
     what_next: tuple[str, ...] = ()
     where: tuple[dict[str, Any], ...] = ()
+    simulator: str | None = None
     stopped_after_rounds: int | None = None
     wall_s: float = 0.0
 

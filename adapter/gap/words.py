@@ -248,8 +248,8 @@ def _figures(result: GapResult) -> list[str]:
         ("torque noise, N m", result.noise_floor_nm, 1.0),
         ("torque error before, N m", before.torque_rmse_nm, 1.0),
         ("             after, N m", after.torque_rmse_nm, 1.0),
-        ("rollout error before, mrad", before.rollout_rmse_rad, 1e3),
-        ("              after, mrad", after.rollout_rmse_rad, 1e3),
+        (f"{result.simulator or 'rollout'} off by, before, mrad", before.rollout_rmse_rad, 1e3),
+        ("       after, mrad", after.rollout_rmse_rad, 1e3),
     ]
     return [
         f"{name:<{LABEL}} " + " ".join(f"{plain(factor * x, 3):>7}" for x in values)

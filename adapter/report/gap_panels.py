@@ -36,7 +36,8 @@ def error_panels(result: GapResult) -> list[Panel]:
         rollout = after.rollout_rmse_rad
         end = np.full(len(before.rollout_rmse_rad), np.nan) if rollout is None else rollout
         drawing = _steps(1e3 * before.rollout_rmse_rad, 1e3 * end, None)
-        note = "forward simulation, restarted from the data every 0.5 s"
+        by = f" by {result.simulator}" if result.simulator else ""
+        note = f"forward simulation{by}, restarted from the data every 0.5 s"
         panels.append(drawing.panel("Position error by joint", "mrad rms", note))
     return panels
 

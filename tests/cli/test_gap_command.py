@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.cli.rollouts import Rollouts
 from adapter.effects.torque import ModelTorque
 from adapter.gap.held_out import rms, rollout_errors
 from adapter.gap.signals import COMMANDS, MEASURED, Recorded
@@ -20,6 +19,7 @@ from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from adapter.signals.validation import validation_torque_rmse
+from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import read_log
 from sim.effects import Effect
 from sim.hidden import Recording, Trial, draw, nominal_urdf, pybullet_recording
@@ -206,10 +206,18 @@ def simulated(hidden: tuple[Trial, Recording]) -> tuple[Recorded, SelfModel, Sel
 
 def test_rollouts_of_the_command(hidden: tuple[Trial, Recording], tmp_path: Path) -> None:
     write_recording(hidden[1], tmp_path / "log.mcap")
-    figures = gap(tmp_path, "panda", [tmp_path / "log.mcap"])
+    figures = gap(tmp_path, "panda", [tmp_path / "log.mcap"], "--simulator", "mujoco")
     assert coulomb_on_joint_4(figures) == pytest.approx(2.0, rel=0.05)
+    assert figures["simulator"] == "mujoco"
     before, after = (np.array(figures[x]["rollout_rmse_rad"]) for x in ("before", "after"))
     assert after[3] < 0.2 * before[3] and (after < 0.3 * before).all()
+    assert "forward simulation by mujoco" in (tmp_path / "out" / "report.html").read_text()
+    recorded, model = Recorded.of(hidden[1].log()), load_model(figures["model_out"])
+    nominal = documented("panda")
+    both = [rollout_errors(recorded, nominal, [model], Rollouts(name)) for name in SIMULATORS]
+    for key in ("before_q", "after_q"):
+        mine, theirs = (rms([getattr(x, key)]) for x in both)
+        np.testing.assert_allclose(mine, theirs, rtol=0.1)
 
 
 def test_rollouts_by_commands_and_by_measured_torque(

@@ -8,13 +8,15 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from adapter.model.model_file import load_model
+from adapter.model.model_file import load_model, save_model
+from adapter.model.robots import documented
 from adapter.realtime import SnapshotWriter
 from adapter.runs.config import read_config
 from drivers.files.mcap import read_log
@@ -202,6 +204,18 @@ def test_learning_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     exec(code.replace("runs/tour/recording.mcap", str(short)), found)
     assert np.abs(found["tau"] - found["state"].tau).max() < 1.0
     assert (tmp_path / "learned.urdf").exists()
+
+
+def test_simulating_with_the_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "gap").mkdir(parents=True)
+    friction = {"effect": "coulomb_friction", "joints": [2], "parameters": {"Fc": 0.5}}
+    offset = {"effect": "torque_offset", "joints": [1], "parameters": {"o": 0.4}}
+    save_model(replace(documented("panda"), effects=(friction, offset)), "runs/gap/model.json")
+    names: dict[str, Any] = {}
+    exec(next(block for block in blocks("python") if "MujocoArm" in block), names)
+    assert names["tau"].tolist() == [0.4, *[0.0] * 6]
+    assert (names["dq"] != 0.0).sum() >= 5 and abs(names["q"][1] + 0.8) < 1e-4
 
 
 def test_reading_the_estimate() -> None:

@@ -8,21 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapter.cli.rollouts import Rollouts
 from adapter.effects.base import Array, JointSignals, LinearEffect, Parameter, Values
 from adapter.effects.catalogue import CATALOGUE, registered
 from adapter.effects.export import robot_urdf, to_urdf
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, experiments
-from adapter.gap.held_out import DrivenMotion
 from adapter.gap.words import headline
 from adapter.gap.workflow import find_gap
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf_text import DAMPING, Additions
+from adapter.simulate import SIMULATORS, DrivenMotion, Rollouts
 from sim.effects import Effect
-from sim.rollout import MotionTable, rollout
-from sim.truth import panda
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
+from tests.sim.test_sim_effects import Record, arm_with
 
 J, C = 1, 1.2  # the joint, from 0, and what it has, N m s²/rad²
 
@@ -93,23 +91,18 @@ def test_it_is_told_from_all_others(drag: Drag) -> None:
         assert "drag" in said and other.title in said
 
 
-def test_it_is_rolled_out() -> None:
-    """As the simulator does it that has the same equation of its own."""
-    data = stirring(2.0)
-    t, (q, dq, _, tau) = 1e-9 * (data.stamp_ns - data.stamp_ns[0]), data.true
-    drive = tau.copy()
-    drive[:, J] += C * dq[:, J] * np.abs(dq[:, J])
-    motion, segments = DrivenMotion(t, q, dq, drive), [(500, 1000), (1200, 1700)]
-    rollouts = Rollouts()
-    ours, _ = rollouts(with_drag(), motion, segments, "commands")
-    without, _ = rollouts(panda_model(), motion, segments, "commands")
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
+def test_it_is_simulated(simulator: str) -> None:
+    """As the simulated arm moves that has the same equation of its own."""
+    made = Record(arm_with(Effect("x_quadratic_drag", (J + 1,), {"c": C})), 0.6)
+    motion = DrivenMotion(made.t, made.read_q, made.read_dq, made.u)
+    rollouts = Rollouts(simulator)
+    off = [
+        np.nanmax(np.abs(rollouts(model, motion, [(100, 600)], "commands")[0] - made.read_q))
+        for model in (with_drag(), panda_model())
+    ]
     assert rollouts.troubles == []
-    truth = panda().with_changes(effects=(Effect("x_quadratic_drag", (J + 1,), {"c": C}),))
-    theirs = rollout(truth, MotionTable(*motion), segments).q
-    inside = np.isfinite(theirs)
-    assert inside[:, 0].sum() == 1000 and (np.isfinite(ours) == inside).all()
-    assert np.abs(ours - theirs)[inside].max() < 1e-5
-    assert np.abs(without - theirs)[inside].max() > 1e-3
+    assert off[0] < 1e-4 < 1e-3 < off[1]
 
 
 def test_it_is_exported() -> None:

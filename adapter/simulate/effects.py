@@ -1,0 +1,364 @@
+"""What a simulator's file of an arm leaves out, as joint torques to add in every step.
+
+The motion is the simulator's own: what acts in the drives and joints comes as a torque on the
+joint (`Effects.__call__`), what encoders and torque sensors make of it as a reading
+(`Effects.measured`). Each effect says itself where it belongs, by its class in `effects.base`:
+
+    TorqueEffect   friction, springs, ripple, motor inertia, a wrench at the flange: torque
+    BodyEffect     payload, link inertia, base tilt: in the file; where they come or go in
+                   mid-recording, the difference to the file as torque
+    MotionEffect   encoder offset and ripple, elasticity, backlash: read q, dq. The encoder sits on
+                   the motor's side of the gear, so the joint's torque moves the link as it is
+    SensorEffect   gain and delay of the torque sensors, and their offset: read tau
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from adapter.effects.active import Active, active_effects, by_joint, with_bodies
+from adapter.effects.base import BodyEffect, JointTorque, Motion, TorqueEffect
+from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth_sign
+from adapter.effects.export import MJCF_ATTRIBUTES, additions
+from adapter.effects.torque import arm_between, moved_links
+from adapter.errors import ModelError, SettingsError
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
+from adapter.physics.rigid_arm import RigidArm
+from adapter.simulate.friction import speed_change
+
+# What the joints of a file have beside the bodies, by the format's name.
+FORMATS: dict[str, tuple[str, ...]] = {
+    "bodies": (),
+    "bodies and armature": (ARMATURE,),
+    "urdf": URDF_PLACES,
+    "mjcf": tuple(MJCF_ATTRIBUTES),
+}
+CROSSING_S = 0.01  # the motor crosses the gear's play in this time
+BAND_HZ = 25.0  # of what twists an elastic joint before a simulation begins
+SLOPE_RAD_S = 1e-3  # over which a law's slope is taken
+# A law is asked five times at once: without direction, forwards, backwards, faster, accelerated.
+DIRECTIONS = np.array([[0.0], [1.0], [-1.0], [0.0], [0.0]])
+FASTER = np.array([[0.0], [0.0], [0.0], [SLOPE_RAD_S], [0.0]])
+ACCELERATED = np.array([[0.0], [0.0], [0.0], [0.0], [1.0]])
+
+
+class _Asked(JointSignals):
+    """Signals (5, n) whose direction of motion is told."""
+
+    direction = DIRECTIONS
+
+
+class _AskedMotion(Motion):
+    """The same over a table."""
+
+    @property
+    def direction(self) -> Array:
+        """As told."""
+        return np.broadcast_to(DIRECTIONS, self.q.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stage:
+    """What acts between two switches.
+
+    Attributes:
+        arm: the rigid body; laws: torques of joints; others: torques that only a table knows.
+        sensors: what encoders and torque sensors do; shifts: what the latter add last of all.
+    """
+
+    arm: RigidArm
+    laws: ByJoint
+    others: tuple[Active, ...]
+    sensors: ByJoint
+    shifts: ByJoint
+
+    @classmethod
+    def of(cls, arm: RigidArm, acting: Sequence[Active]) -> _Stage:
+        """Of the effects that act in it."""
+        torques = [a for a in acting if isinstance(a.effect, TorqueEffect)]
+        last = [a for a in torques if _after_sensors(a)]
+        laws = [a for a in torques if isinstance(a.effect, JointTorque) and a not in last]
+        n = arm.n
+        return cls(
+            arm,
+            by_joint(laws, n),
+            tuple(a for a in torques if a not in laws and a not in last),
+            by_joint([a for a in acting if a not in torques], n),
+            by_joint(last, n),
+        )
+
+    @cached_property
+    def reads_true(self) -> bool:
+        """Whether the torque sensors say what is."""
+        return not (self.sensors.gain.any() or self.sensors.delay_s.any() or self.shifts.laws)
+
+
+def _after_sensors(active: Active) -> bool:
+    return isinstance(active.effect, TorqueEffect) and active.effect.after_sensors
+
+
+@dataclass(frozen=True, eq=False)
+class _Asking:
+    """What the laws say at an instant, (n,) each: f(dq) = rest + viscous dq + level sign(dq)."""
+
+    rest: Array
+    viscous: Array
+    forwards: Array
+    backwards: Array
+    armature: Array
+
+    @classmethod
+    def of(cls, said: Array, dq: Array) -> _Asking:
+        """Of answers (5, n); friction that drives motion is no friction and acts as it stands."""
+        forwards, backwards = said[1] - said[0], said[0] - said[2]
+        level = np.where(dq > 0.0, forwards, backwards)
+        driving = np.minimum(level, 0.0) * np.tanh(dq / SMOOTHING_DQ)
+        viscous = np.maximum((said[3] - said[0]) / SLOPE_RAD_S, 0.0)
+        least = np.maximum(forwards, 0.0), np.maximum(backwards, 0.0)
+        return cls(said[0] - viscous * dq + driving, viscous, *least, said[4] - said[0])
+
+    def torque(self, u: Array, ddq: Array) -> Array:
+        """(n,) N m at the speed u, rad/s, and the acceleration ddq, rad/s²."""
+        level = np.where(u > 0.0, self.forwards, self.backwards)
+        return self.rest + self.viscous * u + level * smooth_sign(u) + self.armature * ddq
+
+
+class Effects:
+    """The effects of a model in a simulator that steps its rigid arm.
+
+    The torque is stateless and may be asked for as often as an integrator likes; what is read has
+    a memory (play of the gears, delay lines), so `measured` is called once a step and `reset` when
+    the arm is put somewhere else.
+
+    Args:
+        model: on a fixed base.
+        period_s: of the simulator's step. Friction, springs' damping and motor inertia are taken
+            at the end of the step (see `friction.speed_change`), which needs its length.
+        holds: what the simulator's arm has of the effects already, so that nothing counts twice:
+            one of `FORMATS`. "urdf" is what `adapter export --urdf` writes, "mjcf" what `--mjcf`
+            does; "bodies" the same without damping, friction, armature and springs (PyBullet takes
+            no friction from a URDF). All of them hold the inertias, payloads, the base's tilt and
+            the encoders' zero. `MujocoArm` and `PybulletArm` see to this by themselves.
+
+    Attributes:
+        joint_names: order of all (n,).
+        left_out: names of effects that no simulation has.
+
+    Raises:
+        ModelError: a floating base, an effect that is not in the catalogue.
+        SettingsError: an unknown format; a period that is not above 0.
+    """
+
+    def __init__(self, model: SelfModel, period_s: float = 1e-3, holds: str = "bodies") -> None:
+        if holds not in FORMATS:
+            raise SettingsError(f"no format '{holds}'; have: {', '.join(FORMATS)}")
+        if not period_s > 0.0:
+            raise SettingsError(f"a step of {period_s} s; needs more than 0")
+        if model.tree.floating:
+            raise ModelError(f"{model.name} has a floating base; effects need a fixed one")
+        n = model.tree.n
+        self.period_s, self.joint_names = period_s, model.tree.joint_names
+        self._nothing = np.zeros(n)
+        self._arm, self._held = RigidArm.of(model), RigidArm.of(with_bodies(model))
+        self._active = active_effects(model.effects, n)
+        self._holds = additions(model, FORMATS[holds])
+        ends = {float(x) for a in self._active for x in a.interval_s if np.isfinite(x)}
+        self._switches = np.array(sorted(ends))
+        self._stages: dict[int, _Stage] = {}
+        kinds = TorqueEffect, BodyEffect
+        silent = by_joint(self._active, n).left_out
+        told = {a.effect.name for a in self._active if isinstance(a.effect, kinds)}
+        self.left_out = tuple(name for name in silent if name not in told)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what the sensors remember."""
+        self._gap: Array | None = None
+        self._past: list[tuple[float, Array]] = []  # newest first: s, driving torque
+
+    def held(self, place: str) -> Array:
+        """(n,) what the simulator's joints hold in one of its places, see `model.urdf_text`."""
+        return self._holds.joint.get(place, self._nothing)
+
+    def __call__(
+        self, q: Array, dq: Array, ddq: Array | None, tau: Array, t: float | None = None
+    ) -> Array:
+        """Torque (n,) N m to add at the joints in the step that begins now.
+
+        Args:
+            q, dq: (n,) rad, rad/s, of the simulator's joints.
+            ddq: (n,) rad/s² in the last step; None where unknown. What a gear carries follows it.
+            tau: (n,) N m, what else acts on the joints in this step: drives, not gravity. Whether
+                a joint at rest breaks loose depends on it.
+            t: s since the recording began that the effects' times refer to; None: those without
+                an end act, as if long begun.
+        """
+        stage = self._stage(t)
+        if not stage.laws.laws and not stage.others and stage.arm is self._held:
+            return self._nothing.copy()
+        return self.at_middle(q, dq, ddq, tau, t, 0.0)
+
+    def at_middle(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array | None,
+        tau: Array,
+        t: float | None,
+        part: float = 0.5,
+    ) -> Array:
+        """The same, and what makes the simulator's step one of second order.
+
+        Simulators take what hangs on the speed (Coriolis torques) at the step's start; here it is
+        that of its middle, as far as the last step's acceleration tells.
+
+        Args:
+            q, dq, ddq, tau, t: as above.
+            part: of the step.
+        """
+        stage, link = self._stage(t), q - self._holds.offset
+        last = self._nothing if ddq is None else ddq
+        M, bias = _dynamics(self._held, link, dq)
+        body, carried = M, bias
+        if part or stage.arm is not self._held:
+            body, carried = _dynamics(stage.arm, link, dq + part * self.period_s * last)
+        a, u = last, dq
+        for _ in range(2 if stage.laws.by_load else 1):  # what a gear carries follows from a
+            asked = _Asking.of(self._said(stage, (link, dq, carried + body @ a), t), dq)
+            losses = np.array([asked.viscous, asked.forwards, asked.backwards])
+            push = tau - carried - asked.rest
+            dv, u = speed_change(body + np.diag(asked.armature), push, dq, losses, self.period_s)
+            a = dv / self.period_s
+        own = carried + body @ a + asked.torque(u, a)
+        return np.asarray(bias + M @ a + self._of_file(q, u, a) - own)
+
+    def measured(
+        self, q: Array, dq: Array, tau: Array, t: float | None = None
+    ) -> tuple[Array, Array, Array]:
+        """What the sensors say of q, dq and the driving torque tau, (n,) each; once a step."""
+        sensors, now = self._stage(t).sensors, self._clock(t)
+        last_s, last = self._past[0] if self._past else (now, tau)
+        passed_s = now - last_s if now > last_s else self.period_s
+        rate = (tau - last) / passed_s
+        gap, crossing = self._play(sensors.half_play, dq, passed_s)
+        turn = sensors.compliance
+        q_read = q - self._holds.offset + turn * tau + gap
+        dq_read = dq + turn * rate + crossing
+        angle = q_read + sensors.phase
+        dq_read = dq_read * (1.0 + sensors.ripple * np.cos(angle))
+        q_read = q_read + sensors.ripple * np.sin(angle) + sensors.offset
+        self._past.insert(0, (now, tau))
+        return q_read, dq_read, self._sensed(t, now)
+
+    def links(self, t: Array, q: Array, dq: Array, tau: Array) -> tuple[Array, Array]:
+        """q, dq (m, n) of the simulator's joints where the sensors read this at t (m,) s.
+
+        Args:
+            tau: (m, n) driving torque, N m.
+        """
+        ddq = np.gradient(dq, t, axis=0)
+        read = Motion(t, q, dq, ddq, self._arm, BAND_HZ)
+        moved = moved_links(read, self._active, tau)
+        return moved.q + self._holds.offset, moved.dq
+
+    def settle(self, q: Array, dq: Array, tau: Array, t: float, read: Array) -> None:
+        """Start anew with the gears' play such that the encoders read `read` (n,) rad."""
+        self.reset()
+        half = self._stage(t).sensors.half_play
+        if half.any():
+            self._gap = self._nothing
+            self._gap = np.clip(read - self.measured(q, dq, tau, t)[0], -half, half)
+            self._past.clear()
+
+    def driving(self, t: Array, read: Array) -> Array:
+        """Driving torque (m, n) N m behind what the torque sensors read at t (m,) s."""
+        stages = [self._stage(float(now)) for now in t]
+        if all(stage.reads_true for stage in stages):
+            return read
+        at = JointSignals(*np.zeros((3, *read[0].shape)))
+        shift = np.array([stage.shifts.torque(at) + self._nothing for stage in stages])
+        out = (read - shift) / (1.0 + np.array([stage.sensors.gain for stage in stages]))
+        late = np.array([stage.sensors.delay_s for stage in stages])
+        for j in np.flatnonzero(late.any(axis=0)):
+            out[:, j] = np.interp(t + late[:, j], t, out[:, j])
+        return out
+
+    def _stage(self, t: float | None) -> _Stage:
+        """What acts at t; what has no end where t is None."""
+        ends = self._switches
+        k = len(ends) if t is None else int(np.searchsorted(ends, t + 1e-9, side="right"))
+        if k not in self._stages:
+            begin = ends[k - 1] if k > 0 else -np.inf
+            end = ends[k] if k < len(ends) else np.inf
+            acting = [
+                a for a in self._active if a.interval_s[0] <= begin and end <= a.interval_s[1]
+            ]
+            now, held = arm_between(self._arm, acting, begin, end), self._held
+            same = (now.theta == held.theta).all() and (now.gravity == held.gravity).all()
+            arm = held if same else self._arm.changed(now.theta, now.gravity)
+            self._stages[k] = _Stage.of(arm, acting)
+        return self._stages[k]
+
+    def _said(self, stage: _Stage, state: tuple[Array, Array, Array], t: float | None) -> Array:
+        """Torque (5, n) of all laws, asked five times; `state` is q, dq and the rigid torque."""
+        q, dq, load = (np.tile(x, (5, 1)) for x in state)
+        dq, ddq = dq + FASTER, np.broadcast_to(ACCELERATED, q.shape)
+        said = stage.laws.torque(_Asked(q, dq, ddq, load)) + np.zeros(q.shape)
+        for active in stage.others:
+            assert isinstance(active.effect, TorqueEffect)
+            begin = active.interval_s[0]
+            since = self._clock(t) - (begin if np.isfinite(begin) else 0.0)
+            motion = _AskedMotion(np.full(5, since), q, dq, ddq, stage.arm)
+            said += active.effect.torque(motion, load, active.joint, active.values)
+        return said
+
+    def _of_file(self, q: Array, u: Array, ddq: Array) -> Array:
+        """Torque (n,) N m that the simulator takes off at the joints by itself."""
+        pull = self.held(STIFFNESS) * q + self._holds.pull
+        lost = self.held(DAMPING) * u + self.held(FRICTION) * smooth_sign(u)
+        return np.asarray(pull + lost + self.held(ARMATURE) * ddq)
+
+    def _play(self, half: Array, dq: Array, passed_s: float) -> tuple[Array, Array]:
+        """By how much (n,) the motors are ahead of the links, and its rate."""
+        if not half.any():
+            return self._nothing, self._nothing
+        way = np.clip(dq / SMOOTHING_DQ, -1.0, 1.0)
+        before = half * way if self._gap is None else self._gap
+        crossed = 2.0 * half * way * passed_s / CROSSING_S
+        self._gap = np.clip(before + crossed, -half, half)
+        return self._gap, (self._gap - before) / passed_s
+
+    def _sensed(self, t: float | None, now: float) -> Array:
+        """What the torque sensors say (n,): late, then scaled, then shifted."""
+        stage, tau = self._stage(t), self._past[0][1]
+        late = np.maximum(stage.sensors.delay_s, 0.0)
+        longest = now - late.max()
+        while len(self._past) > 2 and self._past[-2][0] < longest:
+            self._past.pop()
+        if late.any():
+            times, rows = (np.array(x[::-1]) for x in zip(*self._past, strict=True))
+            each = zip(late, rows.T, strict=True)
+            tau = np.array([np.interp(now - d, times, x) for d, x in each])
+        at = JointSignals(*np.zeros((3, len(tau))))
+        return np.asarray((1.0 + stage.sensors.gain) * tau + stage.shifts.torque(at))
+
+    def _clock(self, t: float | None) -> float:
+        """t; without one, steps counted since the last reset."""
+        if t is not None:
+            return float(t)
+        return self._past[0][0] + self.period_s if self._past else 0.0
+
+
+def _dynamics(arm: RigidArm, q: Array, dq: Array) -> tuple[Array, Array]:
+    """Mass matrix (n, n) kg m² and torque (n,) N m at rest of ddq, by inverse dynamics."""
+    n = arm.n
+    speed, ddq = np.zeros((2, n + 2, n))
+    speed[0], ddq[2:] = dq, np.eye(n)
+    tau = arm.torque(np.tile(q, (n + 2, 1)), speed, ddq)
+    return tau[2:] - tau[1], tau[0]

@@ -1,0 +1,215 @@
+"""Effects step by step: nothing counts twice, friction holds still, other loops work as well."""
+
+from __future__ import annotations
+
+import builtins
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.effects.export import mjcf_joints, to_urdf
+from adapter.errors import MeansError, ModelError, SettingsError
+from adapter.model.self_model import SelfModel
+from adapter.simulate import FORMATS, SIMULATORS, Effects, MujocoArm, Rollouts
+from sim.effects import Effect
+from sim.truth import panda
+from tests.helpers.arm_data import pin_model
+from tests.simulate.test_rollouts import CASES, PANDA, SENSED, model_with
+
+READY = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])
+DQ = np.array([0.4, -0.5, 0.6, 0.3, -0.7, 0.8, -0.9])
+LOSSES = (
+    Effect("viscous_friction", (1, 5), {"Fv": 0.6}),
+    Effect("coulomb_friction", (2, 7), {"Fc": 0.5}),
+    Effect("stribeck_friction", (4,), {"Fc": 0.4, "Fs": 1.0, "vs": 0.1}),
+    Effect("asymmetric_friction", (6,), {"Fc_pos": 0.5, "Fc_neg": 0.2}),
+    Effect("motor_inertia", (3, 6), {"B": 0.1}),
+    Effect("joint_spring", (5,), {"k": 1.5, "q0": 0.3}),
+)
+STICKING = (
+    Effect("coulomb_friction", (1, 5, 6, 7), {"Fc": 0.5}),
+    Effect("stribeck_friction", (2, 3, 4), {"Fc": 0.5, "Fs": 1.2, "vs": 0.05}),
+)
+
+
+def test_the_torque_is_that_of_the_effects_own_equations() -> None:
+    """Where nothing is stiff, against Pinocchio's rigid torque and the equations by hand."""
+    model = model_with(
+        Effect("viscous_friction", (1,), {"Fv": 0.6}),
+        Effect("coulomb_friction", (2,), {"Fc": 0.5}),
+        Effect("stribeck_friction", (4,), {"Fc": 0.4, "Fs": 1.0, "vs": 0.3}),
+        Effect("torque_ripple", (5,), {"a": 0.4, "n": 6.0, "phase": 0.2}),
+        Effect("torque_offset", (6,), {"o": 2.0}),
+        Effect("friction_drift", (7,), {"dFc": 0.02}),
+    )
+    arm = pin_model(panda())
+    load = pin.rnea(arm, arm.createData(), READY, DQ, np.zeros(7))
+    added = Effects(model, 1e-6)(READY, DQ, np.zeros(7), load, 5.0)
+    stribeck = 0.4 + 0.6 * np.exp(-((DQ[3] / 0.3) ** 2))
+    by_hand = [0.6 * DQ[0], -0.5, 0.0, stribeck]
+    by_hand += [0.4 * np.sin(6.0 * READY[4] + 0.2), 0.0, -0.02 * 5.0]  # the offset is a sensor's
+    np.testing.assert_allclose(added, -np.array(by_hand), atol=2e-3)
+
+
+def test_friction_goes_with_the_load_of_this_very_step() -> None:
+    """The load is the rigid torque at the acceleration that comes out, by Pinocchio."""
+    arm, tau = pin_model(panda()), np.array([5.0, -30.0, 8.0, 20.0, 1.0, 2.0, 0.1])
+    model = model_with(Effect("load_dependent_friction", (1, 2, 3), {"Fl": 0.1}))
+    added = Effects(model, 1e-6)(READY, DQ, None, tau, 0.0)
+    ddq = pin.aba(arm, arm.createData(), READY, DQ, tau + added)
+    load = pin.rnea(arm, arm.createData(), READY, DQ, ddq)
+    expected = -0.1 * np.abs(load[:3]) * np.sign(DQ[:3])
+    np.testing.assert_allclose(added[:3], expected, atol=0.02 * np.abs(load).max())
+
+
+@pytest.mark.parametrize("holds", list(FORMATS))
+def test_what_the_file_holds_is_not_added_again(holds: str) -> None:
+    """Each format loses what it holds by itself; with the rest the arm moves the same."""
+    model, h = model_with(*LOSSES), 1e-5
+    whole = _acceleration(model, "bodies", h)
+    np.testing.assert_allclose(_acceleration(model, holds, h), whole, rtol=1e-3)
+    assert np.abs(Effects(model, h, holds)(READY, DQ, None, np.zeros(7), 0.0)).max() > 0.1
+    if holds == "mjcf":  # holds all of these
+        held = model_with(LOSSES[0], LOSSES[1], LOSSES[4], LOSSES[5])
+        assert np.abs(Effects(held, h, holds)(READY, DQ, None, np.zeros(7), 0.0)).max() < 1e-9
+
+
+def _acceleration(model: SelfModel, holds: str, h: float) -> np.ndarray:
+    """(n,) rad/s² of one step; losses of the file by hand, as a simulator takes them."""
+    arm = pin_model(panda())
+    data = arm.createData()
+    M = pin.crba(arm, data, READY) + 0.0
+    M = np.triu(M) + np.triu(M, 1).T
+    tau = pin.rnea(arm, data, READY, DQ, np.zeros(7))
+    tau = tau + Effects(model, h, holds)(READY, DQ, None, tau, 0.0)
+    push = tau - pin.rnea(arm, data, READY, DQ, np.zeros(7))
+    parts = {
+        "bodies": (),
+        "bodies and armature": ("armature",),
+        "urdf": ("damping", "frictionloss"),
+    }
+    every = ("damping", "frictionloss", "armature", "stiffness", "springref")
+    D, F, A, K, ref = (
+        np.array([joint.get(key, 0.0) for joint in mjcf_joints(model)])
+        * (key in parts.get(holds, every))
+        for key in every
+    )
+    push = push - F * np.sign(DQ) - K * (READY - ref) - D * DQ
+    return np.linalg.solve(M + np.diag(A + h * D), push)
+
+
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
+def test_friction_holds_still_without_chattering(simulator: str) -> None:
+    """At 1 ms, under a torque below friction: the arm creeps less than a hand's unrest."""
+    model = model_with(*STICKING)
+    arm = SIMULATORS[simulator](model)
+    arm.place(READY, np.zeros(7))
+    rigid = pin_model(panda())
+    hold = pin.rnea(rigid, rigid.createData(), READY, np.zeros(7), np.zeros(7))
+    push = 0.4 * np.array([1, -1, 1, -1, 1, -1, 1])
+    speeds = []
+    for _ in range(500):
+        arm.step(hold + push)
+        speeds.append(arm.state()[1])
+    arm.close()
+    late = np.array(speeds)[100:]
+    assert np.abs(late).max() < 0.02  # law: tanh(dq / 0.01) reaches 0.8 at 0.011 rad/s
+    assert np.abs(np.diff(late, axis=0)).max() < 1e-3  # no speed that jumps to and fro
+    assert (late * np.sign(push) > -1e-6).all()
+
+
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
+def test_a_joint_comes_to_rest(simulator: str) -> None:
+    arm = SIMULATORS[simulator](model_with(*STICKING))
+    arm.place(READY, 0.3 * DQ)
+    rigid = pin_model(panda())
+    data = rigid.createData()
+    for _ in range(1000):
+        q, dq = arm.state()
+        arm.step(pin.rnea(rigid, data, q, dq, np.zeros(7)))
+    _, dq = arm.state()
+    arm.close()
+    assert np.abs(dq).max() < 1e-4
+
+
+def test_sensors_read_what_the_effects_say() -> None:
+    effects = Effects(
+        model_with(
+            Effect("encoder_offset", (1,), {"o": 0.02}),
+            Effect("encoder_ripple", (2,), {"a": 0.01, "phase": 0.2}),
+            Effect("joint_elasticity", (3,), {"k": 3000.0}),
+            Effect("backlash", (4,), {"b": 0.008}),
+            Effect("torque_gain", (5,), {"g": 0.06}),
+            Effect("torque_offset", (6,), {"o": 0.5}),
+            Effect("signal_delay", (7,), {"d": 0.002}),
+        )
+    )
+    tau = np.array([1.0, 2.0, 30.0, 4.0, 5.0, 6.0, 0.0])
+    for k in range(40):
+        t = 1e-3 * k
+        tau[6] = 2.0 * t
+        q, dq, read = effects.measured(READY, DQ, tau.copy(), t)
+    # the encoder's offset is in the zero of the file already
+    expected = READY + np.array([0.0, 0.01 * np.sin(READY[1] + 0.2), 0.01, 0.004, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(q, expected, atol=1e-12)
+    np.testing.assert_allclose(read, [1.0, 2.0, 30.0, 4.0, 5.3, 6.5, 2.0 * 0.037], atol=1e-9)
+    ripple = 0.01 * np.cos(READY[1] + 0.2) * DQ[1]
+    np.testing.assert_allclose(dq, DQ + np.array([0, ripple, 0, 0, 0, 0, 0]), atol=1e-12)
+    effects.reset()
+    assert effects.measured(READY, -DQ, tau, 0.0)[0][3] == pytest.approx(READY[3] - 0.004)
+
+
+def test_plain_mj_steps_have_the_effects() -> None:
+    """A file with losses of its own, stepped by anybody, moves as our loop moves the bare arm."""
+    model = model_with(*LOSSES)
+    theirs = mujoco.MjModel.from_xml_string(to_urdf(replace(model, frames=())))
+    theirs.opt.timestep = 1e-3
+    data = mujoco.MjData(theirs)
+    wrapped, own = MujocoArm(model, (theirs, data)), MujocoArm(model)
+    wrapped.put(READY, DQ)
+    own.put(READY, DQ)
+    tau = np.array([1.0, -20.0, 2.0, 18.0, 0.3, 1.8, 0.1])
+    data.qfrc_applied[:] = tau
+    with wrapped.acting():
+        for _ in range(200):
+            mujoco.mj_step(theirs, data)
+    for _ in range(200):
+        own.advance(tau + own.effects(*own.read(), None, tau, own.data.time))
+    np.testing.assert_allclose(wrapped.read()[0], own.read()[0], atol=1e-4)
+    assert np.abs(own.read()[0] - READY).max() > 0.02
+    assert mujoco.get_mjcb_passive() is None
+
+
+def test_missing_mujoco_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    real: Callable[..., Any] = builtins.__import__
+
+    def without(name: str, *rest: Any, **more: Any) -> Any:
+        if name == "mujoco":
+            raise ImportError(name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MeansError, match=r"panda-adapter\[mujoco\]"):
+        Rollouts("mujoco")
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    with pytest.raises(SettingsError, match="no format 'sdf'; have: bodies, "):
+        Effects(PANDA, holds="sdf")
+    with pytest.raises(SettingsError, match=r"step of 0.0 s"):
+        Effects(PANDA, 0.0)
+    other = replace(PANDA, tree=replace(PANDA.tree, joint_names=tuple("abcdefg")))
+    arm = MujocoArm(PANDA)
+    with pytest.raises(ModelError, match="no joint 'a'; has: panda_joint1"):
+        MujocoArm(other, (arm.model, arm.data))
+
+
+def test_every_effect_is_simulated() -> None:
+    """Of the catalogue, all is done on one side or the other."""
+    for effect in (*CASES, *SENSED):
+        assert Effects(model_with(effect)).left_out == ()
