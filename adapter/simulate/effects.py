@@ -23,9 +23,10 @@ import numpy as np
 from adapter.effects.active import Active, active_effects, by_joint, with_bodies
 from adapter.effects.base import BodyEffect, JointTorque, Motion, TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth_sign
-from adapter.effects.export import MJCF_ATTRIBUTES, additions
+from adapter.effects.export import additions
 from adapter.effects.torque import arm_between, moved_links
 from adapter.errors import ModelError, SettingsError
+from adapter.model.mjcf_text import MJCF_PLACES
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
@@ -37,7 +38,7 @@ FORMATS: dict[str, tuple[str, ...]] = {
     "bodies": (),
     "bodies and armature": (ARMATURE,),
     "urdf": URDF_PLACES,
-    "mjcf": tuple(MJCF_ATTRIBUTES),
+    "mjcf": tuple(MJCF_PLACES),
 }
 CROSSING_S = 0.01  # the motor crosses the gear's play in this time
 BAND_HZ = 25.0  # of what twists an elastic joint before a simulation begins

@@ -12,8 +12,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.effects.export import mjcf_joints, to_urdf
+from adapter.effects.export import additions, to_urdf
 from adapter.errors import MeansError, ModelError, SettingsError
+from adapter.model.mjcf_text import MJCF_PLACES, joint_attributes
 from adapter.model.self_model import SelfModel
 from adapter.simulate import FORMATS, SIMULATORS, Effects, MujocoArm, Rollouts
 from sim.effects import Effect
@@ -93,9 +94,10 @@ def _acceleration(model: SelfModel, holds: str, h: float) -> np.ndarray:
         "bodies and armature": ("armature",),
         "urdf": ("damping", "frictionloss"),
     }
+    more = additions(model, tuple(MJCF_PLACES))
     every = ("damping", "frictionloss", "armature", "stiffness", "springref")
     D, F, A, K, ref = (
-        np.array([joint.get(key, 0.0) for joint in mjcf_joints(model)])
+        np.array([joint_attributes(more, j).get(key, 0.0) for j in range(7)])
         * (key in parts.get(holds, every))
         for key in every
     )
