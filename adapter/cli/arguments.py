@@ -300,6 +300,38 @@ def _check_gap(args: argparse.Namespace) -> None:
     _check_files(*args.logs)
 
 
+def _load(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Weigh what the hand carries from the first sample of a recording on: mass, centre and "
+        "inertia with standard deviations, and the lines that Franka and Universal Robots take. "
+        "Without --empty the documented arm is the reference."
+    )
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="MCAP recording with the load, moving or at rest")
+    add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
+    add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
+    _add_joints(parser)
+    add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
+    add(
+        "--inertia-prior",
+        type=float,
+        metavar="SHARE",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.03; "
+        "0.2 with --empty)",
+    )
+    add("--json", type=Path, metavar="FILE|-", help="write the figures; - to the standard output")
+    parser.set_defaults(check=_check_load)
+
+
+def _check_load(args: argparse.Namespace) -> None:
+    locks_of(args)
+    if args.inertia_prior is not None and not 0.0 < args.inertia_prior <= 1.0:
+        raise UsageError(f"--inertia-prior must be in (0, 1], got {args.inertia_prior}")
+    if args.robot is not None:
+        _check_robot(args.robot)
+    _check_files(args.log, args.empty)
+
+
 def _discover(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "From joint signals and link motion in unknown order find which joint moves which link "
@@ -436,6 +468,7 @@ COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str]] = {
     "run": (_run, "learn live"),
     "replay": (_replay, "learn from a recording"),
     "gap": (_gap, "find what a model lacks"),
+    "load": (_load, "what the hand carries, to type into the robot"),
     "discover": (_discover, "find the tree of a robot from the motion of its links"),
     "sim": (_sim, "simulated hardware behind real wire protocols"),
     "import": (_import, "turn tables into a recording"),

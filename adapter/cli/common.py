@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import tempfile
+from pathlib import Path
 from typing import Any
 
 from adapter.cli.arguments import joints_of, locks_of
@@ -14,11 +16,23 @@ from adapter.learning.known_effects import learnable, not_taken_off
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_from, config_table, read_config
 from adapter.runs.terminal import program_version, warn
+from drivers.files.mcap import Log
 
 
 def robot_of(args: argparse.Namespace, name: str | None) -> SelfModel:
     """The documented robot by name or file, with the joints that the command line asks for."""
     return read_robot(name or "panda", joints=joints_of(args), lock=locks_of(args))
+
+
+def robot_of_log(args: argparse.Namespace, log: Log) -> SelfModel:
+    """The robot asked for, else the one that the recording carries, else the Panda."""
+    carried = log.attachments.get("documented.json")
+    if args.robot is not None or carried is None:
+        return robot_of(args, args.robot)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "documented.json"
+        path.write_bytes(carried)
+        return robot_of(args, str(path))
 
 
 def configure(

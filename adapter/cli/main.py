@@ -20,6 +20,7 @@ RUN_BY = {
     "run": "adapter.cli.run:run",
     "replay": "adapter.cli.replay:run",
     "gap": "adapter.cli.gap:run",
+    "load": "adapter.cli.load:run",
     "discover": "adapter.cli.discover:run",
     "sim": "adapter.cli.sim:run",
     "import": "adapter.cli.files:run_import",

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.progress import Progress
 
-from adapter.cli.common import configure, robot_of
+from adapter.cli.common import configure, robot_of_log
 from adapter.cli.results import Learned, conclude
 from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
@@ -42,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     whole = read_log(args.log)
     recorded = whole.metadata.get("config")
-    robot = _robot(args, whole)
+    robot = robot_of_log(args, whole)
     recorded = recorded if isinstance(recorded, dict) else None
     config = configure(args, recorded, robot)
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
@@ -95,17 +93,6 @@ def _figures(
         noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
         gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
     )
-
-
-def _robot(args: argparse.Namespace, log: Log) -> SelfModel:
-    """The robot asked for, else the one that the recording carries, else the Panda."""
-    carried = log.attachments.get("documented.json")
-    if args.robot is not None or carried is None:
-        return robot_of(args, args.robot)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "documented.json"
-        path.write_bytes(carried)
-        return robot_of(args, str(path))
 
 
 def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:

@@ -71,6 +71,7 @@ REAL_ARM_EFFECTS = ("viscous_friction", "coulomb_friction", "torque_offset", "mo
 
 # Effects that parts of the program need as such.
 LATENESS = CATALOGUE["signal_delay"]  # what samples look like whose torques come late
+HELD = CATALOGUE["payload"]  # what the hand carries
 WRONG_LINK = CATALOGUE["link_inertia"]  # what inertias are that are wrong altogether
 
 

@@ -93,22 +93,9 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
         Refusal: another robot; no second of data; units or sign of velocities or positions;
             too little motion; units, sign, order or meaning of the torques.
     """
-    recorded = log.joint_names
-    log = _of_this_robot(log, model)
-    names = model.tree.joint_names
-    signals = (log.q, log.dq, log.tau)
-    timing = check_timing(log.stamp_ns, *signals)
-    keep = uniform(log.stamp_ns, *signals)
-    log = rows_of(log, keep)
-    if timing.span_s < MOTION_S or len(log) < 100:
-        raise RecordingRefused(
-            RecordingFault.DATA,
-            f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
-            f"{timing.samples}; record at least {MOTION_S:g} s, better 20 s, of motion.",
-        )
+    recorded, names = log.joint_names, model.tree.joint_names
+    log, timing, outside = cleaned(log, model)
     renamed = not set(names) <= set(recorded)
-    _check_motion_units(log, model, timing)
-    outside = _outside_limits(log, model, recorded, renamed)
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     q, dq, ddq, tau = smooth(stamps_s, log.q, log.dq, log.tau)
     moving = moving_joints(q, dq)
@@ -117,6 +104,34 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     judge_torque(log, model, arm, (q, dq, ddq, tau), renamed, recorded)
     notes = [*timing.words(), *outside, *_standing(names, moving, q, dq), *silent]
     return Screened(log, timing, moving, notes)
+
+
+def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]:
+    """The usable samples of a recording, whether it moves or rests.
+
+    Args:
+        log: as read; model: whose joints it should have.
+
+    Returns:
+        The recording with the model's joints, its clock, and notes on joints beyond their limits.
+
+    Raises:
+        Refusal: another robot, too few samples, units or sign of velocities or positions.
+    """
+    recorded = log.joint_names
+    log = _of_this_robot(log, model)
+    signals = (log.q, log.dq, log.tau)
+    timing = check_timing(log.stamp_ns, *signals)
+    log = rows_of(log, uniform(log.stamp_ns, *signals))
+    if timing.span_s < MOTION_S or len(log) < 100:
+        raise RecordingRefused(
+            RecordingFault.DATA,
+            f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
+            f"{timing.samples}; record at least {MOTION_S:g} s, better 20 s, of motion.",
+        )
+    _check_motion_units(log, model, timing)
+    renamed = not set(model.tree.joint_names) <= set(recorded)
+    return log, timing, _outside_limits(log, model, recorded, renamed)
 
 
 def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:

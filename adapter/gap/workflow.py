@@ -120,7 +120,7 @@ def _task(
         locked += said
     arm = RigidArm.of(model)
     screened: list[Screened] = [refuse(log, model, arm) for log in read]
-    recordings = tuple(Recorded.of(x.log, _lateness(x.timing)) for x in screened)
+    recordings = tuple(Recorded.of(x.log, lateness(x.timing)) for x in screened)
     if len(recordings) > 1:
         fitted, scored = recordings[:-1], recordings[-1:]
     elif settings.validate_from_s is not None:
@@ -147,7 +147,7 @@ def _name(log: Path | str | Log) -> str:
     return log.path.name if isinstance(log, Log) else Path(log).name
 
 
-def _lateness(timing: RecordingClock) -> float:
+def lateness(timing: RecordingClock) -> float:
     """How much later dq is than q, where that is known, s."""
     late, std = timing.lateness_s, timing.lateness_std_s
     return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
