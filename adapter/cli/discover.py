@@ -149,4 +149,10 @@ def _write_model(
     if left is not None:
         what = f"λ and θ; torque left unexplained {left.max():.2g} N m rms at the worst joint"
     console.print(f"{args.model}: {what}")
-    return {"model": str(args.model), "torque_rmse_nm": left}
+    arbitrary = model.provenance["discovered"]["theta_arbitrary"]
+    if left is not None and arbitrary:
+        console.print(
+            f"θ of {len(arbitrary)} links is arbitrary where no torque shows it; the model file "
+            "lists what"
+        )
+    return {"model": str(args.model), "torque_rmse_nm": left, "theta_arbitrary": arbitrary}

@@ -127,12 +127,9 @@ def write_robot(path: Path, written: RobotText) -> None:
 def run_export(args: argparse.Namespace) -> int:
     """Carry `export` out."""
     model = check_effects(load_model(args.model), args.model)
-    filled = list(model.provenance.get("lambda_filled", ()))
-    facts: dict[str, Any] = {
-        "model": str(args.model),
-        "lambda_source": model.lambda_source,
-        "lambda_filled": filled,
-    }
+    facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
+    for key in ("lambda_filled", "theta_filled"):
+        facts[key] = list(model.provenance.get(key, ()))
     for kind, path, text_of in (
         ("urdf", args.urdf, robot_urdf),
         ("mjcf", args.mjcf, robot_mjcf),
@@ -149,8 +146,13 @@ def run_export(args: argparse.Namespace) -> int:
         onto = "" if written.onto is None else f" onto {written.onto}"
         console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     write_json(args.json, facts)
-    for words in filled:
-        console.print(f"  from the documentation, as no data showed it: {words}", soft_wrap=True)
+    for key, what in (("lambda_filled", "no motion"), ("theta_filled", "no torque")):
+        if facts[key]:
+            console.print(f"from the documentation, as {what} shows it alone:")
+        for words in facts[key]:
+            console.print(f"  {words}", soft_wrap=True)
+    if "theta_moved" in model.provenance:
+        warn([model.provenance["theta_moved"]])
     return 0
 
 

@@ -18,12 +18,14 @@ from adapter.errors import ModelError
 from adapter.learning.batch.moments import LinkNoise
 from adapter.learning.batch.schema import BatchSchemaSettings, SchemaResult, schema_from_moments
 from adapter.learning.batch.theta_factors import row_factors, scales, system
+from adapter.learning.batch.theta_filling import filled_words
 from adapter.learning.batch.theta_solvers import consistent_theta, least_squares_theta
 from adapter.learning.theta import PRIOR_STD, neutral_body
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import LAMBDA_MEASURED, SelfModel, gravity_down
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
+from adapter.physics.identifiability import numerical_rank
 
 CHANNEL_NOISE_FLOOR = 1e-9  # rad/s, m/s, ...: keeps a link at rest from infinite weight
 ROUNDS = 3  # of weighting
@@ -155,9 +157,9 @@ def self_model(
     tree = data.tree
     with_torque = discovery.log.tau is not None and "a" in discovery.bodies.motion
     left = None
-    theta = np.tile(neutral_body(), (tree.bodies, 1))
+    theta, arbitrary = np.tile(neutral_body(), (tree.bodies, 1)), ["all"]
     if with_torque and np.abs(data.tau).max() > 0.0:
-        theta, left = theta_of(data, schema.lam)
+        theta, left, arbitrary = theta_of(data, schema.lam)
     gravity = gravity_down()
     if not tree.floating and "a" in discovery.bodies.motion:
         gravity = -data.base.a.mean(axis=0)
@@ -177,16 +179,17 @@ def self_model(
                 "mounting": {k: m.as_dict() for k, m in discovery.mountings.items()},
                 "lambda_arbitrary": schema.freedom.words(tree),
                 "theta": "learned from joint torques" if left is not None else "not learned",
+                "theta_arbitrary": arbitrary,
             }
         },
     ), left
 
 
-def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
-    """θ (bodies, 10) and the torque (n,), N m rms, that it leaves unexplained.
+def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array, list[str]]:
+    """θ (bodies, 10), the torque (n,), N m rms, that it leaves unexplained, and what is arbitrary.
 
     The wrench on a floating base is not used: nothing in a recording measures it. What torques
-    don't show stays near a neutral body. Friction is not modelled.
+    don't show stays near a neutral body, which is said by link. Friction is not modelled.
 
     Args:
         data: samples with joint torques; the base's motion with gravity.
@@ -201,9 +204,11 @@ def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array]:
         r, b = system(rows, std, bodies)
         theta[first:] = least_squares_theta(r, b, theta[first:]).theta
         std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
+    shown = numerical_rank(system(rows, std, bodies)[0])[1]
+    arbitrary = filled_words(shown, data.tree.body_names[first:])
     r, b = _with_prior(*system(rows, std, bodies), np.tile(neutral_body(), (len(bodies), 1)))
     theta[first:] = consistent_theta(r, b).theta
-    return theta, np.array([row.residual(theta) for row in rows])
+    return theta, np.array([row.residual(theta) for row in rows]), arbitrary
 
 
 def _with_prior(r: Array, b: Array, centre: Array) -> tuple[Array, Array]:

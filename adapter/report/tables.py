@@ -20,7 +20,7 @@ LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
 HIDDEN = 1e-6  # a share below it is none
-DOCUMENTED, PRIOR = "taken from the documentation", "held at its prior"
+DOCUMENTED = "taken from the documentation"
 
 TIMES = {
     "tick_us": "Compute: driver, filter, synthesis",
@@ -139,7 +139,7 @@ def theta_matrix(data: RunData) -> Matrix:
     rows = []
     for j, name in enumerate(names):
         shares = data.theta_shown[j] if started else np.zeros(10)
-        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], PRIOR) for k in range(10)]
+        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], DOCUMENTED) for k in range(10)]
         rows.append((name, cells))
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
@@ -208,7 +208,10 @@ def theta_table(data: RunData) -> Table:
         alone = data.theta_shown[j] > SHARE_ALONE
         pairs = zip(theta, std, alone, strict=True)
         rows.append([name, *(plus_minus(x, s) if a else f"({number(x)})" for x, s, a in pairs)])
-    note = "In brackets: the value of a possible body, not identifiable on its own."
+    note = (
+        "In brackets: not identifiable on its own; of all possible bodies with the learned "
+        "combinations those nearest to the documented ones."
+    )
     return Table(["Link", *THETA_NAMES], rows, ["", *THETA_UNITS], note)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
+from adapter.learning.batch.theta_filling import filled_theta, filled_words
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
@@ -17,7 +18,8 @@ from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import base_parameters
+from adapter.physics.identifiability import base_parameters, random_motion
+from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import LinkMotionKind
 
 SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
@@ -159,6 +161,38 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda
     return CompletedLambda(lam, freedom.words(documented.tree))
 
 
+def completed_theta(
+    outcome: Outcome, documented: SelfModel, lam: Array, basis: Array
+) -> tuple[Array, dict[str, Any]]:
+    """The learned θ (n, 10) with what torques do not show taken from the documentation.
+
+    Torques stay what they were, unless no possible bodies have them.
+
+    Args:
+        lam: (n, 6) λ as it leaves the house; basis: of the combinations that torques show.
+
+    Returns:
+        θ, and what is to be said of it, for the model's provenance.
+    """
+    if outcome.theta_started_ns is None:
+        return documented.theta, {"theta_source": "documentation: λ had not converged"}
+    motion = random_motion(documented.tree, 4 * len(basis), seed=0)
+    arm = RigidArm.of(replace(documented, lam=lam))
+    table = arm.regressor(*motion).reshape(-1, len(basis))
+    found = filled_theta(outcome.theta, documented.theta, basis, table)
+    said: dict[str, Any] = {
+        "theta_source": "learned",
+        "theta_filled": filled_words(basis, documented.tree.link_names),
+    }
+    if not found.possible:
+        moved = table @ (found.theta - outcome.theta).ravel()
+        said["theta_moved"] = (
+            "no possible bodies have what was learned; the nearest are off by "
+            f"{np.sqrt(np.mean(moved**2)):.2g} N m rms"
+        )
+    return found.theta, said
+
+
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
     """The self model a run ends with, as it leaves the house: what was learned, and what no data
     showed as the documentation has it, which is said.
@@ -173,13 +207,14 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     base = base_parameters(documented.tree, completed.lam, documented.gravity)
     share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
     known = outcome.theta_started_ns is not None
+    theta, said = completed_theta(outcome, documented, completed.lam, base.basis)
     body = outcome.covariance.diagonal()[: 10 * (n + 1)].reshape(-1, 10)
     body = body[np.r_[: n - 1, n]] if outcome.spare_in_use else body[:n]
     return replace(
         documented,
         name=f"{documented.name} (learned)",
         lam=completed.lam,
-        theta=outcome.theta,
+        theta=theta,
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
@@ -190,7 +225,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         provenance={
             **provenance,
             "lambda_filled": completed.filled,
-            "theta_source": "learned" if known else "neutral prior: λ had not converged",
+            **said,
             "changes": changes(outcome),
         },
     )

@@ -77,3 +77,21 @@ def test_measured_frames_keep_what_the_data_show(seed: int) -> None:
     std = np.sqrt(np.einsum("jaa->ja", outcome.lam_covariance))[2:]
     assert (turn < 5.0 * np.linalg.norm(std[:, :3], axis=1)).all()
     assert (shift < 5.0 * np.linalg.norm(std[:, 3:], axis=1)).all()
+
+
+def test_theta_leaves_the_house_with_the_documented_weights_and_the_learned_torques() -> None:
+    documented, outcome = panda_model(), collect(taught("synthesized", 0))
+    model = learned_model(outcome, documented)
+    arm = RigidArm.of(model)
+    motion = random_motion(documented.tree, 50, 3)
+    learned = arm.changed(theta=outcome.theta).torque(*motion)
+    assert np.abs(arm.torque(*motion) - learned).max() < 1e-6
+    assert model.theta[0, 0] == pytest.approx(
+        documented.theta[0, 0], rel=0.05
+    )  # no torque shows it
+    assert (model.theta[:, 0] > 0.05 * documented.theta[:, 0]).all()
+    back = loads(dumps(model)).provenance
+    assert back["theta_source"] == "learned" and back["theta_filled"][0] == "panda_link1: all"
+    none = learned_model(replace(outcome, theta_started_ns=None), documented)
+    np.testing.assert_array_equal(none.theta, documented.theta)
+    assert none.provenance["theta_source"] == "documentation: λ had not converged"

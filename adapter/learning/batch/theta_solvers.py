@@ -115,17 +115,25 @@ def _svd(matrix: Array) -> tuple[Array, Array, Array]:
 _UPPER = [(row, column) for column in range(4) for row in range(column + 1)]
 
 
-def _entries(matrix: Array) -> Array:
+def entries(matrix: Array) -> Array:
     """(..., 10) of symmetric matrices (..., 4, 4): as Clarabel wants a triangle."""
     twice = np.sqrt(2.0)
     parts = [matrix[..., i, j] * (1.0 if i == j else twice) for i, j in _UPPER]
     return np.stack(parts, axis=-1)
 
 
+def matrices(entry: Array) -> Array:
+    """Symmetric matrices (..., 4, 4) of their entries (..., 10)."""
+    out = np.empty((*entry.shape[:-1], 4, 4))
+    for k, (i, j) in enumerate(_UPPER):
+        out[..., i, j] = out[..., j, i] = entry[..., k] / (1.0 if i == j else np.sqrt(2.0))
+    return out
+
+
 _UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
-_FROM_THETA = _entries(_UNITS @ pseudo_inertia(np.eye(PER_BODY)) @ _UNITS).T  # entries of one body
+_FROM_THETA = entries(_UNITS @ pseudo_inertia(np.eye(PER_BODY)) @ _UNITS).T  # entries of one body
 _TO_THETA = np.linalg.inv(_FROM_THETA)
-_ONE = _entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
+_ONE = entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
 
 
 @dataclass(frozen=True)
@@ -175,13 +183,13 @@ def _roomiest(shown: Array, hidden: Array) -> Possible:
     goal = np.append(LIGHT * (free.T @ one), -1.0)
     in_cone = np.column_stack([-free, one])
     in_room = np.append(np.zeros(count), 1.0)
-    cones = [*_cones(bodies), clarabel.NonnegativeConeT(1)]
-    x, steps, _ = _solve(
+    in_cones = [*cones(bodies), nonnegative(1)]
+    x, steps, _ = solve_conic(
         np.zeros((count + 1, count + 1)),
         goal,
         np.vstack([in_cone, in_room]),
         np.append(fixed, ROOM) / size,
-        cones,
+        in_cones,
     )
     if not np.isfinite(x).all():
         return Possible(shown, steps, False)
@@ -198,12 +206,12 @@ def _closest(r: Array, b: Array) -> Possible:
     quadratic, goal = table.T @ table / power, -(table.T @ b) / power
     hold = HELD * float(np.trace(quadratic)) / len(quadratic)
     one = np.tile(_ONE, bodies)
-    x, steps, solved = _solve(
+    x, steps, solved = solve_conic(
         quadratic + hold * np.eye(len(quadratic)),
         goal - hold * one,
         -np.eye(len(quadratic)),
         -EDGE * one,
-        _cones(bodies),
+        cones(bodies),
     )
     if not np.isfinite(x).all():
         raise ModelError("no possible bodies were found near what the data say; are they sound?")
@@ -214,21 +222,29 @@ def _closest(r: Array, b: Array) -> Possible:
     return Possible(theta + lifted, steps, solved)
 
 
-def _cones(bodies: int) -> list[clarabel.PSDTriangleConeT]:
+def cones(bodies: int) -> list[object]:
+    """Where the entries of so many bodies' matrices are those of possible bodies."""
     return [clarabel.PSDTriangleConeT(4)] * bodies
 
 
-def _solve(
-    quadratic: Array, linear: Array, left: Array, right: Array, cones: list[object]
+def nonnegative(count: int) -> object:
+    """Where so many numbers are not below zero."""
+    return clarabel.NonnegativeConeT(count)
+
+
+def solve_conic(
+    quadratic: Array, linear: Array, left: Array, right: Array, in_cones: list[object]
 ) -> tuple[Array, int, bool]:
-    """Minimise x·Q x / 2 + linear·x where right - left x lies in the cones: x, steps, solved."""
+    """Minimise x·Q x / 2 + linear·x where right - left x lies in cones: x, steps, solved."""
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = PRECISION
     # Its scaling of rows would turn the cones; the units above scale better.
     settings.equilibrate_enable = False
     upper = sparse.triu(sparse.csc_matrix(quadratic), format="csc")
-    solver = clarabel.DefaultSolver(upper, linear, sparse.csc_matrix(left), right, cones, settings)
+    solver = clarabel.DefaultSolver(
+        upper, linear, sparse.csc_matrix(left), right, in_cones, settings
+    )
     answer = solver.solve()
     return np.array(answer.x), int(answer.iterations), str(answer.status) in SOLVED
 

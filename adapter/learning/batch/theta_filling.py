@@ -1,0 +1,173 @@
+"""Bodies with what torques do not show taken from the documentation.
+
+Torques show combinations of inertial parameters (base parameters); of all possible bodies that
+have the learned combinations, those nearest to the documented ones are the model's. Near is by
+the documented body's own measure: with J = L Lᵀ its pseudo-inertia, |L⁻¹ (J' - J) L⁻ᵀ|, a share
+of its mass and size that does not depend on the frame (the affine-invariant distance of Lee,
+Wensing and Park 2020, for small changes).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.learning.batch.theta_factors import qr_factor
+from adapter.learning.batch.theta_solvers import (
+    LENGTH,
+    cones,
+    entries,
+    matrices,
+    nonnegative,
+    solve_conic,
+)
+from adapter.model.inertia import PARAMETERS, pseudo_inertia, theta_from_pseudo_inertia
+from adapter.model.spatial import Array
+
+KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
+LEAST_KEPT = 1e-3  # the same where no possible body has what was learned
+# Of its mass: what counts as the least eigenvalue (kg, lengths in units of `LENGTH`) of a
+# documented body in measuring others; a rod or a point has none.
+LEAST_SIZE = 1e-3
+NEARNESS = 1e-8  # weight of nearness beside the torques, where both cannot be had
+ALONE = 0.99  # of a parameter that must show for it to be called learned
+
+
+@dataclass(frozen=True)
+class FilledTheta:
+    """θ as it leaves the house.
+
+    Attributes:
+        theta: (bodies, 10), every body possible.
+        kept: least share that is left of any documented body.
+        possible: whether possible bodies have the learned combinations; else θ is that of the
+            possible bodies nearest to them, by torque.
+    """
+
+    theta: Array
+    kept: float
+    possible: bool
+
+
+def filled_theta(learned: Array, told: Array, basis: Array, regressor: Array) -> FilledTheta:
+    """The possible bodies nearest to the documented ones that have the learned combinations.
+
+    Args:
+        learned, told: (bodies, 10) θ as learned and as documented.
+        basis: (10 bodies, rank) orthonormal, the combinations that torques show.
+        regressor: (m, 10 bodies) torques over motion, what is near where no possible body has
+            the learned combinations.
+
+    Raises:
+        ModelError: the solver gave up without an answer.
+    """
+    measure = _Measure(told)
+    start = measure.of(learned)
+    hidden = np.linalg.svd(basis.T)[2][basis.shape[1] :]
+    free = np.linalg.qr(measure.of(hidden.reshape(-1, *told.shape)).T)[0]
+    toward = free.T @ (measure.told - start)
+    share = start + free @ toward
+    least = measure.least(share)
+    if least < KEPT:
+        room = _most_room(measure, start, free)
+        if room <= 0.0:
+            return _nearest_by_torque(measure, start, regressor)
+        margin = min(KEPT, 0.5 * room)
+        y = solve_conic(
+            np.eye(free.shape[1]), -toward, -free, start - margin * measure.own, measure.cones
+        )[0]
+        share = start + free @ y
+        least = measure.least(share)
+    return FilledTheta(measure.theta(share), least, True)
+
+
+def filled_words(basis: Array, names: tuple[str, ...]) -> list[str]:
+    """What of θ torques do not show alone, so that the documentation says it; by link.
+
+    Args:
+        basis: as of `filled_theta`; names: of the bodies.
+    """
+    shown = np.einsum("ab,ab->a", basis, basis).reshape(-1, len(PARAMETERS)) > ALONE
+    found = []
+    for name, flags in zip(names, shown, strict=True):
+        own = [p for p, flag in zip(PARAMETERS, flags, strict=True) if flag]
+        rest = [p for p in PARAMETERS if p not in own]
+        most = f"all but {' '.join(own)}" if own else "all"
+        if rest:
+            found.append(f"{name}: {most if len(rest) > len(own) else ' '.join(rest)}")
+    return found
+
+
+class _Measure:
+    """Bodies as shares of the documented ones: entries (10 bodies,) of L⁻¹ J L⁻ᵀ, one by one.
+
+    Attributes:
+        told: the documented bodies themselves; own: as much in all directions as they have in
+            that in which they have least; cones: of as many possible bodies.
+    """
+
+    def __init__(self, told: Array) -> None:
+        units = np.diag([1.0 / LENGTH] * 3 + [1.0])
+        values, vectors = np.linalg.eigh(units @ pseudo_inertia(told) @ units)
+        mass = np.maximum(told[:, 0], LEAST_SIZE)
+        values = np.maximum(values, LEAST_SIZE * mass[:, None])
+        root = vectors * np.sqrt(values)[:, None, :]
+        self._root = np.linalg.inv(units) @ root
+        self._inverse = np.linalg.inv(self._root)
+        self.told, self.cones = self.of(told), cones(len(told))
+        least = np.linalg.eigvalsh(matrices(self.told.reshape(-1, 10)))[:, 0]
+        self._size = np.clip(least, LEAST_SIZE, 1.0)
+        self.own = np.kron(self._size, entries(np.eye(4)))
+
+    def of(self, theta: Array) -> Array:
+        """(..., 10 bodies) of θ (..., bodies, 10)."""
+        inverse = self._inverse
+        shares = entries(inverse @ pseudo_inertia(theta) @ np.swapaxes(inverse, -1, -2))
+        return shares.reshape(*shares.shape[:-2], -1)
+
+    def theta(self, share: Array) -> Array:
+        """θ (bodies, 10) back."""
+        return theta_from_pseudo_inertia(
+            self._root @ matrices(share.reshape(-1, 10)) @ np.swapaxes(self._root, -1, -2)
+        )
+
+    def least(self, share: Array) -> float:
+        """Least share of a documented body (of its `own`) that is left in any direction."""
+        values = np.linalg.eigvalsh(matrices(share.reshape(-1, 10)))[:, 0]
+        return float((values / self._size).min())
+
+
+def _most_room(measure: _Measure, start: Array, free: Array) -> float:
+    """The largest share, up to `KEPT`, that can be left of every body at once; 0 where none."""
+    count = free.shape[1]
+    x, _, _ = solve_conic(
+        NEARNESS * np.diag(np.append(np.ones(count), 0.0)),
+        np.append(np.zeros(count), -1.0),
+        np.vstack([np.column_stack([-free, measure.own]), np.append(np.zeros(count), 1.0)]),
+        np.append(start, KEPT),
+        [*measure.cones, nonnegative(1)],
+    )
+    if not np.isfinite(x).all():
+        return 0.0
+    return min(float(x[-1]), measure.least(start + free @ x[:-1]))
+
+
+def _nearest_by_torque(measure: _Measure, start: Array, regressor: Array) -> FilledTheta:
+    """Possible bodies whose torques are nearest to those of what was learned."""
+    back = np.array([measure.theta(x).ravel() for x in np.eye(len(start))])  # θ of each unit
+    table = regressor @ back.T
+    table = qr_factor(table) / max(float(np.linalg.norm(table @ start)), 1e-300)
+    quadratic = table.T @ table + NEARNESS * np.eye(len(start))
+    share, _, _ = solve_conic(
+        quadratic,
+        -table.T @ (table @ start) - NEARNESS * measure.told,
+        -np.eye(len(start)),
+        -LEAST_KEPT * measure.own,
+        measure.cones,
+    )
+    least = measure.least(share) if np.isfinite(share).all() else 0.0
+    if least <= 0.0:
+        raise ModelError("no possible bodies were found near what was learned; is it sound?")
+    return FilledTheta(measure.theta(share), least, False)
