@@ -151,8 +151,8 @@ def run_export(args: argparse.Namespace) -> int:
             console.print(f"from the documentation, as {what} shows it alone:")
         for words in facts[key]:
             console.print(f"  {words}", soft_wrap=True)
-    if "theta_moved" in model.provenance:
-        warn([model.provenance["theta_moved"]])
+    if "theta_note" in model.provenance:
+        warn([f"θ: {model.provenance['theta_note']}"])
     return 0
 
 

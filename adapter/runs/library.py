@@ -237,6 +237,7 @@ class Learner:
             names = learnable(self._documented, REAL_ARM_EFFECTS)
             settings = PipelineSettings(learner=LearnerSettings(effects=names))
         self._pipeline = Pipeline(self._documented, settings)
+        self._told: tuple[int, SelfModel] | None = None  # at how many samples, and what
 
     def step(
         self,
@@ -270,7 +271,11 @@ class Learner:
     @property
     def model(self) -> SelfModel:
         """The self model as it is known now, with standard deviations."""
-        return learned_model(collect(self._pipeline.learner), self._documented)
+        learned = self._pipeline.learner.learned
+        if self._told is None or self._told[0] != learned:
+            model = learned_model(collect(self._pipeline.learner), self._documented)
+            self._told = learned, model
+        return self._told[1]
 
     @property
     def refused(self) -> dict[str, int]:

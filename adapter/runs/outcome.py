@@ -10,6 +10,7 @@ import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
+from adapter.errors import ModelError
 from adapter.learning.batch.theta_filling import filled_theta, filled_words
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
 from adapter.learning.learner import OnlineLearner
@@ -179,14 +180,15 @@ def completed_theta(
     motion = random_motion(documented.tree, 4 * len(basis), seed=0)
     arm = RigidArm.of(replace(documented, lam=lam))
     table = arm.regressor(*motion).reshape(-1, len(basis))
-    found = filled_theta(outcome.theta, documented.theta, basis, table)
-    said: dict[str, Any] = {
-        "theta_source": "learned",
-        "theta_filled": filled_words(basis, documented.tree.link_names),
-    }
+    said: dict[str, Any] = {"theta_source": "learned"}
+    try:
+        found = filled_theta(outcome.theta, documented.theta, basis, table)
+    except ModelError as error:  # a run's results are not lost over it
+        return outcome.theta, {**said, "theta_note": f"nothing of it is filled: {error}"}
+    said["theta_filled"] = filled_words(basis, documented.tree.link_names)
     if not found.possible:
         moved = table @ (found.theta - outcome.theta).ravel()
-        said["theta_moved"] = (
+        said["theta_note"] = (
             "no possible bodies have what was learned; the nearest are off by "
             f"{np.sqrt(np.mean(moved**2)):.2g} N m rms"
         )

@@ -11,6 +11,7 @@ import pytest
 from adapter.cli import main
 from adapter.model.model_file import load_model
 from drivers.files.mcap import read_log
+from tests.helpers.robot_models import PANDA
 
 pytestmark = pytest.mark.alone
 
@@ -77,8 +78,12 @@ def test_export(run, tmp_path: Path) -> None:
     folder, _ = run
     urdf = tmp_path / "arm.urdf"
     facts = command(
-        "export", folder / "model.json", "--urdf", urdf, "--json", tmp_path / "facts.json"
+        *("export", folder / "model.json", "--urdf", urdf, "--mjcf", tmp_path / "arm.xml"),
+        *("--json", tmp_path / "facts.json"),
     )
+    assert facts["onto"] == "panda.urdf" and facts["mjcf"] == str(tmp_path / "arm.xml")
+    assert urdf.read_text().startswith(PANDA.read_text()[:500])
+    assert {"lambda_filled", "theta_filled"} <= facts.keys()
     assert facts["lambda_source"] == "reproduces the documentation"
     model = load_model(folder / "model.json")
     exported = pin.buildModelFromUrdf(str(urdf))

@@ -33,6 +33,7 @@ LEAST_KEPT = 1e-3  # the same where no possible body has what was learned
 LEAST_SIZE = 1e-3
 NEARNESS = 1e-8  # weight of nearness beside the torques, where both cannot be had
 ALONE = 0.99  # of a parameter that must show for it to be called learned
+UNSOLVED = "no possible bodies were found near what was learned; is it sound?"
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,9 @@ def filled_theta(learned: Array, told: Array, basis: Array, regressor: Array) ->
             np.eye(free.shape[1]), -toward, -free, start - margin * measure.own, measure.cones
         )[0]
         share = start + free @ y
-        least = measure.least(share)
+        least = measure.least(share) if np.isfinite(share).all() else 0.0
+    if least <= 0.0:
+        raise ModelError(UNSOLVED)
     return FilledTheta(measure.theta(share), least, True)
 
 
@@ -104,8 +107,8 @@ class _Measure:
     """Bodies as shares of the documented ones: entries (10 bodies,) of L⁻¹ J L⁻ᵀ, one by one.
 
     Attributes:
-        told: the documented bodies themselves; own: as much in all directions as they have in
-            that in which they have least; cones: of as many possible bodies.
+        told: the documented bodies themselves; own: the same, rods and points given some size;
+            cones: of as many possible bodies.
     """
 
     def __init__(self, told: Array) -> None:
@@ -117,9 +120,11 @@ class _Measure:
         self._root = np.linalg.inv(units) @ root
         self._inverse = np.linalg.inv(self._root)
         self.told, self.cones = self.of(told), cones(len(told))
-        least = np.linalg.eigvalsh(matrices(self.told.reshape(-1, 10)))[:, 0]
-        self._size = np.clip(least, LEAST_SIZE, 1.0)
-        self.own = np.kron(self._size, entries(np.eye(4)))
+        values, vectors = np.linalg.eigh(matrices(self.told.reshape(-1, 10)))
+        size = np.sqrt(np.clip(values, LEAST_SIZE, 1.0))[:, None, :]
+        back = np.swapaxes(vectors, -1, -2)
+        self.own = entries(vectors * size**2 @ back).ravel()
+        self._whiten = vectors / size @ back
 
     def of(self, theta: Array) -> Array:
         """(..., 10 bodies) of θ (..., bodies, 10)."""
@@ -135,8 +140,8 @@ class _Measure:
 
     def least(self, share: Array) -> float:
         """Least share of a documented body (of its `own`) that is left in any direction."""
-        values = np.linalg.eigvalsh(matrices(share.reshape(-1, 10)))[:, 0]
-        return float((values / self._size).min())
+        whole = self._whiten @ matrices(share.reshape(-1, 10)) @ self._whiten
+        return float(np.linalg.eigvalsh(whole).min())
 
 
 def _most_room(measure: _Measure, start: Array, free: Array) -> float:
@@ -169,5 +174,5 @@ def _nearest_by_torque(measure: _Measure, start: Array, regressor: Array) -> Fil
     )
     least = measure.least(share) if np.isfinite(share).all() else 0.0
     if least <= 0.0:
-        raise ModelError("no possible bodies were found near what was learned; is it sound?")
+        raise ModelError(UNSOLVED)
     return FilledTheta(measure.theta(share), least, False)
