@@ -332,6 +332,27 @@ def _check_load(args: argparse.Namespace) -> None:
     _check_files(args.log, args.empty)
 
 
+def _diff(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "What differs from model A to model B, joint by joint: frames, inertias and effects, by "
+        "how many standard deviations, whether any data could show it, and what it does to torques "
+        "and to the hand's place. Of one model alone: from its documentation to it."
+    )
+    add = parser.add_argument
+    add("first", metavar="A", help="model file (.json), robot file or known name")
+    add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
+    _add_joints(parser)
+    add("--json", type=Path, metavar="FILE|-", help="write the figures; - to the standard output")
+    parser.set_defaults(check=_check_diff)
+
+
+def _check_diff(args: argparse.Namespace) -> None:
+    locks_of(args)
+    for name in (args.first, args.second):
+        if name is not None:
+            _check_robot(name)
+
+
 def _discover(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "From joint signals and link motion in unknown order find which joint moves which link "
@@ -469,6 +490,7 @@ COMMANDS: dict[str, tuple[Callable[[argparse.ArgumentParser], None], str]] = {
     "replay": (_replay, "learn from a recording"),
     "gap": (_gap, "find what a model lacks"),
     "load": (_load, "what the hand carries, to type into the robot"),
+    "diff": (_diff, "two models of one arm, joint by joint"),
     "discover": (_discover, "find the tree of a robot from the motion of its links"),
     "sim": (_sim, "simulated hardware behind real wire protocols"),
     "import": (_import, "turn tables into a recording"),

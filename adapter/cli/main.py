@@ -21,6 +21,7 @@ RUN_BY = {
     "replay": "adapter.cli.replay:run",
     "gap": "adapter.cli.gap:run",
     "load": "adapter.cli.load:run",
+    "diff": "adapter.cli.diff:run",
     "discover": "adapter.cli.discover:run",
     "sim": "adapter.cli.sim:run",
     "import": "adapter.cli.files:run_import",

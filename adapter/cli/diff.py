@@ -1,0 +1,29 @@
+"""`adapter diff`: two models of one arm, joint by joint."""
+
+from __future__ import annotations
+
+import argparse
+
+from rich.markup import escape
+
+from adapter.cli.common import robot_of
+from adapter.report.difference_words import difference_json, difference_lines
+from adapter.runs.compare import compare, documentation_of
+from adapter.runs.terminal import console, json_text, write_json
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out: from the documentation to the model, or from A to B."""
+    first = robot_of(args, args.first)
+    if args.second is None:
+        first, second = documentation_of(first), first
+    else:
+        second = robot_of(args, args.second)
+    found = compare(first, second)
+    if str(args.json) == "-":
+        print(json_text(difference_json(found)))
+    else:
+        write_json(args.json, difference_json(found))
+    for line in difference_lines(found):
+        console.print(escape(line), soft_wrap=True)
+    return 0
