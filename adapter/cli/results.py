@@ -78,6 +78,8 @@ def print_figures(figures: dict[str, Any]) -> None:
         f"{max(lam['position_error_m']):.2g} m against {lam['reference']}; "
         f"{lam['identifiable_rank']} directions shown",
     )
+    if lam["restarts"]:
+        table.add_row("  out of wrong valleys", f"joints started anew {lam['restarts']} times")
     for words in lam["filled"]:
         table.add_row("  from the documentation", words)
     rmse = theta["torque_rmse_nm"]

@@ -20,7 +20,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
-VERSION = 3
+VERSION = 4
 
 # What each part would not be the same learner without. Everything else follows from the settings.
 _STATE = {
@@ -30,9 +30,20 @@ _STATE = {
         "_judged",
     ),
     "schema": (
-        *("R0", "p", "start_lam", "kind", "updates", "information", "identifiable", "_inverse"),
-        *("_distance", "rank", "_calm", "converged", "_rough", "_then"),
+        *("R0", "p", "start_lam", "kind", "updates", "information", "identifiable", "certain"),
+        *(
+            "_inverse",
+            "_may_move",
+            "_distance",
+            "rank",
+            "ranks",
+            "_calm",
+            "converged",
+            "_rough",
+            "_then",
+        ),
     ),
+    "schema.check": ("misfit", "passed_at", "passed_rank", "turn", "restarts"),
     "schema.moments": MotionMoments._fields,
     "theta": (
         *("x", "mean", "th", "count", "prior", "prior_rhs", "_ranges", "floor", "floor_count"),

@@ -79,9 +79,23 @@ def _channel(sums: Array, c: int, frame: Frame, g: Array, h: Array) -> float:
 
 def profiled_weights(sums: Array, count: float, frame: Frame) -> Array:
     """Weights (c,) of the channels by what the frame leaves of each, as the learner has them."""
+    _, least = _powers(sums, count)
+    return np.asarray(3.0 * count / (channel_costs(sums, frame) + least))
+
+
+def log_misfit(sums: Array, count: float, frame: Frame) -> float:
+    """Logarithm of the share of each channel that a frame leaves unexplained, summed over them.
+
+    None below `MISFIT_FLOOR` of a channel's power.
+    """
+    power, least = _powers(sums, count)
+    return float(np.log((channel_costs(sums, frame) + least) / (power + least)).sum())
+
+
+def _powers(sums: Array, count: float) -> tuple[Array, Array]:
+    """Sum of |y|² of each channel, and the least misfit that is looked at."""
     power = np.trace(sums[:, :3, :3], axis1=1, axis2=2)
-    least = 3.0 * count * NOISE_FLOOR**2 + MISFIT_FLOOR * power
-    return np.asarray(3.0 * count / (channel_costs(sums, frame) + least + 1e-300))
+    return power, 3.0 * count * NOISE_FLOOR**2 + MISFIT_FLOOR * power + 1e-300
 
 
 def weighted_power(sums: Array, weights: Array) -> float:
@@ -171,6 +185,16 @@ def best_frame(sums: Array, weights: Array, prior: Frame) -> tuple[Frame, float]
     found = [descend(sums, weights, start) for start in first_frames(sums, weights, prior)]
     good = min(cost for _, cost in found) + SAME_COST * weighted_power(sums, weights)
     return min((x for x in found if x[1] <= good), key=lambda x: x[0].distance(prior))
+
+
+def hidden_freedom(sums: Array, weights: Array, frame: Frame, least: float) -> Freedom:
+    """What moments do not show of a frame: all whose curvature is not above `least`."""
+    _, _, own = slope_and_curvature(sums, weights, frame)
+    turn = np.eye(6)
+    turn[:3, :3] = frame.R0
+    values, vectors = np.linalg.eigh(turn @ own @ turn.T)
+    hidden = vectors[:, values <= least]
+    return Freedom.of((hidden @ hidden.T)[None], frame.p[None])
 
 
 def nearest(sums: Array, weights: Array, frame: Frame, to: Frame, freedom: Freedom) -> Frame:

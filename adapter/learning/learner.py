@@ -160,7 +160,7 @@ class OnlineLearner:
         self._judged = -1
         self._shadow: Moments | None = None
         self._shadow_at = 0
-        self.schema_trace = Trace(1 + 12 * tree.n)
+        self.schema_trace = Trace(2 + 13 * tree.n)
         self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
         self.score_trace = Trace(1 + 3 * tree.n + 2 * tree.rows, capacity=12_000)
 
@@ -201,7 +201,7 @@ class OnlineLearner:
         updating = self._since_update >= self.settings.update_every
         if updating:
             self._since_update = 0
-            self.schema.compute_gradient()
+            self._schema_gradient()
         theta_too = self._theta_is_due(table) and self._take_torque(table)
         if updating:
             self._update(theta_too)
@@ -248,7 +248,7 @@ class OnlineLearner:
         if len(table):
             self.schema.absorb(table)
         for _ in range(updates):
-            self.schema.compute_gradient()
+            self._schema_gradient()
             self._adam_step(theta_too=False)
         self.learned += len(table)
         if updates:
@@ -279,6 +279,13 @@ class OnlineLearner:
             s = self.settings.theta
             self.adam.rate = s.settled_rate if self.theta_converged else s.rate
 
+    def _schema_gradient(self) -> None:
+        """λ's gradient; what ADAM remembers of a joint that has jumped is of no use."""
+        self.schema.compute_gradient()
+        while self.schema.started_anew:
+            j = self.schema.started_anew.pop()
+            self.adam.forget(slice(6 * j, 6 * j + 6))
+
     def _update(self, theta_too: bool) -> None:
         """One ADAM step on λ and, if it is being learned, on θ."""
         ready = theta_too and self.theta.compute_gradient()
@@ -296,7 +303,10 @@ class OnlineLearner:
 
     def _trace_schema(self, table: Array) -> None:
         if self.schema_trace.due(len(table)):
-            self.schema_trace.keep(stamp_of(table[-1]), self.schema.R0, self.schema.p)
+            s = self.schema
+            self.schema_trace.keep(
+                stamp_of(table[-1]), s.R0, s.p, s.ranks.astype(float), float(s.converged)
+            )
 
     def _theta_is_due(self, table: Array) -> bool:
         """Whether θ is being learned; sees to it that its moments follow λ."""

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adapter.learning.frame_fit import Frame
+from adapter.learning.schema_check import Evidence, SchemaCheck
 from adapter.learning.schema_kernels import (
     Count,
     MotionMoments,
@@ -80,9 +82,13 @@ class Schema:
         tangent, gradient: (n, 6) what ADAM steps on (zero between steps), and its gradient.
         moments: of all samples so far.
         information: (n, 6, 6) of (phi, d).
-        identifiable: (n, 6, 6) projector on the directions the data show.
-        rank: their number over all joints.
-        converged: whether λ has settled (see SchemaSettings).
+        identifiable: (n, 6, 6) projector on the directions the data show, if roughly: ADAM keeps
+            to them. rank: their number over all joints.
+        certain: (n, 6, 6) projector on those that are known as well as is asked for; ranks: (n,)
+            their number by joint.
+        converged: whether λ has settled (see SchemaSettings), in no joint in a wrong valley.
+        check: looks for wrong valleys; counts `restarts`.
+        started_anew: joints that were moved since ADAM last forgot its averages of them.
     """
 
     def __init__(
@@ -120,12 +126,16 @@ class Schema:
         self._clean = np.zeros_like(self.moments.M)
         self.updates = 0
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
-        self._H, self._distance = np.zeros((n, 6, 6)), np.zeros(n)
-        self._everything = np.tile(np.eye(6), (n, 1, 1))
+        self._H, self._distance = np.zeros((n, 6, 6)), np.zeros((n, 2))
         self.information = np.zeros((n, 6, 6))
         self.identifiable = np.zeros((n, 6, 6))
-        self._inverse = np.zeros((n, 6, 6))
+        # by directions that are known, and those that are not yet
+        self._may_move, self._inverse = np.zeros((2, n, 2, 6, 6))
+        self.certain = np.zeros((n, 6, 6))
         self.rank = 0
+        self.ranks, self._there = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
+        self.check = SchemaCheck(n, max(settings.stable_updates // settings.judge_every, 1))
+        self.started_anew: list[int] = []
         self._calm = 0
         self.converged = False
         self._rough, self._then = not settings.spin_measured, self.R0.copy()
@@ -227,19 +237,24 @@ class Schema:
         shown = np.einsum("jaa->j", self.identifiable)
         self._rough = bool(np.abs(turned).max() > CARRIED_TURN or shown.min() < 1.0)
         if self._rough:
-            self._forget_all()
-            self._then = self.R0.copy()
+            self._carry_anew()
+
+    def _carry_anew(self) -> None:
+        """Drop moments that other frames than those of now have carried dw in."""
+        self._forget_all()
+        self._rough, self._then = True, self.R0.copy()
 
     def apply_step(self, rate: float) -> None:
         """Move the frames by ADAM's step in `tangent`, taken at `rate`, and zero it."""
         s = self.settings
         if self.each_sample:
-            unlimited = np.full(len(self.p), np.inf)
-            pace = s.sample_rate, 1.0, rate
-            retract(self._frames, self.tangent, self._everything, unlimited, pace)
+            everywhere = np.zeros_like(self._may_move)
+            everywhere[:, 0] = np.eye(6)
+            unlimited = np.tile([np.inf, 0.0], (len(self.p), 1))
+            retract(self._frames, self.tangent, everywhere, unlimited, (s.sample_rate, 1.0, rate))
         else:
             pace = s.rate, s.share, rate
-            retract(self._frames, self.tangent, self.identifiable, self._distance, pace)
+            retract(self._frames, self.tangent, self._may_move, self._distance, pace)
 
     def _profile(self) -> None:
         """Fill the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
@@ -253,24 +268,54 @@ class Schema:
 
     def _judge(self) -> None:
         """Which directions the data show, how far the optimum is, whether λ has settled."""
-        gain = self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
+        gain = self._gain
         self.information[:] = self._H / gain
         values, vectors = np.linalg.eigh(self._H)
         # noise alone makes eigenvalues of the size sqrt(count); 400 is a std of 0.05 rad or m
         shown = values > max(400.0, 10.0 * np.sqrt(self.count))
-        kept = vectors * shown[:, None, :]
-        self.identifiable[:] = kept @ kept.transpose(0, 2, 1)
-        safe = np.where(shown, values, 1.0)
-        self._inverse[:] = (kept / safe[:, None, :]) @ kept.transpose(0, 2, 1)
-        rank = int(shown.sum())
-        distance = np.abs(np.einsum("jab,jb->ja", self._inverse, self.gradient))
-        std = np.sqrt(np.einsum("jaa->ja", self._inverse) * gain)
-        goal = np.repeat([self.settings.rotation_goal, self.settings.position_goal], 3)
-        calm = rank > 0 and rank == self.rank and bool((np.maximum(distance, std) < goal).all())
-        self._calm = self._calm + self.settings.judge_every if calm else 0
-        self.rank = rank
+        certain = values > gain / self.settings.std_goal**2
+        for k, kind in enumerate((shown & certain, shown & ~certain)):
+            kept = vectors * kind[:, None, :]
+            self._may_move[:, k] = kept @ kept.transpose(0, 2, 1)
+            safe = np.where(kind, values, 1.0)
+            self._inverse[:, k] = (kept / safe[:, None, :]) @ kept.transpose(0, 2, 1)
+        self.identifiable[:] = self._may_move.sum(axis=1)
+        self.certain[:] = self._may_move[:, 0]
+        self.rank, ranks = int(shown.sum()), (shown & certain).sum(axis=1)
+        step = np.abs(np.einsum("jab,jb->ja", self._inverse[:, 0], self.gradient))
+        std = np.sqrt(gain * np.einsum("jaa->ja", self._inverse[:, 0]))
+        s = self.settings
+        self._there = (step < np.maximum(s.distance_goal, std)).all(axis=1)
+        calm = self._there.all() and ranks.any() and bool((ranks == self.ranks).all())
+        self._calm = self._calm + s.judge_every if calm else 0
+        self.ranks[:] = ranks
         self._hold_unshown()
-        self.converged = self._calm >= self.settings.stable_updates and not self._rough
+        if not self.each_sample and not self._rough:
+            self._check_valleys()
+        settled = self._calm >= self.settings.stable_updates and not self._rough
+        self.converged = settled and (self.each_sample or self.check.passed(self.ranks))
+
+    @property
+    def _gain(self) -> float:
+        """Samples that one independent sample is worth."""
+        return self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
+
+    def _check_valleys(self) -> None:
+        """Start joints anew that stand in a wrong valley; ADAM goes on from there."""
+        least = self._gain / self.settings.std_goal**2
+        clean = self._clean if self.kind == LinkMotionKind.MEASURED else self.moments.M
+        for j in self.check.next_joints():
+            sums = self.moments.M[j], clean[j]
+            still = bool(self._there[j] and self.ranks[j])
+            known = Evidence(*sums, self.count, int(self.ranks[j]), least, still)
+            start = Frame(matrix_from_zxz(self.start_lam[j, :3]), self.start_lam[j, 3:])
+            found = self.check.better(j, Frame(self.R0[j].copy(), self.p[j].copy()), start, known)
+            if found is not None:
+                self.R0[j], self.p[j], self.gradient[j] = found.R0, found.p, 0.0
+                self.started_anew.append(j)
+                self._calm = 0
+        if self.started_anew and not self.settings.spin_measured:
+            self._carry_anew()
 
     def _hold_unshown(self) -> None:
         """Put shifts that the data do not show back to where they started.
@@ -278,15 +323,14 @@ class Schema:
         Steps keep out of such directions, but while noise still tilts the picture of what is
         shown, a little leaks into them.
         """
-        unshown = self._everything - self.identifiable
+        unshown = np.eye(6) - self.identifiable
         pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < PURE_SHIFT
         leaked = np.einsum("jab,jb->ja", unshown[:, 3:, 3:], self.p - self.start_lam[:, 3:])
         self.p -= pure[:, None] * leaked
 
     def covariance(self) -> Array:
         """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""
-        gain = self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
-        return gain * self._inverse
+        return np.asarray(self._gain * self._inverse.sum(axis=1))
 
     def moved_from(self, R0: Array, p: Array) -> Array:
         """(n, 6) small turns and shifts (phi, d) from other frames to these, rad and m.

@@ -378,16 +378,18 @@ def steepest(frames, M, g):
 
 @jit
 def distances(inverse, count, g, out):
-    """out (n,): longest entry of each joint's Newton step, rad or m; then g is put per sample."""
+    """out (n, 2): longest entry of each joint's Newton step, rad or m, in the directions that are
+    known and in those that are not yet (inverse (n, 2, 6, 6)); then g is put per sample."""
     for j in range(g.shape[0]):
-        out[j] = np.abs(inverse[j] @ g[j]).max()
+        for k in range(2):
+            out[j, k] = np.abs(inverse[j, k] @ g[j]).max()
     g /= max(count, 1.0)
 
 
 @jit
 def descend(frames, M, count, inverse, g, out):
     """`profiled` without curvature, then `distances`, in one call for the 1 kHz step."""
-    profiled(frames, M, count, M[:0], g, inverse)  # no curvature: nothing is written there
+    profiled(frames, M, count, M[:0], g, inverse[:, 0])  # no curvature: nothing is written there
     distances(inverse, count, g, out)
 
 
@@ -397,17 +399,19 @@ def retract(frames, step, project, distance, pace):
 
     Args:
         frames: `Frames` as a plain tuple, moved.
-        project: (n, 6, 6) onto the directions that may move.
-        distance: (n,) of each joint to its optimum.
+        project: (n, 2, 6, 6) onto directions that may move, known ones and others.
+        distance: (n, 2) of each joint to its optimum in them.
         pace: (longest, share, rate): a step taken at `rate` is scaled to `longest`, or to a share
-            of the joint's distance.
+            of the joint's distance. In directions that noise still hides the distance is large; it
+            may not set the pace in those that are known.
     """
     tree = Frames(*frames)
     longest, share, rate = pace
     turn = np.empty((3, 3))
     for j in range(step.shape[0]):
-        scale = min(longest, share * distance[j]) / rate
-        x = scale * (project[j] @ step[j])
+        x = (min(longest, share * distance[j, 0]) / rate) * (project[j, 0] @ step[j])
+        if distance[j, 1] > 0.0:
+            x += (min(longest, share * distance[j, 1]) / rate) * (project[j, 1] @ step[j])
         a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
         s = np.sin(a) / a if a > 1e-8 else 1.0
         h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5

@@ -30,7 +30,8 @@ class SchemaSettings:
         start_rms: spread of the random starting λ, rad and m.
         forget_s: time constant of the forgotten window in moving samples x 1 ms; None keeps all.
         judge_every: updates between two looks at curvature and identifiability.
-        rotation_goal, position_goal: std and remaining distance below which λ has converged.
+        std_goal: standard deviation of a turn (rad) or shift (m) that counts as known.
+        distance_goal: what of those may be left to the optimum when λ has converged.
         stable_updates: for how many updates in a row that must hold.
         spin_measured: whether measured link motion has angular accelerations dw. Where not, the
             base's is carried along the tree by eq. 8d with the present λ, and moments made
@@ -43,8 +44,8 @@ class SchemaSettings:
     start_rms: float = 0.01
     forget_s: float | None = None
     judge_every: int = 10
-    rotation_goal: float = 0.005
-    position_goal: float = 0.0025
+    std_goal: float = 0.0025
+    distance_goal: float = 2.5e-4
     stable_updates: int = 200
     spin_measured: bool = True
 

@@ -134,6 +134,8 @@ def _schema_tiles(data: RunData) -> list[Tile]:
     at = schema.get("converged_s")
     value = "not reached" if at is None else words.quantity(at, "s", 3)
     note = f"after the first motion, to stay within {words.GOALS}"
+    if schema.get("restarts"):
+        note += f"; joints started anew {schema['restarts']} times, out of wrong valleys"
     found = [Tile("λ converged", value, note)]
     turn, shift = schema.get("rotation_error_rad"), schema.get("position_error_m")
     if turn and shift and None not in [*turn, *shift]:

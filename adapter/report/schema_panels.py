@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
-from adapter.physics.identifiability import frame_observability
 from adapter.report.style import (
     Drawing,
     Panel,
@@ -18,7 +17,6 @@ from adapter.report.style import (
     thin_rows,
     time_axis,
 )
-from adapter.runs.outcome import frame_errors
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
@@ -52,13 +50,12 @@ def schema_panels(data: RunData) -> list[Panel]:
     ]
     if data.reference is None:
         return panels
-    seen = frame_observability(data.documented.tree, data.reference, data.documented.gravity)
-    turn, shift = frame_errors(lam, data.reference, seen.freedom)
+    turn, shift = data.schema_errors
     goals = (ROTATION_GOAL_RAD, "rad"), (POSITION_GOAL_M, "m")
     titles = "Orientation error", "Position error"
     for title, error, (goal, unit) in zip(titles, (turn, shift), goals, strict=True):
         drawing = _errors(t, error, goal, unit, converged)
-        panels.append(drawing.panel(title, unit, "in the directions that motion shows"))
+        panels.append(drawing.panel(title, unit, "in what the data had shown by then"))
     return panels
 
 

@@ -35,12 +35,15 @@ class Outcome:
         start_lam, lam: (n, 6) λ at first and at last.
         lam_covariance, lam_identifiable: (n, 6, 6) of (turn, shift) in the parents' axes.
         lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
+        lam_restarts: joints that λ was started anew for, out of a wrong valley.
         lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
         theta: (n, 10); effects: (e, n); variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
         payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
+        schema_known: (k, n + 1) of the rows of schema_trace: directions known by joint, and
+            whether λ was said to have converged. lam_information: (n, 6, 6) at last.
         score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
         frames: (R0, p) that θ's moments were taken with.
         smoothing_s: how long the filter takes a step of torque.
@@ -57,6 +60,7 @@ class Outcome:
     lam_rank: int
     lam_converged: bool
     lam_measured: bool
+    lam_restarts: int
     lam_moments: Array
     lam_count: float
     theta: Array
@@ -70,6 +74,8 @@ class Outcome:
     changes_ns: tuple[int, ...]
     rebuilds: int
     schema_trace: Array
+    schema_known: Array
+    lam_information: Array
     theta_trace: Array
     score_trace: Array
     min_eigenvalue: float
@@ -93,10 +99,11 @@ def collect(learner: OnlineLearner) -> Outcome:
         start_lam=schema.start_lam,
         lam=schema.lam,
         lam_covariance=to_parent @ schema.covariance() @ back,
-        lam_identifiable=to_parent @ schema.identifiable @ back,
-        lam_rank=schema.rank,
+        lam_identifiable=to_parent @ schema.certain @ back,
+        lam_rank=round(float(np.einsum("jaa->", schema.certain))),
         lam_converged=schema.converged,
         lam_measured=schema.kind == LinkMotionKind.MEASURED,
+        lam_restarts=schema.check.restarts,
         lam_moments=schema.moments.M.copy(),
         lam_count=schema.count,
         theta=theta.theta,
@@ -110,6 +117,8 @@ def collect(learner: OnlineLearner) -> Outcome:
         changes_ns=tuple(change.stamp_ns for change in learner.changes),
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
+        schema_known=learner.schema_trace.rows[:, 1 + 12 * n :].copy(),
+        lam_information=to_parent @ schema.information @ back,
         theta_trace=learner.theta_trace.rows.copy(),
         score_trace=learner.score_trace.rows.copy(),
         min_eigenvalue=float(np.min(eigenvalues)),
@@ -123,7 +132,7 @@ def _course_of_lam(learner: OnlineLearner) -> Array:
     """Rows [stamp ns, λ]; the learner keeps frames, since reading λ off them takes longer."""
     n, rows = learner.tree.n, learner.schema_trace.rows
     angles = zxz_from_matrix(rows[:, 1 : 1 + 9 * n].reshape(-1, n, 3, 3))
-    lam = np.concatenate([angles, rows[:, 1 + 9 * n :].reshape(-1, n, 3)], axis=2)
+    lam = np.concatenate([angles, rows[:, 1 + 9 * n : 1 + 12 * n].reshape(-1, n, 3)], axis=2)
     return np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
 
 

@@ -21,10 +21,10 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.outcome import Outcome, learned_model
-from adapter.runs.score import Reference, ScoreRows, stamps_s
+from adapter.runs.score import Reference, ScoreRows, course_errors, stamps_s
 from adapter.runs.terminal import json_text
 
-VERSION = 1
+VERSION = 2
 MODEL, DOCUMENTED = "model.json", "documented.json"
 FIGURES, TRACES = "figures.json", "traces.npz"
 FILES = (MODEL, DOCUMENTED, FIGURES, TRACES)
@@ -32,6 +32,7 @@ NEEDED_FIGURES = ("samples", "learned", "refused", "lambda", "theta")
 TRACE_ARRAYS = (
     "start_lam",
     "schema_trace",
+    "schema_errors",
     "theta_trace",
     "score_trace",
     "fit",
@@ -60,6 +61,8 @@ class RunData:
         documented: what the arm's maker says.
         reference: (n, 6) λ that errors are against; None where there is none.
         start_lam: (n, 6) λ at first.
+        schema_errors: (2, k, n) of the rows of schema_trace: rad and m against the reference, in
+            what the data had shown by then; zeros where there is no reference.
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ, spare body, effects].
         score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
         fit, batch: (k, n) torque of the learned model and of the final batch least squares on
@@ -80,6 +83,7 @@ class RunData:
     reference: Array | None
     start_lam: Array
     schema_trace: Array
+    schema_errors: Array
     theta_trace: Array
     score_trace: Array
     fit: Array
@@ -101,6 +105,7 @@ class RunData:
         shapes: dict[str, tuple[int, ...]] = {
             "start_lam": (n, 6),
             "schema_trace": (len(self.schema_trace), 1 + 6 * n),
+            "schema_errors": (2, len(self.schema_trace), n),
             "score_trace": (rows, 1 + 5 * n),
             "fit": (rows, n),
             "batch": (rows, n),
@@ -169,6 +174,9 @@ def run_data(
         best = outcome.least_squares
         effects = best[10 * (n + 1) :].reshape(-1, n)
         batch = rows.torque(best[: 10 * n].reshape(n, 10), effects)
+    errors = np.zeros((2, len(outcome.schema_trace), n))
+    if reference is not None:
+        errors[:] = course_errors(outcome, documented, reference)
     model = learned_model(outcome, documented)
     basis = base_parameters(documented.tree, model.lam, documented.gravity).basis
     return RunData(
@@ -178,6 +186,7 @@ def run_data(
         reference=None if reference is None else reference.lam,
         start_lam=outcome.start_lam,
         schema_trace=outcome.schema_trace,
+        schema_errors=errors,
         theta_trace=outcome.theta_trace,
         score_trace=outcome.score_trace,
         fit=fit,

@@ -18,6 +18,7 @@ from adapter.errors import ModelError
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import base_parameters, frame_observability
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.outcome import Outcome, changes, completed_lambda, frame_errors
@@ -80,17 +81,48 @@ def settled_at(times: Array, good: Any) -> float | None:
     return float(times[bad[-1] + 1] if len(bad) else times[0])
 
 
+def course_errors(
+    outcome: Outcome, documented: SelfModel, reference: Reference
+) -> tuple[Array, Array]:
+    """Rotation, rad, and position, m, errors (k, n) of λ on its way (rows of `schema_trace`).
+
+    Measured in what the data had shown by then: of the directions that they show at last the
+    clearest, as many as were known.
+    """
+    n = documented.tree.n
+    seen = frame_observability(documented.tree, reference.lam, documented.gravity)
+    lam = outcome.schema_trace[:, 1:].reshape(-1, n, 6)
+    out = np.zeros((2, len(lam), n))
+    for j in range(n):
+        known, one = outcome.schema_known[:, j], slice(j, j + 1)
+        _, clearest = np.linalg.eigh(outcome.lam_information[j])
+        for rank in np.unique(known).astype(int):
+            freedom = seen.freedom.joint(j)
+            if rank < seen.ranks[j]:
+                hidden = clearest[:, : 6 - rank]
+                freedom = Freedom.of((hidden @ hidden.T)[None], reference.lam[one, 3:])
+            rows = known == rank
+            errors = frame_errors(lam[rows, one], reference.lam[one], freedom)
+            out[0, rows, j], out[1, rows, j] = errors[0][:, 0], errors[1][:, 0]
+    return out[0], out[1]
+
+
 def schema_score(
     outcome: Outcome, documented: SelfModel, reference: Reference, start_s: float | None
 ) -> dict[str, Any]:
-    """The `lambda` part of the figures; errors per joint in what any link motion shows."""
+    """The `lambda` part of the figures; errors per joint in what the data show.
+
+    λ has converged when the learner has said so and its errors are inside both goals, for good.
+    """
     completed = completed_lambda(outcome, documented)
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
-    lam = outcome.schema_trace[:, 1:].reshape(-1, documented.tree.n, 6)
-    turn, shift = frame_errors(lam, reference.lam, seen.freedom)
+    turn, shift = course_errors(outcome, documented, reference)
     inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
+    inside &= np.maximum.accumulate(outcome.schema_known[:, -1] > 0.0)
     at = settled_at(stamps_s(outcome.schema_trace), inside)
-    last_turn, last_shift = frame_errors(completed.lam, reference.lam, seen.freedom)
+    hidden = np.eye(6) - outcome.lam_identifiable
+    freedom = Freedom.of(hidden, reference.lam[:, 3:])
+    last_turn, last_shift = frame_errors(completed.lam, reference.lam, freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
         "converged_s": None if at is None or start_s is None else at - start_s,
@@ -107,6 +139,7 @@ def schema_score(
         "reference": reference.source,
         "values": completed.lam.tolist(),
         "filled": completed.filled,
+        "restarts": outcome.lam_restarts,
     }
 
 

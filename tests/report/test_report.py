@@ -161,6 +161,7 @@ def test_an_arm_that_never_moved_has_a_report(data: RunData) -> None:
     still = replace(
         with_figures(data, **{"lambda": schema, "theta": theta, "learned": 0}),
         schema_trace=data.schema_trace[:0],
+        schema_errors=data.schema_errors[:, :0],
         theta_trace=data.theta_trace[:0],
         score_trace=data.score_trace[:0],
         fit=np.zeros((0, n)),
@@ -223,7 +224,7 @@ def test_folder_errors_name_the_file(data: RunData, tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r"traces\.npz: cannot be read"):
         load_run(folder)
     np.savez(folder / "traces.npz", version=99)
-    with pytest.raises(RunFolderError, match="version 99 of the traces; have: 1"):
+    with pytest.raises(RunFolderError, match="version 99 of the traces; have: 2"):
         load_run(folder)
     np.savez(folder / "traces.npz", version=np.array([{}], dtype=object))
     with pytest.raises(RunFolderError, match=r"traces\.npz: cannot be read"):

@@ -1,0 +1,107 @@
+"""Whether λ stands in a wrong valley, joint by joint, and the place to start anew from.
+
+The cost of a rotation has saddle points half a turn away from its minimum, and with the position
+beside it other valleys: there ADAM stands still at the wrong frame. The moments tell, since a
+closed form on them needs no start (`frame_fit`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from adapter.learning.frame_fit import (
+    Frame,
+    best_frame,
+    descend,
+    hidden_freedom,
+    log_misfit,
+    nearest,
+    profiled_weights,
+)
+from adapter.model.spatial import Array
+
+# Logarithms of what frames leave unexplained, summed over the channels.
+LEAST_PROGRESS = 0.2  # of ADAM on its way, from one look at a joint to the next
+CLEARLY_BETTER = 0.5
+AGAIN = 2.0  # a joint is checked again when there are so many times the samples
+
+
+class Evidence(NamedTuple):
+    """What is known of one joint.
+
+    Attributes:
+        sums, clean: (3, 15, 15) moments of so many samples, and what of them is motion.
+        rank: directions known. least: curvature of one that counts as known.
+        still: whether ADAM has arrived where the gradient leads it.
+    """
+
+    sums: Array
+    clean: Array
+    samples: float
+    rank: int
+    least: float
+    still: bool
+
+
+class SchemaCheck:
+    """Looks at every joint once in so many looks, and rarely solves for one.
+
+    Args:
+        n: joints; looks: until the first joint's turn comes again.
+
+    Attributes:
+        misfit: (n,) what each frame left unexplained when it was last looked at.
+        passed_at, passed_rank: (n,) samples and directions shown when it was last found right.
+        turn: the number of the next look.
+        restarts: joints that were started anew so far.
+    """
+
+    def __init__(self, n: int, looks: int) -> None:
+        self.looks = looks
+        self.misfit = np.full(n, np.inf)
+        self.passed_at, self.passed_rank = np.zeros(n), np.full(n, -1)
+        self.turn = self.restarts = 0
+
+    def next_joints(self) -> range:
+        """The joints that this look is at."""
+        joints = range(self.turn, len(self.misfit), self.looks)
+        self.turn = (self.turn + 1) % self.looks
+        return joints
+
+    def passed(self, ranks: np.ndarray) -> bool:
+        """Whether every joint was found right with these (n,) directions shown."""
+        return bool((self.passed_rank == ranks).all())
+
+    def better(self, j: int, frame: Frame, start: Frame, known: Evidence) -> Frame | None:
+        """Where joint j is to start anew; None where it is right, or still on its way.
+
+        Args:
+            frame: where it stands; start: where it stays in what the data do not show.
+        """
+        misfit, before = log_misfit(known.sums, known.samples, frame), self.misfit[j]
+        self.misfit[j] = misfit
+        due = known.rank != self.passed_rank[j] or known.samples > AGAIN * self.passed_at[j]
+        if not due or (misfit < before - LEAST_PROGRESS and not known.still):
+            return None
+        found = self._solved(frame, start, known, misfit)
+        self.passed_at[j], self.passed_rank[j] = known.samples, known.rank
+        if found is not None:
+            self.misfit[j] = log_misfit(known.sums, known.samples, found)
+            self.restarts += 1
+        return found
+
+    @staticmethod
+    def _solved(frame: Frame, start: Frame, known: Evidence, misfit: float) -> Frame | None:
+        """The closed form's frame where it is clearly better."""
+        sums, count = known.sums, known.samples
+        found, _ = best_frame(sums, profiled_weights(sums, count, frame), frame)
+        weights = profiled_weights(sums, count, found)
+        found, _ = descend(sums, weights, found)
+        if log_misfit(sums, count, found) > misfit - CLEARLY_BETTER:
+            return None
+        weights = profiled_weights(sums, count, found)
+        freedom = hidden_freedom(known.clean, weights, found, known.least)
+        held = nearest(sums, weights, found, start, freedom)
+        return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else None
