@@ -254,3 +254,7 @@ def test_robots_by_name_and_by_file(tmp_path: Path) -> None:
     path = save_model(model, tmp_path / "wall.json")
     back = documented(path)
     assert isinstance(back, SelfModel) and back.gravity.tolist() == [9.81, 0, 0]
+    older = documented(save_model(replace(model, source=None), path))
+    assert older.source is not None and older.source.text == PANDA.read_text()
+    other = replace(model, source=None, lam=model.lam + 0.01)
+    assert documented(save_model(other, path)).source is None

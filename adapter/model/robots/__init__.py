@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from adapter.errors import ModelError
@@ -55,5 +56,15 @@ def documented(
         )
     if suffix == ".urdf":
         return read_urdf(text, joints, floating, gravity, lock)
-    model = restricted(load_model(text).with_base(floating), joints, lock or {})
+    model = restricted(_sourced(load_model(text)).with_base(floating), joints, lock or {})
     return model if gravity is None else replace(model, gravity=vector3(gravity))
+
+
+def _sourced(model: SelfModel) -> SelfModel:
+    """The model with the file of the robot that it is, where its own file is older than that."""
+    if model.source is None and model.name in names():
+        known = documented(model.name)
+        same = known.tree.joint_names == model.tree.joint_names
+        if same and np.allclose(known.lam, model.lam, rtol=0.0, atol=1e-12):
+            return replace(model, source=known.source)
+    return model
