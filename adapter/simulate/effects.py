@@ -37,6 +37,7 @@ from adapter.simulate.friction import speed_change
 FORMATS: dict[str, tuple[str, ...]] = {
     "bodies": (),
     "bodies and armature": (ARMATURE,),
+    "pybullet": (DAMPING,),
     "urdf": URDF_PLACES,
     "mjcf": tuple(MJCF_PLACES),
 }
@@ -142,10 +143,10 @@ class Effects:
         period_s: of the simulator's step. Friction, springs' damping and motor inertia are taken
             at the end of the step (see `friction.speed_change`), which needs its length.
         holds: what the simulator's arm has of the effects already, so that nothing counts twice:
-            one of `FORMATS`. "urdf" is what `adapter export --urdf` writes, "mjcf" what `--mjcf`
-            does; "bodies" the same without damping, friction, armature and springs (PyBullet takes
-            no friction from a URDF). All of them hold the inertias, payloads, the base's tilt and
-            the encoders' zero. `MujocoArm` and `PybulletArm` see to this by themselves.
+            "mjcf" what `adapter export --mjcf` writes, "urdf" what `--urdf` does and MuJoCo reads,
+            "pybullet" what PyBullet takes of that (no friction), "bodies" no damping, friction,
+            armature or springs. All of them hold the inertias, payloads, the base's tilt and the
+            encoders' zero. `MujocoArm` and `PybulletArm` see to this by themselves.
 
     Attributes:
         joint_names: order of all (n,).
@@ -156,7 +157,7 @@ class Effects:
         SettingsError: an unknown format; a period that is not above 0.
     """
 
-    def __init__(self, model: SelfModel, period_s: float = 1e-3, holds: str = "bodies") -> None:
+    def __init__(self, model: SelfModel, period_s: float = 1e-3, holds: str = "mjcf") -> None:
         if holds not in FORMATS:
             raise SettingsError(f"no format '{holds}'; have: {', '.join(FORMATS)}")
         if not period_s > 0.0:
@@ -223,8 +224,9 @@ class Effects:
             q, dq, ddq, tau, t: as above.
             part: of the step.
         """
+        q, dq, tau = (np.asarray(x, dtype=float) for x in (q, dq, tau))
         stage, link = self._stage(t), q - self._holds.offset
-        last = self._nothing if ddq is None else ddq
+        last = self._nothing if ddq is None else np.asarray(ddq, dtype=float)
         M, bias = _dynamics(self._held, link, dq)
         body, carried = M, bias
         if part or stage.arm is not self._held:
@@ -274,7 +276,8 @@ class Effects:
         half = self._stage(t).sensors.half_play
         if half.any():
             self._gap = self._nothing
-            self._gap = np.clip(read - self.measured(q, dq, tau, t)[0], -half, half)
+            without = self.measured(q, dq, tau, t)[0] - self._gap
+            self._gap = np.clip(read - without, -half, half)
             self._past.clear()
 
     def driving(self, t: Array, read: Array) -> Array:

@@ -108,7 +108,7 @@ def main() -> None:
     parser.add_argument("--effects", nargs="+", default=list(CATALOGUE), choices=list(CATALOGUE))
     parser.add_argument("--trials", type=int, default=3, help="seeds of each effect")
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--maker", choices=sorted(MAKERS), default="pybullet")
+    parser.add_argument("--maker", choices=sorted(MAKERS), default="mujoco")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()

@@ -42,3 +42,13 @@ def test_find_a_gap(tmp_path, monkeypatch, capsys) -> None:
 def test_write_a_driver(tmp_path, monkeypatch, capsys) -> None:
     text = said("write_a_driver", tmp_path, monkeypatch, capsys)
     assert text.strip() == "[False, False]"  # the filter settles first
+
+
+def test_simulate_what_was_learned(tmp_path, monkeypatch, capsys) -> None:
+    text = said("simulate_what_was_learned", tmp_path, monkeypatch, capsys)
+    (has, bare), (_, reads) = (
+        map(float, pair) for pair in re.findall(r"torque (\S+) N m, read (\S+) N m", text)
+    )
+    assert bare == has != 0.0 and abs(reads - 1.05 * has) < 0.02
+    free, stuck = map(float, re.findall(r"(\S+) rad", text))
+    assert free > 0.05 > 0.01 > stuck >= 0.0

@@ -5,14 +5,16 @@ from __future__ import annotations
 import builtins
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 import pinocchio as pin
+import pybullet
 import pytest
 
-from adapter.effects.export import additions, to_urdf
+from adapter.effects.export import additions, robot_mjcf, to_urdf
 from adapter.errors import MeansError, ModelError, SettingsError
 from adapter.model.mjcf_text import MJCF_PLACES, joint_attributes
 from adapter.model.self_model import SelfModel
@@ -50,7 +52,7 @@ def test_the_torque_is_that_of_the_effects_own_equations() -> None:
     )
     arm = pin_model(panda())
     load = pin.rnea(arm, arm.createData(), READY, DQ, np.zeros(7))
-    added = Effects(model, 1e-6)(READY, DQ, np.zeros(7), load, 5.0)
+    added = Effects(model, 1e-6, "bodies")(READY, DQ, np.zeros(7), load, 5.0)
     stribeck = 0.4 + 0.6 * np.exp(-((DQ[3] / 0.3) ** 2))
     by_hand = [0.6 * DQ[0], -0.5, 0.0, stribeck]
     by_hand += [0.4 * np.sin(6.0 * READY[4] + 0.2), 0.0, -0.02 * 5.0]  # the offset is a sensor's
@@ -61,7 +63,7 @@ def test_friction_goes_with_the_load_of_this_very_step() -> None:
     """The load is the rigid torque at the acceleration that comes out, by Pinocchio."""
     arm, tau = pin_model(panda()), np.array([5.0, -30.0, 8.0, 20.0, 1.0, 2.0, 0.1])
     model = model_with(Effect("load_dependent_friction", (1, 2, 3), {"Fl": 0.1}))
-    added = Effects(model, 1e-6)(READY, DQ, None, tau, 0.0)
+    added = Effects(model, 1e-6, "bodies")(READY, DQ, None, tau, 0.0)
     ddq = pin.aba(arm, arm.createData(), READY, DQ, tau + added)
     load = pin.rnea(arm, arm.createData(), READY, DQ, ddq)
     expected = -0.1 * np.abs(load[:3]) * np.sign(DQ[:3])
@@ -90,6 +92,7 @@ def _acceleration(model: SelfModel, holds: str, h: float) -> np.ndarray:
     tau = tau + Effects(model, h, holds)(READY, DQ, None, tau, 0.0)
     push = tau - pin.rnea(arm, data, READY, DQ, np.zeros(7))
     parts = {
+        "pybullet": ("damping",),
         "bodies": (),
         "bodies and armature": ("armature",),
         "urdf": ("damping", "frictionloss"),
@@ -185,6 +188,58 @@ def test_plain_mj_steps_have_the_effects() -> None:
     np.testing.assert_allclose(wrapped.read()[0], own.read()[0], atol=1e-4)
     assert np.abs(own.read()[0] - READY).max() > 0.02
     assert mujoco.get_mjcb_passive() is None
+
+
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
+def test_a_loop_of_ones_own_around_an_exported_file(simulator: str, tmp_path: Path) -> None:
+    """The file with what it holds and the effects with the rest move as our loop does."""
+    ripple = Effect("torque_ripple", (1,), {"a": 4.0, "n": 6.0, "phase": 1.0})
+    model, tau = model_with(*LOSSES, ripple), np.array([1.0, -20.0, 2.0, 18.0, 0.3, 1.8, 0.1])
+    ours = SIMULATORS[simulator](model)
+    ours.put(READY, DQ)
+    for _ in range(150):
+        ours.advance(tau + ours.effects(*ours.read(), None, tau, 0.0))
+    q, _ = ours.read()
+    ours.close()
+    own = {"mujoco": _own_mujoco, "pybullet": _own_pybullet}[simulator]
+    with_them, without = (own(model, tau, tmp_path, share) for share in (1.0, 0.0))
+    assert np.abs(with_them - q).max() < 5e-3  # MuJoCo's own dry friction is a soft one
+    assert np.abs(without - q).max() > 2e-2
+
+
+def _own_mujoco(model: SelfModel, tau: np.ndarray, folder: Path, share: float) -> np.ndarray:
+    file = mujoco.MjModel.from_xml_string(robot_mjcf(model, alone=True).text)
+    file.opt.timestep, file.opt.disableflags = 1e-3, mujoco.mjtDisableBit.mjDSBL_CONTACT
+    data, effects = mujoco.MjData(file), Effects(model)
+    data.qpos[:], data.qvel[:] = READY, DQ
+    for _ in range(150):
+        added = effects(data.qpos, data.qvel, data.qacc, tau, data.time)
+        data.qfrc_applied[:] = tau + share * added
+        mujoco.mj_step(file, data)
+    return np.array(data.qpos)
+
+
+def _own_pybullet(model: SelfModel, tau: np.ndarray, folder: Path, share: float) -> np.ndarray:
+    path, effects, joints = folder / "arm.urdf", Effects(model, holds="pybullet"), list(range(7))
+    path.write_text(to_urdf(replace(model, frames=())))
+    client = {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE
+    arm = pybullet.loadURDF(str(path), useFixedBase=True, flags=flags, **client)
+    pybullet.setGravity(*model.gravity, **client)
+    pybullet.setTimeStep(1e-3, **client)
+    for j in joints:
+        pybullet.changeDynamics(arm, j, linearDamping=0.0, angularDamping=0.0, **client)
+        pybullet.setJointMotorControl2(arm, j, pybullet.VELOCITY_CONTROL, force=0.0, **client)
+        pybullet.resetJointState(arm, j, READY[j], DQ[j], **client)
+    torque = pybullet.TORQUE_CONTROL
+    for _ in range(150):
+        q, dq = np.array([x[:2] for x in pybullet.getJointStates(arm, joints, **client)]).T
+        push = tau + share * effects(q, dq, None, tau, 0.0)
+        pybullet.setJointMotorControlArray(arm, joints, torque, forces=push.tolist(), **client)
+        pybullet.stepSimulation(**client)
+    q = np.array([x[0] for x in pybullet.getJointStates(arm, joints, **client)])
+    pybullet.disconnect(**client)
+    return q
 
 
 def test_missing_mujoco_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
