@@ -9,6 +9,7 @@ import numpy as np
 from adapter.runs.compare import JointDifference, ModelDifference
 
 NO_DATA = "no data can show it"
+MOSTLY = 0.5  # share that data can show, below which it is told
 
 
 def difference_lines(found: ModelDifference) -> list[str]:
@@ -29,7 +30,7 @@ def _joint_line(joint: JointDifference) -> str:
     parts = []
     if joint.frame_moved:
         turn, shift = np.degrees(joint.turn_rad), 1e3 * joint.shift_m
-        tail = _tail(joint.frame_z, joint.frame_shown)
+        tail = _tail(joint.frame_z, float(joint.frame_shown))
         parts.append(f"frame turned by {turn:.3g}° and moved by {shift:.3g} mm{tail}")
     if joint.body_changed:
         a, b = joint.mass
@@ -41,13 +42,15 @@ def _joint_line(joint: JointDifference) -> str:
         )
     for key, (before, after, z) in joint.effects.items():
         numbers = " -> ".join("none" if x is None else f"{x:.3g}" for x in (before, after))
-        parts.append(f"{key} {numbers}{_tail(z, True)}")
+        parts.append(f"{key} {numbers}{_tail(z, 1.0)}")
     return f"{joint.joint}: {'; '.join(parts)}" if parts else ""
 
 
-def _tail(z: float | None, shown: bool) -> str:
+def _tail(z: float | None, shown: float) -> str:
+    """Standard deviations, and how much of a difference no data can show."""
     notes = [f"{z:.1f} standard deviations"] if z is not None else []
-    notes += [] if shown else [NO_DATA]
+    if shown < MOSTLY:
+        notes.append(f"data can show {100.0 * shown:.1g} % of it" if shown else NO_DATA)
     return f" ({', '.join(notes)})" if notes else ""
 
 

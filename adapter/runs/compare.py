@@ -15,6 +15,7 @@ from adapter.errors import ModelError
 from adapter.gap.load import hand_frame
 from adapter.model.inertia import PARAMETERS, body_from_theta
 from adapter.model.locking import LOCKED
+from adapter.model.onto import SAME_PLACE
 from adapter.model.robots import names as robot_names
 from adapter.model.self_model import SelfModel, link_theta
 from adapter.model.spatial import Array, log_rotation
@@ -41,7 +42,7 @@ class JointDifference:
         frame_shown: whether motion of links or torques could show it.
         mass, com, inertia: (before, after): kg, m and kg m² about the centre, in the link's frame.
         body_z: as `frame_z`, of the ten parameters; body_parameter: the one that differs most.
-        body_shown: whether torques could show any of it.
+        body_shown: share of the difference that torques could show, 0 to 1.
         effects: by effect and parameter "effect.key": (before, after, z), None where there is none.
         torque_rms_nm: of the difference over the motion; torque_size_nm: of the first's torque.
     """
@@ -57,7 +58,7 @@ class JointDifference:
     inertia: tuple[Array, Array]
     body_z: float | None
     body_parameter: str
-    body_shown: bool
+    body_shown: float
     effects: Mapping[str, tuple[float | None, float | None, float | None]]
     torque_rms_nm: float
     torque_size_nm: float
@@ -65,7 +66,7 @@ class JointDifference:
     @property
     def frame_moved(self) -> bool:
         """Whether the frame is elsewhere."""
-        return max(self.turn_rad, self.shift_m) > SAME
+        return max(self.turn_rad, self.shift_m) > SAME_PLACE
 
     @property
     def body_changed(self) -> bool:
@@ -242,6 +243,7 @@ def _bodies(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
     for j in range(first.tree.n):
         (_, *before), (_, *after) = body_from_theta(a[j]), body_from_theta(b[j])
         apart = (b - a)[j] / size[j]
+        share = float(np.linalg.norm(shown[j]) / max(np.linalg.norm(apart), SAME))
         found.append(
             {
                 "mass": (float(a[j, 0]), float(b[j, 0])),
@@ -249,7 +251,7 @@ def _bodies(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
                 "inertia": (before[1], after[1]),
                 "body_z": _z((b - a)[j], first.theta_std[j], second.theta_std[j]),
                 "body_parameter": PARAMETERS[int(np.argmax(np.abs(apart)))],
-                "body_shown": bool(np.linalg.norm(shown[j]) > HIDDEN * np.linalg.norm(apart)),
+                "body_shown": min(share, 1.0) if share > HIDDEN else 0.0,
             }
         )
     return found
