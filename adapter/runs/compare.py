@@ -243,7 +243,7 @@ def _bodies(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
     for j in range(first.tree.n):
         (_, *before), (_, *after) = body_from_theta(a[j]), body_from_theta(b[j])
         apart = (b - a)[j] / size[j]
-        share = float(np.linalg.norm(shown[j]) / max(np.linalg.norm(apart), SAME))
+        share = min(float(np.linalg.norm(shown[j])) / max(float(np.linalg.norm(apart)), SAME), 1.0)
         found.append(
             {
                 "mass": (float(a[j, 0]), float(b[j, 0])),
@@ -251,7 +251,7 @@ def _bodies(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
                 "inertia": (before[1], after[1]),
                 "body_z": _z((b - a)[j], first.theta_std[j], second.theta_std[j]),
                 "body_parameter": PARAMETERS[int(np.argmax(np.abs(apart)))],
-                "body_shown": min(share, 1.0) if share > HIDDEN else 0.0,
+                "body_shown": float(share) if share > HIDDEN else 0.0,
             }
         )
     return found
