@@ -14,7 +14,7 @@ from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
 from adapter.learning.known_effects import learnable, not_taken_off
 from adapter.model.self_model import SelfModel
-from adapter.runs.config import Config, config_from, config_table, read_config
+from adapter.runs.config import Config, config_recorded, config_table, read_config
 from adapter.runs.terminal import program_version, warn
 from drivers.files.mcap import Log
 
@@ -48,7 +48,10 @@ def configure(
     """
     as_recorded = args.config is None and recorded is not None
     if as_recorded:
-        config = config_from(recorded or {}, "configuration in the recording")
+        config, unknown = config_recorded(recorded or {}, "configuration in the recording")
+        if unknown:
+            names = ", ".join(unknown)
+            warn([f"recorded by another version: settings that this one has not: {names}"])
     else:
         config = read_config(args.config)
     learner = config.pipeline.learner

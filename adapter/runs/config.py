@@ -98,6 +98,28 @@ def config_from(table: dict[str, Any], where: str = "configuration") -> Config:
     return _build(Config, table, where)
 
 
+def config_recorded(table: dict[str, Any], where: str) -> tuple[Config, list[str]]:
+    """Settings that a recording was made with, and those in it that this version has not.
+
+    Raises SettingsError for a value that is none.
+    """
+    unknown: list[str] = []
+    return config_from(_known(Config, table, unknown), where), unknown
+
+
+def _known(kind: Any, table: Any, unknown: list[str], before: str = "") -> Any:
+    """A table without the keys that are no settings; those go to `unknown`."""
+    if not isinstance(table, dict) or not dataclasses.is_dataclass(kind):
+        return table
+    hints = get_type_hints(kind)
+    unknown += [before + key for key in table if key not in hints]
+    return {
+        key: _known(hints[key], part, unknown, f"{before}{key}.")
+        for key, part in table.items()
+        if key in hints
+    }
+
+
 def config_table(config: Config) -> dict[str, Any]:
     """The settings as nested tables (JSON and TOML values; unset ones left out)."""
     return _drop_none(dataclasses.asdict(config))

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.model.robots import documented
-from adapter.runs.config import Config, config_from, config_table, read_config
+from adapter.runs.config import (
+    Config,
+    config_from,
+    config_recorded,
+    config_table,
+    read_config,
+)
 
 WHOLE = """
 gravity = [9.81, 0, 0.0]
@@ -53,6 +59,18 @@ def written(folder: Path, text: str) -> Path:
     path = folder / "settings.toml"
     path.write_text(text)
     return path
+
+
+def test_a_recording_of_another_version_keeps_what_this_one_knows():
+    table = config_table(Config(gravity=(0.0, 9.81, 0.0)))
+    table["pipeline"]["learner"]["schema"]["old_goal"] = 1e-3
+    table["colour"] = "red"
+    found, unknown = config_recorded(table, "configuration in the recording")
+    assert found == Config(gravity=(0.0, 9.81, 0.0))
+    assert unknown == ["colour", "pipeline.learner.schema.old_goal"]
+    table["gravity"] = "down"
+    with pytest.raises(SettingsError, match="in the recording: gravity needs"):
+        config_recorded(table, "configuration in the recording")
 
 
 def refusal(folder: Path, text: str) -> str:
