@@ -47,6 +47,9 @@ class JointSample:
         dq: (n,) joint velocities, rad/s.
         tau: (n,) link-side joint torques, gravity included, N m.
         links: measured motion of the links at the same instant, where the arm measures it.
+        base: (9,) of a base that floats [v, w, a], in its own frame: velocity of its origin
+            (zero where not measured), angular velocity, and what an accelerometer at its origin
+            reads, m/s, rad/s, m/s².
     """
 
     stamp_ns: int
@@ -54,6 +57,7 @@ class JointSample:
     dq: Array
     tau: Array
     links: LinkMotion | None = None
+    base: Array | None = None
 
 
 @dataclass

@@ -236,6 +236,19 @@ def _replay(parser: argparse.ArgumentParser) -> None:
     add("log", type=Path, metavar="LOG", help="MCAP recording, ours or not")
     _add_learning(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
+    add(
+        "--base",
+        metavar="LINK",
+        help="the base floats, and this is its link (or one fixed to it); its motion is in the "
+        "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
+    )
+    add(
+        "--base-wrench",
+        choices=("zero", "unknown"),
+        default="unknown",
+        help="what pushes a floating base: zero in free motion; unknown (default), as where it "
+        "stands or hangs: only the joints' torques are learned from",
+    )
     held_out = parser.add_mutually_exclusive_group()
     held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
     held_out.add_argument(

@@ -19,20 +19,20 @@ from adapter.runs.terminal import program_version, warn
 from drivers.files.mcap import Log
 
 
-def robot_of(args: argparse.Namespace, name: str | None) -> SelfModel:
+def robot_of(args: argparse.Namespace, name: str | None, floating: bool = False) -> SelfModel:
     """The documented robot by name or file, with the joints that the command line asks for."""
-    return read_robot(name or "panda", joints=joints_of(args), lock=locks_of(args))
+    return read_robot(name or "panda", joints_of(args), floating, lock=locks_of(args))
 
 
-def robot_of_log(args: argparse.Namespace, log: Log) -> SelfModel:
+def robot_of_log(args: argparse.Namespace, log: Log, floating: bool = False) -> SelfModel:
     """The robot asked for, else the one that the recording carries, else the Panda."""
     carried = log.attachments.get("documented.json")
     if args.robot is not None or carried is None:
-        return robot_of(args, args.robot)
+        return robot_of(args, args.robot, floating)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "documented.json"
         path.write_bytes(carried)
-        return robot_of(args, str(path))
+        return robot_of(args, str(path), floating)
 
 
 def configure(

@@ -12,7 +12,6 @@ from rich.progress import Progress
 
 from adapter.cli.common import configure, robot_of_log
 from adapter.cli.results import Learned, conclude
-from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
@@ -23,14 +22,15 @@ from adapter.runs.replay import (
     Replay,
     ReplayOptions,
     fitted_to,
+    held_out_rmse,
     noise_levels,
     seconds,
 )
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, results_folder, warn
+from adapter.signals.base_motion import with_base_motion
 from adapter.signals.matching import matching, present
-from adapter.signals.validation import validation_torque_rmse
 from drivers.files.mcap import Log, read_log
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
@@ -38,19 +38,20 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    whole = read_log(args.log)
+    whole = read_log(args.log, frames=args.base is not None)
     recorded = whole.metadata.get("config")
-    robot = robot_of_log(args, whole)
+    robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
     config = configure(args, recorded, robot)
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
-    log = matching(whole, robot)
+    log = _joined(args, whole, robot)
     log.warnings.extend(locked)
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
     warn(notes)
-    config = replace(config, pipeline=replace(config.pipeline, filter=fitted))
+    learner = replace(config.pipeline.learner, base_wrench=args.base_wrench == "zero")
+    config = replace(config, pipeline=replace(config.pipeline, filter=fitted, learner=learner))
     compile_first(robot, config.pipeline, args.every, console.print)
     result = _learn(args, log, robot, config)
     front_end = result.pipeline.front_end
@@ -59,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
         warn([f"{args.log}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
     held_out = _held_out(args, log, robot)
     if held_out is not None:
-        numbers["theta"]["validation_torque_rmse_nm"] = validation_torque_rmse(
-            *held_out, ModelTorque(learned_model(result.outcome, robot))
-        ).tolist()
+        model = learned_model(result.outcome, robot)
+        rmse = held_out_rmse(held_out, model, config.pipeline)
+        numbers["theta"]["validation_torque_rmse_nm"] = rmse.tolist()
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, str(args.log))
@@ -93,6 +94,12 @@ def _figures(
         noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
         gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
     )
+
+
+def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:
+    """The recording as the robot has it, with the base's motion where it floats."""
+    log = matching(log, robot)
+    return log if args.base is None else with_base_motion(log, robot, args.base)
 
 
 def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:
@@ -128,16 +135,12 @@ def tell(line: str) -> None:
     console.print(f"[yellow]new disagreement:[/] {line}", soft_wrap=True)
 
 
-def _held_out(
-    args: argparse.Namespace, log: Log, robot: SelfModel
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """(seconds, q, dq, tau) to score on, or None."""
+def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:
+    """What to score on, or None."""
     if args.validate_from is not None:
-        late = seconds(log) >= args.validate_from
-        return seconds(log)[late], log.q[late], log.dq[late], log.tau[late]
+        return log.take(seconds(log) >= args.validate_from)
     if args.validate is not None:
-        other = matching(read_log(args.validate), robot)
-        return seconds(other), other.q, other.dq, other.tau
+        return _joined(args, read_log(args.validate, frames=args.base is not None), robot)
     return None
 
 

@@ -109,7 +109,7 @@ def print_figures(figures: dict[str, Any]) -> None:
 def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
     """One line each; one that says so where nothing watched."""
     if reports is None:
-        return ["not watched for in batches (--every above 1)"]
+        return ["not watched for in batches (--every above 1) and where the base floats"]
     return [sentence(report) for report in reports]
 
 

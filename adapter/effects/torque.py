@@ -111,14 +111,16 @@ def sensors(motion: Motion, tau: Array, effects: Sequence[Active]) -> Array:
 
 
 class ModelTorque:
-    """Inverse dynamics of a fixed-base self model with its tool and its effects.
+    """Inverse dynamics of a self model's joints with its tool and its effects.
 
     Args:
         model: whose λ, θ, tool, gravity and effects are used.
+        base: (m, 12) motion of its base, for tables of those m samples; None where it rests.
     """
 
-    def __init__(self, model: SelfModel) -> None:
-        self._arm = RigidArm.of(model)
+    def __init__(self, model: SelfModel, base: Array | None = None) -> None:
+        arm = RigidArm.of(model)
+        self._arm = arm if base is None else arm.moving(base)
         self._effects = active_effects(model.effects, model.tree.n)
         self._lasting = lasting_effects(model.effects, model.tree.n)
 

@@ -136,10 +136,11 @@ class OnlineLearner:
             known.hand,
             known.tool_theta,
             told,
+            s.base_wrench,
         )
         self.theta = Theta(tree, before, effects_by_name(s.effects), s.theta, each_sample)
         self.given = tuple(known.effects)
-        self.known = _taken_off(known, s.effects, self.theta.smoothing_s)
+        self.known = _taken_off(known, s.effects, self.theta.smoothing_s, tree.floating)
         self.change = ChangeDetector(tree.n, s.change)
         rate = s.theta.sample_rate if each_sample else s.theta.rate
         # one flat parameter, so that one step serves λ and θ
@@ -162,7 +163,8 @@ class OnlineLearner:
         self._shadow_at = 0
         self.schema_trace = Trace(2 + 13 * tree.n)
         self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
-        self.score_trace = Trace(1 + 3 * tree.n + 2 * tree.rows, capacity=12_000)
+        moving = 12 if tree.floating else 0  # numbers of the base's motion
+        self.score_trace = Trace(1 + 5 * tree.n + moving, capacity=12_000)
 
     def _bind(self, parameters: Array, gradient: Array) -> None:
         """Let λ's tangent, θ's parameters and their gradients be views of the flat arrays."""
@@ -358,8 +360,9 @@ class OnlineLearner:
     def _look_on(self, table: Array, error: Array) -> None:
         """Keep the scores, and notice a change."""
         for k in self.score_trace.due(len(table)):
-            state = table[k]
-            self.score_trace.keep(stamp_of(state), state[self.layout.signals], error[k])
+            state, at = table[k], self.layout
+            parts = state[at.q.start : at.ddq.stop], state[at.joint_tau], error[k, -self.tree.n :]
+            self.score_trace.keep(stamp_of(state), *parts, state[at.base])
         if self.theta_trace.due(len(table)):
             self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
         alarmed_before = self.change.waiting
@@ -426,13 +429,17 @@ def _resting_base(tree: Tree, gravity: Array | None, arm: RigidArm | None) -> Re
     return RestingBase(documented, documented if arm is None else base_at_rest(arm.gravity))
 
 
-def _taken_off(known: KnownArm, learned: Sequence[str], smoothing_s: float) -> KnownEffects | None:
+def _taken_off(
+    known: KnownArm, learned: Sequence[str], smoothing_s: float, floating: bool
+) -> KnownEffects | None:
     """What takes the known effects off that nobody learns; None where there are none."""
     fixed = [active for active in known.effects if active.effect.name not in learned]
     if not fixed:
         return None
-    if known.arm is None:
-        raise SettingsError("effects of a model need the model's arm beside them")
+    names = ", ".join(dict.fromkeys(active.effect.name for active in fixed))
+    if known.arm is None or floating:
+        needed = "a base that rests" if floating else "the model's arm beside them"
+        raise SettingsError(f"effects of a model ({names}) need {needed}, or have to be learned")
     return KnownEffects(fixed, known.arm, smoothing_s)
 
 

@@ -141,6 +141,8 @@ class LearnerSettings:
         effects: names from the catalogue, learned beside θ.
         seed: of the random start of λ.
         update_every: states for each ADAM step; every state joins the moments.
+        base_wrench: whether the wrench on a floating base in the states counts (zero in free
+            motion); where nobody knows what pushes it, joints' torques alone teach θ.
         wait_for_schema: whether θ waits until λ has converged.
         held_samples: newest states kept to rebuild θ's moments from when λ has moved.
         rebuild_rows: how many of them each state redoes.
@@ -152,6 +154,7 @@ class LearnerSettings:
     effects: tuple[str, ...] = ()
     seed: int = 0
     update_every: int = 1
+    base_wrench: bool = True
     wait_for_schema: bool = True
     held_samples: int = 60_000
     rebuild_rows: int = 10

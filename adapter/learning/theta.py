@@ -83,6 +83,7 @@ class ThetaKnowledge:
         tool_theta: (10,) of a known tool, kept out of θ.
         believed: (e, n) values of the effects' parameters and their standard deviations, from a
             model; NaN where it says nothing, which is held for absent until data show it.
+        wrench: whether the wrench on a floating base is known.
     """
 
     base: Array | None = None
@@ -91,6 +92,7 @@ class ThetaKnowledge:
     hand: int | None = None
     tool_theta: Array | None = None
     believed: tuple[Array, Array] | None = None
+    wrench: bool = True
 
 
 class Theta:
@@ -127,7 +129,7 @@ class Theta:
         self.tree, self.effects, self.each_sample = tree, tuple(effects), each_sample
         self.settings = settings or ThetaSettings()
         self.layout = StateLayout(tree.n, tree.floating)
-        self.noise_gain = known.noise_gain
+        self.noise_gain, self._wrench = known.noise_gain, float(known.wrench)
         self.smoothing_s = STEP_SMOOTHING * known.delay_s
         n, e = tree.n, len(self.effects)
         self.bodies = tree.bodies + 1
@@ -274,11 +276,14 @@ class Theta:
         return True
 
     def base_weights(self) -> Array:
-        """(2,) weight of the base's force and moment rows: 1 / their running squared error."""
+        """(2,) weight of the base's force and moment rows: 1 / their running squared error.
+
+        Zero where the wrench is not known.
+        """
         if not self.tree.floating:
             return _NOTHING
         square = self.moments.base_level.reshape(2, 3).mean(axis=1)
-        return 1.0 / (self.noise_gain * (square + self.model_variance))
+        return self._wrench / (self.noise_gain * (square + self.model_variance))
 
     def restart_due(self, added: int) -> bool:
         """Whether the newest samples reached a restart of the spare body."""

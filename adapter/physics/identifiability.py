@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -104,12 +105,31 @@ def random_motion(tree: Tree, samples: int, seed: int) -> JointMotion:
     return JointMotion(q, rng.normal(size=q.shape), rng.normal(size=q.shape) * 3.0)
 
 
+class RandomRegressor(NamedTuple):
+    """Random motion, and the regressor (samples, rows, 10 bodies) over it."""
+
+    motion: JointMotion
+    matrix: Array
+
+
+def random_regressor(
+    tree: Tree, lam: Array, gravity: Array, samples: int, seed: int = 0, wrench: bool = True
+) -> RandomRegressor:
+    """The regressor over `random_motion`; arguments as of `base_parameters`."""
+    motion = random_motion(tree, samples, seed)
+    base = _random_base(tree, gravity, samples, seed)
+    matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
+    regressors(frames_of(tree.parent, lam), motion, base, matrix)
+    return RandomRegressor(motion, matrix if wrench else matrix[:, tree.rows - tree.n :])
+
+
 def base_parameters(
     tree: Tree,
     lam: Array,
     gravity: Array,
     seed: int = 0,
     extra: ExtraColumns | None = None,
+    wrench: bool = True,
 ) -> BaseParameters:
     """The identifiable subspace of θ, from the regressor over random motion.
 
@@ -119,12 +139,10 @@ def base_parameters(
         gravity: (3,) in base axes, m/s². A floating base gets random motion of its own.
         seed: of the motion.
         extra: columns of further effects to be counted beside θ (friction, offsets, ...).
+        wrench: whether the wrench on a floating base is known.
     """
     samples = max(20, 4 * 10 * tree.bodies // tree.rows + 10)
-    motion = random_motion(tree, samples, seed)
-    base = _random_base(tree, gravity, samples, seed)
-    matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
-    regressors(frames_of(tree.parent, lam), motion, base, matrix)
+    motion, matrix = random_regressor(tree, lam, gravity, samples, seed, wrench)
     if extra is not None:
         matrix = np.concatenate([matrix, extra(*motion)], axis=2)
     rank, basis = numerical_rank(matrix.reshape(-1, matrix.shape[2]))

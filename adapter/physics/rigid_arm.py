@@ -21,17 +21,19 @@ from adapter.physics.kernels import (
 
 @dataclass(frozen=True, eq=False)
 class RigidArm:
-    """A fixed-base arm of revolute joints: what turns motion into torque.
+    """An arm of revolute joints on a base whose motion is known: what turns motion into torque.
 
     Attributes:
         frames: of its joints.
         gravity: (3,) acceleration of gravity in base axes, m/s².
         theta: (n, 10) inertial parameters, tool included.
+        base: (m, 12) motion of the base, sample by sample; None where it rests.
     """
 
     frames: Frames
     gravity: Array
     theta: Array
+    base: Array | None = None
 
     @classmethod
     def of(cls, model: SelfModel) -> RigidArm:
@@ -49,11 +51,16 @@ class RigidArm:
         theta = self.theta if theta is None else np.ascontiguousarray(theta)
         return replace(self, theta=theta, gravity=self.gravity if gravity is None else gravity)
 
+    def moving(self, base: Array) -> RigidArm:
+        """The same arm while its base moves, (m, 12); for tables of those m samples."""
+        return replace(self, base=np.ascontiguousarray(base))
+
     def torque(self, q: Array, dq: Array, ddq: Array) -> Array:
         """tau (m, n), N m, for q, dq, ddq (m, n) rad, rad/s, rad/s²."""
         joints = _tables(q, dq, ddq)
         tau = np.empty_like(joints.q)
-        torques(self.frames, self.theta, joints, base_at_rest(self.gravity)[None], tau)
+        base = base_at_rest(self.gravity)[None] if self.base is None else self.base
+        torques(self.frames, self.theta, joints, base, tau)
         return tau
 
     def regressor(self, q: Array, dq: Array, ddq: Array) -> Array:

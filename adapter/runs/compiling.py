@@ -13,6 +13,7 @@ import numpy as np
 from numba.core import event
 
 from adapter.model.self_model import SelfModel
+from adapter.physics.kernels import base_at_rest
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
@@ -53,7 +54,7 @@ def compile_first(documented: SelfModel, settings: PipelineSettings, every: int,
     """Compile what learning takes, where this machine has not yet, by learning a made-up motion.
 
     Args:
-        documented: an arm on a fixed base.
+        documented: the arm; where its base floats, it is tried on one that rests.
         settings, every: of the learning to come.
         say: hears, once, that compiling takes place.
     """
@@ -76,4 +77,5 @@ def _motion(documented: SelfModel, period_s: float) -> Log:
     dq = SWING_RAD * pace * np.cos(pace * t)
     tau = RigidArm.of(documented).torque(q, dq, -(pace**2) * (q - middle))
     stamps = np.round(1e9 * t[:, 0]).astype(np.int64)
-    return Log(Path("made up"), documented.tree.joint_names, stamps, q, dq, tau)
+    base = np.tile(base_at_rest(documented.gravity)[:9], (len(t), 1))
+    return Log(Path("made up"), documented.tree.joint_names, stamps, q, dq, tau, base=base)

@@ -18,9 +18,13 @@ from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz, zxz_from_matrix
+from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import base_parameters, random_motion
-from adapter.physics.rigid_arm import RigidArm
+from adapter.physics.identifiability import (
+    BaseParameters,
+    base_parameters,
+    random_regressor,
+)
 from adapter.signals.records import LinkMotionKind
 
 SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
@@ -37,14 +41,16 @@ class Outcome:
         lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
         lam_restarts: joints that λ was started anew for, out of a wrong valley.
         lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
-        theta: (n, 10); effects: (e, n); variance: (n,) of the residual torque, (N m)².
+        theta: (bodies, 10), the base first if it floats; effects: (e, n).
+        variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
         payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
         schema_known: (k, n + 1) of the rows of schema_trace: directions known by joint, and
             whether λ was said to have converged. lam_information: (n, 6, 6) at last.
-        score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning].
+        score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning], and behind
+            them the motion (12,) of a base that floats.
         frames: (R0, p) that θ's moments were taken with.
         smoothing_s: how long the filter takes a step of torque.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
@@ -90,8 +96,7 @@ def collect(learner: OnlineLearner) -> Outcome:
     to_parent = np.zeros((learner.tree.n, 6, 6))  # (phi, d) -> (turn in the parent's axes, d)
     to_parent[:, :3, :3], to_parent[:, 3:, 3:] = schema.R0, np.eye(3)
     back = to_parent.transpose(0, 2, 1)
-    n = learner.tree.n
-    traced = learner.theta_trace.rows[:, 1 : 1 + 10 * n].reshape(-1, 10)
+    traced = learner.theta_trace.rows[:, 1 : 1 + 10 * learner.tree.bodies].reshape(-1, 10)
     eigenvalues = min_eigenvalue(np.concatenate([traced, theta.theta]))
     return Outcome(
         learned=learner.learned,
@@ -174,7 +179,7 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda
 def completed_theta(
     outcome: Outcome, documented: SelfModel, lam: Array, basis: Array
 ) -> tuple[Array, dict[str, Any]]:
-    """The learned θ (n, 10) with what torques do not show taken from the documentation.
+    """The learned θ (bodies, 10) with what torques do not show taken from the documentation.
 
     Torques stay what they were, unless no possible bodies have them.
 
@@ -186,15 +191,15 @@ def completed_theta(
     """
     if outcome.theta_started_ns is None:
         return documented.theta, {"theta_source": "documentation: λ had not converged"}
-    motion = random_motion(documented.tree, 4 * len(basis), seed=0)
-    arm = RigidArm.of(replace(documented, lam=lam))
-    table = arm.regressor(*motion).reshape(-1, len(basis))
+    wrench, count = outcome.settings.base_wrench, 4 * len(basis)
+    shown = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
+    table = shown.matrix.reshape(-1, len(basis))
     said: dict[str, Any] = {"theta_source": "learned"}
     try:
         found = filled_theta(outcome.theta, documented.theta, basis, table)
     except ModelError as error:  # a run's results are not lost over it
         return outcome.theta, {**said, "theta_note": f"nothing of it is filled: {error}"}
-    said["theta_filled"] = filled_words(basis, documented.tree.link_names)
+    said["theta_filled"] = filled_words(basis, documented.tree.body_names)
     if not found.possible:
         moved = table @ (found.theta - outcome.theta).ravel()
         said["theta_note"] = (
@@ -211,16 +216,16 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     Effects of the documented model that were not learned stay in it as they are; those that
     ended with the recording they were found in are left out.
     """
-    documented, n = with_bodies(documented), documented.tree.n
+    documented, bodies = with_bodies(documented), documented.tree.bodies
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
     completed = completed_lambda(outcome, documented)
-    base = base_parameters(documented.tree, completed.lam, documented.gravity)
+    base = shown_parameters(outcome, documented, completed.lam)
     share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
     known = outcome.theta_started_ns is not None
     theta, said = completed_theta(outcome, documented, completed.lam, base.basis)
-    body = outcome.covariance.diagonal()[: 10 * (n + 1)].reshape(-1, 10)
-    body = body[np.r_[: n - 1, n]] if outcome.spare_in_use else body[:n]
+    body = outcome.covariance.diagonal()[: 10 * (bodies + 1)].reshape(-1, 10)
+    body = body[np.r_[: bodies - 1, bodies]] if outcome.spare_in_use else body[:bodies]
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -229,9 +234,9 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
-        theta_std=np.sqrt(body) if known else np.full((n, 10), np.nan),
+        theta_std=np.sqrt(body) if known else np.full((bodies, 10), np.nan),
         theta_identifiable=(share > SHOWN_SHARE) & known,
-        effects=(*_effects(outcome, n), *_kept(documented, outcome.settings.effects)),
+        effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={
             **provenance,
@@ -242,10 +247,16 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     )
 
 
-def _effects(outcome: Outcome, n: int) -> list[dict[str, Any]]:
+def shown_parameters(outcome: Outcome, documented: SelfModel, lam: Array) -> BaseParameters:
+    """What of θ the torques that were learned from can show."""
+    wrench = outcome.settings.base_wrench
+    return base_parameters(documented.tree, lam, documented.gravity, wrench=wrench)
+
+
+def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
     """Entries of the model file, one per effect and joint."""
-    entries = []
-    std = np.sqrt(outcome.covariance.diagonal()[10 * (n + 1) :]).reshape(-1, n)
+    entries, n = [], tree.n
+    std = np.sqrt(outcome.covariance.diagonal()[10 * (tree.bodies + 1) :]).reshape(-1, n)
     for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
         for j in range(n):
             entries.append(

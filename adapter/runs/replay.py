@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.torque import ModelTorque
 from adapter.errors import SettingsError
 from adapter.gap.monitor import Monitor
 from adapter.learning.checkpoint import load_checkpoint
@@ -19,9 +20,10 @@ from adapter.model.spatial import Array
 from adapter.runs.batch import learn_batch
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import Outcome, collect
-from adapter.runs.pipeline import Pipeline
+from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
 from adapter.signals.settings import FilterSettings
+from adapter.signals.validation import validation_torque_rmse
 from drivers.files.mcap import Log
 from drivers.interface import DriverError, JointSample, LinkMotion
 
@@ -82,7 +84,7 @@ def replay(
 
     Raises:
         SettingsError: `every` out of range, or a checkpoint that does not fit.
-        DriverError: no samples.
+        DriverError: no samples, or nothing of the motion of a base that floats.
     """
     every, until_s, progress, resume, say = options or ReplayOptions()
     if not 1 <= every <= MOST_PER_UPDATE:
@@ -92,11 +94,17 @@ def replay(
         stop = int(np.sum(log.stamp_ns < log.stamp_ns[0] + round(1e9 * until_s)))
     if stop == 0:
         raise DriverError(f"{log.path}: no samples to learn from")
+    if documented.tree.floating and log.base is None:
+        raise DriverError(
+            f"{log.path}: the base of {documented.name} floats, and nothing of its motion was read "
+            "(read_log with frames, then base_motion.with_base_motion)"
+        )
     pipeline = Pipeline(documented, settings)
     if every == 1:  # a batch learns of everything before it could tell what is new
         tool = None if documented.tool is None else documented.tool.theta()
         delay_s = pipeline.front_end.delay_s
-        pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
+        if not documented.tree.floating:  # what it knows of disagreements is of a base that rests
+            pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
     if resume is not None:
         load_checkpoint(pipeline.learner, resume)
     started = time.perf_counter()
@@ -117,7 +125,9 @@ def _exact(
         links = None
         if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
             links = LinkMotion(log.twists[i], log.accels[i])
-        sample = JointSample(int(log.stamp_ns[i]), log.q[i], log.dq[i], log.tau[i], links)
+        joints = log.q[i], log.dq[i], log.tau[i]
+        base = None if log.base is None else log.base[i]
+        sample = JointSample(int(log.stamp_ns[i]), *joints, links, base)
         before = time.perf_counter_ns()
         state = front_end.step(sample)
         tick_ns[i] = time.perf_counter_ns() - before
@@ -140,10 +150,12 @@ def _batch(
 ) -> NDArray[np.int64]:
     def states(start: int) -> Array:
         part = slice(start, min(start + AT_ONCE, stop))
-        twists = None if log.twists is None else log.twists[part]
-        accels = None if log.accels is None else log.accels[part]
+        links = None
+        if log.twists is not None and log.accels is not None:
+            links = log.twists[part], log.accels[part]
         joints = log.stamp_ns[part], log.q[part], log.dq[part], log.tau[part]
-        return pipeline.front_end.step_table(*joints, twists, accels)
+        base = None if log.base is None else log.base[part]
+        return pipeline.front_end.step_table(*joints, links, base)
 
     tables = (states(start) for start in range(0, stop, AT_ONCE))
     learn_batch(pipeline.learner, tables, every, progress)
@@ -181,6 +193,23 @@ def noise_levels(log: Log) -> dict[str, Array]:
         name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))
         for name in ("q", "dq", "tau")
     }
+
+
+def held_out_rmse(log: Log, model: SelfModel, settings: PipelineSettings) -> Array:
+    """Torque RMSE (n,) of a model on a recording it has not seen, N m.
+
+    Of a base that floats, on the states that the front end makes of the recording; else by the
+    recipe of `validation`.
+    """
+    if not model.tree.floating:
+        signals = seconds(log), log.q, log.dq, log.tau
+        return validation_torque_rmse(*signals, ModelTorque(model))
+    front_end = make_front_end(model, settings)
+    states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
+    at = front_end.layout
+    q, dq, ddq = (states[:, part] for part in (at.q, at.dq, at.ddq))
+    error = states[:, at.joint_tau] - ModelTorque(model, states[:, at.base])(q, dq, ddq)
+    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
 def seconds(log: Log) -> Array:

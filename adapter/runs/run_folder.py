@@ -19,8 +19,7 @@ from adapter.errors import ModelError
 from adapter.model.model_file import load_model, save_model, whole_file
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.identifiability import base_parameters
-from adapter.runs.outcome import Outcome, learned_model
+from adapter.runs.outcome import Outcome, learned_model, shown_parameters
 from adapter.runs.score import Reference, ScoreRows, course_errors, stamps_s
 from adapter.runs.terminal import json_text
 
@@ -50,6 +49,8 @@ class RunFolderError(ModelError):
 @dataclass(frozen=True)
 class RunData:
     """Everything a report shows, n joints, P = 10 (n + 1) + effects x n flat parameters.
+
+    A base that floats is in the models alone.
 
     Attributes:
         figures: the JSON of `run` and `replay`. Beside the keys of `score.figures` a report
@@ -171,14 +172,13 @@ def run_data(
     if len(outcome.score_trace):
         rows = ScoreRows(outcome, documented)
         fit = rows.torque(outcome.theta, outcome.effects)
-        best = outcome.least_squares
-        effects = best[10 * (n + 1) :].reshape(-1, n)
-        batch = rows.torque(best[: 10 * n].reshape(n, 10), effects)
+        batch = rows.batch_torque()
     errors = np.zeros((2, len(outcome.schema_trace), n))
     if reference is not None:
         errors[:] = course_errors(outcome, documented, reference)
     model = learned_model(outcome, documented)
-    basis = base_parameters(documented.tree, model.lam, documented.gravity).basis
+    basis = shown_parameters(outcome, documented, model.lam).basis
+    shown, first = np.einsum("ab,ab->a", basis, basis), int(documented.tree.floating)
     return RunData(
         figures=dict(figures),
         model=replace(model, provenance={**provenance, **model.provenance}),
@@ -187,13 +187,13 @@ def run_data(
         start_lam=outcome.start_lam,
         schema_trace=outcome.schema_trace,
         schema_errors=errors,
-        theta_trace=outcome.theta_trace,
-        score_trace=outcome.score_trace,
+        theta_trace=np.delete(outcome.theta_trace, np.s_[1 : 1 + 10 * first], axis=1),
+        score_trace=outcome.score_trace[:, : 1 + 5 * n],
         fit=fit,
         batch=batch,
         noise=np.sqrt(outcome.variance),
         lam_shown=np.clip(np.einsum("jaa->ja", outcome.lam_identifiable), 0.0, 1.0),
-        theta_shown=np.clip(np.einsum("ab,ab->a", basis, basis).reshape(n, 10), 0.0, 1.0),
+        theta_shown=np.clip(shown.reshape(-1, 10)[first:], 0.0, 1.0),
         delay_s=delay_s,
         first_moving_ns=first_moving_ns,
     )

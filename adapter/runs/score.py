@@ -19,9 +19,15 @@ from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.freedom import Freedom
-from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.physics.identifiability import frame_observability
 from adapter.physics.rigid_arm import RigidArm
-from adapter.runs.outcome import Outcome, changes, completed_lambda, frame_errors
+from adapter.runs.outcome import (
+    Outcome,
+    changes,
+    completed_lambda,
+    frame_errors,
+    shown_parameters,
+)
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_GOAL = 1.1  # times the final batch least squares
@@ -153,16 +159,25 @@ class ScoreRows:
         self.q, self.dq, self.ddq, self.tau, self.error = (
             np.ascontiguousarray(rows[:, 1 + k * n : 1 + (k + 1) * n]) for k in range(5)
         )
+        self._base = rows[:, 1 + 5 * n :] if documented.tree.floating else None
         self._outcome, self._documented = outcome, with_bodies(documented)
         first = outcome.changes_ns[0] if outcome.changes_ns else np.inf
         self.before_change = rows[:, 0] < first
         last = outcome.changes_ns[-1] if outcome.changes_ns else -np.inf
         self.after_changes = rows[:, 0] >= last
 
+    def batch_torque(self) -> Array:
+        """(k, n) torque of the final batch least squares."""
+        best, bodies = self._outcome.least_squares, self._documented.tree.bodies
+        effects = best[10 * (bodies + 1) :].reshape(-1, self.n)
+        return self.torque(best[: 10 * bodies].reshape(bodies, 10), effects)
+
     def torque(self, theta: Array, effects: Array) -> Array:
-        """(k, n) torque of θ (n, 10) and effect parameters (e, n), with the learned frames."""
+        """(k, n) torque of θ (bodies, 10) and effect parameters (e, n), with the learned frames."""
         learned = replace(self._documented, lam=self._outcome.lam, theta=theta)
-        tau = RigidArm.of(learned).torque(self.q, self.dq, self.ddq)
+        arm = RigidArm.of(learned)
+        arm = arm if self._base is None else arm.moving(self._base)
+        tau = arm.torque(self.q, self.dq, self.ddq)
         at = JointSignals(self.q, self.dq, self.ddq, smoothing_s=self._outcome.smoothing_s)
         names = self._outcome.settings.effects
         for gain, effect in zip(effects, effects_by_name(names), strict=True):
@@ -184,9 +199,8 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     Convergence is judged up to the first change at the hand: prequential torque error against
     the batch solution's on the same samples, joints in units of their noise.
     """
-    n = documented.tree.n
     lam = completed_lambda(outcome, documented).lam
-    base = base_parameters(documented.tree, lam, documented.gravity)
+    base = shown_parameters(outcome, documented, lam)
     score: dict[str, Any] = {
         "converged_s": None,
         "base_parameters": base.rank,
@@ -210,9 +224,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     late = rows.after_changes
     final = rows.tau - rows.torque(outcome.theta, outcome.effects)
     score["torque_rmse_nm"] = np.sqrt(np.mean(final[late] ** 2, axis=0)).tolist()
-    best = outcome.least_squares
-    bodies = best[: 10 * (n + 1)].reshape(-1, 10)
-    batch = rows.tau - rows.torque(bodies[:n], best[10 * (n + 1) :].reshape(-1, n))
+    batch = rows.tau - rows.batch_torque()
     noise = np.sqrt(outcome.variance)
     early = rows.before_change
     ours = trailing_rms(rows.time_s[early], rows.error[early] / noise, TORQUE_WINDOW_S)

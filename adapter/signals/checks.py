@@ -51,6 +51,7 @@ class Verdict(IntEnum):
     STUCK_JOINT = 9
     ENCODER_JUMP = 10
     TIME_AHEAD = 11
+    BASE_UNHEARD = 12
 
 
 class Rules(NamedTuple):
@@ -80,7 +81,7 @@ class Memory(NamedTuple):
         good, doubted: (3, n) the last believed reading, the last one that was not.
         usual: (3, n) squares of the readings' usual changes.
         since: (n,) int64 stamps at which the joints' readings last changed.
-        ahead: (3 n,) the reading whose stamp lay far ahead.
+        ahead: (3 n + b,) the reading whose stamp lay far ahead, with the base's b numbers.
         marks: (10,) int64, see `Mark`.
         filter: of the filter.
         fastest: (n,) highest filtered |dq|, rad/s.
@@ -145,8 +146,11 @@ def packed(rules: Rules) -> Array:
 
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 6,), (9, 3, n) and (n + 12,)."""
-    n = memory.shape[2]
+    """`Rules` and `Memory` as views of (8 n + 6,), (25 n + 4 b,) and (n + 12,).
+
+    The base's motion, b numbers, passes the filter behind the joints' 3 n.
+    """
+    n = whole.shape[0] - 12
     at = 8 * n
     rest_dq, gap_ns, k1, k2 = rules[at], rules[at + 1], rules[at + 2], rules[at + 3]
     delay_ns, settle_ns = rules[at + 4], rules[at + 5]
@@ -154,15 +158,18 @@ def unpacked(rules, memory, whole):
     allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
     own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, int(gap_ns), gains)
     since, marks, times = whole[:n], whole[n : n + 10], whole[n + 10 :]
+    tables = memory[: 12 * n].reshape(4, 3, n)
+    last, good, doubted, usual = tables[0], tables[1], tables[2], tables[3]
+    wide = memory[12 * n : memory.shape[0] - n]
+    size = wide.shape[0] // 4
     ahead, old, y, dy = (
-        memory[4].reshape(3 * n),
-        memory[5].reshape(3 * n),
-        memory[6].reshape(3 * n),
-        memory[7].reshape(3 * n),
+        wide[:size],
+        wide[size : 2 * size],
+        wide[2 * size : 3 * size],
+        wide[3 * size :],
     )
-    state = FilterState(times, old, y, dy)
-    last, good, doubted, usual = memory[0], memory[1], memory[2], memory[3]
-    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, memory[8, 0])
+    state, fastest = FilterState(times, old, y, dy), memory[memory.shape[0] - n :]
+    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, fastest)
 
 
 @jit

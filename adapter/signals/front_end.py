@@ -23,7 +23,7 @@ from adapter.signals.checks import (
     unpacked,
 )
 from adapter.signals.filters import NEVER, JointFilter, filter_step
-from adapter.signals.records import StateLayout
+from adapter.signals.records import StateLayout, columns
 from adapter.signals.settings import FilterSettings, FrontEndSettings
 from adapter.signals.twist import TwistSynthesis
 from drivers.interface import JointSample
@@ -36,6 +36,7 @@ NOTEWORTHY = (
     Verdict.IMPLAUSIBLE_STEP,
     Verdict.STUCK_JOINT,
     Verdict.ENCODER_JUMP,
+    Verdict.BASE_UNHEARD,
 )
 
 UNSEEN = (
@@ -46,16 +47,15 @@ UNSEEN = (
     Mark.DOUBTED,
     Mark.LAST,
 )  # stamps of what has not been yet
+BASE = 9  # numbers of a floating base's motion in a sample, [v, w, a]
 FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
 
 
 class Samples(NamedTuple):
-    """Raw samples: stamps (m,) int64 ns; q, dq, tau (m, n)."""
+    """Raw samples: stamps (m,) int64 ns; signals (m, 3 n + b), see `process`."""
 
     stamps: NDArray[np.int64]
-    q: Array
-    dq: Array
-    tau: Array
+    signals: Array
 
 
 class Answers(NamedTuple):
@@ -75,24 +75,23 @@ class Answers(NamedTuple):
 @jit
 def taken(samples, i, rules, memory, answers):
     """Verdict on sample i; filtered into its record where it teaches something."""
-    stamp, dq, tau, marks = samples.stamps[i], samples.dq[i], samples.tau[i], memory.marks
-    times, gains = memory.filter.times, rules.gains
-    verdict = judge(stamp, samples.q[i], dq, tau, rules, memory)
+    stamp, signals, marks = samples.stamps[i], samples.signals[i], memory.marks
+    times, gains, n = memory.filter.times, rules.gains, rules.effort.shape[0]
+    x = signals[: 3 * n].reshape(3, n)
+    verdict = judge(stamp, x[0], x[1], x[2], rules, memory)
+    if not np.isfinite(signals[3 * n :]).all():
+        verdict = Verdict.BASE_UNHEARD
     seen, ahead_ns = marks[Mark.SEEN], marks[Mark.AHEAD]
     if verdict == Verdict.GOOD:
         verdict = in_order(stamp, rules.gap_ns, times, marks)
-    n = dq.shape[0]
     if verdict == Verdict.TIME_AHEAD:
-        memory.ahead[:n], memory.ahead[n : 2 * n] = samples.q[i], dq
-        memory.ahead[2 * n :] = tau
+        memory.ahead[:] = signals
     if verdict != Verdict.GOOD:
         return verdict
     gap = times[0] != NEVER and (
         stamp <= times[0] or stamp - seen > rules.gap_ns or marks[Mark.OLD_STAMPS] >= STREAK
     )
     marks[Mark.OLD_STAMPS] = 0
-    x = np.empty((3, n))
-    x[0], x[1], x[2] = samples.q[i], dq, tau
     if gap:  # nothing can be said of steps
         memory.since[:] = stamp
         marks[Mark.JUMPED] = 0
@@ -109,7 +108,7 @@ def taken(samples, i, rules, memory, answers):
         if ahead_ns != NEVER and 0 < stamp - ahead_ns <= rules.gap_ns:  # it began there
             answers.holes[i, 1] = ahead_ns
             filter_step(ahead_ns, memory.ahead, gains, memory.filter)
-    settled = filter_step(stamp, x.reshape(3 * n), gains, memory.filter)
+    settled = filter_step(stamp, signals, gains, memory.filter)
     return worth(stamp, x, settled, rules, memory)
 
 
@@ -143,16 +142,18 @@ def process(signals, rules, memory, whole, records, answers):
     Takes few plain arrays, since handing over a record of many takes longer than the work itself.
 
     Args:
-        signals: (m, 3, n) q, dq, tau.
-        rules: as packed by `packed`; memory: (9, 3, n) and whole: (n + 12,) int64, see `unpacked`.
+        signals: (m, 3 n + b) q, dq, tau, and the b = 9 numbers of a base that floats.
+        rules, memory, whole: see `packed` and `unpacked`.
         records: (m, size), filled where the verdict is GOOD.
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
     """
     own, kept = unpacked(rules, memory, whole)
-    samples = Samples(answers[:, 0], signals[:, 0], signals[:, 1], signals[:, 2])
+    samples = Samples(answers[:, 0], signals)
     found = Answers(records, answers[:, 1], answers[:, 2:])
-    n, y, dy = signals.shape[2], kept.filter.y, kept.filter.dy
+    n, y, dy = own.effort.shape[0], kept.filter.y, kept.filter.dy
+    floating = signals.shape[1] > 3 * n
+    at = columns(n, floating)
     for i in range(signals.shape[0]):
         found.holes[i] = 0
         verdict = taken(samples, i, own, kept, found)
@@ -160,9 +161,12 @@ def process(signals, rules, memory, whole, records, answers):
         if verdict == Verdict.GOOD:
             row = records[i]
             row[:1].view(np.int64)[0] = samples.stamps[i] - own.gains.delay_ns
-            row[2 : 2 + 2 * n] = y[: 2 * n]
-            row[2 + 2 * n : 2 + 3 * n] = dy[n : 2 * n]
-            row[2 + 3 * n : 2 + 4 * n] = y[2 * n :]
+            row[at.q : at.ddq] = y[: 2 * n]
+            row[at.ddq : at.tau] = dy[n : 2 * n]
+            row[at.base - n : at.base] = y[2 * n : 3 * n]
+            if floating:
+                row[at.base : at.base + BASE] = y[3 * n :]
+                row[at.base + BASE : at.motion_q] = dy[3 * n + 3 : 3 * n + 6]  # rate of w
 
 
 class FrontEnd:
@@ -185,19 +189,20 @@ class FrontEnd:
         n = documented.tree.n
         self.settings = settings or FrontEndSettings()
         self.names = documented.tree.joint_names
-        self.layout = StateLayout(n)
+        self.layout = StateLayout(n, documented.tree.floating)
         self.filter = JointFilter(n, filter_settings)
         self.twist = TwistSynthesis(documented)
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
-        self._kept, self._whole = np.zeros((9, 3, n)), np.zeros(n + 12, dtype=np.int64)
+        base = BASE if documented.tree.floating else 0
+        self._kept, self._whole = np.zeros(25 * n + 4 * base), np.zeros(n + 12, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
         self._memory.filter.times[:] = NEVER
         for mark in UNSEEN:
             self._memory.marks[mark] = NEVER
         self.filter.use(self._memory.filter)
-        self._signals, self._answers = np.empty((1, 3, n)), np.zeros((1, 4), dtype=np.int64)
+        self._signals, self._answers = np.empty((1, 3 * n + base)), np.zeros((1, 4), np.int64)
         self._records = self.layout.new(1)
         self.refused: Counter[str] = Counter()
         self.gaps: list[tuple[int, float]] = []
@@ -241,8 +246,11 @@ class FrontEnd:
 
         The record is reused by the next call. Reasons are counted in `refused`.
         """
-        signals, answers = self._signals, self._answers
-        signals[0, 0], signals[0, 1], signals[0, 2] = sample.q, sample.dq, sample.tau
+        signals, answers, n = self._signals, self._answers, self.layout.n
+        row = signals[0]
+        row[:n], row[n : 2 * n], row[2 * n : 3 * n] = sample.q, sample.dq, sample.tau
+        if self.layout.floating:
+            row[3 * n :] = np.nan if sample.base is None else sample.base
         answers[0, 0] = sample.stamp_ns
         process(signals, self._packed, self._kept, self._whole, self._records, answers)
         if answers[0, 1]:
@@ -258,15 +266,19 @@ class FrontEnd:
         q: Array,
         dq: Array,
         tau: Array,
-        twists: Array | None = None,
-        accels: Array | None = None,
+        links: tuple[Array, Array] | None = None,
+        base: Array | None = None,
     ) -> Array:
         """The filtered states (k, size) of a whole recording, as `step` makes them one by one.
 
         Args:
-            stamp_ns: (m,); q, dq, tau: (m, n); twists, accels: (m, n, 6), NaN where not measured.
+            stamp_ns: (m,); q, dq, tau: (m, n); links: twists and accels (m, n, 6), NaN where not
+                measured; base: (m, 9) of a base that floats, see `JointSample`.
         """
-        signals = np.ascontiguousarray(np.stack([q, dq, tau], axis=1))
+        parts = [q, dq, tau]
+        if self.layout.floating:
+            parts.append(np.full((len(q), BASE), np.nan) if base is None else base)
+        signals = np.concatenate(parts, axis=1)
         records, answers = self.layout.new(len(q)), np.zeros((len(q), 4), dtype=np.int64)
         answers[:, 0] = stamp_ns
         process(signals, self._packed, self._kept, self._whole, records, answers)
@@ -279,8 +291,7 @@ class FrontEnd:
             records,
             q[good],
             dq[good],
-            None if twists is None else twists[good],
-            None if accels is None else accels[good],
+            None if links is None else (links[0][good], links[1][good]),
         )
         return records
 
@@ -315,6 +326,8 @@ class FrontEnd:
                         f"{at}: {signal} of {self.names[j]} is {value[j]:.4g}, outside "
                         f"[{low[j]:.4g}, {high[j]:.4g}]{hint}"
                     )
+        if reason == Verdict.BASE_UNHEARD:
+            return f"{at}: nothing is known of the base's motion; the sample was refused"
         if reason == Verdict.NON_FINITE:
             return f"{at}: a reading is not a finite number; the sample was refused"
         if reason == Verdict.TORQUE_SATURATED:

@@ -52,7 +52,9 @@ def matching(log: Log, documented: SelfModel) -> Log:
         )
     links, more = _corresponding(tree.link_names, log.link_names, "link")
     heard = all(links) and log.twists is not None and log.accels is not None
-    if log.link_names and not heard:
+    if tree.floating:  # see `twist`
+        heard = False
+    elif log.link_names and not heard:
         more.append(
             f"{log.path}: motion of not all links was recorded (twists and accelerations of "
             f"{', '.join(tree.link_names)}); link motion is synthesized instead"

@@ -21,15 +21,16 @@ def describe(path: str | Path) -> dict[str, Any]:
 
     Of a file without usable joint states only its topics are told, and `problem` says what is
     missing. Keys: file, bytes, truncated, problem, topics, warnings; with joint states also
-    joints, links, samples, start_s, duration_s, rate_hz, period_ms, jitter_ms, repeated_samples,
-    repeated_stamps, backward_steps, not_finite, gaps, range, metadata, attachments.
+    joints, links, frames (topics that tell the motion of others), samples, start_s, duration_s,
+    rate_hz, period_ms, jitter_ms, repeated_samples, repeated_stamps, backward_steps, not_finite,
+    gaps, range, metadata, attachments.
 
     Raises:
         DriverError: the file is unreadable, empty or not MCAP.
     """
     path = Path(path)
     try:
-        log = read_log(path)
+        log = read_log(path, frames=True)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
@@ -52,6 +53,7 @@ def _joint_facts(log: Log) -> dict[str, Any]:
     return {
         "joints": list(log.joint_names),
         "links": list(log.link_names),
+        "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],
         "samples": len(log),
         "commands": 0 if log.commands is None else len(log.commands.stamp_ns),
         "repeated_samples": int(_repeated(log).sum()),

@@ -68,7 +68,7 @@ class StateLayout:
     Attributes:
         q, dq, ddq, tau, base, motion_q, motion_dq, motion: slices, as `columns` has them; `base`
             is empty where the base does not float.
-        signals: q, dq, ddq and tau in one slice.
+        joint_tau: the joints' torques, behind the wrench on a floating base.
         before_links: all columns before what the body schema learns from.
     """
 
@@ -80,7 +80,7 @@ class StateLayout:
             slice(at[k], at[k + 1]) for k in range(7)
         )
         self.motion = slice(at.motion, at.size)
-        self.signals = slice(at.q, at.base)
+        self.joint_tau = slice(at.base - n, at.base)
         self.before_links = slice(0, at.motion_q)
 
     def new(self, rows: int | None = None) -> Array:

@@ -3,8 +3,10 @@
 The paper's Panda has no sensors on its links; it computes their motion from the joint signals
 and the documented λ. What is learned from that can only reproduce the documentation, and is
 labelled so. Synthesized motion uses the same q and dq that the learner sees, so their noise
-cancels. Measured motion is handed on unfiltered beside the q and dq of its own stamp: the
-body-schema moments average its noise, and a low-pass would shift products of fast signals.
+cancels. So does that of a floating base, whose links' motion is always synthesized: the base's has
+passed the filter, and theirs would be of another instant. Measured motion is handed on unfiltered
+beside the q and dq of its own stamp: the body-schema moments average its noise, and a low-pass
+would shift products of fast signals.
 """
 
 from __future__ import annotations
@@ -29,15 +31,15 @@ class TwistSynthesis:
     """
 
     def __init__(self, documented: SelfModel) -> None:
-        self.layout = StateLayout(documented.tree.n)
+        self.layout = StateLayout(documented.tree.n, documented.tree.floating)
         # a plain tuple: numba takes 3 µs longer for a named one
         self._frames = tuple(frames_of(documented.tree.parent, documented.lam))
-        self._base = base_at_rest(documented.gravity)
+        self._base = np.empty(0) if self.layout.floating else base_at_rest(documented.gravity)
 
     def fill(self, record: Array, sample: JointSample) -> None:
         """Complete a record whose q, dq, ddq are filled, for the sample that led to it."""
         links = sample.links
-        if links is None:
+        if links is None or self.layout.floating:
             synthesize(self._frames, self._base, record[None])
         else:
             self._measured(
@@ -45,12 +47,13 @@ class TwistSynthesis:
             )
 
     def fill_table(
-        self, records: Array, q: Array, dq: Array, twists: Array | None, accels: Array | None
+        self, records: Array, q: Array, dq: Array, links: tuple[Array, Array] | None
     ) -> None:
-        """Complete records (m, size); raw q, dq (m, n) and link motion (m, n, 6) beside them."""
-        if twists is None or accels is None:
+        """Complete records (m, size); raw q, dq (m, n), twists and accels (m, n, 6) beside them."""
+        if links is None or self.layout.floating:
             synthesize(self._frames, self._base, records)
             return
+        twists, accels = links
         heard = ~np.isnan(twists).all(axis=(1, 2)) | ~np.isnan(accels).all(axis=(1, 2))
         part = records[heard]
         self._measured(part, q[heard], dq[heard], twists[heard], accels[heard])
@@ -72,13 +75,17 @@ class TwistSynthesis:
 
 @jit
 def synthesize(frames, base, records):
-    """Fill the link motion of records (m, size) from their filtered q, dq, ddq."""
+    """Fill the link motion of records (m, size) from their filtered q, dq, ddq.
+
+    `base` is the motion (12,) of a base at rest; empty where the records hold the base's.
+    """
     arm = Frames(*frames)
     n = arm.parent.shape[0]
-    at = columns(n, False)
+    at = columns(n, base.shape[0] == 0)
     for i in range(records.shape[0]):
         row = records[i]
         row[KIND] = LinkMotionKind.DOCUMENTED.value
         row[at.motion_q : at.motion] = row[at.q : at.ddq]
         joints = JointMotion(row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau])
-        link_motion(arm, joints, base, row[at.motion :].reshape((n, 12)))
+        moves = row[at.base : at.motion_q] if base.shape[0] == 0 else base
+        link_motion(arm, joints, moves, row[at.motion :].reshape((n, 12)))

@@ -3,12 +3,12 @@
 `SCHEMAS` are their definitions (`ros2msg`) as MCAP wants them: the definition of the message,
 followed by those of all messages it uses, each after a line of 80 `=` and a line `MSG:
 package/Name`. Field names, types and order are facts of the public packages builtin_interfaces,
-std_msgs, geometry_msgs and sensor_msgs (ROS 2 Humble and later).
+std_msgs, geometry_msgs, nav_msgs and sensor_msgs (ROS 2 Humble and later).
 
 Written: CDR (XCDR1) little endian, encapsulation header 00 01 00 00. Read: plain CDR of either
 byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes). Alignment counts from
 the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4 (encapsulation, plain
-CDR). Imu is only read.
+CDR). Imu and Odometry are only read.
 
 Decoding is split in two: a parser finds *where* the numbers of a message lie (`Layout`), then
 numpy reads them, from one message or from all messages whose other bytes are the same. Encoders
@@ -35,12 +35,17 @@ _FIELDS = {
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
     "geometry_msgs/Accel": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z\n",
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance\n",
+    "geometry_msgs/TwistWithCovariance": "geometry_msgs/Twist twist\nfloat64[36] covariance\n",
 }
 _HEADER = ("std_msgs/Header", "builtin_interfaces/Time")
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
 IMU = "sensor_msgs/msg/Imu"
+ODOMETRY = "nav_msgs/msg/Odometry"
 CDR_LE = b"\x00\x01\x00\x00"
 SECOND_NS = 1_000_000_000
 _STAMP_LE = struct.Struct("<iI")
@@ -50,6 +55,7 @@ Rows = NDArray[np.uint8]
 _STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulation header
 _MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
 IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
+ODOMETRY_DOUBLES = 85  # pose 7, its covariance 36, twist 6 (child frame), its covariance 36
 _LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
@@ -78,6 +84,16 @@ SCHEMAS = {
         "geometry_msgs/Vector3 angular_velocity\nfloat64[9] angular_velocity_covariance\n"
         "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n",
         (*_HEADER, "geometry_msgs/Quaternion", "geometry_msgs/Vector3"),
+    ),
+    ODOMETRY: _schema(
+        "std_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n",
+        (
+            *_HEADER,
+            *("geometry_msgs/PoseWithCovariance", "geometry_msgs/Pose", "geometry_msgs/Point"),
+            *("geometry_msgs/Quaternion", "geometry_msgs/TwistWithCovariance"),
+            *("geometry_msgs/Twist", "geometry_msgs/Vector3"),
+        ),
     ),
 }
 
@@ -280,6 +296,17 @@ def parse_imu(data: Bytes) -> Layout:
     return Layout(cursor.little, cursor.text(), (), (cursor.doubles(IMU_DOUBLES),))
 
 
+def parse_odometry(data: Bytes) -> Layout:
+    """Layout of a nav_msgs/Odometry: one run of `ODOMETRY_DOUBLES`; its frame is the child's.
+
+    Raises:
+        CdrError: it is no such message.
+    """
+    cursor = _Cursor(data)
+    cursor.text()  # the frame that the pose is told in
+    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(ODOMETRY_DOUBLES),))
+
+
 def decode_many(
     rows: Rows, parse: Callable[[Bytes], Layout]
 ) -> tuple[list[Block], list[tuple[int, str]]]:
@@ -287,7 +314,7 @@ def decode_many(
 
     Args:
         rows: (m, size) bytes, one message a row.
-        parse: `parse_joint_state`, `parse_motion` or `parse_imu`.
+        parse: `parse_joint_state`, `parse_motion`, `parse_imu` or `parse_odometry`.
 
     Returns:
         The blocks, and (place, reason) of messages that cannot be read.

@@ -246,7 +246,8 @@ def states_of(
 ) -> np.ndarray:
     """Filtered states (k, size) of a recording."""
     front_end = FrontEnd(model or panda_model(), settings)
-    return front_end.step_table(data.stamp_ns, data.q, data.dq, data.tau, data.twists, data.accels)
+    links = None if data.twists is None else (data.twists, data.accels)
+    return front_end.step_table(data.stamp_ns, data.q, data.dq, data.tau, links)
 
 
 def learner_for(model: SelfModel | None = None, **settings: object) -> OnlineLearner:

@@ -47,13 +47,12 @@ def damaged(links: bool) -> ArmData:
 
 def tables(data: ArmData, front_end: FrontEnd, cuts: list[int]) -> np.ndarray:
     """`step_table` on consecutive pieces."""
-    names = ("stamp_ns", "q", "dq", "tau", "twists", "accels")
-    columns = [getattr(data, name) for name in names]
-    edges = [0, *cuts, len(data)]
-    pieces = [
-        front_end.step_table(*(None if c is None else c[i:j] for c in columns))
-        for i, j in pairwise(edges)
-    ]
+    columns = [getattr(data, name) for name in ("stamp_ns", "q", "dq", "tau")]
+    motion = data.twists, data.accels
+    pieces = []
+    for i, j in pairwise([0, *cuts, len(data)]):
+        links = None if data.twists is None else tuple(x[i:j] for x in motion)
+        pieces.append(front_end.step_table(*(c[i:j] for c in columns), links))
     return np.concatenate(pieces)
 
 

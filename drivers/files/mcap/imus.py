@@ -1,14 +1,15 @@
-"""Sensors glued on links: `sensor_msgs/msg/Imu` on whatever topic.
+"""What topics say of frames' motion: sensors glued on links, `sensor_msgs/msg/Imu` on whatever
+topic, and of a floating base also `Odometry`, `TwistStamped` and `AccelStamped`.
 
-Angular velocity and what the accelerometer reads (9.81 m/s² up at rest), in the sensor's own frame.
-A sensor is what one topic says of one frame. ROS marks what a sensor does not measure by -1 as the
-first number of its covariance.
+An Imu tells angular velocity and what the accelerometer reads (9.81 m/s² up at rest), in the
+sensor's own frame. A sensor is what one topic says of one frame. ROS marks what a sensor does not
+measure by -1 as the first number of its covariance.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,11 +19,12 @@ from numpy.typing import NDArray
 from drivers.files.mcap.joints import stamps
 from drivers.files.mcap.links import Carrier, Links
 from drivers.files.mcap.series import Series
-from drivers.files.ros import IMU
+from drivers.files.ros import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
 from drivers.interface import Array
 
 _W, _W_UNKNOWN = slice(13, 16), 16  # of the run of doubles, and where its covariance begins
 _A, _A_UNKNOWN = slice(25, 28), 28
+_TWIST = 43  # where an Odometry's twist begins in its run of doubles
 _MOST_W = 200.0  # rad/s; gyroscopes end at 70 (4000 °/s)
 _MOST_A = 5000.0  # m/s²; accelerometers of robots end at 2000 (200 g)
 _AT_REST = (5.0, 15.0)  # m/s², the median of what an accelerometer reads lies around 9.81
@@ -30,14 +32,22 @@ _RARE = 0.05  # of a topic's messages; a frame named less often comes from damag
 
 
 @dataclass(frozen=True, slots=True)
-class Imu:
-    """One sensor: (k,) stamps ns, (k, 3) rad/s and m/s², not a number where not measured."""
+class FrameMotion:
+    """What one topic says of one frame, in its axes; not a number where not measured.
+
+    Attributes:
+        topic, schema, frame: their names.
+        stamp_ns: (k,) ns.
+        w, a, v: (k, 3) angular velocity rad/s, what an accelerometer reads m/s², velocity m/s.
+    """
 
     topic: str
+    schema: str
     frame: str
     stamp_ns: NDArray[np.int64]
     w: Array
     a: Array
+    v: Array
 
 
 def with_imus(
@@ -51,7 +61,7 @@ def with_imus(
         carrier: to the joint samples' stamps.
         path, warnings: for sentences on what was left out.
     """
-    found = _distinct(_imus(topics, path, warnings), path, warnings)
+    found = _distinct(frame_motions(topics, (IMU,), path, warnings), path, warnings)
     names, motion = list(links.names), []
     for imu, name in zip(found, _names(found, links.names), strict=True):
         values = carrier.carry(name, imu.stamp_ns, np.concatenate([imu.w, imu.a], axis=1))
@@ -73,14 +83,18 @@ def with_imus(
     )
 
 
-def _imus(topics: Mapping[str, Series], path: Path, warnings: list[str]) -> list[Imu]:
+def frame_motions(
+    topics: Mapping[str, Series], schemas: Collection[str], path: Path, warnings: list[str]
+) -> list[FrameMotion]:
+    """What the topics of these types (of `READERS`) say, one entry for each topic and frame."""
     found = []
     for topic, series in topics.items():
-        if series.schema != IMU or not series.count:
+        if series.schema not in schemas or not series.count:
             continue
         where = f"{path}: {topic}"
         if series.encoding != "cdr":
-            warnings.append(f"{where}: holds {IMU} as {series.encoding}, not as cdr; left out")
+            held = f"{series.schema} as {series.encoding}"
+            warnings.append(f"{where}: holds {held}, not as cdr; left out")
         if series.bad:
             place, reason = series.bad[0]
             warnings.append(
@@ -94,16 +108,19 @@ def _imus(topics: Mapping[str, Series], path: Path, warnings: list[str]) -> list
             if count < _RARE * counts.total():
                 warnings.append(f"{where}: {count} messages name the frame {frame!r}; left out")
                 continue
-            imu = _imu(series, frame, where, warnings)
-            if imu is not None:
-                found.append(imu)
+            motion = READERS[series.schema](_of(series, frame), frame, where, warnings)
+            if motion is not None:
+                found.append(motion)
     return found
 
 
-def _imu(series: Series, frame: str, where: str, warnings: list[str]) -> Imu | None:
-    """What a topic says of one frame; None where no angular velocity is among it."""
-    part = series.only(lambda block: block.layout.frame_id == frame)
-    values = part.in_order([block.values[0] for block in part.blocks])
+def _of(series: Series, frame: str) -> Series:
+    return series.only(lambda block: block.layout.frame_id == frame)
+
+
+def _imu(series: Series, frame: str, where: str, warnings: list[str]) -> FrameMotion | None:
+    """What an Imu says; None where no angular velocity is among it."""
+    values = series.in_order([block.values[0] for block in series.blocks])
     w = _measured(values, _W, _W_UNKNOWN, _MOST_W, f"{where}: angular velocities", warnings)
     a = _measured(values, _A, _A_UNKNOWN, _MOST_A, f"{where}: accelerations", warnings)
     if np.isnan(w).all():
@@ -116,7 +133,28 @@ def _imu(series: Series, frame: str, where: str, warnings: list[str]) -> Imu | N
             f"{where}: accelerations are mostly about {size:.2g} m/s², but at rest 9.81 is what "
             "an accelerometer reads; are they in g, or without gravity?"
         )
-    return Imu(series.topic, frame, stamps(part, where, warnings), w, a)
+    stamp_ns = stamps(series, where, warnings)
+    return FrameMotion(series.topic, series.schema, frame, stamp_ns, w, a, np.full_like(w, np.nan))
+
+
+def _other(series: Series, frame: str, where: str, warnings: list[str]) -> FrameMotion | None:
+    """What a TwistStamped, an AccelStamped or an Odometry says."""
+    values = series.in_order([block.values[0] for block in series.blocks])
+    first = _TWIST if series.schema == ODOMETRY else 0
+    linear, angular = values[:, first : first + 3], values[:, first + 3 : first + 6]
+    nothing, stamp_ns = np.full_like(linear, np.nan), stamps(series, where, warnings)
+    about = series.topic, series.schema, frame, stamp_ns
+    if series.schema == ACCEL_STAMPED:  # its angular part is the rate of a velocity that is there
+        return FrameMotion(*about, nothing, linear, nothing)
+    return FrameMotion(*about, angular, nothing, linear)
+
+
+READERS: dict[str, Callable[[Series, str, str, list[str]], FrameMotion | None]] = {
+    IMU: _imu,
+    ODOMETRY: _other,
+    TWIST_STAMPED: _other,
+    ACCEL_STAMPED: _other,
+}
 
 
 def _measured(
@@ -132,9 +170,9 @@ def _measured(
     return x
 
 
-def _distinct(found: Sequence[Imu], path: Path, warnings: list[str]) -> list[Imu]:
+def _distinct(found: Sequence[FrameMotion], path: Path, warnings: list[str]) -> list[FrameMotion]:
     """Without sensors that another topic holds too (raw and processed, say)."""
-    kept: list[Imu] = []
+    kept: list[FrameMotion] = []
     for imu in found:
         twin = next((k for k in kept if _same(k, imu)), None)
         if twin is None:
@@ -144,7 +182,7 @@ def _distinct(found: Sequence[Imu], path: Path, warnings: list[str]) -> list[Imu
     return kept
 
 
-def _same(one: Imu, other: Imu) -> bool:
+def _same(one: FrameMotion, other: FrameMotion) -> bool:
     return (
         np.array_equal(one.stamp_ns, other.stamp_ns)
         and np.array_equal(one.w, other.w, equal_nan=True)
@@ -153,7 +191,7 @@ def _same(one: Imu, other: Imu) -> bool:
     )
 
 
-def _names(found: Sequence[Imu], taken: Collection[str]) -> list[str]:
+def _names(found: Sequence[FrameMotion], taken: Collection[str]) -> list[str]:
     """Frames where each sensor has one of its own, else topics."""
     frames = [imu.frame for imu in found]
     if all(frames) and len(set(frames)) == len(frames) and not set(frames) & set(taken):

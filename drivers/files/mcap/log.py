@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap.imus import with_imus
+from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
 from drivers.files.mcap.joints import Commands, Joints, assemble_joints, read_commands
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
 from drivers.files.mcap.records import McapScan
@@ -49,6 +49,9 @@ class Log:
         link_names: order of the links; of our own recordings link i is moved by joint i.
         twists, accels: (m, links, 6) measured link motion, not a number where a stamp has none;
             None where the file has none at all.
+        frames: what topics say of frames' motion, where it was asked for.
+        base: (m, 9) [v, w, a] of a floating base at the joint samples, in its own frame and as
+            `JointSample.base` has it, once a reader of `frames` has put it here.
         commands: commanded torques.
         metadata: our own entries (configuration, version, ...) decoded, those of other tools under
             their record's name.
@@ -67,6 +70,8 @@ class Log:
     link_names: tuple[str, ...] = ()
     twists: Array | None = None
     accels: Array | None = None
+    frames: tuple[FrameMotion, ...] = ()
+    base: Array | None = None
     commands: Commands | None = None
     metadata: dict[str, Any] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
@@ -109,6 +114,13 @@ class Log:
             link_names = self._links_moved_by(joint_names)
         return log if link_names is None else log._select_links(link_names)
 
+    def take(self, rows: NDArray[np.bool_]) -> Log:
+        """The same recording with these samples only."""
+        links = (None if x is None else x[rows] for x in (self.twists, self.accels, self.base))
+        twists, accels, base = links
+        log = replace(self, stamp_ns=self.stamp_ns[rows], q=self.q[rows], dq=self.dq[rows])
+        return replace(log, tau=self.tau[rows], twists=twists, accels=accels, base=base)
+
     def _links_moved_by(self, joint_names: Sequence[str]) -> list[str] | None:
         """The links that these joints move, where the recording says so and has them all."""
         joints, links = self.metadata.get("joint_names"), self.metadata.get("link_names")
@@ -148,6 +160,7 @@ def read_log(
     topic: str = JOINT_STATES,
     *,
     sensors: bool = False,
+    frames: bool = False,
 ) -> Log:
     """Read a recording, cut or whole, by whatever recorder.
 
@@ -158,13 +171,14 @@ def read_log(
         sensors: read what sensors on links recorded beside the joints, for discovery: also
             Imu topics and link motion with stamps of its own, carried to the joint samples'
             stamps; efforts and velocities may be absent.
+        frames: read into `Log.frames` what topics say of frames' motion, whatever frames.
 
     Raises:
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
     scan = McapScan(Path(path))
-    topics = collect(scan, lambda series: _wanted(series, topic, sensors))
+    topics = collect(scan, lambda series: _wanted(series, topic, sensors, frames))
     series = topics.get(topic)
     if series is None or not series.count:
         raise DriverError(_nothing_found(scan, topics, topic))
@@ -173,6 +187,10 @@ def read_log(
     warnings = scan.warnings + joints.warnings
     metadata = _metadata(scan)
     links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
+    found: list[FrameMotion] = []
+    if frames:
+        with np.errstate(invalid="ignore", over="ignore"):
+            found = frame_motions(topics, READERS, scan.path, warnings)
     commands = None
     if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
         commands = read_commands(topics[JOINT_COMMANDS], scan.path, joints.names, warnings)
@@ -186,6 +204,7 @@ def read_log(
         link_names=links.names,
         twists=links.twists,
         accels=links.accels,
+        frames=tuple(found),
         commands=commands,
         metadata=metadata,
         attachments={a.name: bytes(a.data) for a in scan.attachments},
@@ -212,9 +231,9 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
             yield json.loads(region.data[region.start[i] : region.stop[i]].tobytes())
 
 
-def _wanted(series: Series, topic: str, sensors: bool) -> bool:
+def _wanted(series: Series, topic: str, sensors: bool, frames: bool) -> bool:
     """Whether the messages of a topic are decoded."""
-    if series.topic in (topic, JOINT_COMMANDS):
+    if series.topic in (topic, JOINT_COMMANDS) or (frames and series.schema in READERS):
         return True
     if series.schema == IMU:
         return sensors

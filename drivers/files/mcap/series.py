@@ -14,6 +14,7 @@ from drivers.files.ros import (
     ACCEL_STAMPED,
     IMU,
     JOINT_STATE,
+    ODOMETRY,
     TWIST_STAMPED,
     Block,
     Bytes,
@@ -22,6 +23,7 @@ from drivers.files.ros import (
     parse_imu,
     parse_joint_state,
     parse_motion,
+    parse_odometry,
 )
 
 _PARSERS: dict[str, Callable[[Bytes], Layout]] = {
@@ -29,6 +31,7 @@ _PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     TWIST_STAMPED: parse_motion,
     ACCEL_STAMPED: parse_motion,
     IMU: parse_imu,
+    ODOMETRY: parse_odometry,
 }
 
 

@@ -1,0 +1,187 @@
+"""Robots whose base floats, from recordings: joint states and the base's motion beside them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.cli import main
+from adapter.errors import ModelError
+from adapter.learning.learner import OnlineLearner
+from adapter.learning.settings import LearnerSettings
+from adapter.learning.tree_data import TreeData
+from adapter.model.model_file import load_model
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import exp_rotation, rpy_from_matrix
+from adapter.model.urdf import model_from_urdf
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import make_front_end
+from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
+from adapter.signals.base_motion import frames_on_base, with_base_motion
+from adapter.signals.matching import matching
+from drivers.files.mcap import Log, read_log
+from drivers.interface import DriverError, JointSample
+from tests.helpers.floating_logs import Mount, Rates, record
+from tests.helpers.tree_motion import in_motion, random_tree_text
+
+RATES = Rates(500.0, 200.0)
+LEARNED_S, WHOLE_S = 5.0, 6.5
+MOUNT = Mount("imu_link", exp_rotation(np.array([0.4, -0.8, 1.1])), np.array([0.07, -0.05, 0.12]))
+
+
+@cache
+def text() -> str:
+    """A tree of three joints with an Imu's frame on its base."""
+    rpy, xyz = (
+        " ".join(map(repr, map(float, x))) for x in (rpy_from_matrix(MOUNT.rotation), MOUNT.place)
+    )
+    frame = (
+        '<link name="imu_link"/><joint name="imu" type="fixed"><parent link="base"/>'
+        f'<child link="imu_link"/><origin xyz="{xyz}" rpy="{rpy}"/></joint></robot>'
+    )
+    return random_tree_text(3, 3).replace("</robot>", frame)
+
+
+def robot() -> SelfModel:
+    return model_from_urdf(text(), floating=True)
+
+
+@cache
+def falling() -> TreeData:
+    return in_motion(text(), True, WHOLE_S, 30, RATES.joints)[1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tree, and its fall told by an Imu and by twist and acceleration."""
+    path = tmp_path_factory.mktemp("floating")
+    (path / "tree.urdf").write_text(text())
+    record(path / "imu.mcap", falling(), 1, mount=MOUNT, rates=RATES)
+    record(path / "twist.mcap", falling(), 2, rates=RATES)
+    return path
+
+
+def read(path: Path, link: str = "base") -> Log:
+    return with_base_motion(matching(read_log(path, frames=True), robot()), robot(), link)
+
+
+@pytest.mark.parametrize("mount", [MOUNT, None])
+def test_motion_of_a_base_is_that_of_its_origin(tmp_path: Path, mount: Mount | None) -> None:
+    """An Imu mounted anyhow, or a twist and an acceleration, between the joint samples."""
+    data = falling().take(slice(0, 500))
+    log = read(record(tmp_path / "a.mcap", data, None, mount=mount, rates=Rates(500.0, 490.0)))
+    told = log.base[2:-2]
+    for part, truth in zip(
+        np.split(told, 3, axis=1), (data.base.v, data.base.w, data.base.a), strict=True
+    ):
+        truth = truth[2:-2]
+        assert np.abs(part - truth).max() < 2e-3 * np.abs(truth).max()
+
+
+def test_across_a_silence_nothing_is_made_up(folder: Path) -> None:
+    log = read_log(folder / "imu.mcap", frames=True)
+    silent = [
+        replace(m, **{k: getattr(m, k)[keep] for k in ("stamp_ns", "w", "a", "v")})
+        for m in log.frames
+        for keep in [(m.stamp_ns < log.stamp_ns[1000]) | (m.stamp_ns > log.stamp_ns[1100])]
+    ]
+    log = with_base_motion(matching(replace(log, frames=tuple(silent)), robot()), robot(), "base")
+    unheard = ~np.isfinite(log.base).all(axis=1)
+    assert unheard[1005:1095].all() and not unheard[5:995].any()
+    front_end = make_front_end(robot(), PipelineSettings())
+    states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
+    assert front_end.refused["base_unheard"] == unheard.sum() and np.isfinite(states).all()
+    assert len(front_end.gaps) == 1 and any("motion" in m for m in front_end.messages)
+
+
+def test_tables_equal_single_steps_bit_for_bit(folder: Path) -> None:
+    log = read(folder / "imu.mcap").take(np.arange(3250) < 900)
+    one, table = (make_front_end(robot(), PipelineSettings()) for _ in range(2))
+    rows = [
+        state.copy()
+        for i, stamp in enumerate(log.stamp_ns)
+        for state in [
+            one.step(JointSample(int(stamp), log.q[i], log.dq[i], log.tau[i], base=log.base[i]))
+        ]
+        if state is not None
+    ]
+    states = table.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
+    assert len(rows) > 500 and np.array(rows).tobytes() == states.tobytes()
+
+
+@pytest.mark.parametrize("name,wrench", [("imu", True), ("twist", False)])
+def test_a_falling_tree_is_learned_as_well_as_by_least_squares(
+    folder: Path, name: str, wrench: bool
+) -> None:
+    log = read(folder / f"{name}.mcap", "imu_link" if wrench else "base")
+    settings = PipelineSettings(learner=LearnerSettings(base_wrench=wrench))
+    settings = replace(settings, filter=fitted_to(log, settings.filter)[0])
+    learner = replay(log, robot(), settings, ReplayOptions(until_s=LEARNED_S)).pipeline.learner
+    rest = log.take(seconds(log) >= LEARNED_S)
+    states = make_front_end(robot(), settings).step_table(
+        rest.stamp_ns, rest.q, rest.dq, rest.tau, base=rest.base
+    )
+    tau = states[:, learner.layout.joint_tau]
+    ours = learner.predict(states)[:, 6:] - tau
+    learner.theta.th[:] = learner.theta.least_squares()
+    batch = learner.predict(states)[:, 6:] - tau
+    assert (ours**2).mean() < 1.1**2 * (batch**2).mean()
+    assert (ours**2).mean() < 0.1**2 * (tau**2).mean()
+
+
+def test_an_unknown_wrench_teaches_nothing() -> None:
+    states = falling().states()[:600].copy()
+    pushed = states.copy()
+    settings = LearnerSettings(base_wrench=False, wait_for_schema=False)
+    learner, other = (OnlineLearner(robot().tree, settings=settings) for _ in range(2))
+    pushed[:, learner.layout.tau.start : learner.layout.joint_tau.start] = 50.0
+    for a, b in zip(states, pushed, strict=True):
+        learner.step(a)
+        other.step(b)
+    assert learner.theta.updates > 50 and np.array_equal(learner.theta.th, other.theta.th)
+
+
+def test_the_command_learns_and_keeps_the_base_as_documented(folder: Path, tmp_path: Path) -> None:
+    """With an unknown wrench nothing shows the base's body; the report and the URDF are there."""
+    log, out = str(folder / "imu.mcap"), tmp_path / "out"
+    options = ["--robot", str(folder / "tree.urdf"), "--base", "base", "--every", "10"]
+    options += ["--validate-from", str(LEARNED_S), "--out", str(out), "--json", str(tmp_path / "j")]
+    assert main(["replay", log, *options, "--quiet"]) == 0
+    figures = json.loads((tmp_path / "j").read_text())
+    documented, learned = robot(), load_model(out / "model.json")
+    assert figures["lambda"]["settled"] and max(figures["lambda"]["position_error_m"]) < 1e-6
+    size = np.sqrt((falling().tau[:, 6:] ** 2).mean())
+    assert np.mean(figures["theta"]["validation_torque_rmse_nm"]) < 0.1 * size
+    assert np.allclose(learned.theta[0], documented.theta[0], atol=1e-6)
+    assert not learned.theta_identifiable[0].any() and learned.theta_identifiable[1:].any()
+    assert (out / "model.urdf").exists() and (out / "report.html").exists()
+
+
+def test_what_does_not_fit_is_refused_with_the_choices(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="'l0' moves on it; have: base, imu_link"):
+        frames_on_base(robot(), "l0")
+    with pytest.raises(ModelError, match="'pelvis' is not there; have: base, imu_link"):
+        frames_on_base(robot(), "pelvis")
+    whole = read_log(folder / "imu.mcap", frames=True)
+    with pytest.raises(DriverError, match=r"no acceleration .*sensor_msgs/msg/Imu.*have: /odom"):
+        odometry = tuple(m for m in whole.frames if m.topic == "/odom")
+        with_base_motion(replace(whole, frames=odometry), robot(), "base")
+    elsewhere = tuple(replace(m, frame="torso") for m in whole.frames)
+    with pytest.raises(DriverError, match="no angular velocity and no acceleration"):
+        with_base_motion(replace(whole, frames=elsewhere), robot(), "base")
+    late = tuple(replace(m, stamp_ns=m.stamp_ns + 10**12) for m in whole.frames)
+    with pytest.raises(DriverError, match="share a clock"):
+        with_base_motion(replace(whole, frames=late), robot(), "base")
+    with pytest.raises(DriverError, match="nothing of its motion was read"):
+        replay(matching(whole, robot()), robot(), PipelineSettings())
+
+
+def test_info_tells_of_base_motion(folder: Path, tmp_path: Path) -> None:
+    assert main(["info", str(folder / "imu.mcap"), "--json", str(tmp_path / "j")]) == 0
+    told = json.loads((tmp_path / "j").read_text())["frames"]
+    assert told == ["/imu (imu_link)", "/odom (base)"]
