@@ -122,7 +122,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         changes_ns=tuple(change.stamp_ns for change in learner.changes),
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
-        schema_known=learner.schema_trace.rows[:, 1 + 12 * n :].copy(),
+        schema_known=learner.schema_trace.rows[:, 1 + 12 * learner.tree.n :].copy(),
         lam_information=to_parent @ schema.information @ back,
         theta_trace=learner.theta_trace.rows.copy(),
         score_trace=learner.score_trace.rows.copy(),
