@@ -287,6 +287,8 @@ class Schema:
         s = self.settings
         self._there = (step < np.maximum(s.distance_goal, std)).all(axis=1)
         calm = self._there.all() and ranks.any() and bool((ranks == self.ranks).all())
+        if self.kind == LinkMotionKind.DOCUMENTED:  # no noise hides for long what is shown
+            calm = calm and self.rank == ranks.sum()
         self._calm = self._calm + s.judge_every if calm else 0
         self.ranks[:] = ranks
         self._hold_unshown()

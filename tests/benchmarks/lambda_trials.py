@@ -54,6 +54,7 @@ ARMS = {
 LARGE, ARM_S, TREE_S = 15, 1.5, 3.0  # joints, s after the soft start
 GOAL = 1e-3  # of the motion, relative
 POSES = 60
+STILL = 1e-2  # m/s, rad/s, ...: added to what errors are relative to, as some robots' links rest
 NO_ARMS = (
     "arms: not tried, since example-robot-data is not installed: pip install "
     "'panda-adapter[robots]', or name the folder of its robots in ERD_ROBOTS"
@@ -104,7 +105,7 @@ def motion_error(model: SelfModel, frames: Frames) -> float:
     size, off = (
         np.sqrt((x.reshape(*x.shape[:2], 4, 3) ** 2).sum(axis=(0, 3))) for x in (true, found - true)
     )
-    return float((off / np.maximum(size, 0.1 * size.max(axis=0))).max())
+    return float((off / np.maximum(size, 0.1 * size.max(axis=0) + STILL)).max())
 
 
 def learn(model: SelfModel, seed: int) -> Row:
