@@ -27,6 +27,7 @@ from adapter.model.self_model import SelfModel
 
 WHOLE = (-np.inf, np.inf)
 NEEDED = ("effect", "parameters")
+SHOWN_STD = 3.0  # so many standard deviations from zero is more than noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,15 @@ class Active:
     def lasting(self) -> bool:
         """Whether it has no end: it is there in whatever comes after the recording."""
         return self.interval_s[1] == np.inf
+
+    @property
+    def shown(self) -> bool:
+        """Whether any of its numbers is more than noise, or is not known to be noise."""
+        stds = {key: self.std.get(key) for key in self.values}
+        return any(
+            std is None or np.any(np.abs(np.asarray(self.values[key], float)) > SHOWN_STD * std)
+            for key, std in stds.items()
+        )
 
 
 def active_effects(entries: Iterable[Mapping[str, Any]], n: int) -> tuple[Active, ...]:

@@ -93,9 +93,21 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
 
 
 def additions(model: SelfModel, places: Sequence[str]) -> Additions:
-    """What the model's effects add to a file whose joints have these places."""
+    """What the model's effects add to a file whose joints have these places.
+
+    Numbers that are no more than noise are written where they have a place, and not missed where
+    they have none.
+    """
+    acting = active_effects(model.effects, model.tree.n)
+    more = _additions(model, places, acting)
+    shown = _additions(model, places, [active for active in acting if active.shown])
+    more.left_out, more.names = shown.left_out, shown.names
+    return more
+
+
+def _additions(model: SelfModel, places: Sequence[str], acting: Sequence[Active]) -> Additions:
     more, names = Additions(model.tree.n, model.tree.floating, tuple(places)), set()
-    for active in active_effects(model.effects, model.tree.n):
+    for active in acting:
         note = "it ended"
         if active.lasting:
             part = active.effect.export(more, active.joint, active.values)
