@@ -29,6 +29,7 @@ from drivers.interface import DriverError, JointSample
 from tests.helpers.floating_logs import Mount, Rates, record
 from tests.helpers.tree_motion import in_motion, random_tree_text
 
+SHARED = Path(__file__).parents[3] / "shared" / "models"
 RATES = Rates(500.0, 200.0)
 LEARNED_S, WHOLE_S = 5.0, 6.5
 MOUNT = Mount("imu_link", exp_rotation(np.array([0.4, -0.8, 1.1])), np.array([0.07, -0.05, 0.12]))
@@ -114,22 +115,41 @@ def test_tables_equal_single_steps_bit_for_bit(folder: Path) -> None:
     assert len(rows) > 500 and np.array(rows).tobytes() == states.tobytes()
 
 
-@pytest.mark.parametrize("name,wrench", [("imu", True), ("twist", False)])
-def test_a_falling_tree_is_learned_as_well_as_by_least_squares(
-    folder: Path, name: str, wrench: bool
-) -> None:
-    log = read(folder / f"{name}.mcap", "imu_link" if wrench else "base")
+def errors_of(log: Log, model: SelfModel, wrench: bool, until_s: float) -> list[np.ndarray]:
+    """Torque on the rest of a recording: error of what was learned, of least squares; torque."""
     settings = PipelineSettings(learner=LearnerSettings(base_wrench=wrench))
     settings = replace(settings, filter=fitted_to(log, settings.filter)[0])
-    learner = replay(log, robot(), settings, ReplayOptions(until_s=LEARNED_S)).pipeline.learner
-    rest = log.take(seconds(log) >= LEARNED_S)
-    states = make_front_end(robot(), settings).step_table(
+    learner = replay(log, model, settings, ReplayOptions(until_s=until_s)).pipeline.learner
+    rest = log.take(seconds(log) >= until_s)
+    states = make_front_end(model, settings).step_table(
         rest.stamp_ns, rest.q, rest.dq, rest.tau, base=rest.base
     )
     tau = states[:, learner.layout.joint_tau]
     ours = learner.predict(states)[:, 6:] - tau
     learner.theta.th[:] = learner.theta.least_squares()
-    batch = learner.predict(states)[:, 6:] - tau
+    return [ours, learner.predict(states)[:, 6:] - tau, tau]
+
+
+@pytest.mark.parametrize("name,wrench", [("imu", True), ("twist", False)])
+def test_a_falling_tree_is_learned_as_well_as_by_least_squares(
+    folder: Path, name: str, wrench: bool
+) -> None:
+    log = read(folder / f"{name}.mcap", "imu_link" if wrench else "base")
+    ours, batch, tau = errors_of(log, robot(), wrench, LEARNED_S)
+    assert (ours**2).mean() < 1.1**2 * (batch**2).mean()
+    assert (ours**2).mean() < 0.1**2 * (tau**2).mean()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::adapter.errors.ModelWarning")
+def test_talos_is_learned_as_well_as_by_least_squares(tmp_path: Path) -> None:
+    path, link = SHARED / "talos_reduced.urdf", "base_link"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    model, data = in_motion(path.read_text(), True, 12.0, 5, RATES.joints)
+    recorded = read_log(record(tmp_path / "a.mcap", data, 1, base=link, rates=RATES), frames=True)
+    log = with_base_motion(matching(recorded, model), model, link)
+    ours, batch, tau = errors_of(log, model, True, 10.0)
     assert (ours**2).mean() < 1.1**2 * (batch**2).mean()
     assert (ours**2).mean() < 0.1**2 * (tau**2).mean()
 
