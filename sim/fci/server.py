@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -104,10 +105,19 @@ class ClientSession:
         with suppress(OSError):  # buffer full, or nobody listens at that port (any more)
             self._udp.send(state)
 
-    def wait_for_command(self, patience_s: float) -> bool:
-        """Whether the client said something in so many seconds."""
-        said_at = [end for end in (self._tcp, self._udp) if end is not None]
-        return bool(select.select(said_at, [], [], patience_s)[0])
+    def wait_for_command(self, message_id: int, patience_s: float) -> RobotCommand | None:
+        """The command that answers the last state; None where a request comes first, or nothing.
+
+        Raises TimeoutError where nothing came in so many seconds.
+        """
+        until = time.monotonic() + patience_s
+        while (found := self.command(message_id)) is None and self._udp is not None:
+            left_s = until - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError
+            if self._tcp in select.select([self._tcp, self._udp], [], [], left_s)[0]:
+                break
+        return found
 
     def command(self, message_id: int) -> RobotCommand | None:
         """The command that answers the last state, if it is there."""
@@ -223,8 +233,6 @@ class FciServer:
                     self._accept()
                     continue
                 self._ticks.wait()
-                if self._owed and self._patient:
-                    self._wait_for_client()
                 self._one_tick()
                 self._talk()
 
@@ -252,10 +260,15 @@ class FciServer:
         self._listener.close()
         self.robot.arm.close()
 
-    def _wait_for_client(self) -> None:
-        """Let the world slip until the client answers the last state, or leaves it owing."""
-        assert self._session is not None
-        self._patient = self._session.wait_for_command(self._patience_s)
+    def _answer_to_state(self, session: ClientSession) -> RobotCommand | None:
+        """The client's command of this tick; the world slips while one that is owed is late."""
+        if not (self._owed and self._patient):
+            return session.command(self._id)
+        try:
+            return session.wait_for_command(self._id, self._patience_s)
+        except TimeoutError:
+            self._patient = False
+            return None
 
     def _one_tick(self) -> None:
         """Command in, world on, state out."""
@@ -263,7 +276,7 @@ class FciServer:
         self._strike()
         session, robot, command = self._session, self.robot, None
         if session is not None:
-            command = session.command(self._id)
+            command = self._answer_to_state(session)
             if command is not None and self._spoiler.loses_command(self._tick):
                 command = None
         if command is not None or robot.motion is None:

@@ -137,9 +137,8 @@ BY_THE_MACHINE = (
 
 def served(line: str, folder: Path) -> subprocess.Popen[str]:
     """A simulated arm started as the README says, on a port of its own, once it is ready."""
-    more = ["--patience", "5"] if "fci" in line else []  # with a client that the machine holds up
     arm = subprocess.Popen(
-        [*shlex.split(line), "--port", str(PORT), "--json", "arm.json", *more],
+        [*shlex.split(line), "--port", str(PORT), "--json", "arm.json"],
         cwd=folder,
         env={**environment(folder), "PYTHONUNBUFFERED": "1"},
         stdout=subprocess.PIPE,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,23 +21,37 @@ from tests.helpers.live_tools import wait_for
 
 pytestmark = pytest.mark.alone
 
+ATTEMPTS = 3
+
 
 def test_a_robot_whose_loop_is_killed_brakes_by_itself(tmp_path):
-    settings = tmp_path / "fast.toml"
+    # A robot rightly ends a motion whose machine was away for 20 ms; then there is no loop to kill.
+    for k in range(ATTEMPTS):
+        ended = _killed_in_motion(tmp_path / str(k))
+        if not ended:
+            return
+    pytest.skip(f"this machine is away too often for a robot to move: {ended}")
+
+
+def _killed_in_motion(folder: Path) -> str:
+    """Kill the loop of a moving robot, which has to come to rest; why it ended before, or ""."""
+    folder.mkdir()
+    figures, settings = folder / "run.json", folder / "fast.toml"
     settings.write_text("[excitation]\nslow_s = 1.0\n")  # in motion at once
-    with rigs.process("-m", "sim.fci", "--port", "0", "--patience", rigs.PATIENCE_S) as line:
+    with rigs.process("-m", "sim.fci", "--port", "0") as line:
         address = f"fci://{line.split()[2]}"
-        command = [
-            sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion",
-            "--duration", "60", "--quiet", "--out", str(tmp_path), "--config", str(settings),
-        ]  # fmt: skip
-        recording = tmp_path / "recording.mcap"
+        command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
+        command += ["--duration", "60", "--quiet", "--out", str(folder), "--json", str(figures)]
+        command += ["--config", str(settings)]
+        recording = folder / "recording.mcap"
         loop = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:
             # A second of samples is some 0.25 MB; after three seconds it moves at full speed.
             full_speed = lambda: recording.exists() and recording.stat().st_size > 0.7e6  # noqa: E731
             wait_for(lambda: full_speed() or loop.poll() is not None, 120)
-            assert loop.poll() is None and full_speed()
+            if loop.poll() is not None:
+                return _rightly_ended(loop.returncode, json.loads(figures.read_text()))
+            assert full_speed()
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(loop.pid, signal.SIGKILL)
@@ -43,6 +59,13 @@ def test_a_robot_whose_loop_is_killed_brakes_by_itself(tmp_path):
         q = _at_rest(address)
         time.sleep(0.5)
         assert np.abs(_at_rest(address) - q).max() < 1e-3
+    return ""
+
+
+def _rightly_ended(code: int, figures: dict) -> str:
+    """The sentence of a run that the robot or its driver ended, as states or commands were late."""
+    assert (code, figures["ended"]) == (3, "driver_error") and figures["fault"]
+    return figures["fault"]
 
 
 def _at_rest(address: str) -> np.ndarray:
