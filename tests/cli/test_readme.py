@@ -131,7 +131,7 @@ PORT = 14337  # instead of the usual ones, which something else may use
 HELD_UP_S = 2e-3  # a process or core that stands still for so long was held up by the machine
 BY_THE_MACHINE = (
     r"missed 20 commands|silent for|answers? on|not answer|no usable joint reading|no state|"
-    r"communication lost"
+    r"communication lost|no joint can move to|too fast"
 )
 
 
