@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(args: argparse.Namespace) -> None:
-    """Raises ValueError for an arm or a fault that does not exist, or for no patience at all."""
+    """Raises ValueError for an arm, a fault or a patience that does not exist."""
     if not 0.0 <= args.patience < float("inf"):
         raise ValueError(f"--patience takes seconds from 0 up, got {args.patience}")
     check_scenario(args.scenario, options_of(args.set))
