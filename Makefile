@@ -10,6 +10,7 @@ QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/re
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PAIRS := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 SHARED := $(PAIRS) -m "not alone and not slow"
+REAL_TIME := -m "alone and not slow"
 
 .PHONY: run test quick experiment setup lint shared quick-tests trials soak bench clean
 
@@ -19,10 +20,12 @@ run: $(STAMP)
 experiment: $(STAMP)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
-# The lint beside the tests that judge no time: mypy alone would leave a processor idle
+# The lint beside the tests that judge no time: mypy alone would leave a processor idle.
+# A test in real time that fails is run once more, with the machine to itself: a shared machine
+# stands still now and then. One that fails twice fails.
 test: $(STAMP)
 	$(MAKE) --jobs 2 lint shared
-	$(PYTEST) $(PAIRS) -m "alone and not slow"
+	$(PYTEST) $(PAIRS) $(REAL_TIME) || $(PYTEST) --last-failed --last-failed-no-failures none $(REAL_TIME)
 
 quick: $(STAMP)
 	$(MAKE) --jobs 2 lint quick-tests

@@ -137,7 +137,8 @@ def test_joint_positions_are_followed(visited):
 
 def test_settings_are_taken_or_refused(visited):
     seen = visited.seen("settings")
-    assert seen["upward"] < -0.9  # the flange points down, if not held up on the way back
+    # how far a longer tool raises the hand depends on where motions before left the flange pointing
+    assert abs(seen["upward"]) > 0.2, "the flange points sideways: the tool's length would not show"
     assert seen["raised"] == pytest.approx(0.1 * seen["upward"], abs=1e-3)
     np.testing.assert_allclose(seen["load"][:4], [0.5, 0.0, 0.01, 0.05], atol=1e-6)
     np.testing.assert_allclose(seen["load"][4:], 1e-3 * np.eye(3).ravel(), atol=1e-9)
