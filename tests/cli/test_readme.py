@@ -1,12 +1,8 @@
 """What the README tells people to type works, word for word."""
 
 import json
-import os
 import re
-import shlex
 import shutil
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -20,46 +16,11 @@ from adapter.model.robots import documented
 from adapter.realtime import SnapshotWriter
 from adapter.runs.config import read_config
 from drivers.files.mcap import read_log
-from tests.helpers.stalls import Stalls
+from tests.helpers.readme import PATIENCE_S, README, ROOT, SHELL, blocks, commands, give
 
-PATIENCE_S = 1500.0  # with a command, on a machine with other work
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(2 * PATIENCE_S)]
 
-ROOT = Path(__file__).parents[2]
 LANES = 2  # commands at a time
-SHELL = r"```sh\n(.*?)```"
-README = (ROOT / "README.md").read_text()
-
-
-def blocks(language: str) -> list[str]:
-    """Fenced blocks of a language, in order."""
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-
-
-def commands(block: str) -> list[str]:
-    """The adapter's commands of a block, without comments."""
-    lines = (line.partition("#")[0].strip() for line in block.splitlines())
-    return [line for line in lines if line.startswith("adapter ")]
-
-
-def environment(folder: Path) -> dict[str, str]:
-    """As a shell has it in which the project's own was activated."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    return {**os.environ, "PATH": path, "PANDA_ADAPTER_CACHE": str(folder / "cache")}
-
-
-def give(line: str, folder: Path, codes: tuple[int, ...] = (0,)) -> tuple[int, str]:
-    """Run a command line as a shell would; its exit code, one of these, and its complaints."""
-    done = subprocess.run(
-        shlex.split(line),
-        cwd=folder,
-        env=environment(folder),
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
-    assert done.returncode in codes, f"{line}\n{done.stderr}"
-    return done.returncode, done.stderr
 
 
 def chains(lines: list[str]) -> list[list[str]]:
@@ -125,68 +86,6 @@ def test_your_own_log(toured: Path) -> None:
     block = next(block for block in blocks("sh") if "adapter import" in block)
     for line in commands(block):
         give(line, toured)
-
-
-PORT = 14337  # instead of the usual ones, which something else may use
-HELD_UP_S = 2e-3  # a process or core that stands still for so long was held up by the machine
-BY_THE_MACHINE = (
-    r"missed 20 commands|silent for|answers? on|not answer|no usable joint reading|no state|"
-    r"communication lost|no joint can move to|too fast"
-)
-
-
-def served(line: str, folder: Path) -> subprocess.Popen[str]:
-    """A simulated arm started as the README says, on a port of its own, once it is ready."""
-    arm = subprocess.Popen(
-        [*shlex.split(line), "--port", str(PORT), "--json", "arm.json"],
-        cwd=folder,
-        env={**environment(folder), "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert arm.stdout is not None
-    for said in arm.stdout:
-        if str(PORT) in said:
-            return arm
-    raise AssertionError(f"{line} ended with {arm.wait()}")
-
-
-@pytest.mark.parametrize("kind", ["fci", "can"])
-def test_simulated_hardware(kind: str, tmp_path: Path) -> None:
-    """Its accounts balance; an arm that stopped says so, and only where processors were away."""
-    section = README.split("## Simulated hardware")[1].split("\n## ")[0]
-    shell = "".join(re.findall(SHELL, section, re.DOTALL))
-    serve = next(line for line in commands(shell) if line.strip() == f"adapter sim {kind}")
-    run = next(line for line in commands(shell) if f"{kind}://" in line)
-    run = run.replace("127.0.0.1", f"127.0.0.1:{PORT}").replace("163.2?", f"163.2:{PORT}?")
-    (tmp_path / "soon.toml").write_text("[excitation]\nslow_s = 2.0\n")
-    arm = served(serve, tmp_path)
-    with Stalls() as stalls:
-        try:
-            options = "--duration 2 --config soon.toml --out run --json run.json"
-            code, said = give(f"{run} {options}", tmp_path, codes=(0, 2, 3))
-        finally:
-            arm.terminate()
-            arm.communicate(timeout=30)
-    if code == 2:  # before the loop had its priority: the motors' replies came too late
-        assert re.search(f"error: .*({BY_THE_MACHINE})", said) and stalls.worst_s > HELD_UP_S
-        return
-    figures, seen = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("run", "arm"))
-    intake = figures["intake"]
-    assert intake["received"] == intake["used"] + sum(intake["refused"].values()) > 0
-    assert figures["samples"] == figures["learned"] + sum(figures["refused"].values()) > 0
-    assert figures["recorded"] + figures["unrecorded"] == figures["samples"]
-    if kind == "fci":  # none that the robot does not know of
-        assert intake["received"] <= seen["states_sent"]
-    if code == 0:
-        assert figures["fault"] is None and figures["ended"] == "duration"
-        assert figures["samples"] > 3000
-        return
-    assert figures["ended"] == "driver_error" and "\n" not in figures["fault"]
-    assert re.search(BY_THE_MACHINE, figures["fault"]), figures["fault"]
-    simulator_s = 1e-3 * (seen["stalled_ms"] if kind == "fci" else seen["slipped_ms"])
-    loop_s = 1e-6 * figures["timing"]["period_us"]["max"]
-    assert max(stalls.worst_s, simulator_s, loop_s) > HELD_UP_S
 
 
 def test_settings(tmp_path: Path) -> None:
