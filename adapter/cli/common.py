@@ -8,8 +8,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from adapter.cli.arguments import joints_of, locks_of
 from adapter.cli.names import effects_named
+from adapter.cli.options import joints_of, locks_of
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
 from adapter.learning.known_effects import learnable, not_taken_off

@@ -2,36 +2,114 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
-from adapter.cli.arguments import build_parser
+from adapter.cli import (
+    diff_options,
+    discover_options,
+    files_options,
+    gap_options,
+    load_options,
+    replay_options,
+    results_options,
+    run_options,
+    sim,
+)
 from adapter.errors import MeansError, ModelWarning
-from adapter.runs.terminal import console
+from adapter.experiments import arguments as experiments
+from adapter.runs.terminal import console, program_version
 from drivers.interface import DriverError
 
 EXIT_WRONG_USE, EXIT_NO_MEANS, EXIT_INTERRUPTED = 2, 5, 130
-# What carries a command out. Loaded by name, after the command line was found right: most of
-# these bring libraries that take a second to load. `tests/house` reads this table, too.
-RUN_BY = {
-    "run": "adapter.cli.run:run",
-    "replay": "adapter.cli.replay:run",
-    "gap": "adapter.cli.gap:run",
-    "load": "adapter.cli.load:run",
-    "diff": "adapter.cli.diff:run",
-    "discover": "adapter.cli.discover:run",
-    "sim": "adapter.cli.sim:run",
-    "import": "adapter.cli.files:run_import",
-    "export": "adapter.cli.results:run_export",
-    "report": "adapter.cli.results:run_report",
-    "recover": "adapter.cli.files:run_recover",
-    "info": "adapter.cli.files:run_info",
-    "experiment": "adapter.experiments.command:run",
-    "bench": "adapter.experiments.benchmark:run",
+
+
+class Command(NamedTuple):
+    """What declares its options and may set `check`, one line of help, what carries it out.
+
+    The last is loaded by name, after the command line was found right: most bring libraries that
+    take a second to load. `tests/house` reads this table, too.
+    """
+
+    declare: Callable[[argparse.ArgumentParser], None]
+    words: str
+    run_by: str
+
+
+COMMANDS = {  # in the order of --help
+    "run": Command(run_options.declare, "learn live", "adapter.cli.run:run"),
+    "replay": Command(replay_options.declare, "learn from a recording", "adapter.cli.replay:run"),
+    "gap": Command(gap_options.declare, "find what a model lacks", "adapter.cli.gap:run"),
+    "load": Command(
+        load_options.declare,
+        "what the hand carries, to type into the robot",
+        "adapter.cli.load:run",
+    ),
+    "diff": Command(
+        diff_options.declare, "two models of one arm, joint by joint", "adapter.cli.diff:run"
+    ),
+    "discover": Command(
+        discover_options.declare,
+        "find the tree of a robot from the motion of its links",
+        "adapter.cli.discover:run",
+    ),
+    "sim": Command(
+        sim.declare, "simulated hardware behind real wire protocols", "adapter.cli.sim:run"
+    ),
+    "import": Command(
+        files_options.declare_import,
+        "turn tables into a recording",
+        "adapter.cli.files:run_import",
+    ),
+    "export": Command(
+        results_options.declare_export,
+        "write a model file as URDF",
+        "adapter.cli.results:run_export",
+    ),
+    "report": Command(
+        results_options.declare_report,
+        "make the HTML page of a run again",
+        "adapter.cli.results:run_report",
+    ),
+    "recover": Command(
+        files_options.declare_recover,
+        "mend a recording that was cut",
+        "adapter.cli.files:run_recover",
+    ),
+    "info": Command(
+        files_options.declare_info,
+        "what is in a recording or a model file",
+        "adapter.cli.files:run_info",
+    ),
+    "experiment": Command(
+        experiments.experiment,
+        "rerun the paper's experiments",
+        "adapter.experiments.command:run",
+    ),
+    "bench": Command(
+        experiments.bench, "time the update beside its rivals", "adapter.experiments.benchmark:run"
+    ),
 }
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line; what it returns carries `command` and `check`, which may raise."""
+    parser = argparse.ArgumentParser(
+        prog="adapter",
+        description="Lets a torque-sensed arm learn its own body while it moves.",
+        epilog="adapter COMMAND --help tells more",
+    )
+    parser.add_argument("--version", action="version", version=program_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    for name, command in COMMANDS.items():
+        part = commands.add_parser(name, help=command.words)
+        part.set_defaults(check=lambda args: None)
+        command.declare(part)
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -40,7 +118,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         args.check(args)
-        module, _, function = RUN_BY[args.command].partition(":")
+        module, _, function = COMMANDS[args.command].run_by.partition(":")
         return int(getattr(import_module(module), function)(args))
     except MeansError as error:
         console.print(f"[red]error:[/] {error}", soft_wrap=True)

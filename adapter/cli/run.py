@@ -11,10 +11,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from adapter.cli.arguments import simulated
 from adapter.cli.common import configure, recording_metadata, robot_of
 from adapter.cli.display import make_display
 from adapter.cli.results import Learned, conclude
+from adapter.cli.run_options import simulated
 from adapter.control.controller import ExcitationController
 from adapter.control.excitation import plan_lines
 from adapter.control.feedforward import Feedforward, ModelFeedforward

@@ -32,6 +32,18 @@ ARMS = {
 }
 
 
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare what is common to all arms."""
+    kinds = " ".join(f"{name}: {served.words}." for name, served in ARMS.items())
+    parser.description = (
+        "Serve a simulated arm to drivers and to other people's clients, on this machine only, "
+        f"until SIGTERM or Ctrl-C. {kinds}"
+    )
+    parser.epilog = "adapter sim ARM --help tells more"
+    parser.add_argument("arm", choices=tuple(ARMS), metavar="ARM", help=", ".join(ARMS))
+    parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="options of the arm")
+
+
 def run(args: argparse.Namespace) -> int:
     """Serve; returns the exit code."""
     served = ARMS[args.arm]

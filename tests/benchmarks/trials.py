@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.cli.arguments import build_parser
+from adapter.cli.main import build_parser
 from adapter.cli.run import controller_of, open_arm, run_plan
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits

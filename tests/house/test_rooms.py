@@ -12,8 +12,8 @@ from pathlib import Path
 import grimp
 import pytest
 
-from adapter.cli.arguments import NAMES
-from adapter.cli.main import RUN_BY
+from adapter.cli.main import COMMANDS
+from adapter.cli.options import NAMES
 from adapter.cli.run import SIMULATED_BY
 from adapter.cli.sim import ARMS
 from drivers.registry import HARDWARE, LOG
@@ -37,9 +37,9 @@ FACES = {
 def graph() -> grimp.ImportGraph:
     """Every import, wherever it stands in a file, and the commands that are loaded by name."""
     whole = grimp.build_graph(*PACKAGES, cache_dir=None)
-    by_name = {"adapter.cli.main": [target.partition(":")[0] for target in RUN_BY.values()]}
+    by_name = {"adapter.cli.main": [c.run_by.partition(":")[0] for c in COMMANDS.values()]}
     by_name["adapter.cli.sim"] = [m for s in ARMS.values() for m in (s.options, s.command)]
-    by_name["adapter.cli.arguments"] = [NAMES]
+    by_name["adapter.cli.options"] = [NAMES]
     by_name["adapter.cli.run"] = [SIMULATED_BY]
     by_name["drivers.registry"] = [target.partition(":")[0] for target in (LOG, *HARDWARE.values())]
     for importer, imported in by_name.items():
@@ -118,7 +118,7 @@ def test_the_experiments_are_known_to_the_command_alone() -> None:
     whole = graph()
     inside = {m for m in whole.modules if m.startswith("adapter.experiments")}
     importers = {m for inner in inside for m in whole.find_modules_that_directly_import(inner)}
-    assert importers - inside <= {"adapter.cli.arguments", "adapter.cli.main"}
+    assert importers - inside <= {"adapter.cli.main"}
 
 
 def test_functions_import_heavy_libraries_alone() -> None:

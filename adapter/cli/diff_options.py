@@ -1,0 +1,30 @@
+"""Options of `adapter diff`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adapter.cli.options import add_joints, check_robot, locks_of
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "What differs from model A to model B, joint by joint: frames, inertias and effects, by "
+        "how many standard deviations, whether any data could show it, and what it does to torques "
+        "and to the hand's place. Of one model alone: from its documentation to it."
+    )
+    add = parser.add_argument
+    add("first", metavar="A", help="model file (.json), robot file or known name")
+    add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
+    add_joints(parser)
+    add("--json", type=Path, metavar="FILE|-", help="write the figures; - to the standard output")
+    parser.set_defaults(check=_check)
+
+
+def _check(args: argparse.Namespace) -> None:
+    locks_of(args)
+    for name in (args.first, args.second):
+        if name is not None:
+            check_robot(name)

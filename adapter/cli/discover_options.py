@@ -1,0 +1,35 @@
+"""Options of `adapter discover`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adapter.cli.options import add_json, check_files
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "From joint signals and link motion in unknown order find which joint moves which link "
+        "and who is whose parent, each with a confidence; say what the data leave open; then "
+        "learn λ, and θ where torques were recorded."
+    )
+    add = parser.add_argument
+    add(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="MCAP recording with link motion: Imu topics, "
+        "or /link_twists/<link> and /link_accels/<link>",
+    )
+    add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
+    add(
+        "--base",
+        metavar="LINK",
+        help="the link that carries all others; needed for a floating base whose links' frames "
+        "do not turn about their z",
+    )
+    add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
+    add_json(parser)
+    parser.set_defaults(check=lambda args: check_files(args.log))

@@ -1,0 +1,55 @@
+"""Options of `adapter import`, `recover` and `info`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adapter.cli.options import add_json, check_files, check_robot
+
+
+def declare_import(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Turn CSV, whitespace tables or .npz into an MCAP recording. Sources are one FILE, or "
+        "SIGNAL=FILE for each of time, q, dq, tau."
+    )
+    add = parser.add_argument
+    add("sources", nargs="+", metavar="[SIGNAL=]FILE")
+    add("--to", type=Path, required=True, metavar="FILE", help="recording to write")
+    add("--columns", default="", metavar="MAP", help="as in time=0,q=1:8,dq=8:15,tau=tau_*")
+    add("--units", default="", metavar="MAP", help="as in q=deg,tau=mNm,time=ms")
+    add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
+    add("--joints", default="", metavar="LIST", help="joint names, commas between")
+    add("--flat", action="store_true", help="one value per line")
+    add("--period", type=float, metavar="S", help="where there is no time")
+    add("--overwrite", action="store_true", help="replace an existing recording")
+    add_json(parser)
+    parser.set_defaults(check=_check_import)
+
+
+def _check_import(args: argparse.Namespace) -> None:
+    for source in args.sources:
+        if not Path(source).exists():
+            check_files(Path(source.partition("=")[2] or source))
+    if args.robot is not None:
+        check_robot(args.robot)
+
+
+def declare_recover(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.add_argument("file", type=Path, metavar="FILE")
+    parser.add_argument("--to", type=Path, metavar="FILE", help="default: NAME.recovered.mcap")
+    add_json(parser)
+    parser.set_defaults(check=_check_file)
+
+
+def declare_info(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.add_argument("file", type=Path, metavar="FILE")
+    add_json(parser)
+    parser.set_defaults(check=_check_file)
+
+
+def _check_file(args: argparse.Namespace) -> None:
+    check_files(args.file)

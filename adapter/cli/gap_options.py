@@ -1,0 +1,59 @@
+"""Options of `adapter gap`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adapter.cli.options import add_joints, add_results, check_files, check_robot, locks_of
+from adapter.errors import UsageError
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Find where a model and recordings disagree, name the effects that the model lacks, add "
+        "them, and measure the gap again on data that the fit never saw. Of several recordings "
+        "the last one is held out; of one, blocks of it. Exit codes: 0 analysed, also where too "
+        "little moves to tell anything; 2 wrong use, or a recording that does not fit the model "
+        "(another robot, flipped signs, other units)."
+    )
+    add = parser.add_argument
+    add("logs", nargs="+", type=Path, metavar="LOG", help="MCAP recording")
+    add(
+        "--model",
+        required=True,
+        metavar="MODEL",
+        help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
+    )
+    add_joints(parser)
+    add(
+        "--inertia-prior",
+        type=float,
+        metavar="SHARE",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.02)",
+    )
+    add("--validate-from", type=float, metavar="S", help="fit before this second, score after it")
+    add(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="rounds of the search, in each of which something may be named (default 24)",
+    )
+    add(
+        "--simulator",
+        default="pybullet",
+        choices=("pybullet", "mujoco"),
+        help="of the forward simulation (default pybullet; mujoco is the extra [mujoco])",
+    )
+    add("--no-simulation", action="store_true", help="compare torques only")
+    add_results(parser)
+    parser.set_defaults(check=_check)
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.validate_from is not None and len(args.logs) > 1:
+        raise UsageError("--validate-from splits one LOG; of several the last one is held out")
+    locks_of(args)
+    check_robot(args.model)
+    check_files(*args.logs)

@@ -1,0 +1,125 @@
+"""Options that several commands share, and what is wrong with them at first sight.
+
+Nothing here brings a library that takes long to load: wrong use is answered at once. The same
+holds of every `..._options` beside a command's file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from importlib import import_module
+from pathlib import Path
+
+from adapter.errors import UsageError
+from adapter.model.robots import names as robot_names
+
+MODES = ("moments", "sample")  # of `adapter.learning.learner`
+NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
+MODEL_FILES = (".urdf", ".xml", ".json")
+
+
+def add_learning(parser: argparse.ArgumentParser) -> None:
+    """Options of everything that learns."""
+    add = parser.add_argument
+    add("--robot", metavar="NAME|FILE", help="panda (default), .urdf, .xml (MJCF) or .json")
+    add_joints(parser)
+    add("--config", type=Path, metavar="FILE", help="settings in TOML")
+    add("--mode", choices=MODES, help="moments (default) or the paper's sample")
+    add(
+        "--effects",
+        metavar="LIST",
+        help="effects learned beside θ: none, real, or names with commas between (a name that "
+        "does not exist lists them)",
+    )
+    add(
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="in base axes, m/s², of an arm that does not stand upright: on a wall 9.81 0 0",
+    )
+    add("--seed", type=int, help="of every random choice")
+    add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
+    add_results(parser)
+    add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
+
+
+def add_joints(parser: argparse.ArgumentParser) -> None:
+    """Which joints of the model move; those that a recording lacks are locked at zero."""
+    add = parser.add_argument
+    add("--joints", metavar="A,B,C", help="joints of the model that move; the others are locked")
+    add(
+        "--lock",
+        action="append",
+        default=[],
+        metavar="JOINT=VALUE",
+        help="lock a joint at a value, rad or m (default: zero where a recording lacks it)",
+    )
+
+
+def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
+    """Names given to `--joints`."""
+    if args.joints is None:
+        return None
+    return tuple(name.strip() for name in args.joints.split(",") if name.strip())
+
+
+def locks_of(args: argparse.Namespace) -> dict[str, float]:
+    """Values given to `--lock` by joint. Raises UsageError."""
+    values = {}
+    for option in args.lock:
+        name, _, text = option.rpartition("=")
+        try:
+            values[name.strip()] = float(text)
+        except ValueError:
+            name = ""
+        if not name.strip() or not math.isfinite(values[name.strip()]):
+            raise UsageError(f"--lock '{option}' is not JOINT=VALUE, a number in rad or m")
+    return values
+
+
+def add_results(parser: argparse.ArgumentParser) -> None:
+    """Where results go."""
+    add = parser.add_argument
+    add_json(parser)
+    add("--out", type=Path, metavar="FOLDER", help="where results go")
+    add("--no-report", action="store_true", help="do not write the HTML page")
+    add("--quiet", action="store_true", help="no progress")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Where figures go."""
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+
+
+def check_learning(args: argparse.Namespace) -> None:
+    """What is wrong with options of everything that learns. Raises UsageError, SettingsError."""
+    locks_of(args)
+    if args.robot is not None:
+        check_robot(args.robot)
+    check_files(args.config, args.truth, args.resume)
+    if args.effects is not None or args.config is not None:
+        import_module(NAMES).check_learning(args)
+
+
+def check_robot(name: str) -> None:
+    """Refuse what is neither a known robot nor a file of one. Raises UsageError."""
+    if name in robot_names():
+        return
+    if Path(name).suffix.lower() not in MODEL_FILES:
+        raise UsageError(
+            f"no robot '{name}'; have: {', '.join(robot_names())}, a .urdf file, an MJCF file "
+            "(.xml) or a .json model file"
+        )
+    check_files(Path(name))
+
+
+def check_files(*paths: Path | None) -> None:
+    """Refuse what cannot be read. Raises UsageError."""
+    for path in paths:
+        try:
+            if path is not None:
+                path.open("rb").close()
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be read: {error.strerror}") from None

@@ -1,0 +1,47 @@
+"""Options of `adapter replay`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from adapter.cli.options import add_learning, check_files, check_learning
+from adapter.errors import UsageError
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Learn λ and θ from an MCAP recording, sample by sample as the live process does (the "
+        "result is the same), or in batches."
+    )
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="MCAP recording, ours or not")
+    add_learning(parser)
+    add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
+    add(
+        "--base",
+        metavar="LINK",
+        help="the base floats, and this is its link (or one fixed to it); its motion is in the "
+        "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
+    )
+    add(
+        "--base-wrench",
+        choices=("zero", "unknown"),
+        default="unknown",
+        help="what pushes a floating base: zero in free motion; unknown (default), as where it "
+        "stands or hangs: only the joints' torques are learned from",
+    )
+    held_out = parser.add_mutually_exclusive_group()
+    held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
+    held_out.add_argument(
+        "--validate-from", type=float, metavar="S", help="learn before this second, score after it"
+    )
+    parser.set_defaults(check=_check)
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.every > 1 and args.mode == "sample":
+        raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
+    check_learning(args)
+    check_files(args.log, args.validate)

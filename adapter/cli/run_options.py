@@ -1,0 +1,96 @@
+"""Options of `adapter run`."""
+
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+from pathlib import Path
+
+from adapter.cli.options import NAMES, add_learning, check_learning
+from adapter.errors import UsageError
+from drivers.registry import SCHEMES, split_address
+
+FEEDFORWARD = ("none", "documented", "learned")
+SIMULATED = ("panda",)
+
+
+def declare(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Move an arm on smooth random trajectories (or only listen) and learn λ and θ at its "
+        "rate, in real time. Exit codes: 0 done, 2 wrong use, 3 the arm failed, 4 the learner "
+        "failed."
+    )
+    add = parser.add_argument
+    add(
+        "--driver",
+        default="pybullet:panda",
+        metavar="ADDRESS",
+        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=...",
+    )
+    add(
+        "--allow-motion",
+        action="store_true",
+        help="leave to move an arm that may be real (fci, can): prints the plan, goes at a tenth "
+        "of the speed for 10 s, stops when this terminal closes. Without it, only listen",
+    )
+    add("--duration", type=float, default=30.0, metavar="S", help="default 30")
+    add(
+        "--scenario",
+        metavar="NAME",
+        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, wall_mounted "
+        "(whose mounting is to be told: --gravity 9.81 0 0)",
+    )
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="option of the scenario, as in --set mass=0.3 --set noise=none",
+    )
+    add("--passive", action="store_true", help="only listen; do not move the arm")
+    add("--fault", metavar="LIST", help="inject faults into the samples, as in lost=0.01,nan=0.001")
+    add(
+        "--feedforward",
+        choices=FEEDFORWARD,
+        default="none",
+        help="model that helps the controller; its worth is told as tracking error",
+    )
+    add("--record", type=Path, metavar="FILE", help="default: in the results")
+    add("--no-record", action="store_true", help="keep no recording")
+    add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
+    add_learning(parser)
+    parser.set_defaults(check=_check)
+
+
+def _check(args: argparse.Namespace) -> None:
+    if not args.duration > 0.0:
+        raise UsageError(f"--duration must be above zero, got {args.duration}")
+    scheme, rest = split_address(args.driver)
+    if scheme not in SCHEMES:
+        raise UsageError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+    if scheme == "pybullet" and rest not in SIMULATED:
+        raise UsageError(f"no simulated arm '{rest}'; have: {', '.join(SIMULATED)}")
+    if (args.scenario or args.set) and not simulated(args.driver):
+        raise UsageError(
+            f"--scenario and --set need --driver pybullet:..., not {args.driver}; for a served "
+            "arm give them to `adapter sim`"
+        )
+    for option in args.set:
+        if "=" not in option:
+            raise UsageError(f"'{option}' is not KEY=VALUE")
+    check_learning(args)
+    if args.fault is not None or simulated(args.driver):
+        import_module(NAMES).check_run(args)
+
+
+def simulated(address: str) -> bool:
+    """Whether an address names an arm that is simulated in the process itself.
+
+    A virtual CAN bus lives in one process only, so its motors are simulated there.
+    """
+    scheme, _ = split_address(address)
+    if scheme != "can":
+        return scheme == "pybullet"
+    _, _, query = address.partition("?")
+    return "interface=virtual" in query.split("&")
