@@ -65,19 +65,19 @@ class Folds:
             carried.prior_std,
         )
 
-    def coefficients(self, at: np.ndarray | slice = slice(None)) -> list[Array]:
-        """Some coefficients, alone, one set per fold, each without that fold's blocks of time.
+    def known(self, at: np.ndarray | slice = slice(None)) -> list[Normal]:
+        """Some coefficients, alone, once per fold, each without that fold's blocks of time.
 
         Names, dates and the noise are those that all data gave; what is fitted is refitted.
         """
         G, g, std = self.G[:, at][:, :, at], self.g[:, at], self.prior_std[at]
-        return [Normal(G.sum(0) - G[f], g.sum(0) - g[f], std).x for f in range(FOLDS)]
+        return [Normal(G.sum(0) - G[f], g.sum(0) - g[f], std) for f in range(FOLDS)]
 
     def left(self, at: np.ndarray) -> float:
         """Squared distance of each fold's data from what the others foretell, over all folds."""
         total = 0.0
-        for f, x in enumerate(self.coefficients(at)):
-            G, g = self.G[f][np.ix_(at, at)], self.g[f, at]
+        for f, known in enumerate(self.known(at)):
+            x, G, g = known.x, self.G[f][np.ix_(at, at)], self.g[f, at]
             total += float(self.power[f] - 2.0 * (x @ g) + x @ G @ x)
         return total
 

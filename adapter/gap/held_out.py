@@ -14,10 +14,10 @@ from adapter.gap.evidence import Carried
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of
+from adapter.gap.possible import possible
 from adapter.gap.result import Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
-from adapter.model.inertia import is_consistent
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
@@ -31,29 +31,18 @@ WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
 def model_of(model: SelfModel, fit: Fit) -> SelfModel:
-    """The self model with the corrections and the named effects of a fit.
-
-    A correction that would make a body impossible is taken back as far as it must be.
-    """
+    """The self model with the corrections and the named effects of a fit."""
     theta = model.theta.copy()
-    first = len(theta) - len(fit.dtheta)  # a floating base comes before the links
-    for k, change in enumerate(fit.dtheta, start=first):
-        share = 1.0
-        while not is_consistent(theta[k] + share * change) and is_consistent(theta[k]):
-            share *= 0.7
-            if share < 1e-3:
-                share = 0.0
-                break
-        theta[k] += share * change
+    theta[len(theta) - len(fit.dtheta) :] += fit.dtheta  # a floating base comes before the links
     return replace(model, theta=theta, effects=(*model.effects, *entries(fit)))
 
 
 def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfModel]:
     """One model per fold: the named effects refitted without that fold's blocks of time."""
     models = []
-    for x in Folds.of(fit, carried).coefficients():
+    for known in Folds.of(fit, carried).known():
         try:
-            models.append(model_of(model, fit.at(x)))
+            models.append(model_of(model, possible(fit.at(known.x), known)))
         except ModelError:  # a coefficient at its bound without these data
             models.append(model_of(model, fit))
     return models
@@ -221,6 +210,7 @@ def measure(
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
     found = _corrected_where_it_pays(task, found)
+    found = replace(found, fit=possible(found.fit, found.carried))
     block = block_s(found.fit)
     if task.folds:
         after = held_out_models(task.model, found.fit, found.carried)
@@ -284,9 +274,9 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     own, model = found.fit.recordings[i], found.fit.model
     nominal = Model((own,), np.zeros_like(found.fit.dtheta), known=model.known)
     after = np.empty_like(own.tau)
-    for f, x in enumerate(Folds.of(found.fit, found.carried).coefficients()):
+    for f, known in enumerate(Folds.of(found.fit, found.carried).known()):
         rows = fold_of(own.t, block_s(found.fit)) == f
-        after[rows] = found.fit.at(x).without_patterns().model.residual(i)[rows]
+        after[rows] = found.fit.at(known.x).without_patterns().model.residual(i)[rows]
     motion = own.motion
     rows = np.searchsorted(motion.t, own.t - 1e-9)
     signals = motion.q[rows], motion.dq[rows], motion.ddq[rows]

@@ -29,9 +29,11 @@ from adapter.gap.evidence import LEAST_NM, ORDER, WHITE, Carried, Noise, noise_o
 from adapter.gap.findings import parameter_std
 from adapter.gap.fit import Fit, Model, Named, beside, refitted, theta_prior, worth
 from adapter.gap.folds import Folds, fold_rows, pays_held_out
+from adapter.gap.possible import possible
 from adapter.gap.rivals import standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
+from adapter.model.inertia import is_consistent
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
 from sim.hidden import draw
@@ -524,6 +526,34 @@ def test_a_refit_finds_what_was_planted():
     assert np.sqrt(np.mean(np.square(pulls))) < 2.5
 
 
+def test_bodies_that_cannot_exist_give_way_where_torques_do_not_show_it():
+    fit, carried = refitted(fit_of(SHORT))
+    x = fit.coefficients
+    x[4] -= 2.0 * ARM.theta[0, 4]  # XX of link 1, which turns about z
+    asked = fit.at(x)
+    found = possible(asked, carried)
+    assert is_consistent(ARM.theta + found.dtheta)
+    assert not is_consistent(ARM.theta + asked.dtheta)
+    assert np.abs(found.model.residual(0) - asked.model.residual(0)).max() < 1e-3
+    assert possible(found, carried) is found
+
+
+def test_a_payload_that_cannot_exist_gives_way_as_little_as_the_data_let_it():
+    """Of all that can exist, nothing is nearer to what the data say."""
+    fit = fit_of(SHORT)
+    nothing = replace(named(fit, "payload"), x=np.zeros(10), interval_s=(3.0, np.inf))
+    fit, carried = refitted(fit.with_named([nothing]))
+    right, off = fit.coefficients, np.zeros(len(fit.coefficients))
+    off[-6] = -1.5 * ARM.theta[-1, 4]  # XX of the payload
+    asked = fit.at(right + off)
+    found = possible(asked, carried)
+    assert is_consistent(ARM.theta[-1] + found.dtheta[-1] + found.named[0].x)
+    information = carried.G + np.diag(carried.prior_std**-2.0)
+    way, back = found.coefficients - asked.coefficients, right - found.coefficients
+    assert way @ information @ way < 0.9 * (off @ information @ off)
+    assert way @ information @ back > 0.0  # the nearest point of a convex set
+
+
 def _frictions(fit: Fit) -> list:
     found = signatures(stages_of(fit.recordings[0], ()), EVERYWHERE)[1]
     return [c for c in found if c.effect.name == "coulomb_friction"]
@@ -548,8 +578,8 @@ def test_what_folds_leave_is_what_their_residuals_are():
     fit = fit_of(SHORT)
     fit, carried = refitted(fit.with_named([Named(_frictions(fit)[RUBS], np.array([FC]))]))
     fold, folds, direct = fold_rows(fit), Folds.of(fit, carried), 0.0
-    for f, x in enumerate(folds.coefficients()):
-        left = (carried.data - x @ carried.N)[fold == f]
+    for f, known in enumerate(folds.known()):
+        left = (carried.data - known.x @ carried.N)[fold == f]
         direct += float(left @ left)
     assert folds.left(np.arange(len(carried.x))) == pytest.approx(direct, rel=1e-9)
 

@@ -64,7 +64,7 @@ def filled_theta(learned: Array, told: Array, basis: Array, regressor: Array) ->
     Raises:
         ModelError: the solver gave up without an answer.
     """
-    measure = _Measure(told)
+    measure = Measure(told)
     start = measure.of(learned)
     hidden = np.linalg.svd(basis.T)[2][basis.shape[1] :]
     free = np.linalg.qr(measure.of(hidden.reshape(-1, *told.shape)).T)[0]
@@ -103,7 +103,7 @@ def filled_words(basis: Array, names: tuple[str, ...]) -> list[str]:
     return found
 
 
-class _Measure:
+class Measure:
     """Bodies as shares of the documented ones: entries (10 bodies,) of L⁻¹ J L⁻ᵀ, one by one.
 
     Attributes:
@@ -144,7 +144,7 @@ class _Measure:
         return float(np.linalg.eigvalsh(whole).min())
 
 
-def _most_room(measure: _Measure, start: Array, free: Array) -> float:
+def _most_room(measure: Measure, start: Array, free: Array) -> float:
     """The largest share, up to `KEPT`, that can be left of every body at once; 0 where none."""
     count = free.shape[1]
     x, _, _ = solve_conic(
@@ -159,7 +159,7 @@ def _most_room(measure: _Measure, start: Array, free: Array) -> float:
     return min(float(x[-1]), measure.least(start + free @ x[:-1]))
 
 
-def _nearest_by_torque(measure: _Measure, start: Array, regressor: Array) -> FilledTheta:
+def _nearest_by_torque(measure: Measure, start: Array, regressor: Array) -> FilledTheta:
     """Possible bodies whose torques are nearest to those of what was learned."""
     back = np.array([measure.theta(x).ravel() for x in np.eye(len(start))])  # θ of each unit
     table = regressor @ back.T
