@@ -30,6 +30,7 @@ from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, results_folder, warn
 from adapter.signals.base_motion import with_base_motion
+from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching, present
 from drivers.files.mcap import Log, read_log
 
@@ -38,7 +39,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    whole = read_log(args.log, frames=args.base is not None)
+    whole = read_log(args.log, frames=args.base is not None, imus=True)
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -46,11 +47,16 @@ def run(args: argparse.Namespace) -> int:
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
     log = _joined(args, whole, robot)
+    imus: tuple[str, ...] = ()
+    if args.base is None:
+        log, imus = with_link_imus(log, robot, args.imu)
     log.warnings.extend(locked)
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
     warn(notes)
-    learner = replace(config.pipeline.learner, base_wrench=args.base_wrench == "zero")
+    schema = replace(config.pipeline.learner.schema, imus=imus)
+    wrench = args.base_wrench == "zero"
+    learner = replace(config.pipeline.learner, base_wrench=wrench, schema=schema)
     config = replace(config, pipeline=replace(config.pipeline, filter=fitted, learner=learner))
     compile_first(robot, config.pipeline, args.every, console.print)
     result = _learn(args, log, robot, config)
@@ -86,7 +92,7 @@ def _figures(
         robot,
         reference,
         course,
-        warnings=[*log.warnings, *front_end.messages],
+        warnings=[*log.warnings, *front_end.messages, *result.outcome.lam_notes],
         recording=str(args.log),
         robot=robot.name,
         every=args.every,

@@ -32,6 +32,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="what pushes a floating base: zero in free motion; unknown (default), as where it "
         "stands or hangs: only the joints' torques are learned from",
     )
+    add(
+        "--imu",
+        action="append",
+        default=[],
+        metavar="TOPIC=LINK",
+        help="an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
+        "does not name the link; none: take no notice of any",
+    )
     held_out = parser.add_mutually_exclusive_group()
     held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
     held_out.add_argument(

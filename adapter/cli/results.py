@@ -38,7 +38,7 @@ def conclude(
 ) -> None:
     """Write model, figures and report; print the headline."""
     outcome, robot, reference, front_end = learned
-    warn(front_end.messages)
+    warn([*front_end.messages, *outcome.lam_notes])
     figures["model"] = str(folder / "model.json")
     data = run_data(
         outcome,

@@ -21,6 +21,7 @@ from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
 VERSION = 4
+MORE = "schema.more."  # before the names of what some kinds of schema hold
 
 # What each part would not be the same learner without. Everything else follows from the settings.
 _STATE = {
@@ -74,6 +75,8 @@ def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = Tr
             value = getattr(owner, name)
             if value is not None:
                 arrays[f"{part}.{name}"] = value
+    for name, state in learner.schema.more_state().items():
+        arrays[f"{MORE}{name}"] = state
     size = len(learner._held)
     rows = np.arange(learner._held_from, learner._held_to) % size
     arrays[".held"] = learner._held[rows]
@@ -110,6 +113,8 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
         for name in names if owner is not None else ():
             _put(owner, name, arrays.get(f"{part}.{name}"))
     learner.schema.kind = LinkMotionKind(learner.schema.kind)
+    more = {key.removeprefix(MORE): x for key, x in arrays.items() if key.startswith(MORE)}
+    learner.schema.take_state(more)
     size = len(learner._held)
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
     learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]

@@ -169,6 +169,6 @@ class KnownEffects:
         """Take the encoders' errors off the angles that measured link motion goes with."""
         at, still, unused = self._layout, np.zeros(self._layout.n), np.zeros(self._layout.n)
         untwisted = JointTorques(still, still, still)
-        for m in np.flatnonzero(table[:, KIND] == LinkMotionKind.MEASURED):
+        for m in np.flatnonzero(table[:, KIND] >= LinkMotionKind.MEASURED):
             q, dq = table[m, at.motion_q], table[m, at.motion_dq]
             to_links(JointMotion(q, dq, unused), untwisted, encoders)

@@ -63,12 +63,14 @@ class KnownArm:
         arm: the model's rigid arm, needed where there are such effects. Its gravity is what
             torques and measured link motion show; where the base is tilted it is not that of
             the documentation, which synthesized link motion is made with.
+        lam: (n, 6) documented λ, which sensors mounted anyhow start from; nobody else looks at it.
     """
 
     hand: int | None = None
     tool_theta: Array | None = None
     effects: Sequence[Active] = ()
     arm: RigidArm | None = None
+    lam: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,7 @@ class OnlineLearner:
         each_sample = s.mode == Mode.SAMPLE
         rest = _resting_base(tree, gravity, known.arm)
         self.base = np.empty(0) if rest is None else rest.measured
-        self.schema = Schema(tree, rest, s.schema, each_sample, filtered.noise_gain, s.seed)
+        self.schema = self._schema(rest, filtered.noise_gain, known.lam)
         told = believed(known.effects, s.effects, tree.n)
         before = ThetaKnowledge(
             None if rest is None else rest.measured,
@@ -165,6 +167,17 @@ class OnlineLearner:
         self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
         moving = 12 if tree.floating else 0  # numbers of the base's motion
         self.score_trace = Trace(1 + 5 * tree.n + moving, capacity=12_000)
+
+    def _schema(self, rest: RestingBase | None, noise_gain: float, lam: Array | None) -> Schema:
+        s = self.settings
+        if not s.schema.imus:
+            each_sample = s.mode == Mode.SAMPLE
+            return Schema(self.tree, rest, s.schema, each_sample, noise_gain, s.seed)
+        if lam is None:
+            raise SettingsError("sensors on links need a documented λ to start from")
+        from adapter.learning.imu_schema import ImuSchema  # brings a part of scipy
+
+        return ImuSchema(self.tree, rest, s.schema, lam)
 
     def _bind(self, parameters: Array, gradient: Array) -> None:
         """Let λ's tangent, θ's parameters and their gradients be views of the flat arrays."""

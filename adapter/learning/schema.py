@@ -14,6 +14,7 @@ plain ADAM, each a consequence of the moments being there:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +145,18 @@ class Schema:
     def lam(self) -> Array:
         """λ (n, 6): [α β γ p]."""
         return np.concatenate([zxz_from_matrix(self.R0), self.p], axis=1)
+
+    def more_state(self) -> dict[str, Array]:
+        """What a checkpoint holds of a kind of schema beside what it holds of all."""
+        return {}
+
+    def take_state(self, state: Mapping[str, Array]) -> None:
+        """Go on from what `more_state` gave."""
+
+    @property
+    def notes(self) -> list[str]:
+        """What is wrong with the link motion, a sentence each."""
+        return []
 
     def set_lam(self, lam: Array) -> None:
         """Start from a given λ (n, 6), e.g. a checkpoint's."""

@@ -36,6 +36,8 @@ class SchemaSettings:
         spin_measured: whether measured link motion has angular accelerations dw. Where not, the
             base's is carried along the tree by eq. 8d with the present λ, and moments made
             while λ still turned are dropped.
+        imus: links with a gyroscope and an accelerometer mounted anyhow; λ is then found from
+            these (see `imu_schema`), and most of the above does not count.
     """
 
     rate: float = 1.5e-2
@@ -48,8 +50,11 @@ class SchemaSettings:
     distance_goal: float = 2.5e-4
     stable_updates: int = 200
     spin_measured: bool = True
+    imus: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if len(set(self.imus)) < len(self.imus):
+            raise SettingsError(f"schema.imus names a link twice: {', '.join(self.imus)}")
         for name in ("rate", "share", "sample_rate", "start_rms", "judge_every"):
             if not getattr(self, name) > 0:
                 raise SettingsError(f"schema.{name} must be above zero, got {getattr(self, name)}")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.model.spatial import Array, exp_rotation, skew
+from adapter.model.spatial import Array, exp_rotation, rot_z, skew
 from adapter.model.tree import BASE, Tree
 
 # Share of turns below which a hidden direction is a shift alone; noise tilts directions a little,
@@ -131,6 +131,30 @@ class Freedom:
         moved = np.where(self.any_turn[:, None, None], to_R, Q @ R)
         placed = c + np.einsum("...jab,...jb->...ja", Q, p - c)
         return moved, placed + np.einsum("jab,...jb->...ja", self.shifts, to_p - placed)
+
+
+def slid_to(
+    tree: Tree, frames: tuple[Array, Array], to: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The same axes, with each link's frame slid along its own and turned about it.
+
+    Sensors mounted anyhow on the links tell no two such arms apart.
+
+    Args:
+        frames: R (n, 3, 3) and p (n, 3) m; to: those that the frames shall come close to.
+    """
+    R, p = frames[0].copy(), frames[1].copy()
+    turn, slide = np.zeros(tree.n), np.zeros(tree.n)
+    for j, i in enumerate(tree.parent):
+        if i != BASE:
+            back = rot_z(-turn[i])
+            R[j], p[j] = back @ R[j], back @ (p[j] - slide[i] * np.array([0.0, 0.0, 1.0]))
+        M = to[0][j].T @ R[j]
+        turn[j] = np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1])
+        slide[j] = (to[1][j] - p[j]) @ R[j, :, 2]
+        p[j] += slide[j] * R[j, :, 2]
+        R[j] = R[j] @ rot_z(turn[j])
+    return R, p
 
 
 def _numbers(axis: Array) -> str:

@@ -40,6 +40,7 @@ class Outcome:
         lam_covariance, lam_identifiable: (n, 6, 6) of (turn, shift) in the parents' axes.
         lam_rank, lam_converged, lam_measured: directions shown; settled; learned from sensors.
         lam_restarts: joints that λ was started anew for, out of a wrong valley.
+        lam_notes: what is wrong with sensors on links, a sentence each.
         lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
         theta: (bodies, 10), the base first if it floats; effects: (e, n).
         variance: (n,) of the residual torque, (N m)².
@@ -67,6 +68,7 @@ class Outcome:
     lam_converged: bool
     lam_measured: bool
     lam_restarts: int
+    lam_notes: tuple[str, ...]
     lam_moments: Array
     lam_count: float
     theta: Array
@@ -109,6 +111,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         lam_converged=schema.converged,
         lam_measured=schema.kind == LinkMotionKind.MEASURED,
         lam_restarts=schema.check.restarts,
+        lam_notes=tuple(schema.notes),
         lam_moments=schema.moments.M.copy(),
         lam_count=schema.count,
         theta=theta.theta,
@@ -165,6 +168,8 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda
     R, p = matrix_from_zxz(outcome.lam[:, :3]), outcome.lam[:, 3:]
     told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
     freedom = Freedom.of(np.eye(6) - outcome.lam_identifiable, p)
+    if outcome.settings.schema.imus:  # began at the documentation, and stayed where none is shown
+        return CompletedLambda(outcome.lam, freedom.words(documented.tree))
     moved = freedom.nearest(R, p, *told)
     found = [Frame(*x) for x in zip(*moved, strict=True)]
     if outcome.lam_converged:  # else what moments say is not what was learned

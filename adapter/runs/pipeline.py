@@ -39,7 +39,8 @@ class Pipeline:
 
 def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:
     """The front end of a pipeline with these settings."""
-    return FrontEnd(documented, settings.filter, settings.front_end)
+    imus = bool(settings.learner.schema.imus)
+    return FrontEnd(documented, settings.filter, settings.front_end, imus)
 
 
 def make_learner(documented: SelfModel, settings: PipelineSettings) -> OnlineLearner:
@@ -57,5 +58,6 @@ def make_learner(documented: SelfModel, settings: PipelineSettings) -> OnlineLea
             tool_theta=None if tool is None else tool.theta(),
             effects=known,
             arm=None if whole is documented and not known else RigidArm.of(whole),
+            lam=documented.lam,
         ),
     )

@@ -17,8 +17,8 @@ from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
-from adapter.physics.freedom import Freedom
+from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
+from adapter.physics.freedom import Freedom, slid_to
 from adapter.physics.identifiability import frame_observability
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.outcome import (
@@ -121,6 +121,8 @@ def schema_score(
     λ has converged when the learner has said so and its errors are inside both goals, for good.
     """
     completed = completed_lambda(outcome, documented)
+    if outcome.settings.schema.imus:
+        reference = _slid(documented, reference, completed.lam)
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
     turn, shift = course_errors(outcome, documented, reference)
     inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
@@ -147,6 +149,13 @@ def schema_score(
         "filled": completed.filled,
         "restarts": outcome.lam_restarts,
     }
+
+
+def _slid(documented: SelfModel, reference: Reference, lam: Array) -> Reference:
+    """The reference with its links' frames, along and about their axes, where λ (n, 6) has them."""
+    ours, theirs = ((matrix_from_zxz(x[:, :3]), x[:, 3:]) for x in (lam, reference.lam))
+    R, p = slid_to(documented.tree, theirs, ours)
+    return replace(reference, lam=np.concatenate([zxz_from_matrix(R), p], axis=1))
 
 
 class ScoreRows:

@@ -174,6 +174,7 @@ class FrontEnd:
 
     Args:
         documented: the arm's documented kinematics, limits and gravity.
+        imus: whether links carry sensors mounted anyhow (see `LinkMotionKind`).
 
     Attributes:
         refused: how many samples were not passed on, by reason.
@@ -185,13 +186,14 @@ class FrontEnd:
         documented: SelfModel,
         filter_settings: FilterSettings | None = None,
         settings: FrontEndSettings | None = None,
+        imus: bool = False,
     ) -> None:
         n = documented.tree.n
         self.settings = settings or FrontEndSettings()
         self.names = documented.tree.joint_names
         self.layout = StateLayout(n, documented.tree.floating)
         self.filter = JointFilter(n, filter_settings)
-        self.twist = TwistSynthesis(documented)
+        self.twist = TwistSynthesis(documented, imus)
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0

@@ -19,11 +19,16 @@ STAMP, KIND = 0, 1  # the first two columns of every state
 
 
 class LinkMotionKind(IntEnum):
-    """Where the link motion of a state comes from."""
+    """Where the link motion of a state comes from.
+
+    Of sensors mounted anyhow (IMU) a link's row is [heard 0 0, w, a, 0 0 0] in the sensor's axes,
+    heard being 1 where the sensor said something at that stamp; all else is then zero.
+    """
 
     NONE = 0
     DOCUMENTED = 1
     MEASURED = 2
+    IMU = 3
 
 
 class StateColumns(NamedTuple):

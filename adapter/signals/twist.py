@@ -28,9 +28,11 @@ class TwistSynthesis:
 
     Args:
         documented: whose λ and gravity the synthesized motion follows.
+        imus: links carry sensors mounted anyhow, and what they read is handed on.
     """
 
-    def __init__(self, documented: SelfModel) -> None:
+    def __init__(self, documented: SelfModel, imus: bool = False) -> None:
+        self._imus = imus
         self.layout = StateLayout(documented.tree.n, documented.tree.floating)
         # a plain tuple: numba takes 3 µs longer for a named one
         self._frames = tuple(frames_of(documented.tree.parent, documented.lam))
@@ -39,7 +41,10 @@ class TwistSynthesis:
     def fill(self, record: Array, sample: JointSample) -> None:
         """Complete a record whose q, dq, ddq are filled, for the sample that led to it."""
         links = sample.links
-        if links is None or self.layout.floating:
+        if self._imus:
+            told = None if links is None else (links.twist[None], links.accel[None])
+            self._of_imus(record[None], sample.q[None], sample.dq[None], told)
+        elif links is None or self.layout.floating:
             synthesize(self._frames, self._base, record[None])
         else:
             self._measured(
@@ -50,6 +55,9 @@ class TwistSynthesis:
         self, records: Array, q: Array, dq: Array, links: tuple[Array, Array] | None
     ) -> None:
         """Complete records (m, size); raw q, dq (m, n), twists and accels (m, n, 6) beside them."""
+        if self._imus:
+            self._of_imus(records, q, dq, links)
+            return
         if links is None or self.layout.floating:
             synthesize(self._frames, self._base, records)
             return
@@ -71,6 +79,20 @@ class TwistSynthesis:
         # schema a sample short
         usable = (np.abs(motion) < MOTION_CAP).all(axis=(1, 2))  # false for NaN
         records[:, KIND] = np.where(usable, LinkMotionKind.MEASURED, LinkMotionKind.NONE)
+
+    def _of_imus(
+        self, records: Array, q: Array, dq: Array, links: tuple[Array, Array] | None
+    ) -> None:
+        at = self.layout
+        records[:, at.motion_q], records[:, at.motion_dq] = q, dq
+        records[:, at.motion], records[:, KIND] = 0.0, LinkMotionKind.IMU
+        if links is None:
+            return
+        told = np.concatenate([links[0][..., 3:], links[1][..., :3]], axis=2)  # w and a
+        heard = (np.abs(told) < MOTION_CAP[3:9]).all(axis=2)  # false for NaN
+        rows = records[:, at.motion].reshape(len(records), at.n, 12)
+        rows[..., 0], rows[..., 3:9] = heard, np.where(heard[..., None], told, 0.0)
+        records[:, at.motion] = rows.reshape(len(records), 12 * at.n)
 
 
 @jit

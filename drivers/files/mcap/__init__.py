@@ -2,13 +2,14 @@
 
 `/joint_states` (sensor_msgs/msg/JointState), `/link_twists/<link>` and `/link_accels/<link>`
 (geometry_msgs/msg/TwistStamped and AccelStamped, frame_id the link), `/joint_commands` (JointState
-with effort only), `/estimates` (JSON), a metadata record with configuration and version. Read only,
-for discovery and of a floating base: sensor_msgs/msg/Imu on any topic; of a floating base also
-nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any topic.
+with effort only), `/estimates` (JSON), a metadata record with configuration and version. Read only:
+sensor_msgs/msg/Imu on any topic; of a floating base also nav_msgs/msg/Odometry, TwistStamped and
+AccelStamped on any topic.
 """
 
 from drivers.files.mcap.imus import READERS, FrameMotion
 from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
+from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
 from drivers.files.mcap.recover import Recovery, recover
 from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
@@ -16,6 +17,7 @@ from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
 __all__ = [
     "FLUSH_S",
     "READERS",
+    "Carrier",
     "Commands",
     "FrameMotion",
     "Log",

@@ -161,6 +161,7 @@ def read_log(
     *,
     sensors: bool = False,
     frames: bool = False,
+    imus: bool = False,
 ) -> Log:
     """Read a recording, cut or whole, by whatever recorder.
 
@@ -171,14 +172,16 @@ def read_log(
         sensors: read what sensors on links recorded beside the joints, for discovery: also
             Imu topics and link motion with stamps of its own, carried to the joint samples'
             stamps; efforts and velocities may be absent.
-        frames: read into `Log.frames` what topics say of frames' motion, whatever frames.
+        frames: read into `Log.frames` what topics say of frames' motion, whatever frames; `imus`
+            the same for Imu topics alone.
 
     Raises:
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
     scan = McapScan(Path(path))
-    topics = collect(scan, lambda series: _wanted(series, topic, sensors, frames))
+    tell = tuple(READERS) if frames else (IMU,) if imus else ()
+    topics = collect(scan, lambda series: _wanted(series, topic, sensors, tell))
     series = topics.get(topic)
     if series is None or not series.count:
         raise DriverError(_nothing_found(scan, topics, topic))
@@ -188,9 +191,9 @@ def read_log(
     metadata = _metadata(scan)
     links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
     found: list[FrameMotion] = []
-    if frames:
+    if tell:
         with np.errstate(invalid="ignore", over="ignore"):
-            found = frame_motions(topics, READERS, scan.path, warnings)
+            found = frame_motions(topics, tell, scan.path, warnings)
     commands = None
     if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
         commands = read_commands(topics[JOINT_COMMANDS], scan.path, joints.names, warnings)
@@ -231,9 +234,9 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
             yield json.loads(region.data[region.start[i] : region.stop[i]].tobytes())
 
 
-def _wanted(series: Series, topic: str, sensors: bool, frames: bool) -> bool:
+def _wanted(series: Series, topic: str, sensors: bool, tell: Sequence[str]) -> bool:
     """Whether the messages of a topic are decoded."""
-    if series.topic in (topic, JOINT_COMMANDS) or (frames and series.schema in READERS):
+    if series.topic in (topic, JOINT_COMMANDS) or series.schema in tell:
         return True
     if series.schema == IMU:
         return sensors

@@ -1,0 +1,173 @@
+"""Readings of joints and of sensors on links, on one grid of time, weighed by smooth windows.
+
+A window is a bell w(t), a B-spline of degree 5, that is zero outside some tenths of a second. What
+a sensor reads and where the joints say that it was are compared as integrals over windows:
+
+    ∫ w a dt = ∫ w'' p dt,
+
+for an acceleration a of a place p. So positions of joints are never differentiated twice, nothing
+is delayed or flattened, however fast the motion, and the noise of both sides is averaged alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from adapter.model.spatial import Array
+
+STEP_S = 0.005  # of the grid
+KNOT_S = 0.04  # between two knots of the bell, and from one window to the next
+DEGREE = 5  # so smooth that sums over the grid are integrals to 1e-6
+LONGEST_GAP_S = 0.05  # no window spans a longer silence
+LONGEST_PERIODS = 3.0  # nor one of more than so many periods
+FASTEST_HZ = 200.0  # faster signals are averaged to about this rate first
+PER_KNOT = round(KNOT_S / STEP_S)
+
+
+class Readings(NamedTuple):
+    """What was read at the joints' stamps.
+
+    Attributes:
+        t_s: (m,) rising, s.
+        q: (m, n) rad.
+        w, a: (m, s, 3) angular velocity, rad/s, and what the accelerometer reads, m/s², of each
+            sensor in its own axes; not a number where it said nothing.
+    """
+
+    t_s: Array
+    q: Array
+    w: Array
+    a: Array
+
+
+class Course:
+    """A signal (k, c) as a smooth curve over time.
+
+    Args:
+        t_s: (k,) rising, s; at least four.
+        x: (k, c).
+    """
+
+    def __init__(self, t_s: Array, x: Array) -> None:
+        from scipy.interpolate import CubicSpline  # a tenth of a second that few runs need
+
+        longest = max(LONGEST_GAP_S, LONGEST_PERIODS * float(np.median(np.diff(t_s))))
+        t_s, x = _thinned(t_s, x)
+        self._t_s, self._longest_s = t_s, longest
+        self._curve = CubicSpline(t_s, x)
+
+    def at(self, t_s: Array) -> Array:
+        """(g, c) at other times."""
+        return np.asarray(self._curve(t_s))
+
+    def rate(self, t_s: Array) -> Array:
+        """(g, c) its rate of change there."""
+        return np.asarray(self._curve(t_s, 1))
+
+    def heard(self, t_s: Array) -> np.ndarray:
+        """(g,) whether times lie between readings that are close to each other."""
+        behind = np.clip(np.searchsorted(self._t_s, t_s), 1, len(self._t_s) - 1)
+        near = self._t_s[behind] - self._t_s[behind - 1] <= self._longest_s
+        inside = (t_s >= self._t_s[0]) & (t_s <= self._t_s[-1])
+        return np.asarray(near & inside)
+
+
+def _thinned(t_s: Array, x: Array) -> tuple[Array, Array]:
+    """Averages of so many readings that `FASTEST_HZ` is about their rate; none across a gap."""
+    period_s = float(np.median(np.diff(t_s)))
+    count = int(1.0 / (FASTEST_HZ * period_s) + 1e-6)
+    if count < 2:
+        return t_s, x
+    part = np.cumsum(np.diff(t_s, prepend=t_s[0]) > LONGEST_PERIODS * period_s)
+    start = np.flatnonzero(np.diff(part, prepend=-1))
+    place = np.arange(len(t_s)) - start[part]
+    first = np.flatnonzero(place % count == 0)
+    size = np.diff(first, append=len(t_s))
+    t_mean, mean = np.add.reduceat(t_s, first) / size, np.add.reduceat(x, first) / size[:, None]
+    return t_mean, mean
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows over a grid of time with gaps.
+
+    Attributes:
+        t_s: (g,) the grid; uniform pieces one after the other.
+        starts: (k,) first place on the grid of each window.
+    """
+
+    t_s: Array
+    starts: np.ndarray
+
+    @classmethod
+    def over(cls, course: Course, t_s: Array) -> Windows:
+        """On the stretches where a signal with stamps (m,) was heard."""
+        grid = np.arange(t_s[0], t_s[-1], STEP_S)
+        heard = course.heard(grid)
+        part = np.cumsum(np.diff(heard.astype(int), prepend=0) > 0)
+        kept, starts, size = [], [], 0
+        for k in range(1, part[-1] + 1 if len(part) else 1):
+            piece = grid[heard & (part == k)]
+            if len(piece) >= len(BELL):
+                starts.append(size + np.arange(0, len(piece) - len(BELL) + 1, PER_KNOT))
+                kept.append(piece)
+                size += len(piece)
+        none = np.zeros(0)
+        return cls(
+            np.concatenate(kept) if kept else none,
+            np.concatenate(starts) if starts else none.astype(int),
+        )
+
+    def sums(self, kernel: Array) -> Sums:
+        """What weighs signals on the grid with a kernel, window by window."""
+        return Sums(kernel, self.starts, len(self.t_s))
+
+    def whole(self, heard: np.ndarray) -> np.ndarray:
+        """(k,) windows in all of which something was heard, from (g,)."""
+        missing = np.concatenate([[0], np.cumsum(~heard)])
+        return np.asarray(missing[self.starts + len(BELL)] == missing[self.starts])
+
+
+class Sums:
+    """A kernel laid over a grid at each window."""
+
+    def __init__(self, kernel: Array, starts: np.ndarray, size: int) -> None:
+        from scipy.sparse import csr_array
+
+        columns = (starts[:, None] + np.arange(len(kernel))).ravel()
+        rows = np.arange(0, len(columns) + 1, len(kernel))
+        self._table = csr_array((np.tile(kernel, len(starts)), columns, rows), (len(starts), size))
+
+    def __call__(self, x: Array) -> Array:
+        """(k, ...) weighted sums of x (g, ...)."""
+        out = self._table @ np.ascontiguousarray(x).reshape(len(x), -1)
+        return np.asarray(out).reshape(-1, *x.shape[1:])
+
+
+def _bell() -> tuple[Array, Array]:
+    """Weights of w and of w'' on the grid; those of w sum to one."""
+    from scipy.interpolate import BSpline
+
+    spline = BSpline.basis_element(KNOT_S * np.arange(DEGREE + 2), extrapolate=False)
+    t_s = STEP_S * np.arange(1, PER_KNOT * (DEGREE + 1))
+    w, bend = spline(t_s), spline.derivative(2)(t_s)
+    return w / w.sum(), bend / w.sum()
+
+
+BELL, BEND = _bell()
+# So many windows say as much of slow signals, in white noise, as one that stood by itself: they
+# overlap, and what is common to neighbours counts once.
+OVERLAP = float(1.0 / (PER_KNOT * np.sum(BELL**2)))
+
+
+def steady_rates(t_s: Array, heard: Sequence[np.ndarray]) -> list[float]:
+    """Readings a second of each sensor, 0 for fewer than two; `heard` (m,) by sensor."""
+    rates = []
+    for h in heard:
+        steps = np.diff(t_s[h])
+        rates.append(float(1.0 / np.median(steps)) if len(steps) else 0.0)
+    return rates
