@@ -11,7 +11,7 @@ is delayed or flattened, however fast the motion, and the noise of both sides is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class Course:
     """
 
     def __init__(self, t_s: Array, x: Array) -> None:
-        from scipy.interpolate import CubicSpline  # a tenth of a second that few runs need
+        from scipy.interpolate import CubicSpline  # takes long to load, and few runs need it
 
         longest = max(LONGEST_GAP_S, LONGEST_PERIODS * float(np.median(np.diff(t_s))))
         t_s, x = _thinned(t_s, x)
@@ -150,24 +150,16 @@ class Sums:
 
 def _bell() -> tuple[Array, Array]:
     """Weights of w and of w'' on the grid; those of w sum to one."""
-    from scipy.interpolate import BSpline
-
-    spline = BSpline.basis_element(KNOT_S * np.arange(DEGREE + 2), extrapolate=False)
-    t_s = STEP_S * np.arange(1, PER_KNOT * (DEGREE + 1))
-    w, bend = spline(t_s), spline.derivative(2)(t_s)
-    return w / w.sum(), bend / w.sum()
+    x = np.arange(1, PER_KNOT * (DEGREE + 1)) / PER_KNOT
+    w, bend = np.zeros_like(x), np.zeros_like(x)
+    for k in range(DEGREE + 2):  # a sum of powers of what lies behind each knot
+        behind, share = np.maximum(x - k, 0.0), (-1) ** k * math.comb(DEGREE + 1, k)
+        w += share * behind**DEGREE
+        bend += share * DEGREE * (DEGREE - 1) * behind ** (DEGREE - 2)
+    return w / w.sum(), bend / (w.sum() * KNOT_S**2)
 
 
 BELL, BEND = _bell()
 # So many windows say as much of slow signals, in white noise, as one that stood by itself: they
 # overlap, and what is common to neighbours counts once.
 OVERLAP = float(1.0 / (PER_KNOT * np.sum(BELL**2)))
-
-
-def steady_rates(t_s: Array, heard: Sequence[np.ndarray]) -> list[float]:
-    """Readings a second of each sensor, 0 for fewer than two; `heard` (m,) by sensor."""
-    rates = []
-    for h in heard:
-        steps = np.diff(t_s[h])
-        rates.append(float(1.0 / np.median(steps)) if len(steps) else 0.0)
-    return rates

@@ -17,6 +17,7 @@ from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.learning.adam import FlatAdam
 from adapter.learning.change import ChangeDetector
+from adapter.learning.imu_schema import ImuSchema
 from adapter.learning.known_effects import KnownEffects, believed
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
@@ -175,8 +176,6 @@ class OnlineLearner:
             return Schema(self.tree, rest, s.schema, each_sample, noise_gain, s.seed)
         if lam is None:
             raise SettingsError("sensors on links need a documented λ to start from")
-        from adapter.learning.imu_schema import ImuSchema  # brings a part of scipy
-
         return ImuSchema(self.tree, rest, s.schema, lam)
 
     def _bind(self, parameters: Array, gradient: Array) -> None:
