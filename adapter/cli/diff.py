@@ -5,9 +5,16 @@ from __future__ import annotations
 import argparse
 
 from rich.markup import escape
+from rich.table import Table
 
 from adapter.cli.common import robot_of
-from adapter.report.difference_words import difference_json, difference_lines
+from adapter.report.difference_words import (
+    HEADS,
+    LEGEND,
+    difference_json,
+    difference_rows,
+    difference_summary,
+)
 from adapter.runs.compare import compare, documentation_of
 from adapter.runs.terminal import console, json_text, write_json
 
@@ -24,6 +31,12 @@ def run(args: argparse.Namespace) -> int:
         print(json_text(difference_json(found)))
     else:
         write_json(args.json, difference_json(found))
-    for line in difference_lines(found):
+    rows = difference_rows(found)
+    if rows:
+        table = Table(*HEADS, box=None, pad_edge=False, caption=LEGEND, caption_justify="left")
+        for row in rows:
+            table.add_row(*map(escape, row))
+        console.print(table)
+    for line in difference_summary(found):
         console.print(escape(line), soft_wrap=True)
     return 0

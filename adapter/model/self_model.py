@@ -120,7 +120,8 @@ class SelfModel:
         tool: a known load, not part of `theta`.
         lam_std: (n, 6) standard deviations of each frame's turn (rotation vector, rad) and
             shift (m), both in the axes of the parent link; NaN where unknown.
-        theta_std: (bodies, 10) standard deviations; NaN where unknown or without meaning alone.
+        theta_std: (bodies, 10) standard deviations, of a learned θ those of what torques show
+            of it (`identifiability.BaseParameters.shown_map`); NaN where unknown.
         lam_identifiable: (n, 6) bool, the same directions as `lam_std`; None where not judged.
         theta_identifiable: (bodies, 10) bool, the parameter alone; None where not judged.
         effects: one mapping each {effect, joints, parameters} with what goes along ({interval_s,

@@ -28,6 +28,9 @@ from adapter.physics.kernels import (
 # of many decades: true ones stay above 1e-6 on arms, rounding below 1e-14.
 RANK_TOLERANCE = 1e-10
 
+# Ten parameters of a body of 1 kg, 10 cm across: kg, kg m, kg m².
+BODY_SIZE = np.r_[1.0, np.full(3, 0.1), np.full(6, 0.01)]
+
 # Turns and shifts that change a link's motion by less than this share do not count as shown: axes
 # that a URDF has upright to five digits, and no more, show nothing that a sensor could tell.
 LEAST_SHOWN = 1e-4
@@ -51,6 +54,16 @@ class BaseParameters:
     def of(self, theta: Array) -> Array:
         """Coordinates (rank,) of parameters in the identifiable subspace."""
         return self.basis.T @ np.asarray(theta, dtype=np.float64).ravel()
+
+    def shown_map(self) -> Array:
+        """(columns, columns): of a difference in θ what torques show.
+
+        Of all differences that torques cannot tell from it the one that is smallest against a
+        body of 1 kg, 10 cm across.
+        """
+        size = np.tile(BODY_SIZE, len(self.basis) // len(BODY_SIZE))
+        rows = np.linalg.qr(self.basis * size[:, None])[0]
+        return np.asarray(size[:, None] * (rows @ rows.T) / size)
 
     def distance(self, first: Array, second: Array) -> float:
         """Length of the difference that torques can show."""

@@ -1,85 +1,126 @@
-"""A difference of two models in words and for JSON."""
+"""A difference of two models as a table in words, and for JSON."""
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from adapter.runs.compare import JointDifference, ModelDifference
+from adapter.runs.compare import (
+    BODY,
+    FRAME,
+    GRAVITY,
+    NOTHING,
+    SIGNIFICANT,
+    Change,
+    ModelDifference,
+)
 
-NO_DATA = "no data can show it"
+HEADS = ("what", "from A to B", "z", "N m", "mm")
+LEGEND = "z: standard deviations; N m, mm: what it alone does to torque and to the hand, rms"
 MOSTLY = 0.5  # share that data can show, below which it is told
 
 
-def difference_lines(found: ModelDifference) -> list[str]:
-    """A line for each joint that differs, and what all of it does."""
-    lines = [line for joint in found.joints if (line := _joint_line(joint))]
-    lines += found.others
-    if not lines:
-        return [f"{found.names[0]} and {found.names[1]} are the same"]
-    change = " ".join(f"{joint.torque_rms_nm:.3g}" for joint in found.joints)
-    size = " ".join(f"{joint.torque_size_nm:.3g}" for joint in found.joints)
-    lines.append(f"torque, rms by joint: {change} N m, of {size}")
-    hand = f"{1e3 * found.hand_rms_m:.3g} mm rms, {1e3 * found.hand_max_m:.3g} mm at most"
-    lines.append(f"{found.hand} stands elsewhere by {hand}")
-    return lines
-
-
-def _joint_line(joint: JointDifference) -> str:
-    parts = []
-    if joint.frame_moved:
-        turn, shift = np.degrees(joint.turn_rad), 1e3 * joint.shift_m
-        tail = _tail(joint.frame_z, float(joint.frame_shown))
-        parts.append(f"frame turned by {turn:.3g}° and moved by {shift:.3g} mm{tail}")
-    if joint.body_changed:
-        a, b = joint.mass
-        way = 1e3 * float(np.linalg.norm(joint.com[1] - joint.com[0]))
-        sizes = [float(np.trace(tensor)) / 3.0 for tensor in joint.inertia]
-        parts.append(
-            f"{joint.link} {a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
-            f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²{_tail(joint.body_z, joint.body_shown)}"
+def difference_rows(found: ModelDifference) -> list[tuple[str, ...]]:
+    """Rows of a table under `HEADS`, what does most first; what is noise or nothing is left out."""
+    return [
+        (
+            _name(change),
+            _change_words(change),
+            "-" if change.z is None else f"{change.z:.1f}",
+            f"{change.torque_nm:.2g} ({change.torque_joint})" if change.torque_nm > 0.0 else "0",
+            f"{1e3 * change.hand_m:.2g}",
         )
-    for key, (before, after, z) in joint.effects.items():
-        numbers = " -> ".join("none" if x is None else f"{x:.3g}" for x in (before, after))
-        parts.append(f"{key} {numbers}{_tail(z, 1.0)}")
-    return f"{joint.joint}: {'; '.join(parts)}" if parts else ""
+        for change in found.changes
+        if _listed(change)
+    ]
 
 
-def _tail(z: float | None, shown: float) -> str:
-    """Standard deviations, and how much of a difference no data can show."""
-    notes = [f"{z:.1f} standard deviations"] if z is not None else []
-    if shown < MOSTLY:
-        notes.append(f"data can show {100.0 * shown:.1g} % of it" if shown else NO_DATA)
-    return f" ({', '.join(notes)})" if notes else ""
+def difference_summary(found: ModelDifference) -> list[str]:
+    """What all of it does, and what is not listed."""
+    if not found.changes:
+        return [f"{found.names[0]} and {found.names[1]} are the same"]
+    pairs = zip(found.joints, found.torque_nm, found.torque_size_nm, strict=True)
+    torques = ", ".join(f"{joint} {x:.2g} of {size:.2g}" for joint, x, size in pairs)
+    rms, most = 1e3 * found.hand_rms_m, 1e3 * found.hand_max_m
+    away = f"elsewhere by {rms:.2g} mm rms, {most:.2g} mm at most"
+    stands = f"{found.hand} stands {away if found.hand_max_m > NOTHING else 'where it stood'}"
+    lines = [f"all together: torque of {torques} N m rms; {stands}"]
+    left = [change for change in found.changes if not _listed(change)]
+    noise = [change for change in left if not change.significant]
+    idle = ", ".join(_name(change) for change in left if change.significant)
+    parts = []
+    if noise:
+        kinds = Counter(change.what for change in noise)
+        counts = ", ".join(f"{kind} {count}" for kind, count in kinds.items())
+        parts = [f"{len(noise)} by less than {SIGNIFICANT:g} standard deviations ({counts})"]
+    parts += [f"without any torque, and the hand stays: {idle}"] if idle else []
+    return [*lines, f"not listed: {'; '.join(parts)}"] if parts else lines
+
+
+def _listed(change: Change) -> bool:
+    return change.significant and change.matters
+
+
+def _name(change: Change) -> str:
+    owner = change.link if change.what == BODY else change.joint
+    return f"{owner} {change.what}".strip()
+
+
+def _change_words(change: Change) -> str:
+    values = change.values
+    if change.what == FRAME:
+        turn, shift = np.degrees(values["turn_rad"][1]), 1e3 * values["shift_m"][1]
+        words = f"turned by {turn:.3g}°, moved by {shift:.3g} mm"
+    elif change.what == BODY:
+        (a, b), centres = values["mass_kg"], values["com_m"]
+        way = 1e3 * float(np.linalg.norm(centres[1] - centres[0]))
+        sizes = [float(np.trace(tensor)) / 3.0 for tensor in values["inertia_kg_m2"]]
+        words = (
+            f"{a:.4g} -> {b:.4g} kg, centre moved by {way:.3g} mm, mean inertia "
+            f"{sizes[0]:.3g} -> {sizes[1]:.3g} kg m²"
+        )
+    else:
+        words = ", ".join(
+            f"{'' if key == GRAVITY else key + ' '}{_number(a)} -> {_number(b)} {change.units[key]}"
+            for key, (a, b) in values.items()
+        )
+    if change.shown >= MOSTLY:
+        return words
+    share = f"{100.0 * change.shown:.2g} % of it" if change.shown else "none of it"
+    return f"{words} (data can show {share})"
+
+
+def _number(value: Any) -> str:
+    """A number, or some."""
+    if value is None:
+        return "none"
+    return " ".join(f"{x:.3g}" for x in np.ravel(value))
 
 
 def difference_json(found: ModelDifference) -> dict[str, Any]:
     """Everything, ready for JSON."""
-    keys = ("joint", "link", "frame_z", "frame_shown", "body_z", "body_shown", "body_parameter")
-    joints = [
+    changes = [
         {
-            **{key: getattr(joint, key) for key in keys},
-            "frame_turn_deg": float(np.degrees(joint.turn_rad)),
-            "frame_shift_mm": 1e3 * joint.shift_m,
-            "mass_kg": list(joint.mass),
-            "com_m": [com.tolist() for com in joint.com],
-            "inertia_kg_m2": [tensor.tolist() for tensor in joint.inertia],
-            "effects": {
-                key: dict(zip(("before", "after", "z"), numbers, strict=True))
-                for key, numbers in joint.effects.items()
+            **asdict(change),
+            "values": {
+                key: [None if x is None else np.asarray(x).tolist() for x in pair]
+                for key, pair in change.values.items()
             },
-            "torque_rms_nm": joint.torque_rms_nm,
-            "torque_size_nm": joint.torque_size_nm,
+            "listed": _listed(change),
         }
-        for joint in found.joints
+        for change in found.changes
     ]
     return {
         "models": list(found.names),
-        "joints": joints,
+        "changes": changes,
+        "joints": list(found.joints),
+        "torque_nm": found.torque_nm.tolist(),
+        "torque_size_nm": found.torque_size_nm.tolist(),
         "hand": found.hand,
-        "hand_rms_mm": 1e3 * found.hand_rms_m,
-        "hand_max_mm": 1e3 * found.hand_max_m,
-        "others": list(found.others),
-        "lines": difference_lines(found),
+        "hand_rms_m": found.hand_rms_m,
+        "hand_max_m": found.hand_max_m,
+        "summary": difference_summary(found),
     }

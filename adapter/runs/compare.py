@@ -1,26 +1,26 @@
-"""Two models of one arm, joint by joint: what moved, by how much, what of it data could show."""
+"""Two models of one arm: each thing that differs, and what it alone does."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.active import lasting_effects, with_bodies
+from adapter.effects.active import Active, lasting_effects, with_bodies
 from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
 from adapter.gap.load import hand_frame
-from adapter.model.inertia import PARAMETERS, body_from_theta
+from adapter.model.inertia import body_from_theta
 from adapter.model.locking import LOCKED
 from adapter.model.onto import SAME_PLACE
 from adapter.model.robots import names as robot_names
-from adapter.model.self_model import SelfModel, link_theta
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, log_rotation
 from adapter.model.urdf import model_from_urdf
-from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.physics.identifiability import BODY_SIZE, base_parameters, frame_observability
 from adapter.physics.kernels import frames_of, place_frames
 
 MOTION_S, STEP_S, EVERY = 8.0, 1e-3, 20  # motion that torques are compared on; rows between poses
@@ -29,52 +29,50 @@ FREE_RAD, FREE_RAD_S = 1.5, 1.0  # of a joint whose limits nobody knows
 SHARE = 0.45  # of the range and of the documented speed
 SAME = 1e-9  # of a number's size, rad and m: rounding
 HIDDEN = 1e-3  # share of a difference that data could show, below which none could
+SIGNIFICANT = 4.0  # standard deviations: the largest of a body's ten numbers is rarely above it
+NOTHING = 1e-6  # N m and m: a change that does no more does nothing
+FRAME, BODY, GRAVITY, TOOL = "frame", "body", "gravity", "tool"
 
 
 @dataclass(frozen=True)
-class JointDifference:
-    """What differs at a joint and the link that it moves, second model less first.
+class Change:
+    """One thing that differs, second model less first.
 
     Attributes:
-        joint, link: their names.
-        turn_rad, shift_m: of the joint's frame in its parent's.
-        frame_z: largest difference in standard deviations; None where there are none.
-        frame_shown: whether motion of links or torques could show it.
-        mass, com, inertia: (before, after): kg, m and kg m² about the centre, in the link's frame.
-        body_z: as `frame_z`, of the ten parameters; body_parameter: the one that differs most.
-        body_shown: share of the difference that torques could show, 0 to 1.
-        effects: by effect and parameter "effect.key": (before, after, z), None where there is none.
-        torque_rms_nm: of the difference over the motion; torque_size_nm: of the first's torque.
+        what: FRAME of a joint, BODY of a link, GRAVITY, TOOL, or the name of an effect.
+        joint, link: names of the joint and of the link that it moves; "" of the whole arm.
+        values: by what is told, (before, after); None where one model has it not. Of a frame
+            "turn_rad" and "shift_m" in its parent's, from zero; of a body "mass_kg", "com_m" and
+            "inertia_kg_m2" (about the centre), in the link's frame; of an effect its parameters.
+        units: of the values, by the same keys.
+        z: the largest difference in standard deviations, of a body in what torques show of it;
+            None where there are none.
+        shown: share of the difference that data could show, 0 to 1.
+        torque_nm: rms of what it alone does to the torque of the joint that it tells on most, of a
+            body with standard deviations what torques show of it; torque_joint: that joint.
+        hand_m: rms of how far it alone moves the hand.
     """
 
-    joint: str
-    link: str
-    turn_rad: float
-    shift_m: float
-    frame_z: float | None
-    frame_shown: bool
-    mass: tuple[float, float]
-    com: tuple[Array, Array]
-    inertia: tuple[Array, Array]
-    body_z: float | None
-    body_parameter: str
-    body_shown: float
-    effects: Mapping[str, tuple[float | None, float | None, float | None]]
-    torque_rms_nm: float
-    torque_size_nm: float
+    what: str
+    joint: str = ""
+    link: str = ""
+    values: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    z: float | None = None
+    shown: float = 1.0
+    torque_nm: float = 0.0
+    torque_joint: str = ""
+    hand_m: float = 0.0
 
     @property
-    def frame_moved(self) -> bool:
-        """Whether the frame is elsewhere."""
-        return max(self.turn_rad, self.shift_m) > SAME_PLACE
+    def significant(self) -> bool:
+        """Whether it is more than noise, as far as that is known."""
+        return self.z is None or self.z >= SIGNIFICANT
 
     @property
-    def body_changed(self) -> bool:
-        """Whether the link weighs otherwise."""
-        return any(
-            not np.allclose(a, b, rtol=SAME, atol=SAME)
-            for a, b in (self.mass, self.com, self.inertia)
-        )
+    def matters(self) -> bool:
+        """Whether it does anything to torques or to the hand's place."""
+        return max(self.torque_nm, self.hand_m) > NOTHING
 
 
 @dataclass(frozen=True)
@@ -82,17 +80,23 @@ class ModelDifference:
     """Two models beside each other.
 
     Attributes:
-        names: of the two; joints: one for each.
-        hand: of the frame whose place is compared, hand_rms_m and hand_max_m over the poses.
-        others: gravity, tool and effects without a joint, in words.
+        names: of the two; joints: names of the joints.
+        changes: what does most to torques and to the hand's place first.
+        torque_nm: (n,) rms of the difference of torques; torque_size_nm: of the first's torques.
+        hand: the frame whose place is compared; hand_rms_m, hand_max_m: how far it is elsewhere.
     """
 
     names: tuple[str, str]
-    joints: tuple[JointDifference, ...]
+    joints: tuple[str, ...]
+    changes: tuple[Change, ...]
+    torque_nm: Array
+    torque_size_nm: Array
     hand: str
     hand_rms_m: float
     hand_max_m: float
-    others: tuple[str, ...] = field(default=())
+
+
+Variant = tuple[Change, SelfModel]  # a change, and the first model with this change alone
 
 
 def documentation_of(model: SelfModel) -> SelfModel:
@@ -116,6 +120,8 @@ def documentation_of(model: SelfModel) -> SelfModel:
 def compare(first: SelfModel, second: SelfModel, seed: int = 0) -> ModelDifference:
     """What differs from one model to another of the same tree.
 
+    What effects do to bodies and to gravity (a payload, a tilt) is told as these.
+
     Args:
         first, second: models of one arm on a fixed base.
         seed: of the motion over which torques and the hand's places are compared.
@@ -124,35 +130,57 @@ def compare(first: SelfModel, second: SelfModel, seed: int = 0) -> ModelDifferen
         ModelError: other trees; names the difference.
     """
     _check_trees(first, second)
+    first, second = with_bodies(first), with_bodies(second)
     motion = _motion(first, seed)
-    torques = [ModelTorque(model)(*motion) for model in (first, second)]
-    change, size = (np.sqrt(np.mean(x**2, axis=0)) for x in (torques[1] - torques[0], torques[0]))
-    hands = np.stack([_hand(model, motion[0][::EVERY]) for model in (first, second)])
-    apart = np.linalg.norm(hands[1] - hands[0], axis=1)
-    frames, bodies = _frames(first, second), _bodies(first, second)
-    effects = _effects(first, second)
-    joints = tuple(
-        JointDifference(
-            joint=first.tree.joint_names[j],
-            link=first.tree.link_names[j],
-            effects=effects.get(j, {}),
-            torque_rms_nm=float(change[j]),
-            torque_size_nm=float(size[j]),
-            **frames[j],
-            **bodies[j],
-        )
-        for j in range(first.tree.n)
-    )
-    rms = float(np.sqrt(np.mean(apart**2)))
-    names = first.name, second.name
+    torque, hand = ModelTorque(first)(*motion), _hand(first, motion[0][::EVERY])
+    joints = first.tree.joint_names
+
+    def done(model: SelfModel) -> tuple[Array, Array]:
+        """Rms (n,) of what another model does to torques; distances (poses,) of the hand."""
+        apart = _hand(model, motion[0][::EVERY]) - hand
+        error = ModelTorque(model)(*motion) - torque
+        return np.sqrt(np.mean(error**2, axis=0)), np.linalg.norm(apart, axis=1)
+
+    changes = []
+    for change, alone in _variants(first, second):
+        rms, apart = done(alone)
+        most, way = int(np.argmax(rms)), float(np.sqrt(np.mean(apart**2)))
+        change = replace(change, torque_nm=float(rms[most]), torque_joint=joints[most], hand_m=way)
+        changes.append(change)
+    rms, apart = done(second)
+    size = np.sqrt(np.mean(torque**2, axis=0))
+    reach_m = float(np.linalg.norm(hand, axis=1).max())
     return ModelDifference(
-        names,
+        (first.name, second.name),
         joints,
-        hand_frame(first).name,
+        tuple(_ranked(changes, max(float(size.max()), NOTHING), max(reach_m, NOTHING))),
         rms,
+        size,
+        hand_frame(first).name,
+        float(np.sqrt(np.mean(apart**2))),
         float(apart.max()),
-        _others(first, second, effects),
     )
+
+
+def _ranked(changes: list[Change], torque_nm: float, reach_m: float) -> list[Change]:
+    """What does most first, against the arm's largest torque (rms) and its reach."""
+    return sorted(changes, key=lambda c: -(c.torque_nm / torque_nm + c.hand_m / reach_m))
+
+
+def _variants(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
+    """All that differs."""
+    yield from _frames(first, second)
+    yield from _bodies(first, second)
+    yield from _effects(first, second)
+    if not np.allclose(first.gravity, second.gravity):
+        pair = {GRAVITY: (first.gravity, second.gravity)}
+        turned = replace(first, gravity=second.gravity)
+        yield Change(GRAVITY, values=pair, units={GRAVITY: "m/s²"}), turned
+    tools = tuple(model.theta_with_tool() - model.theta for model in (first, second))
+    if not np.allclose(tools[0], tools[1], rtol=SAME, atol=SAME):
+        masses = tuple(float(theta[:, 0].sum()) for theta in tools)
+        values = {"mass_kg": (masses[0], masses[1])}
+        yield Change(TOOL, values=values, units={"mass_kg": "kg"}), replace(first, tool=second.tool)
 
 
 def _check_trees(first: SelfModel, second: SelfModel) -> None:
@@ -203,107 +231,104 @@ def _hand(model: SelfModel, q: Array) -> Array:
 
 def _z(change: Array, *stds: Array) -> float | None:
     """Largest |change| in standard deviations of two models; None where neither has any."""
-    known = [np.nan_to_num(std) for std in stds]
-    std = np.sqrt(sum(x**2 for x in known))
+    std = np.sqrt(sum(np.nan_to_num(std) ** 2 for std in stds))
     has = std > 0.0
     return float(np.max(np.abs(change[has]) / std[has])) if has.any() else None
 
 
-def _frames(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
-    """Of each joint what `JointDifference` says of its frame."""
+def _frames(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
+    """Joints whose frames are elsewhere."""
     R, to_R = first.joint_rotation(), second.joint_rotation()
     p, to_p = first.lam[:, 3:], second.lam[:, 3:]
     turn, shift = log_rotation(to_R @ np.swapaxes(R, 1, 2)), to_p - p
     freedom = frame_observability(first.tree, first.lam, first.gravity).freedom
     near_R, near_p = freedom.nearest(R, p, to_R, to_p)
-    left = np.hypot(
-        np.linalg.norm(log_rotation(to_R @ np.swapaxes(near_R, 1, 2)), axis=1),
-        np.linalg.norm(to_p - near_p, axis=1),
-    )
-    found = []
-    for j in range(first.tree.n):
-        change = np.r_[turn[j], shift[j]]
-        found.append(
-            {
-                "turn_rad": float(np.linalg.norm(turn[j])),
-                "shift_m": float(np.linalg.norm(shift[j])),
-                "frame_z": _z(change, first.lam_std[j], second.lam_std[j]),
-                "frame_shown": bool(left[j] > max(HIDDEN * np.linalg.norm(change), SAME)),
-            }
-        )
-    return found
-
-
-def _bodies(first: SelfModel, second: SelfModel) -> list[dict[str, Any]]:
-    """Of each link what `JointDifference` says of its body."""
-    wholes = [with_bodies(model) for model in (first, second)]
-    a, b = (link_theta(whole) for whole in wholes)
-    shown, size = _shown_part(first, a, b - a)
-    found = []
-    for j in range(first.tree.n):
-        (_, *before), (_, *after) = body_from_theta(a[j]), body_from_theta(b[j])
-        apart = (b - a)[j] / size[j]
-        share = min(float(np.linalg.norm(shown[j])) / max(float(np.linalg.norm(apart)), SAME), 1.0)
-        found.append(
-            {
-                "mass": (float(a[j, 0]), float(b[j, 0])),
-                "com": (before[0], after[0]),
-                "inertia": (before[1], after[1]),
-                "body_z": _z((b - a)[j], first.theta_std[j], second.theta_std[j]),
-                "body_parameter": PARAMETERS[int(np.argmax(np.abs(apart)))],
-                "body_shown": float(share) if share > HIDDEN else 0.0,
-            }
-        )
-    return found
-
-
-def _shown_part(model: SelfModel, theta: Array, change: Array) -> tuple[Array, Array]:
-    """(n, 10) what torques show of a change of θ, in units of the links' sizes, and these (n, 10).
-
-    Of all changes that torques cannot tell from it the smallest one.
-    """
-    mass = np.maximum(theta[:, :1], 1e-3 * np.abs(theta[:, 0]).max())
-    size = np.hstack([mass, np.repeat(0.1 * mass, 3, 1), np.repeat(0.01 * mass, 6, 1)])
-    basis = base_parameters(model.tree, model.lam, model.gravity).basis * size.reshape(-1, 1)
-    rows = np.linalg.qr(basis)[0]
-    scaled = (change / size).ravel()
-    return (rows @ (rows.T @ scaled)).reshape(size.shape), size
-
-
-def _effects(
-    first: SelfModel, second: SelfModel
-) -> dict[int, dict[str, tuple[float | None, float | None, float | None]]]:
-    """By joint (-1: none) the numbers of effects that differ, before and after, with z."""
-    tables: list[dict[tuple[int, str], tuple[float, float]]] = []
-    for model in (first, second):
-        numbers: dict[tuple[int, str], tuple[float, float]] = {}
-        for active in lasting_effects(model.effects, model.tree.n):
-            for key, value in active.values.items():
-                if np.ndim(value) == 0:
-                    at = active.joint, f"{active.effect.name}.{key}"
-                    numbers[at] = float(value), float(active.std.get(key) or 0.0)
-        tables.append(numbers)
-    found: dict[int, dict[str, tuple[float | None, float | None, float | None]]] = {}
-    for at in sorted(tables[0].keys() | tables[1].keys()):
-        a, b = (table.get(at) for table in tables)
-        if a is not None and b is not None and abs(b[0] - a[0]) <= SAME * abs(a[0]):
+    left_turn = np.linalg.norm(log_rotation(to_R @ np.swapaxes(near_R, 1, 2)), axis=1)
+    left = np.hypot(left_turn, np.linalg.norm(to_p - near_p, axis=1))
+    for j, (joint, link) in enumerate(_names(first)):
+        ways = float(np.linalg.norm(turn[j])), float(np.linalg.norm(shift[j]))
+        if max(ways) <= SAME_PLACE:
             continue
-        std = np.array([x[1] for x in (a, b) if x is not None])
-        change = (b[0] if b else 0.0) - (a[0] if a else 0.0)
-        z = _z(np.array([change]), np.array([np.linalg.norm(std)]))
-        found.setdefault(at[0], {})[at[1]] = (a and a[0], b and b[0], z)
-    return found
+        z = _z(np.r_[turn[j], shift[j]], first.lam_std[j], second.lam_std[j])
+        shown = float(left[j] > max(HIDDEN * np.hypot(*ways), SAME))
+        values = {"turn_rad": (0.0, ways[0]), "shift_m": (0.0, ways[1])}
+        lam = first.lam.copy()
+        lam[j] = second.lam[j]
+        units = {"turn_rad": "rad", "shift_m": "m"}
+        yield Change(FRAME, joint, link, values, units, z, shown), replace(first, lam=lam)
 
 
-def _others(
-    first: SelfModel, second: SelfModel, effects: Mapping[int, Mapping[str, Any]]
-) -> tuple[str, ...]:
-    """Gravity, tool and effects of the whole arm, where they differ, in words."""
-    found = []
-    if not np.allclose(first.gravity, second.gravity):
-        pair = (" ".join(f"{x:.3g}" for x in model.gravity) for model in (first, second))
-        found.append("gravity [{}] -> [{}] m/s²".format(*pair))
-    masses = [0.0 if model.tool is None else model.tool.mass for model in (first, second)]
-    if masses[0] != masses[1]:
-        found.append(f"tool {masses[0]:.3f} -> {masses[1]:.3f} kg")
-    return (*found, *(f"{key} {a} -> {b}" for key, (a, b, _) in effects.get(-1, {}).items()))
+def _bodies(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
+    """Links that weigh otherwise."""
+    change = second.theta - first.theta
+    shown_map = base_parameters(first.tree, first.lam, first.gravity).shown_map()
+    shown = (shown_map @ change.ravel()).reshape(change.shape)
+    units = {"mass_kg": "kg", "com_m": "m", "inertia_kg_m2": "kg m²"}
+    for j, (joint, link) in enumerate(_names(first)):
+        before, after = body_from_theta(first.theta[j]), body_from_theta(second.theta[j])
+        pairs = list(zip(before, after, strict=True))
+        if all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
+            continue
+        part, whole = (float(np.linalg.norm(x[j] / BODY_SIZE)) for x in (shown, change))
+        share = min(part / whole, 1.0)
+        share = share if share > HIDDEN else 0.0
+        z = _z(shown[j], first.theta_std[j], second.theta_std[j]) if share else None
+        theta = first.theta.copy()
+        theta[j] += change[j] if z is None else shown[j]  # what is noise cancels in torques
+        values = dict(zip(units, pairs, strict=True))
+        yield Change(BODY, joint, link, values, units, z, share), replace(first, theta=theta)
+
+
+def _names(model: SelfModel) -> Iterator[tuple[str, str]]:
+    """Names of each joint and of the link that it moves."""
+    return zip(model.tree.joint_names, model.tree.link_names, strict=True)
+
+
+def _effects(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
+    """Effects whose numbers differ, by joint."""
+    tables, n = [], first.tree.n
+    for model in (first, second):
+        table: dict[tuple[int, str], list[Active]] = {}
+        for active in lasting_effects(model.effects, n):
+            table.setdefault((active.joint, active.effect.name), []).append(active)
+        tables.append(table)
+    names = [*_names(first), ("", "")]  # the last of what has no joint
+    for at in sorted(tables[0].keys() | tables[1].keys()):
+        was, now = (table.get(at, []) for table in tables)
+        before, after = ({k: v for a in found for k, v in a.values.items()} for found in (was, now))
+        values = {
+            key: (before.get(key), after.get(key))
+            for key in before | after
+            if not _same(before.get(key), after.get(key))
+        }
+        if not values:
+            continue
+        std = [{k: s for a in found for k, s in a.std.items()} for found in (was, now)]
+        units = (was or now)[0].effect.units()
+        others = [a for key, found in tables[0].items() if key != at for a in found]
+        changed = replace(first, effects=tuple(_entry(a) for a in (*others, *now)))
+        yield Change(at[1], *names[at[0]], values, units, _largest_z(values, *std)), changed
+
+
+def _same(a: Any, b: Any) -> bool:
+    return a is not None and b is not None and np.allclose(a, b, rtol=SAME, atol=0.0)
+
+
+def _largest_z(
+    values: Mapping[str, tuple[Any, Any]], *stds: Mapping[str, float | None]
+) -> float | None:
+    """Largest difference of numbers in standard deviations; a number that is not there is zero."""
+    found = [
+        _z(
+            np.atleast_1d(np.subtract(0.0 if b is None else b, 0.0 if a is None else a)),
+            *(np.atleast_1d(np.asarray(std.get(key) or 0.0, dtype=float)) for std in stds),
+        )
+        for key, (a, b) in values.items()
+    ]
+    return max((z for z in found if z is not None), default=None)
+
+
+def _entry(active: Active) -> dict[str, Any]:
+    """Of a model file."""
+    joints = {"joints": [active.joint + 1]} if active.joint >= 0 else {}
+    return {"effect": active.effect.name, "parameters": dict(active.values), **joints}

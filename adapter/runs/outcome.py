@@ -229,8 +229,6 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
     known = outcome.theta_started_ns is not None
     theta, said = completed_theta(outcome, documented, completed.lam, base.basis)
-    body = outcome.covariance.diagonal()[: 10 * (bodies + 1)].reshape(-1, 10)
-    body = body[np.r_[: bodies - 1, bodies]] if outcome.spare_in_use else body[:bodies]
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -239,7 +237,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
-        theta_std=np.sqrt(body) if known else np.full((bodies, 10), np.nan),
+        theta_std=_shown_std(outcome, base) if known else np.full((bodies, 10), np.nan),
         theta_identifiable=(share > SHOWN_SHARE) & known,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
@@ -250,6 +248,16 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
             "changes": changes(outcome),
         },
     )
+
+
+def _shown_std(outcome: Outcome, base: BaseParameters) -> Array:
+    """Standard deviations (bodies, 10) of what torques show of θ; the rest is documentation."""
+    used = np.arange(len(base.basis) // 10)
+    used[-1] += outcome.spare_in_use
+    at = (10 * used[:, None] + np.arange(10)).ravel()
+    shown = base.shown_map()
+    variance = np.einsum("ai,ij,aj->a", shown, outcome.covariance[np.ix_(at, at)], shown)
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0))).reshape(-1, 10)
 
 
 def shown_parameters(outcome: Outcome, documented: SelfModel, lam: Array) -> BaseParameters:

@@ -98,8 +98,9 @@ def test_the_model_knows_the_hand_as_well_as_its_load_is_known() -> None:
     learner = with_load(1.0).learner
     theta, model = learner.theta, learned_model(collect(learner), panda_model())
     std = np.sqrt(theta.covariance().diagonal())
-    assert np.allclose(model.theta_std[-1], std[theta.spare])
-    assert np.allclose(model.theta_std[:-1].ravel(), std[: theta.hand.start])
+    alone = model.theta_identifiable[-1]  # of the others it is that of what torques show
+    assert alone.sum() >= 5
+    np.testing.assert_allclose(model.theta_std[-1][alone], std[theta.spare][alone], rtol=0.01)
     assert not np.allclose(std[theta.spare], std[theta.hand], rtol=0.02)
 
 

@@ -14,10 +14,10 @@ from adapter.errors import ModelError
 from adapter.model.locking import locked
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
-from adapter.model.self_model import SelfModel
+from adapter.model.self_model import SelfModel, Tool
 from adapter.model.spatial import exp_rotation, zxz_from_matrix
-from adapter.report.difference_words import difference_json, difference_lines
-from adapter.runs.compare import compare, documentation_of
+from adapter.report.difference_words import difference_json, difference_rows, difference_summary
+from adapter.runs.compare import Change, ModelDifference, compare, documentation_of
 
 PANDA = documented("panda")
 
@@ -38,21 +38,30 @@ def heavier(change: dict[tuple[int, int], float]) -> SelfModel:
     return replace(PANDA, theta=theta)
 
 
+def only(found: ModelDifference) -> Change:
+    """The one change that there is."""
+    (change,) = found.changes
+    return change
+
+
 def test_a_model_is_the_same_as_itself() -> None:
     found = compare(PANDA, PANDA)
-    assert difference_lines(found) == ["panda and panda are the same"]
-    assert found.hand_max_m == 0.0 and not any(joint.torque_rms_nm for joint in found.joints)
+    assert not difference_rows(found)
+    assert difference_summary(found) == ["panda and panda are the same"]
+    assert found.hand_max_m == 0.0 and not found.torque_nm.any()
 
 
 def test_a_frame_that_moved_moves_the_hand() -> None:
     found = compare(PANDA, bent(3, [0.0, 0.02, 0.0], [0.0, 0.0, 0.004]))
-    moved = [joint for joint in found.joints if joint.frame_moved]
-    assert [joint.joint for joint in moved] == ["panda_joint4"]
-    assert moved[0].turn_rad == pytest.approx(0.02) and moved[0].shift_m == pytest.approx(0.004)
-    assert moved[0].frame_shown and moved[0].frame_z is None
-    assert 0.004 < found.hand_rms_m < 0.02 * 0.7 + 0.004 and found.joints[1].torque_rms_nm > 0.01
-    line = difference_lines(found)[0]
-    assert line == "panda_joint4: frame turned by 1.15° and moved by 4 mm"
+    moved = only(found)
+    assert moved.what == "frame" and moved.joint == "panda_joint4" and moved.link == "panda_link4"
+    assert moved.values["turn_rad"][1] == pytest.approx(0.02)
+    assert moved.values["shift_m"][1] == pytest.approx(0.004)
+    assert moved.shown == 1.0 and moved.z is None
+    assert 0.004 < found.hand_rms_m < 0.02 * 0.7 + 0.004 and found.torque_nm[1] > 0.01
+    assert moved.hand_m == found.hand_rms_m and moved.torque_nm == found.torque_nm.max()
+    row = difference_rows(found)[0]
+    assert row[:3] == ("panda_joint4 frame", "turned by 1.15°, moved by 4 mm", "-")
 
 
 def test_what_no_motion_shows_is_said() -> None:
@@ -62,41 +71,79 @@ def test_what_no_motion_shows_is_said() -> None:
         (bent(1, [0.0, 0.0, 0.0], [0.0, 0.0, 0.01]), "panda_joint2"),
     ):
         found = compare(PANDA, model)
-        (moved,) = [joint for joint in found.joints if joint.frame_moved]
-        assert moved.joint == name and not moved.frame_shown
-        assert "no data can show it" in difference_lines(found)[0]
-        assert max(joint.torque_rms_nm for joint in found.joints) < 1e-9
+        moved = only(found)
+        assert moved.joint == name and not moved.shown
+        assert "data can show none of it" in difference_rows(found)[0][1]
+        assert found.torque_nm.max() < 1e-9
         assert found.hand_max_m > 5e-3  # and yet the hand is elsewhere
 
 
 def test_masses_that_no_torque_shows_are_said() -> None:
-    hidden = compare(PANDA, heavier({(0, 0): 1.0})).joints[0]
-    assert hidden.body_changed and not hidden.body_shown and hidden.torque_rms_nm < 1e-9
-    shown = compare(PANDA, heavier({(6, 0): 0.5}))
-    assert shown.joints[6].body_shown and shown.joints[6].body_parameter == "m"
-    assert shown.joints[1].torque_rms_nm > 1.0 and shown.hand_max_m == 0.0
-    assert "panda_link7 0.7355 -> 1.236 kg" in difference_lines(shown)[0]
+    found = compare(PANDA, heavier({(0, 0): 1.0}))
+    hidden = only(found)
+    assert hidden.what == "body" and not hidden.shown and hidden.torque_nm < 1e-9
+    assert not difference_rows(found)
+    assert "the hand stays: panda_link1 body" in difference_summary(found)[-1]
+    found = compare(PANDA, heavier({(6, 0): 0.5}))
+    assert only(found).shown and found.torque_nm[1] > 1.0 and found.hand_max_m == 0.0
+    assert difference_rows(found)[0][1].startswith("0.7355 -> 1.236 kg")
+
+
+def test_what_does_most_stands_first() -> None:
+    theta = heavier({(6, 0): 0.5, (3, 0): 1e-3}).theta
+    model = replace(bent(5, [0.0, 0.0, 0.0], [0.0, 5e-4, 0.0]), theta=theta)
+    found = compare(PANDA, model)
+    names = [row[0] for row in difference_rows(found)]
+    assert names == ["panda_link7 body", "panda_joint6 frame", "panda_link4 body"]
+    assert found.changes[0].torque_joint == "panda_joint2"
 
 
 def test_standard_deviations_count() -> None:
-    std = np.full((7, 10), 0.1)
-    model = replace(heavier({(6, 0): 0.5}), theta_std=std, lam_std=np.full((7, 6), 1e-3))
-    found = compare(replace(PANDA, theta_std=std), model).joints[6]
-    assert found.body_z == pytest.approx(0.5 / np.hypot(0.1, 0.1))
+    """A body is judged by what torques show: mass put where they show it whole."""
+    std = np.full((7, 10), 0.01)
+    model = replace(heavier({(6, 1): 0.2}), theta_std=std)
+    assert only(compare(replace(PANDA, theta_std=std), model)).z == pytest.approx(
+        0.2 / np.hypot(0.01, 0.01), rel=1e-6
+    )
     moved = replace(bent(3, [0.0, 0.0, 0.0], [0.0, 0.004, 0.0]), lam_std=np.full((7, 6), 1e-3))
-    assert compare(PANDA, moved).joints[3].frame_z == pytest.approx(4.0)
+    assert only(compare(PANDA, moved)).z == pytest.approx(4.0)
+
+
+def test_noise_is_one_sentence() -> None:
+    noise = replace(heavier({(6, 1): 0.02}), theta_std=np.full((7, 10), 0.01))
+    found = compare(PANDA, noise)
+    assert only(found).z == pytest.approx(2.0, rel=1e-6) and not difference_rows(found)
+    assert difference_summary(found)[-1] == (
+        "not listed: 1 by less than 4 standard deviations (body 1)"
+    )
 
 
 def test_effects_are_compared() -> None:
     rubs = {"effect": "coulomb_friction", "joints": [2, 3], "parameters": {"Fc": [0.4, 0.3]}}
     more = {**rubs, "parameters": {"Fc": [0.4, 0.5]}, "std": {"Fc": [0.01, 0.02]}}
-    found = compare(replace(PANDA, effects=(rubs,)), replace(PANDA, effects=(more,)))
-    assert not found.joints[1].effects
-    assert found.joints[2].effects["coulomb_friction.Fc"] == (0.3, 0.5, pytest.approx(10.0))
-    assert found.joints[2].torque_rms_nm == pytest.approx(0.2, rel=0.05)
+    change = only(compare(replace(PANDA, effects=(rubs,)), replace(PANDA, effects=(more,))))
+    assert (change.what, change.joint) == ("coulomb_friction", "panda_joint3")
+    assert change.values == {"Fc": (0.3, 0.5)} and change.z == pytest.approx(10.0)
+    assert change.torque_joint == "panda_joint3"
+    assert change.torque_nm == pytest.approx(0.2, rel=0.05)
     gone = compare(replace(PANDA, effects=(rubs,)), PANDA)
-    assert "coulomb_friction.Fc 0.3 -> none" in difference_lines(gone)[1]
+    assert ("panda_joint3 coulomb_friction", "Fc 0.3 -> none N m") in [
+        row[:2] for row in difference_rows(gone)
+    ]
     json.dumps(difference_json(gone), allow_nan=False)
+
+
+def test_gravity_tool_and_load_are_compared() -> None:
+    """A load is told as the body that it makes heavier."""
+    load = {"effect": "payload", "parameters": {"m": 0.5, "cx": 0.0, "cy": 0.0, "cz": 0.1}}
+    tool = Tool(0.8, np.zeros(3), np.diag([1e-3, 1e-3, 1e-3]))
+    wall = np.array([9.81, 0.0, 0.0])
+    found = compare(PANDA, replace(PANDA, effects=(load,), tool=tool, gravity=wall))
+    assert {change.what for change in found.changes} == {"body", "tool", "gravity"}
+    said = {row[0]: row[1] for row in difference_rows(found)}
+    assert said["gravity"] == "0 0 -9.81 -> 9.81 0 0 m/s²"
+    assert said["tool"] == "mass_kg 0 -> 0.8 kg"
+    assert said["panda_link7 body"].startswith("0.7355 -> 1.236 kg")
 
 
 def test_other_trees_are_refused() -> None:
@@ -114,10 +161,12 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     path = str(save_model(heavier({(6, 0): 0.5}), tmp_path / "learned.json"))
     assert main(["diff", path, "--json", "-"]) == 0  # against its documentation
     said = capsys.readouterr()
-    assert json.loads(said.out)["joints"][6]["mass_kg"] == pytest.approx([0.7355, 1.2355], abs=1e-4)
-    assert "panda_link7 0.7355 -> 1.236 kg" in said.err
+    assert json.loads(said.out)["changes"][0]["values"]["mass_kg"] == pytest.approx(
+        [0.7355, 1.2355], abs=1e-4
+    )
+    assert "panda_link7 body" in said.err and "0.7355 -> 1.236 kg" in said.err
     assert main(["diff", "panda", path, "--json", str(tmp_path / "diff.json")]) == 0
-    assert json.loads((tmp_path / "diff.json").read_text())["hand_max_mm"] == 0.0
+    assert json.loads((tmp_path / "diff.json").read_text())["hand_max_m"] == 0.0
     for wrong, told in (
         (["diff", path, "pnada"], "panda"),
         (["diff", path, "panda", "--lock", "thumb=1"], "thumb"),
