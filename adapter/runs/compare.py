@@ -261,7 +261,7 @@ def _frames(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
 def _bodies(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
     """Links that weigh otherwise."""
     change = second.theta - first.theta
-    shown_map = base_parameters(first.tree, first.lam, first.gravity).shown_map()
+    shown_map = base_parameters(second.tree, second.lam, second.gravity).shown_map()
     shown = (shown_map @ change.ravel()).reshape(change.shape)
     units = {"mass_kg": "kg", "com_m": "m", "inertia_kg_m2": "kg m²"}
     for j, (joint, link) in enumerate(_names(first)):
