@@ -20,7 +20,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
-VERSION = 4
+VERSION = 5
 MORE = "schema.more."  # before the names of what some kinds of schema hold
 
 # What each part would not be the same learner without. Everything else follows from the settings.
@@ -38,7 +38,8 @@ _STATE = {
             "_distance",
             "rank",
             "ranks",
-            "_calm",
+            "_calm_ns",
+            "_looked_ns",
             "converged",
             "_rough",
             "_then",

@@ -130,7 +130,7 @@ class OnlineLearner:
         each_sample = s.mode == Mode.SAMPLE
         rest = _resting_base(tree, gravity, known.arm)
         self.base = np.empty(0) if rest is None else rest.measured
-        self.schema = self._schema(rest, filtered.noise_gain, known.lam)
+        self.schema = self._schema(rest, known.lam)
         told = believed(known.effects, s.effects, tree.n)
         before = ThetaKnowledge(
             None if rest is None else rest.measured,
@@ -169,11 +169,11 @@ class OnlineLearner:
         moving = 12 if tree.floating else 0  # numbers of the base's motion
         self.score_trace = Trace(1 + 5 * tree.n + moving, capacity=12_000)
 
-    def _schema(self, rest: RestingBase | None, noise_gain: float, lam: Array | None) -> Schema:
+    def _schema(self, rest: RestingBase | None, lam: Array | None) -> Schema:
         s = self.settings
         if not s.schema.imus:
             each_sample = s.mode == Mode.SAMPLE
-            return Schema(self.tree, rest, s.schema, each_sample, noise_gain, s.seed)
+            return Schema(self.tree, rest, s.schema, each_sample, s.seed)
         if lam is None:
             raise SettingsError("sensors on links need a documented λ to start from")
         return ImuSchema(self.tree, rest, s.schema, lam)

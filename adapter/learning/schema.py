@@ -47,6 +47,13 @@ from adapter.signals.filters import THIRD_DIFFERENCE_GAIN
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout
 
 PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
+# Curvature that counts as shown where nothing but rounding (some 1e-6) disturbs it.
+SHOWN_EXACTLY = 1.0
+# Times that λ has to stand still for where something shown is not known yet. Without noise that is
+# soon over, unless a brake holds a joint.
+PATIENCE = 5
+LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
+EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
 FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
 LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
 # Where dw is carried by λ: samples between two looks at λ, and the turn (rad) in between that
@@ -74,8 +81,6 @@ class Schema:
         base: motion of a base that rests; of a floating one the states tell.
         settings: how it is learned.
         each_sample: learn from the newest sample alone, as the paper does.
-        noise_gain: correlated samples that one independent sample is worth, for synthesized
-            (filtered) motion; measured motion is white.
         seed: of the random start.
 
     Attributes:
@@ -98,14 +103,13 @@ class Schema:
         base: RestingBase | None,
         settings: SchemaSettings,
         each_sample: bool = False,
-        noise_gain: float = 1.0,
         seed: int = 0,
     ) -> None:
         n = tree.n
         self.settings, self.each_sample = settings, each_sample
         self.layout = StateLayout(n, tree.floating)
         self._parent = np.array(tree.parent, dtype=np.int64)
-        self._base, self._noise_gain = base, noise_gain
+        self._base = base
         rng = np.random.default_rng(seed)
         start = settings.start_rms * rng.normal(size=(n, 6))
         self.R0 = np.ascontiguousarray(exp_rotation(start[:, :3]))
@@ -127,7 +131,7 @@ class Schema:
         self._clean = np.zeros_like(self.moments.M)
         self.updates = 0
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
-        self._H, self._distance = np.zeros((n, 6, 6)), np.zeros((n, 2))
+        self._distance = np.zeros((n, 2))
         self.information = np.zeros((n, 6, 6))
         self.identifiable = np.zeros((n, 6, 6))
         # by directions that are known, and those that are not yet
@@ -135,9 +139,9 @@ class Schema:
         self.certain = np.zeros((n, 6, 6))
         self.rank = 0
         self.ranks, self._there = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
-        self.check = SchemaCheck(n, max(settings.stable_updates // settings.judge_every, 1))
+        self.check = SchemaCheck(n)
         self.started_anew: list[int] = []
-        self._calm = 0
+        self._calm_ns = self._looked_ns = 0
         self.converged = False
         self._rough, self._then = not settings.spin_measured, self.R0.copy()
 
@@ -195,7 +199,7 @@ class Schema:
         """Drop all samples; λ goes on from where it is."""
         for part in (self.moments.M, self.moments.noise_power, self.moments.counts):
             part[:] = 0.0
-        self._calm, self.converged = 0, False
+        self._calm_ns, self.converged = 0, False
 
     def _keep(self) -> float:
         """Forgetting factor per sample; one while the window would lose what it shows."""
@@ -277,16 +281,19 @@ class Schema:
         if self.kind == LinkMotionKind.MEASURED:
             clean = self._clean
             without_noise(self._parent, M, counts, self.noise_variance(), clean)
-        profiled(self._frames, M, self.count, clean, self.gradient, self._H)
+        profiled(self._frames, M, self.count, clean, self.gradient, self.information)
+
+    @property
+    def _exact(self) -> bool:
+        """Whether nothing but rounding disturbs what all moments say: synthesized motion."""
+        return self.kind == LinkMotionKind.DOCUMENTED and not self.each_sample
 
     def _judge(self) -> None:
         """Which directions the data show, how far the optimum is, whether λ has settled."""
-        gain = self._gain
-        self.information[:] = self._H / gain
-        values, vectors = np.linalg.eigh(self._H)
+        values, vectors = np.linalg.eigh(self.information)
         # noise alone makes eigenvalues of the size sqrt(count); 400 is a std of 0.05 rad or m
-        shown = values > max(400.0, 10.0 * np.sqrt(self.count))
-        certain = values > gain / self.settings.std_goal**2
+        least = SHOWN_EXACTLY if self._exact else max(400.0, 10.0 * np.sqrt(self.count))
+        shown, certain = values > least, values > 1.0 / self.settings.std_goal**2
         for k, kind in enumerate((shown & certain, shown & ~certain)):
             kept = vectors * kind[:, None, :]
             self._may_move[:, k] = kept @ kept.transpose(0, 2, 1)
@@ -295,40 +302,59 @@ class Schema:
         self.identifiable[:] = self._may_move.sum(axis=1)
         self.certain[:] = self._may_move[:, 0]
         self.rank, ranks = int(shown.sum()), (shown & certain).sum(axis=1)
-        step = np.abs(np.einsum("jab,jb->ja", self._inverse[:, 0], self.gradient))
-        std = np.sqrt(gain * np.einsum("jaa->ja", self._inverse[:, 0]))
-        s = self.settings
-        self._there = (step < np.maximum(s.distance_goal, std)).all(axis=1)
-        calm = self._there.all() and ranks.any() and bool((ranks == self.ranks).all())
-        if self.kind == LinkMotionKind.DOCUMENTED:  # no noise hides for long what is shown
-            calm = calm and self.rank == ranks.sum()
-        self._calm = self._calm + s.judge_every if calm else 0
+        same = ranks.any() and bool((ranks == self.ranks).all())
         self.ranks[:] = ranks
-        self._hold_unshown()
+        inverse = self._inverse.sum(axis=1) if self._exact else self._inverse[:, 0]
+        left = np.einsum("jab,jb->ja", inverse, self.gradient)
+        std = 0.0 if self._exact else np.sqrt(np.einsum("jaa->ja", inverse))
+        self._there = (np.abs(left) < np.maximum(self.settings.distance_goal, std)).all(axis=1)
+        looked_ns, self._looked_ns = self._looked_ns, int(self.moments.last_stamps[0])
+        since_ns = min(self._looked_ns - looked_ns, LONGEST_WAIT_NS)
+        self._calm_ns = self._calm_ns + since_ns if same and self._there.all() else 0
+        self._settle(left)
+
+    def _settle(self, left: Array) -> None:
+        """Mend what stands wrong, and say whether λ has converged, with (n, 6) left to go."""
+        if self._exact:
+            self._finish(left)
+        else:
+            self._hold_unshown()
+        checked = self.each_sample
         if not self.each_sample and not self._rough:
             self._check_valleys()
-        settled = self._calm >= self.settings.stable_updates and not self._rough
-        self.converged = settled and (self.each_sample or self.check.passed(self.ranks))
+            checked = self.check.passed(self.ranks)
+        calm = 1e-9 * self._calm_ns / self.settings.stable_s
+        settled = checked and calm >= 1.0 and not self._rough
+        if self._exact:  # no noise hides for long what is shown
+            known = self.rank == self.ranks.sum() or calm >= PATIENCE
+            settled = settled and known and bool(np.abs(left).max() < EXACT_DISTANCE)
+        self.converged = settled
 
-    @property
-    def _gain(self) -> float:
-        """Samples that one independent sample is worth."""
-        return self._noise_gain if self.kind == LinkMotionKind.DOCUMENTED else 1.0
+    def _finish(self, left: Array) -> None:
+        """Go the (n, 6) that is left at once where it is little and no noise moves it.
+
+        ADAM forgets the large gradients of its way too slowly to come close soon.
+        """
+        near = (np.abs(left) < self.settings.std_goal).all(axis=1)
+        self.R0[near] = self.R0[near] @ exp_rotation(-left[near, :3])
+        self.p[near] -= left[near, 3:]
+        self.gradient[near] = 0.0
 
     def _check_valleys(self) -> None:
         """Start joints anew that stand in a wrong valley; ADAM goes on from there."""
-        least = self._gain / self.settings.std_goal**2
+        least = 1.0 / self.settings.std_goal**2
         clean = self._clean if self.kind == LinkMotionKind.MEASURED else self.moments.M
-        for j in self.check.next_joints():
+        still = self._there & (self.ranks > 0)
+        urgent = self.ranks if self._calm_ns else None
+        for j in self.check.next_joints(urgent):
             sums = self.moments.M[j], clean[j]
-            still = bool(self._there[j] and self.ranks[j])
-            known = Evidence(*sums, self.count, int(self.ranks[j]), least, still)
+            known = Evidence(*sums, self.count, int(self.ranks[j]), least, bool(still[j]))
             start = Frame(matrix_from_zxz(self.start_lam[j, :3]), self.start_lam[j, 3:])
             found = self.check.better(j, Frame(self.R0[j].copy(), self.p[j].copy()), start, known)
             if found is not None:
                 self.R0[j], self.p[j], self.gradient[j] = found.R0, found.p, 0.0
                 self.started_anew.append(j)
-                self._calm = 0
+                self._calm_ns = 0
         if self.started_anew and not self.settings.spin_measured:
             self._carry_anew()
 
@@ -345,7 +371,7 @@ class Schema:
 
     def covariance(self) -> Array:
         """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""
-        return np.asarray(self._gain * self._inverse.sum(axis=1))
+        return np.asarray(self._inverse.sum(axis=1))
 
     def moved_from(self, R0: Array, p: Array) -> Array:
         """(n, 6) small turns and shifts (phi, d) from other frames to these, rad and m.

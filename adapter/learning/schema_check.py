@@ -25,6 +25,7 @@ from adapter.model.spatial import Array
 # Logarithms of what frames leave unexplained, summed over the channels.
 LEAST_PROGRESS = 0.2  # of ADAM on its way, from one look at a joint to the next
 CLEARLY_BETTER = 0.5
+LOOKS = 20  # until a joint's turn comes again
 AGAIN = 2.0  # a joint is checked again when there are so many times the samples
 
 
@@ -49,7 +50,7 @@ class SchemaCheck:
     """Looks at every joint once in so many looks, and rarely solves for one.
 
     Args:
-        n: joints; looks: until the first joint's turn comes again.
+        n: joints.
 
     Attributes:
         misfit: (n,) what each frame left unexplained when it was last looked at.
@@ -58,16 +59,22 @@ class SchemaCheck:
         restarts: joints that were started anew so far.
     """
 
-    def __init__(self, n: int, looks: int) -> None:
-        self.looks = looks
+    def __init__(self, n: int) -> None:
         self.misfit = np.full(n, np.inf)
         self.passed_at, self.passed_rank = np.zeros(n), np.full(n, -1)
         self.turn = self.restarts = 0
 
-    def next_joints(self) -> range:
-        """The joints that this look is at."""
-        joints = range(self.turn, len(self.misfit), self.looks)
-        self.turn = (self.turn + 1) % self.looks
+    def next_joints(self, ranks: np.ndarray | None) -> list[int]:
+        """The joints that this look is at.
+
+        Args:
+            ranks: (n,) directions shown where λ stands still, waiting for its check alone: then a
+                joint that has not been found right with them comes out of turn.
+        """
+        joints = list(range(self.turn, len(self.misfit), LOOKS))
+        self.turn = (self.turn + 1) % LOOKS
+        if ranks is not None:
+            joints += [int(j) for j in np.flatnonzero(self.passed_rank != ranks)[:1]]
         return joints
 
     def passed(self, ranks: np.ndarray) -> bool:

@@ -32,7 +32,7 @@ class SchemaSettings:
         judge_every: updates between two looks at curvature and identifiability.
         std_goal: standard deviation of a turn (rad) or shift (m) that counts as known.
         distance_goal: what of those may be left to the optimum when λ has converged.
-        stable_updates: for how many updates in a row that must hold.
+        stable_s: for how long that must hold, of motion.
         spin_measured: whether measured link motion has angular accelerations dw. Where not, the
             base's is carried along the tree by eq. 8d with the present λ, and moments made
             while λ still turned are dropped.
@@ -48,14 +48,14 @@ class SchemaSettings:
     judge_every: int = 10
     std_goal: float = 0.0025
     distance_goal: float = 2.5e-4
-    stable_updates: int = 200
+    stable_s: float = 0.2
     spin_measured: bool = True
     imus: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(set(self.imus)) < len(self.imus):
             raise SettingsError(f"schema.imus names a link twice: {', '.join(self.imus)}")
-        for name in ("rate", "share", "sample_rate", "start_rms", "judge_every"):
+        for name in ("rate", "share", "sample_rate", "start_rms", "judge_every", "stable_s"):
             if not getattr(self, name) > 0:
                 raise SettingsError(f"schema.{name} must be above zero, got {getattr(self, name)}")
         if self.forget_s is not None and self.forget_s < 0.05:

@@ -117,7 +117,7 @@ def learn(model: SelfModel, seed: int) -> Row:
     filtered = Filtered(front_end.filter.noise_gain, front_end.delay_s)
     learner = OnlineLearner(model.tree, model.gravity, LearnerSettings(seed=seed), filtered)
     schema = learner.schema
-    said, right_s, wrongly = None, None, 0
+    said, right_s, wrongly, worst = None, None, 0, 0.0
     for state in states:
         learner.learn_schema(state[None])
         if schema.updates % 20:
@@ -129,6 +129,7 @@ def learn(model: SelfModel, seed: int) -> Row:
         if schema.converged:
             said = said or now
             wrongly += not right
+            worst = max(worst, error)
         else:
             said = None
     return {
@@ -139,6 +140,7 @@ def learn(model: SelfModel, seed: int) -> Row:
         "right_s": right_s,
         "said_s": said,
         "said_wrongly": wrongly,
+        "worst_while_said": worst,
         "restarts": schema.check.restarts,
         "failed": error >= GOAL or said is None or wrongly > 0,
     }

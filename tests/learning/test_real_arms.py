@@ -70,6 +70,6 @@ def test_kuka(tmp_path: Path) -> None:
     urdf, path = folder / "kuka_lwr4.urdf", tmp_path / "kuka.mcap"
     give("import", folder / "measurements_1.npz", "--robot", urdf, "--to", path)
     figures = replayed(path, tmp_path, "--robot", urdf, "--validate-from", 18.0)
-    assert figures["lambda"]["converged_s"] < 4.0  # 200 samples a second, a second of them calm
+    assert figures["lambda"]["converged_s"] < 3.0
     error = np.array(figures["theta"]["validation_torque_rmse_nm"])
     assert (error < 0.5).all(), error  # N m, of torques of up to 60

@@ -105,7 +105,7 @@ def test_after_a_change_only_what_came_behind_it_is_rebuilt() -> None:
     learner._start_change(learner.stamp_ns)
     for k, state in enumerate(states()[3000:4500]):
         if k == 500:
-            learner.schema.p[3, 0] += 2e-3
+            learner.schema.p[3, 0] += 2e-2
         learner.step(state)
     assert learner.rebuilds > done and learner._shadow is None
     assert learner.theta.count == 1500
