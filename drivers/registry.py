@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from typing import Any
 
 from drivers.interface import Driver, DriverError
 
@@ -13,6 +14,7 @@ Builder = Callable[[str], Driver]
 LOG = "drivers.files.log:LogArm"  # takes (file, joint names)
 # Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
 HARDWARE = {"fci": "drivers.fci.arm:FciArm", "can": "drivers.damiao.arm:DamiaoArm"}
+COUNT = {"fci": "drivers.fci.arm:joint_count", "can": "drivers.damiao.settings:joint_count"}
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
 
@@ -55,8 +57,14 @@ def open_driver(
     return _load(HARDWARE[scheme])(address, joint_names, allow_motion)
 
 
-def _load(target: str) -> Callable[..., Driver]:
-    """The class that "MODULE:NAME" names."""
+def joint_count(address: str) -> int | None:
+    """Number of joints of an arm that tells no names; None where nothing says it."""
+    scheme, _ = split_address(address)
+    return None if scheme not in COUNT else _load(COUNT[scheme])(address)
+
+
+def _load(target: str) -> Callable[..., Any]:
+    """What "MODULE:NAME" names."""
     module, _, name = target.partition(":")
-    found: Callable[..., Driver] = getattr(import_module(module), name)
+    found: Callable[..., Any] = getattr(import_module(module), name)
     return found

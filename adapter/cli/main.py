@@ -123,8 +123,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MeansError as error:
         console.print(f"[red]error:[/] {error}", soft_wrap=True)
         return EXIT_NO_MEANS
-    except (DriverError, ValueError, OSError) as error:
-        # an OSError names the file or folder that cannot be read or written
+    except OSError as error:
+        told = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        console.print(f"[red]error:[/] {told}", soft_wrap=True)
+        return EXIT_WRONG_USE
+    except (DriverError, ValueError) as error:
         console.print(f"[red]error:[/] {error}", soft_wrap=True)
         return EXIT_WRONG_USE
     except KeyboardInterrupt:

@@ -18,7 +18,6 @@ from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config
 from adapter.runs.outcome import learned_model
 from adapter.runs.replay import (
-    FEWEST_FOR_NOISE,
     Replay,
     ReplayOptions,
     fitted_to,
@@ -97,7 +96,7 @@ def _figures(
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),
-        noise=noise_levels(log) if len(log) >= FEWEST_FOR_NOISE else None,
+        noise=noise_levels(log),
         gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
     )
 

@@ -34,6 +34,8 @@ def declare_export(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_export(args: argparse.Namespace) -> None:
+    if args.model.suffix != ".json":
+        raise UsageError(f"{args.model}: give a model file (.json), as run and replay write it")
     if args.onto is None:
         if args.urdf is None and args.mjcf is None:
             raise UsageError("nothing to write; have: --urdf FILE, --mjcf FILE, --onto INPUT")
@@ -45,6 +47,9 @@ def _check_export(args: argparse.Namespace) -> None:
     elif (args.urdf if args.onto.suffix == ".urdf" else args.mjcf) is None:
         other = "--urdf" if args.onto.suffix == ".urdf" else "--mjcf"
         raise UsageError(f"--onto {args.onto} is written by {other} FILE")
+    for option, path, other in (("--urdf", args.urdf, ".xml"), ("--mjcf", args.mjcf, ".urdf")):
+        if path is not None and path.suffix == other:
+            raise UsageError(f"{option} {path}: have: --urdf FILE.urdf, --mjcf FILE.xml")
     check_files(args.model, args.onto)
 
 

@@ -32,11 +32,11 @@ from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
 from adapter.runs.terminal import console, program_version, results_folder, warn
 from adapter.signals.front_end import FrontEnd
-from adapter.signals.matching import present
+from adapter.signals.matching import counted, present
 from drivers.faults.driver import FaultyDriver, with_faults
 from drivers.files.mcap import read_log
 from drivers.interface import Driver
-from drivers.registry import HARDWARE, open_driver, split_address
+from drivers.registry import HARDWARE, joint_count, open_driver, split_address
 
 EXIT_ARM, EXIT_LEARNER = 3, 4
 # Of the documented speed, so that 20 ms of a torque that is held, the longest a Franka robot puts
@@ -86,7 +86,10 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     if simulated(args.driver):
         builder = import_module(SIMULATED_BY)
         world = builder.simulation(args.driver, args.scenario, args.set, args.seed or 0)
-    robot, locked = present(robot, _joints_of_arm(args.driver, world), args.driver)
+    names = _joints_of_arm(args.driver, world) or counted(
+        robot, args.driver, joint_count(args.driver)
+    )
+    robot, locked = present(robot, names, args.driver)
     warn(locked)
     config = configure(args, None, robot)
     maybe_real = world is None and scheme in HARDWARE

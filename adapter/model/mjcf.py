@@ -103,6 +103,10 @@ def mjcf_onto(model: SelfModel, more: Additions, path: str | Path) -> tuple[str,
 
 def _compiled(path: str | Path, text: str | None = None) -> Any:
     """MuJoCo's model of a file, or of a text in its place."""
+    top = XmlText(file_text(path), str(path)).root.tag
+    if top != "mujoco":
+        is_urdf = "; a URDF's name ends in .urdf" if top == "robot" else ""
+        raise ModelError(f"{path}: top element is <{top}>, an MJCF has <mujoco>{is_urdf}")
     try:
         import mujoco
     except ImportError:
@@ -247,6 +251,15 @@ class MjcfFile:
         for k in range(m.neq):
             if m.eq_type[k] != EQUAL_JOINTS:
                 self.unused.append(f"equality '{m.equality(k).name or k}'")
+        for i, mocap in enumerate(m.body_mocapid):
+            self.unused += [f"mocap body '{self._name(i)}'"] if mocap >= 0 else []
+        for what, count in (
+            ("sensors", m.nsensor),
+            ("actuators, but for the torque that they can give,", m.nu),
+            ("flexible bodies", m.nflex),
+            ("keyframes", m.nkey),
+        ):
+            self.unused += [f"what it says of {what} ({count})"] if count else []
 
     def _theta(self, body: int) -> Array:
         """θ (10,) of a body in the frame of its link."""

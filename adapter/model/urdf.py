@@ -64,8 +64,10 @@ def file_text(path: str | Path) -> str:
     """A file's text, its line ends as they are. Raises ModelError."""
     try:
         return Path(path).read_bytes().decode("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: cannot be read as text ({error})") from None
+    except UnicodeDecodeError as error:
+        raise ModelError(f"{path}: not text in UTF-8 ({error}); save it as UTF-8") from None
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def parse_urdf(text: str, file: str) -> FileRobot:
@@ -78,6 +80,9 @@ def parse_urdf(text: str, file: str) -> FileRobot:
         root = ET.fromstring(text)
     except ET.ParseError as error:
         raise ModelError(f"{file}: not XML ({error})") from None
+    own = root.tag.rpartition("}")[0] + "}" if root.tag.startswith("{") else ""
+    for element in root.iter():  # without the namespace that a file may give all of it
+        element.tag = element.tag.removeprefix(own)
     if root.tag != "robot":
         raise ModelError(f"{file}: top element is <{root.tag}>, a URDF has <robot>")
     links: dict[str, Array] = {}
@@ -92,6 +97,8 @@ def parse_urdf(text: str, file: str) -> FileRobot:
         if joint.name in joints:
             raise ModelError(f"{file}: joint '{joint.name}' appears twice")
         joints[joint.name] = joint
+    if not joints and any("xacro}" in element.tag for element in root):
+        raise ModelError(f"{file}: is xacro yet; make a URDF of it first: xacro FILE > arm.urdf")
     if not links:
         raise ModelError(f"{file}: no <link> in it")
     source = Source(URDF, Path(file).name, text)

@@ -188,10 +188,12 @@ def _check_trees(first: SelfModel, second: SelfModel) -> None:
     for what in ("joint_names", "link_names", "parent", "floating"):
         one, other = getattr(a, what), getattr(b, what)
         if one != other:
-            told = what.replace("_", " ")
+            told, way = what.replace("_", " "), ""
+            if {*a.joint_names} < {*b.joint_names} or {*b.joint_names} < {*a.joint_names}:
+                way = "; --joints A,B,C compares these, --lock JOINT=VALUE takes one away"
             raise ModelError(
                 f"{first.name} and {second.name} are different trees; {told}: {_listed(one)} and "
-                f"{_listed(other)}"
+                f"{_listed(other)}{way}"
             )
     if a.floating:
         raise ModelError(f"{first.name}: its base floats; only fixed-base arms are compared")

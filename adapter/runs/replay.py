@@ -180,15 +180,21 @@ def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[
                 f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter follows"
             )
     open_noise = settings.dq_noise is None and settings.dq_drive is not None
-    if open_noise and len(log) >= FEWEST_FOR_NOISE:
-        changes["dq_noise"] = float(np.median(noise_levels(log)["dq"]))
+    noise = float(np.median(noise_levels(log)["dq"]))
+    if open_noise and np.isfinite(noise):
+        changes["dq_noise"] = noise
     return replace(settings, **changes), warnings
 
 
 def noise_levels(log: Log) -> dict[str, Array]:
-    """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies."""
+    """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies.
+
+    Not numbers where there are too few samples, or too few that are not the one before.
+    """
     new = np.ones(len(log), dtype=bool)
     new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
+    if new.sum() < FEWEST_FOR_NOISE:
+        return {name: np.full(log.dq.shape[1], np.nan) for name in ("q", "dq", "tau")}
     return {
         name: noise_from_samples(np.nan_to_num(getattr(log, name)[new]))
         for name in ("q", "dq", "tau")

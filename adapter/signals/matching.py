@@ -33,6 +33,35 @@ def present(
     return locked(documented, dict.fromkeys(absent, 0.0)), [said]
 
 
+def counted(documented: SelfModel, source: object, count: int | None) -> tuple[str, ...]:
+    """Names of the robot's joints that an arm of `count` joints without names has.
+
+    Where the robot has more they are those that one name numbers from 1 to `count` (panda_joint1
+    to 7), or else the first ones up to where the tree forks: a gripper of two fingers.
+
+    Raises:
+        DriverError: it could be others; names the robot's joints and the options.
+    """
+    tree = documented.tree
+    names = tree.joint_names
+    if count is None or count >= len(names):
+        return names
+    stems = {name.removesuffix(_number(name)) for name in names}
+    rows = [tuple(f"{stem}{k + 1}" for k in range(count)) for stem in sorted(stems)]
+    rows = [row for row in rows if {*row} <= {*names} and f"{row[0][:-1]}{count + 1}" not in names]
+    children = [[k for k, i in enumerate(tree.parent) if i == j] for j in range(-1, count)]
+    chain = all(below == [j] for j, below in enumerate(children[:-1]))
+    if not rows and chain and len(children[-1]) > 1:
+        rows = [names[:count]]
+    if len(rows) != 1:
+        raise DriverError(
+            f"{source}: has {count} joints and tells no names, {documented.name} has {len(names)}: "
+            f"{', '.join(names)}; name those that move (--joints A,B,C), or lock the others "
+            "(--lock JOINT=VALUE)"
+        )
+    return rows[0]
+
+
 def matching(log: Log, documented: SelfModel) -> Log:
     """The recording with the robot's joints in the robot's order, and its links' motion.
 

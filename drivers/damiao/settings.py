@@ -116,6 +116,12 @@ class BusSettings:
             )
 
 
+def joint_count(address: str) -> int | None:
+    """Number of joints that an address says, None where it does not. Raises DriverError."""
+    text = dict(Address.of(address, OPTIONS).options).get("joints")
+    return None if text is None else _number("joints", text)
+
+
 def _flag(key: str, text: str) -> bool:
     if text not in ("0", "1"):
         raise DriverError(f"option {key} is 0 or 1, not '{text}'")

@@ -26,6 +26,11 @@ _LIMP_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP)
 _RECOVERING_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY)
 
 
+def joint_count(address: str) -> int:
+    """Number of joints of the arm behind an address."""
+    return JOINTS
+
+
 class FciArm:
     """Driver of a robot with the Franka Control Interface.
 

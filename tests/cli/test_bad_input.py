@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.cli import main
+from adapter.cli.main import build_parser, main
+from adapter.cli.run import run_plan
 from adapter.effects.export import to_urdf
-from adapter.model.model_file import load_model
+from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
 from drivers.files.mcap import McapWriter, read_log
 from drivers.interface import JointSample
 
@@ -100,6 +102,71 @@ def test_a_gripper_that_the_log_lacks_is_locked(tmp_path, capsys) -> None:
     assert "'thumb'" in said and "finger_joint" in said
 
 
+FINGERS = ("left", "right")
+
+
+def two_fingers(tmp_path: Path, names: str) -> Path:
+    """The Panda with joints by other names and two turning fingers on its last link."""
+    text = to_urdf(ROBOT).replace("panda_joint", names)
+    for finger in FINGERS:
+        body = LINK.format(finger, 0.1, INERTIA)
+        joint = (
+            f'<joint name="{finger}_joint" type="revolute"><parent link="panda_link8"/>'
+            f'<child link="{finger}"/><axis xyz="1 0 0"/></joint>'
+        )
+        text = text.replace("</robot>", f"{body}{joint}</robot>")
+    path = tmp_path / "fingers.urdf"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("address", ["fci://localhost", "can://can0?joints=7"])
+def test_joints_that_an_arm_without_names_lacks_are_locked(tmp_path, capsys, address) -> None:
+    """By the numbers in their names, or where the tree forks; else the choices are said."""
+
+    def plan(robot: Path, *more: str) -> SelfModel:
+        line = ["run", "--driver", address, "--robot", str(robot), *more]
+        return run_plan(build_parser().parse_args(line)).robot
+
+    for robot in (with_gripper(tmp_path), two_fingers(tmp_path, "axis_")):
+        assert plan(robot).tree.n == 7
+        assert "finger_joint; locked at zero" in capsys.readouterr().err.replace(
+            "left_joint, right_joint", "finger_joint"
+        )
+    chain = tmp_path / "chain.urdf"
+    chain.write_text(with_gripper(tmp_path).read_text().replace("panda_joint7", "wrist"))
+    said = refused(capsys, "run", "--driver", address, "--robot", chain, "--out", tmp_path)
+    assert "has 7 joints and tells no names" in said and "--joints A,B,C" in said
+    assert plan(chain, "--lock", "finger_joint=0").tree.n == 7
+
+
+def test_a_log_that_repeats_one_reading(tmp_path, capsys) -> None:
+    still = motion(1)[0]
+    samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(300)]
+    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
+    assert "299 repeated" in said and "learned 0" in said
+
+
+@pytest.mark.parametrize("count", [3, 3000])
+def test_a_load_needs_more_than_one_reading(tmp_path, capsys, count: int) -> None:
+    still = motion(1)[0]
+    samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(count)]
+    said = refused(capsys, "load", record(tmp_path / "log.mcap", samples))
+    assert "log.mcap: only" in said and "record at least 2 s" in said
+
+
+def test_a_folder_cannot_be_written_to(tmp_path, capsys) -> None:
+    model = save_model(ROBOT, tmp_path / "m.json")
+    (tmp_path / "folder.urdf").mkdir()
+    said = refused(capsys, "export", model, "--urdf", tmp_path / "folder.urdf")
+    assert "folder.urdf: Is a directory" in said and "Errno" not in said
+
+
+def test_models_of_different_joints_are_not_compared(tmp_path, capsys) -> None:
+    said = refused(capsys, "diff", "panda", with_gripper(tmp_path))
+    assert "different trees" in said and "--lock JOINT=VALUE takes one away" in said
+
+
 def test_degrees(tmp_path, capsys) -> None:
     samples = [JointSample(s.stamp_ns, 57.3 * s.q, 57.3 * s.dq, s.tau) for s in motion()]
     said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
@@ -186,6 +253,11 @@ def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> 
         (["export", "nowhere.json"], "--mjcf FILE"),
         (["export", "m.json", "--onto", "arm.sdf"], "a .urdf file, an MJCF file"),
         (["export", "m.json", "--onto", "arm.xml", "--urdf", "x"], "is written by --mjcf"),
+        (["export", "panda", "--urdf", "x.urdf"], "give a model file (.json)"),
+        (["export", "m.json", "--urdf", "x.xml"], "--mjcf FILE.xml"),
+        (["export", "m.json", "--mjcf", "x.urdf"], "--urdf FILE.urdf"),
+        (["diff", "panda", "arm.xacro"], "a .urdf file"),
+        (["diff", "panda", "nowhere.urdf"], "nowhere.urdf: cannot be read"),
         (["info", "nowhere.mcap"], "nowhere.mcap"),
         (["recover", "nowhere.mcap"], "nowhere.mcap"),
         (["import", "nowhere.csv", "--to", "x.mcap"], "nowhere.csv"),

@@ -124,6 +124,35 @@ def test_an_arm_is_read_as_mujoco_means_it(arm: Path) -> None:
     judged(arm, model)
 
 
+MORE = """<sensor><jointpos joint="elbow"/><jointvel joint="elbow"/></sensor>
+  <keyframe><key name="home" qpos="0 0 0 0 0 1 1 0 0 0"/></keyframe>
+  <equality><connect body1="stand" body2="finger" anchor="0 0 0" name="glue"/></equality>"""
+
+
+def test_parts_of_which_an_arm_makes_no_use_are_said(arm: Path) -> None:
+    ball = '<body name="wrist"><joint name="turn" type="ball"/><geom size="0.01"/></body></body>'
+    text = ARM.replace("</mujoco>", f"{MORE}</mujoco>").replace(
+        '<body name="cube"', '<body name="ghost" mocap="true"/><body name="cube"'
+    )
+    arm.write_text(
+        text.replace('<geom type="sphere" size="0.02"/>', "")
+        .replace(
+            '<joint name="grip" type="slide" axis="1 0 0" ref="0.01" range="0 0.02"/>',
+            f'<joint name="grip" type="slide" axis="1 0 0"/><geom size="0.02"/>{ball[:-7]}',
+        )
+        .replace('qpos="0 0 0 0 0 1 1 0 0 0"', 'qpos="0 0 0 1 0 0 0 0 0 0 1 0 0 0"')
+    )
+    with pytest.warns(ModelWarning) as caught:
+        read_robot(arm)
+    said = " ".join(str(w.message) for w in caught)
+    for part in (
+        *("equality 'glue'", "mocap body 'ghost'", "sensors (2)", "keyframes (1)"),
+        "actuators, but for the torque that they can give, (1)",
+    ):
+        assert f"{part} is not used" in said
+    assert "joint 'turn' is ball; locked at zero" in said
+
+
 def test_a_learned_arm_goes_back_into_its_file(arm: Path, tmp_path: Path) -> None:
     model = quietly(arm)
     rng = np.random.default_rng(3)
@@ -160,7 +189,7 @@ def test_a_file_that_changed_is_refused_and_one_that_is_gone_is_said(arm: Path) 
     arm.unlink()
     written = robot_mjcf(model)
     assert written.onto is None and "is not there" in written.notes[0]
-    with pytest.raises(ModelError, match=r"arm\.xml: MuJoCo cannot read it"):
+    with pytest.raises(ModelError, match=r"arm\.xml: cannot be read"):
         robot_mjcf(model, onto=arm)
 
 
@@ -173,7 +202,9 @@ def test_a_compiler_that_overrides_inertias_is_refused(arm: Path) -> None:
 
 BAD = {
     "two joints": ('<joint name="shoulder"', '<joint name="x"/><joint name="shoulder"', "2 joints"),
-    "not MJCF": ("<mujoco ", "<robot ", "MuJoCo cannot read it"),
+    "not MJCF": ("mujoco", "robot", "top element is <robot>.* a URDF's name ends in .urdf"),
+    "not XML": ("</mujoco>", "", "not XML"),
+    "no such geom": ('type="capsule"', 'type="tube"', "MuJoCo cannot read it"),
     "no hinge": ('name="elbow"', 'name="elbow" type="ball"', "joint 'elbow'.* is ball"),
 }
 

@@ -135,6 +135,23 @@ def test_a_robot_keeps_all_but_the_numbers_that_were_learned(crlf: bool) -> None
     assert robot_urdf(model_2).text == written.text
 
 
+def test_a_default_namespace_is_no_obstacle() -> None:
+    text = DRESSED.replace("<robot ", '<robot xmlns="http://www.ros.org" ')
+    model = learned(read_quietly(text))
+    written = robot_urdf(model).text
+    assert skeleton(written) == skeleton(text)
+    same_arm(written, model)
+
+
+def test_xacro_and_other_encodings_are_said(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=r"is xacro yet; .*xacro FILE > arm\.urdf"):
+        read_quietly('<robot name="r" xmlns:xacro="http://x/xacro"><xacro:arm/></robot>')
+    path = tmp_path / "latin.urdf"
+    path.write_bytes(DRESSED.replace("utf-8", "iso-8859-1").encode("iso-8859-1"))
+    with pytest.raises(ModelError, match=r"latin\.urdf: not text in UTF-8 .*save it as UTF-8"):
+        robot_urdf(read_quietly(DRESSED), onto=path)
+
+
 def test_what_was_not_learned_anew_is_not_written_anew() -> None:
     """The documented model onto its file: every byte, but for links that PyBullet would load."""
     written = robot_urdf(read_quietly(DRESSED)).text
