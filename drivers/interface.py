@@ -24,6 +24,8 @@ class EndOfStream(DriverError):
 class LinkMotion:
     """Motion of every moving link at one instant, each in its own link frame.
 
+    Of Imus glued on links anyhow, only w and a, in the sensors' axes; all else is not a number.
+
     Attributes:
         twist: (n, 6) velocity of the link-frame origin and angular velocity [v; w], m/s, rad/s.
         accel: (n, 6) [a; dw]: linear acceleration of the origin as an accelerometer there reads

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from sim.noise_levels import NOISES, check_levels
 
 DEFAULT_SCENARIO = "nominal"
-COMMON_OPTIONS = ("noise", "links", "levels")
+COMMON_OPTIONS = ("noise", "links", "levels", "imus")
 
 
 class ScenarioKind(NamedTuple):
@@ -48,6 +48,9 @@ def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
     if noise not in NOISES:
         raise ValueError(f"no noise {noise!r}; have: {', '.join(NOISES)}")
     check_levels(options.get("levels", {}))
+    imus = options.get("imus", [])
+    if not isinstance(imus, list) or not all(isinstance(x, str) for x in imus):
+        raise ValueError(f'{name}: imus is {imus!r}; have: ["LINK", ...]')
     return numbers
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from drivers.interface import DriverError, JointSample, LinkMotion
 from sim.dynamics import link_motion
 from sim.effects import ENCODER, TORQUE
 from sim.engine import PERIOD_S, Engine
+from sim.imus import Imus
 from sim.noise import SensorNoise, levels_of
 from sim.noise_levels import NoiseLevels
 from sim.sensors import Sensors
@@ -48,7 +50,7 @@ class Plant:
         truth: Truth,
         seed: int = 0,
         noise: NoiseLevels | None = None,
-        links: bool = False,
+        links: bool | tuple[str, ...] = False,
         q0: Array | None = None,
     ) -> None:
         """Set up the arm at rest at t = 0.
@@ -57,14 +59,18 @@ class Plant:
             truth: the arm.
             seed: of the noise.
             noise: what the sensors add; a real Panda's by default.
-            links: whether the links' motion is measured.
+            links: whether the links' motion is measured; or names of links with a sensor glued
+                on, anyhow (`sim.imus`).
             q0: (n,) posture at the start, rad; the truth's by default.
         """
         self.truth = truth
         self.saturated, self.braked = False, True
         self.fault: str | None = None
         self.compute_ns = 0
-        self._links = links
+        self._links = links is True
+        self._imus = (
+            None if isinstance(links, bool) else Imus(truth.link_names, links, seed, PERIOD_S)
+        )
         self._engine = Engine(truth)
         sensing = any(effect.place in (ENCODER, TORQUE) for effect in truth.effects)
         self._sensors = Sensors(truth, PERIOD_S) if sensing else None
@@ -107,6 +113,9 @@ class Plant:
             self._advance()
             self._clean = self._observe()
             sample = self._noise.measure(self._k, self._clean)
+            if self._imus is not None:
+                heard = self._imus.read(self._link_motion())
+                sample = None if sample is None else replace(sample, links=heard)
         self.compute_ns = time.perf_counter_ns() - begun
         return sample
 
@@ -196,8 +205,11 @@ class Plant:
         q, dq, tau = self._seen
         links = None
         if self._links:
-            arm = self._engine.truth
-            motion = link_motion(arm.frames, arm.base, self._q, self._dq, self.ddq())
-            both = motion.reshape(arm.n, 2, 6)  # [v; w] and [a; dw]
+            both = self._link_motion().reshape(self.truth.n, 2, 6)  # [v; w] and [a; dw]
             links = LinkMotion(both[:, 0].copy(), both[:, 1].copy())
         return JointSample(max(self._k, 0) * PERIOD_NS, q, dq, tau, links)
+
+    def _link_motion(self) -> Array:
+        """True motion (n, 4, 3) of the links in their frames: v, w, a with gravity, dw."""
+        arm = self._engine.truth
+        return np.asarray(link_motion(arm.frames, arm.base, self._q, self._dq, self.ddq()))

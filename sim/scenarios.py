@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from sim.effects import payload, per_joint
+from sim.engine import PERIOD_S
+from sim.imus import Imus
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.options import SCENARIOS, check
@@ -35,6 +37,7 @@ class Scenario:
         truth: the arm.
         noise: what the sensors add.
         links: whether link motion is measured.
+        imus: links with a sensor glued on, anyhow, which are then all that tells of link motion.
     """
 
     name: str
@@ -42,10 +45,14 @@ class Scenario:
     truth: Truth
     noise: NoiseLevels
     links: bool
+    imus: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        Imus(self.truth.link_names, self.imus, self.seed, PERIOD_S)
 
     def plant(self, q0: Array | None = None) -> Plant:
         """A fresh arm at t = 0, at rest at q0 (n,) rad or at the truth's own posture."""
-        return Plant(self.truth, self.seed, self.noise, self.links, q0)
+        return Plant(self.truth, self.seed, self.noise, self.imus or self.links, q0)
 
     def as_dict(self) -> dict[str, Any]:
         """What a truth file holds."""
@@ -56,6 +63,7 @@ class Scenario:
             "seed": self.seed,
             **self.truth.as_dict(),
             "links_measured": self.links,
+            "imus": list(self.imus),
             "noise": self.noise.as_dict(),
         }
 
@@ -115,8 +123,9 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         name: one of `options.SCENARIOS`.
         seed: decides truth and noise.
         options: `noise` ("real" or "none"), `links` (bool: measure link motion or not), `levels`
-            (a mapping of single noise levels to change, see `NoiseLevels`), and those of the
-            scenario: `angle_deg`, `offset_m` of bent_link, `mass` (kg), `t_s` of payload_at_20s.
+            (a mapping of single noise levels to change, see `NoiseLevels`), `imus` (names of links
+            with a sensor glued on), and those of the scenario: `angle_deg`, `offset_m` of
+            bent_link, `mass` (kg), `t_s` of payload_at_20s.
 
     Raises:
         ValueError: unknown name, option or level, or a value out of range; with the choices.
@@ -128,6 +137,7 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         DRAWN_BY[name](np.random.default_rng([seed, TRUTH_STREAM]), **numbers),
         levels_of(options.get("noise", "real"), **options.get("levels", {})),
         options.get("links", SCENARIOS[name].links),
+        tuple(options.get("imus", ())),
     )
 
 

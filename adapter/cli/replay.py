@@ -15,7 +15,7 @@ from adapter.cli.results import Learned, conclude
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
-from adapter.runs.config import Config
+from adapter.runs.config import Config, with_imus
 from adapter.runs.outcome import learned_model
 from adapter.runs.replay import (
     Replay,
@@ -53,10 +53,9 @@ def run(args: argparse.Namespace) -> int:
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
     warn(notes)
-    schema = replace(config.pipeline.learner.schema, imus=imus)
-    wrench = args.base_wrench == "zero"
-    learner = replace(config.pipeline.learner, base_wrench=wrench, schema=schema)
-    config = replace(config, pipeline=replace(config.pipeline, filter=fitted, learner=learner))
+    learner = replace(config.pipeline.learner, base_wrench=args.base_wrench == "zero")
+    pipeline = replace(config.pipeline, filter=fitted, learner=learner)
+    config = replace(config, pipeline=with_imus(pipeline, imus))
     compile_first(robot, config.pipeline, args.every, console.print)
     result = _learn(args, log, robot, config)
     front_end = result.pipeline.front_end

@@ -26,7 +26,7 @@ from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.runs.compiling import compile_first
-from adapter.runs.config import Config
+from adapter.runs.config import Config, with_imus
 from adapter.runs.live import describe_estimate, learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
@@ -92,6 +92,9 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     robot, locked = present(robot, names, args.driver)
     warn(locked)
     config = configure(args, None, robot)
+    if world is not None and world.scenario.imus:
+        pipeline = with_imus(config.pipeline, world.scenario.imus)
+        config = dataclasses.replace(config, pipeline=pipeline)
     maybe_real = world is None and scheme in HARDWARE
     if maybe_real and _may_move(args) and not config.excitation.slow_s:
         share = min(config.excitation.share, REAL_SHARE)
@@ -262,7 +265,7 @@ def _conclude(
             result.timing.tick_us,
             result.timing.missed_deadlines,
         ),
-        warnings=[*front_end.messages, *result.troubles],
+        warnings=[*front_end.messages, *result.troubles, *outcome.lam_notes],
         robot=robot.name,
         driver=args.driver,
         scenario=args.scenario,

@@ -47,5 +47,7 @@ def simulation(address: str, scenario: str | None, options: list[str], seed: int
         ValueError: no such scenario or option (names the choices).
     """
     chosen = options_of(options)
+    if chosen.get("imus") and not address.startswith("pybullet"):
+        raise ValueError("imus: no sensor on a link is heard over a CAN bus; have: pybullet:panda")
     world = build(scenario or DEFAULT_SCENARIO, seed, **chosen)
     return Simulation(address, world, scenario is not None)

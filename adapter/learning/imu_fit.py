@@ -32,6 +32,7 @@ from adapter.model.tree import BASE, Tree
 # sensor's place (m), biases (rad/s, m/s²) and the lateness of its stamps (s).
 FRAME_STD, PLACE_STD, W_BIAS_STD, A_BIAS_STD, LATE_STD = 0.3, 1.0, 0.1, 1.0, 0.05
 OWN = 13  # unknowns of a sensor: turn, place, biases of w and a, lateness
+MAINLY = 0.3  # of a gauge's step; a frame that it moves by more is said not to be known along it
 LEAST_STD = 1e-9  # rad/s, m/s²: no sensor is trusted more
 WILD = 6.0  # standard deviations; a window that is further off is not believed
 STEPS = 30
@@ -243,13 +244,16 @@ class ImuFit:
 
     def _free(self, at: Estimate) -> Array:
         """(P, F) orthonormal, all steps but those along the gauge."""
-        n = self.tree.n
-        basis = np.eye(6 * n + OWN * len(self.links))
+        n, s = self.tree.n, len(self.links)
+        basis = np.eye(6 * n + OWN * s)
         kept = np.ones(len(basis), dtype=bool)
         for j in range(n):
             basis[6 * j + 3 : 6 * j + 6, 6 * j + 3 : 6 * j + 6] = at.R0[j]
             kept[[6 * j + 2, 6 * j + 5]] = False
-        return basis[:, kept]
+        basis = basis[:, kept]
+        gauge = basis.T @ np.pad(base_gauge(self.tree, self.gravity, at), ((0, OWN * s), (0, 0)))
+        rest, _ = np.linalg.qr(gauge, mode="complete")
+        return np.asarray(basis @ rest[:, gauge.shape[1] :])
 
     def _share(self, w_std: Array) -> Array:
         share = np.zeros(len(self.links))
@@ -290,27 +294,36 @@ class ImuFit:
         return stds, Slope(cost, gradient, curvature)
 
     def _linearised(self, arm: _Arm, at: Estimate, k: int) -> list[Array]:
-        """Rows [what is left | its slopes] (3 windows, 1 + P) of w and of a of sensor k."""
+        """Rows [what is left | its slopes] (3 windows, 1 + P) of w and of a of sensor k.
+
+        What is left is told in the sensor's axes in the middle of the window, of which its size
+        does not depend: else a turn of the whole robot about gravity, which turns what noise left,
+        would pass for something that data show.
+        """
         w, a, felt = self._residual(arm, at, k)
         whole, i, n = self._whole[k], self.links[k], self.tree.n
+        middle = (self.windows.starts + len(BELL) // 2)[whole]
         by = np.zeros((2, len(w), 3, 1 + 6 * n + OWN * len(self.links)))
         by[0, :, :, 0], by[1, :, :, 0] = w, a
+        own = 1 + 6 * n + OWN * k
+        turns = [
+            (1 + 6 * j, arm.axes[:, j], arm.spin(i, j), arm.p[:, j]) for j in self.tree.path_to(i)
+        ]
+        turns.append((own, felt.axes, np.zeros_like(felt.w), felt.place))
+        for c, axes, spin, p in turns:
+            for b, x in enumerate((felt.w - spin, felt.a)):
+                by[b, :, :, c : c + 3] = self._bell(_turned(x, axes))[whole]
+                by[b, :, :, c : c + 3] -= _turned((w, a)[b], axes[middle])
+            by[1, :, :, c : c + 3] -= self._bend(_turned(felt.place - p, axes))[whole]
         for j in self.tree.path_to(i):
-            axes, c = arm.axes[:, j], 1 + 6 * j
-            by[0, :, :, c : c + 3] = self._bell(_turned(felt.w - arm.spin(i, j), axes))[whole]
-            turned = self._bell(_turned(felt.a, axes))
-            turned -= self._bend(_turned(felt.place - arm.p[:, j], axes))
-            by[1, :, :, c : c + 3] = turned[whole]
-            if self.tree.parent[j] == BASE:
-                continue  # a shift of all changes nothing
-            by[1, :, :, c + 3 : c + 6] = -self._bend(arm.R[:, self.tree.parent[j]])[whole]
-        c = 1 + 6 * n + OWN * k
-        by[0, :, :, c : c + 3] = self._bell(_turned(felt.w, felt.axes))[whole]
-        by[1, :, :, c : c + 3] = self._bell(_turned(felt.a, felt.axes))[whole]
-        by[1, :, :, c + 3 : c + 6] = -self._bend(arm.R[:, i])[whole]
-        by[0, :, :, c + 6 : c + 9] = by[1, :, :, c + 9 : c + 12] = -self._bell(felt.axes)[whole]
-        by[0, :, :, c + 12] = self._bell(felt.w_rate)[whole]
-        by[1, :, :, c + 12] = self._bell(felt.a_rate)[whole]
+            if self.tree.parent[j] != BASE:  # a shift of all changes nothing
+                shift = -self._bend(arm.R[:, self.tree.parent[j]])[whole]
+                by[1, :, :, 1 + 6 * j + 3 : 1 + 6 * j + 6] = shift
+        by[1, :, :, own + 3 : own + 6] = -self._bend(arm.R[:, i])[whole]
+        bias = -self._bell(felt.axes)[whole]
+        by[0, :, :, own + 6 : own + 9] = by[1, :, :, own + 9 : own + 12] = bias
+        by[0, :, :, own + 12] = self._bell(felt.w_rate)[whole]
+        by[1, :, :, own + 12] = self._bell(felt.a_rate)[whole]
         return [x.reshape(3 * len(w), -1) for x in by]
 
 
@@ -377,3 +390,43 @@ def _turned(x: Array, axes: Array) -> Array:
     a, b, c = (axes[:, k] for k in range(3))
     out[:, 0], out[:, 1], out[:, 2] = w * b - v * c, u * c - w * a, v * a - u * b
     return out
+
+
+def base_gauge(tree: Tree, gravity: Array, at: Estimate) -> Array:
+    """(6 n, 2 roots) steps of frames that no sensor feels, where links hang on the base.
+
+    Such a link may be turned about gravity, or slid along its axis, with all that it carries. What
+    that turns and slides a frame along its own axis is undone, and passed on to the next links.
+    """
+    found = []
+    for root in (j for j, i in enumerate(tree.parent) if i == BASE):
+        for turns in (True, False):
+            step, on = np.zeros((tree.n, 6)), np.zeros((tree.n, 2, 3))
+            if turns:
+                turn = at.R0[root].T @ gravity / np.linalg.norm(gravity)
+                step[root, :2], on[root, 0, 2] = turn[:2], turn[2]
+            else:
+                on[root, 1, 2] = 1.0
+            for j, i in enumerate(tree.parent):
+                if i == BASE or not on[i].any():
+                    continue
+                turn, axis = at.R0[j].T @ on[i, 0], at.R0[j, :, 2]
+                shift = np.cross(on[i, 0], at.p[j]) + on[i, 1]
+                on[j, :, 2] = turn[2], axis @ shift
+                step[j, :2], step[j, 3:] = turn[:2], shift - (axis @ shift) * axis
+            found.append(step.ravel())
+    return np.array(found).T
+
+
+def told_apart(tree: Tree, gravity: Array, at: Estimate) -> list[Array]:
+    """(6, k) orthonormal steps of each frame, [turn; shift], that are no gauge."""
+    gauge = base_gauge(tree, gravity, at)
+    gauge = (gauge / np.abs(gauge).max(axis=0)).reshape(tree.n, 6, -1)
+    found = []
+    for j in range(tree.n):
+        hidden = np.zeros((6, 2))
+        hidden[2, 0], hidden[3:, 1] = 1.0, at.R0[j, :, 2]
+        mainly = gauge[j][:, np.linalg.norm(gauge[j], axis=0) > MAINLY]
+        whole, _ = np.linalg.qr(np.concatenate([hidden, mainly], axis=1), mode="complete")
+        found.append(whole[:, 2 + mainly.shape[1] :])
+    return found

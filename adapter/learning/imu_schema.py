@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from adapter.errors import SettingsError
-from adapter.learning.imu_fit import FRAME_STD, Estimate, Fit, ImuFit, Prior
+from adapter.learning.imu_fit import FRAME_STD, Estimate, Fit, ImuFit, Prior, told_apart
 from adapter.learning.imu_windows import LONGEST_GAP_S, Readings
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import SchemaSettings
@@ -25,7 +25,6 @@ LAST_WORD = 100  # updates without a new reading: what is left is solved, too
 SLOWEST_HZ = 40.0
 FEWEST = 20  # readings of a sensor
 SHOWN = 10.0  # times what the springs say
-LEAST_SHARE = 1e-9  # of the largest variance; below is rounding of the gauge's, which is none
 ASTRAY = 0.2  # of how a sensor turns; one that is off by more is not on that link, or mad
 SURE = 2.0  # standard deviations that λ may move from one solution to the next
 HEARD, W, A = 0, slice(3, 6), slice(6, 9)  # of the motion row of a link
@@ -165,20 +164,19 @@ class ImuSchema(Schema):
         before_R0, before_p = self.R0.copy(), self.p.copy()
         self._at = found.estimate
         self.R0[:], self.p[:] = found.estimate.R0, found.estimate.p
-        n, ranks = self._tree.n, np.zeros(self._tree.n, dtype=np.int64)
-        calm = True
+        ranks, calm = np.zeros(self._tree.n, dtype=np.int64), True
         moved = self.moved_from(before_R0, before_p)
-        for j in range(n):
+        apart = told_apart(self._tree, self._gravity, found.estimate)
+        for j, basis in enumerate(apart):
             own = slice(6 * j, 6 * j + 6)
-            values, vectors = np.linalg.eigh(found.covariance[own, own])
-            free = values > 0.0  # the gauge has none
-            free &= values > LEAST_SHARE * values[-1]
-            shown = free & (values < FRAME_STD**2 / SHOWN)
+            values, vectors = np.linalg.eigh(basis.T @ found.covariance[own, own] @ basis)
+            vectors = basis @ vectors
+            shown = values < FRAME_STD**2 / SHOWN
             certain = shown & (values < self.settings.std_goal**2)
             self._covariance[j] = (vectors[:, shown] * values[shown]) @ vectors[:, shown].T
             self.identifiable[j] = vectors[:, shown] @ vectors[:, shown].T
             self.certain[j] = vectors[:, certain] @ vectors[:, certain].T
-            self.information[j] = (vectors[:, free] / values[free]) @ vectors[:, free].T
+            self.information[j] = (vectors / values) @ vectors.T
             ranks[j] = certain.sum()
             step = np.abs(vectors[:, certain].T @ moved[j])
             std = np.sqrt(values[certain])

@@ -134,27 +134,51 @@ class Freedom:
 
 
 def slid_to(
-    tree: Tree, frames: tuple[Array, Array], to: tuple[Array, Array]
+    tree: Tree, gravity: Array, frames: tuple[Array, Array], to: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """The same axes, with each link's frame slid along its own and turned about it.
 
-    Sensors mounted anyhow on the links tell no two such arms apart.
+    Sensors mounted anyhow on the links tell no two such arms apart, nor where a link stands on the
+    base and how it is turned about gravity: there its first child says what is close.
 
     Args:
-        frames: R (n, 3, 3) and p (n, 3) m; to: those that the frames shall come close to.
+        gravity: (3,) in axes of the base; frames: R (n, 3, 3) and p (n, 3) m; to: those that the
+            frames shall come close to.
     """
     R, p = frames[0].copy(), frames[1].copy()
     turn, slide = np.zeros(tree.n), np.zeros(tree.n)
+    z = np.array([0.0, 0.0, 1.0])
     for j, i in enumerate(tree.parent):
         if i != BASE:
             back = rot_z(-turn[i])
-            R[j], p[j] = back @ R[j], back @ (p[j] - slide[i] * np.array([0.0, 0.0, 1.0]))
-        M = to[0][j].T @ R[j]
-        turn[j] = np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1])
+            R[j], p[j] = back @ R[j], back @ (p[j] - slide[i] * z)
+        near = to[0][j].T @ R[j]
+        turn[j] = np.arctan2(near[0, 1] - near[1, 0], near[0, 0] + near[1, 1])
         slide[j] = (to[1][j] - p[j]) @ R[j, :, 2]
-        p[j] += slide[j] * R[j, :, 2]
+        if i == BASE and tree.children[j]:
+            k = tree.children[j][0]
+            turn[j], slide[j] = _about_parent((R[k], p[k]), (to[0][k], to[1][k]))
         R[j] = R[j] @ rot_z(turn[j])
+        p[j] += slide[j] * R[j, :, 2]
+        if i == BASE:
+            up = gravity / np.linalg.norm(gravity)
+            off = R[j] @ to[0][j].T
+            yaw = np.arctan2(np.sum(skew(up) * off), np.trace(off) - up @ off @ up)
+            R[j], p[j] = exp_rotation(-yaw * up) @ R[j], to[1][j]
     return R, p
+
+
+def _about_parent(frame: tuple[Array, Array], to: tuple[Array, Array]) -> tuple[float, float]:
+    """By how much a frame is ahead of another about and along its parent's z, its own z apart."""
+    (R, p), (to_R, to_p) = frame, to
+    off = R @ to_R.T
+    if np.hypot(*to_R[:2, 2]) > PURE_SHIFT:
+        turn = np.arctan2(R[1, 2], R[0, 2]) - np.arctan2(to_R[1, 2], to_R[0, 2])
+    else:
+        turn = np.arctan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
+    across = np.array([0.0, 0.0, 1.0]) - to_R[2, 2] * to_R[:, 2]
+    ahead = (rot_z(-turn) @ p - to_p) @ across
+    return float(turn), float(ahead / max(across @ across, PURE_SHIFT**2))
 
 
 def _numbers(axis: Array) -> str:

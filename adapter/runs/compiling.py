@@ -15,7 +15,7 @@ from numba.core import event
 from adapter.model.self_model import SelfModel
 from adapter.physics.kernels import base_at_rest
 from adapter.physics.rigid_arm import RigidArm
-from adapter.runs.config import PipelineSettings
+from adapter.runs.config import PipelineSettings, with_imus
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.replay import ReplayOptions, replay
 from drivers.files.mcap import Log
@@ -59,6 +59,7 @@ def compile_first(documented: SelfModel, settings: PipelineSettings, every: int,
         say: hears, once, that compiling takes place.
     """
     announcer = announce_compiling(say)
+    settings = with_imus(settings, ())  # there are none in the made-up motion
     log = _motion(documented, settings.filter.period_s)
     make_front_end(documented, settings).step(
         JointSample(int(log.stamp_ns[0]), log.q[0], log.dq[0], log.tau[0])

@@ -80,6 +80,13 @@ class Config:
         return dataclasses.replace(documented, **changes)
 
 
+def with_imus(pipeline: PipelineSettings, links: tuple[str, ...]) -> PipelineSettings:
+    """The same settings with sensors glued on these links, and no others."""
+    schema = dataclasses.replace(pipeline.learner.schema, imus=links)
+    learner = dataclasses.replace(pipeline.learner, schema=schema)
+    return dataclasses.replace(pipeline, learner=learner)
+
+
 def read_config(path: str | Path | None) -> Config:
     """Settings from a TOML file; the defaults without one. Raises SettingsError."""
     if path is None:

@@ -154,7 +154,7 @@ def schema_score(
 def _slid(documented: SelfModel, reference: Reference, lam: Array) -> Reference:
     """The reference with its links' frames, along and about their axes, where λ (n, 6) has them."""
     ours, theirs = ((matrix_from_zxz(x[:, :3]), x[:, 3:]) for x in (lam, reference.lam))
-    R, p = slid_to(documented.tree, theirs, ours)
+    R, p = slid_to(documented.tree, documented.gravity, theirs, ours)
     return replace(reference, lam=np.concatenate([zxz_from_matrix(R), p], axis=1))
 
 

@@ -206,6 +206,24 @@ class MotionEncoder:
         return b"".join((CDR_LE, _stamp(stamp_ns), self._piece, _raw(vector, (6,), "vector")))
 
 
+class ImuEncoder(MotionEncoder):
+    """Encodes Imu of one frame, without an orientation."""
+
+    def __init__(self, frame_id: str) -> None:
+        body = _MessageBuilder()
+        body.text(frame_id)
+        body.doubles(IMU_DOUBLES)
+        (self._piece,) = body.pieces
+
+    def encode(self, stamp_ns: int, vector: Array) -> bytes:
+        """One message of [w; a] (6,). Raises CdrError on a wrong shape."""
+        whole = np.zeros(IMU_DOUBLES)
+        whole[3], whole[4] = 1.0, -1.0  # no turn, and its covariance says that nothing is known
+        whole[13:16], whole[25:28] = vector[:3], vector[3:]
+        raw = _raw(whole, (IMU_DOUBLES,), "vector")
+        return b"".join((CDR_LE, _stamp(stamp_ns), self._piece, raw))
+
+
 @dataclass(frozen=True, slots=True)
 class Layout:
     """Where the numbers of a message lie: byte slices of its runs of doubles, and its texts."""

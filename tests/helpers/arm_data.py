@@ -72,7 +72,7 @@ class ArmData:
         k = slice(round(seconds / PERIOD_S))
         fields = {x: getattr(self, x) for x in ("stamp_ns", "q", "dq", "tau", "twists", "accels")}
         cut = {key: None if value is None else value[k] for key, value in fields.items()}
-        return replace(self, true=tuple(x[k] for x in self.true), **cut)
+        return replace(self, true=tuple(x[k] for x in self.true), **cut)  # type: ignore[arg-type]
 
     def samples(self) -> list[JointSample]:
         """One by one."""
@@ -104,7 +104,7 @@ def pin_model(truth: Truth, payload: Effect | None = None) -> pin.Model:
         model.appendBodyToJoint(parent, body, pin.SE3.Identity())
     if payload is not None:
         com = np.array([payload.number(key) for key in ("cx", "cy", "cz")])
-        xx, xy, xz, yy, yz, zz = payload.parameters.get("inertia", [0.0] * 6)
+        xx, xy, xz, yy, yz, zz = payload.parameters.get("inertia", [0.0] * 6)  # type: ignore[misc]
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body = pin.Inertia(payload.number("m"), com, tensor)
         model.appendBodyToJoint(parent, body, pin.SE3.Identity())
@@ -246,7 +246,9 @@ def states_of(
 ) -> np.ndarray:
     """Filtered states (k, size) of a recording."""
     front_end = FrontEnd(model or panda_model(), settings)
-    links = None if data.twists is None else (data.twists, data.accels)
+    links = None
+    if data.twists is not None and data.accels is not None:
+        links = data.twists, data.accels
     return front_end.step_table(data.stamp_ns, data.q, data.dq, data.tau, links)
 
 

@@ -113,7 +113,7 @@ def record(seed: int, links: Sequence[int], seconds: float, parts: Parts | None 
     grid = np.arange(len(q) - 5) * 1e-3  # within the knots
     q, dq = q[:-5], dq[:-5]
     knots, tau, felt = links_of(truth, motion)
-    felt = CubicSpline(knots, felt)
+    feeling = CubicSpline(knots, felt)
     whole = CubicSpline(grid, np.concatenate([q, dq, CubicSpline(knots, tau)(grid)], axis=1))
     t_s = np.arange(0.0, grid[-1], 1.0 / parts.joints_hz)
     q, dq, tau = np.split(whole(t_s), 3, axis=1)
@@ -124,7 +124,7 @@ def record(seed: int, links: Sequence[int], seconds: float, parts: Parts | None 
         own = np.arange(0.01 + rng.uniform(0, 0.002), grid[-1] - 0.01, 1.0 / parts.rate_hz)
         late, turn = parts.late_s * rng.uniform(-1, 1), exp_rotation(2 * rng.normal(size=3))
         place = 0.05 * rng.normal(size=3)
-        w, dw, a = np.split(felt(own - late)[:, i], 3, axis=1)
+        w, dw, a = np.split(feeling(own - late)[:, i], 3, axis=1)
         a = a + np.cross(dw, place) + np.cross(w, np.cross(w, place))
         w_bias, a_bias = (x * rng.uniform(-1, 1, 3) for x in (parts.w_bias, parts.a_bias))
         w = w @ turn + w_bias + parts.w_noise * rng.normal(size=w.shape)

@@ -63,7 +63,7 @@ def test_errors_are_as_large_as_is_said() -> None:
     for error, std in (("rotation_error_rad", "rotation_rad"), ("position_error_m", "position_m")):
         assert (np.array(score[error]) < 4.0 * np.array(score["std"][std]) + 1e-9).all()
     shown = np.einsum("jaa->j", outcome.lam_identifiable).round()
-    assert shown.tolist() == [2, 2, 3, 4, 4, 4, 4] or shown.sum() >= 22
+    assert shown.tolist() == [2, 2, 4, 4, 4, 4, 4]
     assert len(score["filled"]) == 7  # of each joint's frame its place along the axis, at least
 
 
@@ -72,7 +72,7 @@ def test_what_no_sensor_shows_is_the_documentation() -> None:
     log, links = with_link_imus(glued.log(), panda_model())
     found = replay(log, panda_model(), _settings(links), ReplayOptions(10)).outcome
     model = learned_model(found, panda_model())
-    assert np.allclose(model.lam[4:], panda_model().lam[4:], atol=1e-9)
+    assert np.allclose(model.lam[4:], panda_model().lam[4:], atol=1e-6)
     assert not model.lam_identifiable[4:].any() and model.lam_identifiable[3].any()
 
 

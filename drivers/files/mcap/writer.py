@@ -15,10 +15,12 @@ from mcap.writer import Writer
 
 from drivers.files.ros import (
     ACCEL_STAMPED,
+    IMU,
     JOINT_STATE,
     SCHEMAS,
     TWIST_STAMPED,
     CdrError,
+    ImuEncoder,
     JointStateEncoder,
     MotionEncoder,
 )
@@ -28,6 +30,7 @@ JOINT_STATES = "/joint_states"
 JOINT_COMMANDS = "/joint_commands"
 LINK_TWISTS = "/link_twists/"
 LINK_ACCELS = "/link_accels/"
+LINK_IMUS = "/link_imus/"
 ESTIMATES = "/estimates"
 METADATA = "panda_adapter"  # name of the metadata record with our own settings
 LIBRARY = "panda-adapter"
@@ -96,6 +99,7 @@ class McapWriter:
         self._states = JointStateEncoder(self.joint_names)
         self._commands = JointStateEncoder(self.joint_names, fields=("effort",))
         self._motions = tuple((name, MotionEncoder(name)) for name in self.link_names)
+        self._imus = tuple(ImuEncoder(name) for name in self.link_names)
         try:
             self._file = self.path.open("wb" if overwrite else "xb")
         except FileExistsError as error:
@@ -119,13 +123,23 @@ class McapWriter:
         self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
 
     def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
-        """Record the measured motion of the links, in the order of `link_names`."""
+        """Record the measured motion of the links, in the order of `link_names`.
+
+        Where w and a are all that is told of any link, each is what an Imu on the link read.
+        """
         expected = (len(self._motions), 6)
         if links.twist.shape != expected or links.accel.shape != expected:
             raise DriverError(
                 f"{self.path}: link motion of shapes {links.twist.shape} and {links.accel.shape}, "
                 f"expected {expected} for the links {', '.join(self.link_names) or '(none named)'}"
             )
+        heard = np.isfinite(links.twist[:, 3:]).all(axis=1)
+        if np.isnan(links.twist[:, :3]).all() and np.isnan(links.accel[:, 3:]).all():
+            for i in np.flatnonzero(heard):
+                told = np.concatenate([links.twist[i, 3:], links.accel[i, :3]])
+                channel = self._channel(LINK_IMUS + self.link_names[i], IMU)
+                self._add(channel, stamp_ns, self._imus[i].encode(stamp_ns, told))
+            return
         for (name, encoder), twist, accel in zip(
             self._motions, links.twist, links.accel, strict=True
         ):
