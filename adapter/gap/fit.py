@@ -336,9 +336,8 @@ class Fit:
             if e.recording not in (None, recording):
                 continue
             if e.candidate.effect.inexact:
-                torque = self.model.contribution(recording, k)
-                unsure = np.hypot(e.candidate.effect.inexact * torque, EDGE * _jumps(torque))
-                weight /= np.sqrt(1.0 + (unsure / level) ** 2)
+                off = unsure(e, self.model.contribution(recording, k))
+                weight /= np.sqrt(1.0 + (off / level) ** 2)
             for edge in e.interval_s:
                 after = EDGE_S + ORDER / BAND_HZ
                 weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
@@ -370,6 +369,11 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
     flat = [noise.flat() for noise in fit.own_noise()]
     fit, _ = refitted(fit.with_noise(flat))
     return refitted(fit.with_noise())
+
+
+def unsure(e: Named, torque: Array) -> Array:
+    """(k, n) by how much an effect's torque (k, n) may be otherwise in truth, N m."""
+    return np.asarray(np.hypot(e.candidate.effect.inexact * torque, EDGE * _jumps(torque)))
 
 
 def _jumps(torque: Array) -> Array:

@@ -15,6 +15,7 @@ from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of
 from adapter.gap.possible import possible
+from adapter.gap.refine import refined
 from adapter.gap.result import Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
@@ -209,8 +210,9 @@ def measure(
     task: GapTask, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
-    found = _corrected_where_it_pays(task, found)
-    found = replace(found, fit=possible(found.fit, found.carried))
+    searched, found = found.fit, _corrected_where_it_pays(task, refined(found))
+    fit = possible(found.fit, found.carried)
+    found = replace(found, fit=replace(fit, noise=searched.noise, weights=searched.weights))
     block = block_s(found.fit)
     if task.folds:
         after = held_out_models(task.model, found.fit, found.carried)

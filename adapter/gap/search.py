@@ -181,7 +181,7 @@ def _with(
     trial = shaped(trial, last)
     while True:
         trial, carried = under_own_noise(trial)
-        bad = _worst(trial, carried, before)
+        bad = worst(trial, carried, before)
         if bad is None:
             break
         trial = trial.without(bad)
@@ -195,7 +195,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
     swaps = 0
     while True:
         fit, carried = under_own_noise(fit)
-        bad = _worst(fit, carried)
+        bad = worst(fit, carried)
         if bad is not None:
             fit = fit.without(bad)
             continue
@@ -207,7 +207,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         fit, swaps = dated_anew(swapped), swaps + 1
 
 
-def _worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
+def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
     """Of the named effects from `first` on the one that is least worth having, if one is not."""
     values, folds = {}, Folds.of(fit, carried)
     for k in range(first, len(fit.named)):

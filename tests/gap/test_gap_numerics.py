@@ -27,11 +27,22 @@ from adapter.gap.candidates import (
 )
 from adapter.gap.evidence import LEAST_NM, ORDER, WHITE, Carried, Noise, noise_of, score, scores
 from adapter.gap.findings import parameter_std
-from adapter.gap.fit import Fit, Model, Named, beside, refitted, theta_prior, worth
+from adapter.gap.fit import (
+    Fit,
+    Model,
+    Named,
+    beside,
+    refitted,
+    theta_prior,
+    under_own_noise,
+    worth,
+)
 from adapter.gap.folds import Folds, fold_rows, pays_held_out
 from adapter.gap.possible import possible
+from adapter.gap.refine import DoubtedNoise, refined
 from adapter.gap.rivals import standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
+from adapter.gap.search import Found
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
 from adapter.model.inertia import is_consistent
 from adapter.model.robots import documented
@@ -552,6 +563,54 @@ def test_a_payload_that_cannot_exist_gives_way_as_little_as_the_data_let_it():
     way, back = found.coefficients - asked.coefficients, right - found.coefficients
     assert way @ information @ way < 0.9 * (off @ information @ off)
     assert way @ information @ back > 0.0  # the nearest point of a convex set
+
+
+def test_noise_without_doubt_is_whitened_as_ever():
+    x = process("first order", 3)
+    noise = noise_of(x)
+    assert np.allclose(
+        DoubtedNoise.of(noise, np.zeros_like(x)).whiten(x[None])[0], noise.whiten(x), atol=1e-6
+    )
+
+
+def test_what_is_wrong_in_a_doubted_row_stays_in_it():
+    x = process("first order", 4)
+    noise, doubt, wrong = noise_of(x), np.zeros_like(x), x.copy()
+    doubt[100:110], wrong[100:110] = 50.0, x[100:110] + 5.0
+    doubted, rest = DoubtedNoise.of(noise, doubt), np.r_[0 : 100 - ORDER, 110 - ORDER : 300]
+    change = {own: np.abs(own.whiten(wrong) - own.whiten(x))[rest] for own in (noise, doubted)}
+    assert change[noise].max() > 2.0 and change[doubted].max() < 0.2
+    assert np.abs(doubted.smooth(wrong) - doubted.smooth(x)).max() < 0.2
+
+
+def sticking(seed: int) -> Fit:
+    """A slow arm; friction holds one joint, at any torque up to its size, where it is slowest."""
+    rng, t = np.random.default_rng(seed), np.arange(0.0, 12.0, 1e-3)
+    q, dq, ddq = DRAWN.at(1.0 + 0.3 * t)
+    dq, ddq = 0.3 * dq, 0.09 * ddq
+    v, tau = dq[:, RUBS], ARM.torque(q, dq, ddq)
+    held = np.repeat(rng.uniform(-1.0, 1.0, len(v) // 100 + 1), 100)[: len(v)]
+    tau[:, RUBS] += FC * np.where(np.abs(v) < 0.02, held, np.sign(v))
+    return fit_of(recorded(noisy(tau, TAU_NOISE, seed), t, q, dq))
+
+
+def test_rows_in_which_a_joint_sticks_do_not_pull_at_its_friction():
+    off = []
+    for seed in range(3):
+        fit = sticking(seed)
+        there = next(c for c in _frictions(fit) if c.joint == RUBS)
+        searched, carried = under_own_noise(fit.with_named([Named(there, np.array([FC]))]))
+        found = refined(Found(searched, carried, ()))
+        off.append([own.named[0].values["Fc"] / FC - 1.0 for own in (searched, found.fit)])
+    searched, last = np.sqrt(np.mean(np.square(off), axis=0))
+    assert last < 0.03 and last < 0.7 * searched
+
+
+def test_nothing_is_refined_where_nothing_is_in_doubt():
+    fit = fit_of(SHORT)
+    fit, carried = under_own_noise(fit.with_named([named(fit, "base_tilt")]))
+    found = Found(fit, carried, ())
+    assert refined(found) is found
 
 
 def _frictions(fit: Fit) -> list:
