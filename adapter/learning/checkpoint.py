@@ -20,7 +20,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
-VERSION = 5
+VERSION = 6
 MORE = "schema.more."  # before the names of what some kinds of schema hold
 
 # What each part would not be the same learner without. Everything else follows from the settings.
@@ -49,7 +49,7 @@ _STATE = {
     "schema.moments": MotionMoments._fields,
     "theta": (
         *("x", "mean", "th", "count", "prior", "prior_rhs", "_ranges", "floor", "floor_count"),
-        *("spare_in_use", "updates", "effect_spread", "model_variance"),
+        *("spare_in_use", "updates", "effect_spread", "body_spread", "model_variance"),
     ),
     "theta.rows": ("place", "base_place"),
     "theta.moments": Moments._fields,

@@ -364,7 +364,7 @@ class OnlineLearner:
             return
         self._judged = now
         if now % (ADAPT_EVERY // JUDGE_THETA_EVERY) == 0 and self.theta.count >= ADAPT_EVERY:
-            self.theta.adapt_effects()
+            self.theta.adapt_prior()
         excess = float(np.mean(self.change.level / self.theta.variance()))
         limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
         self.theta_converged = self.change.samples >= self.change.settings.slow and excess < limit

@@ -46,6 +46,7 @@ from adapter.signals.records import StateLayout
 NEUTRAL_MASS = 1.0  # kg
 NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
+WIDEST_BODY = 100.0  # times these, where data say that a body is so heavy
 
 REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.025, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
@@ -114,7 +115,8 @@ class Theta:
             all that was known then.
         hand, spare: (slices of P) the hand's body, and the one that stands in for it after a
             change, when `spare_in_use`.
-        effect_spread: (e,) of each effect's prior over the joints, see `adapt_effects`.
+        effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
+            body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
     """
 
@@ -144,6 +146,7 @@ class Theta:
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
         self.moments, self.newest = self.empty_moments(), self.empty_moments()
         self.count = 0.0
+        self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.prior_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
         self._believed, self._belief_std = known.believed or (nothing, nothing)
@@ -182,7 +185,7 @@ class Theta:
     def _neutral_prior(self) -> tuple[Array, Array]:
         """Information of the prior: bodies and effects; the spare body waits without one."""
         std = np.full(self.P, np.inf)
-        std[: self.spare.start] = np.tile(PRIOR_STD, self.bodies - 1)
+        std[: self.spare.start] = np.outer(self.body_spread[:-1], PRIOR_STD).ravel()
         told = np.isfinite(self._believed)
         spread = np.where(told, self._belief_std, self.effect_spread[:, None])
         std[self._effects_from :] = spread.ravel()
@@ -356,7 +359,35 @@ class Theta:
         """(10, 10 (n + 1) + 1) information of the base's wrench: base by [base, links, wrench]."""
         return np.einsum("h,hab->ab", self.base_weights(), self.moments.C[:, :10])
 
-    def adapt_effects(self) -> None:
+    def adapt_prior(self) -> None:
+        """Let the data say how wide the prior is, of bodies and of effects."""
+        diagonal = self.covariance().diagonal()
+        self._adapt_bodies(diagonal)
+        self._adapt_effects(diagonal)
+
+    def _adapt_bodies(self, diagonal: Array) -> None:
+        """Let the data say how heavy each body may be; the prior only ever gets wider.
+
+        A humanoid's torso of 80 kg is no link of an arm. What data show of a body (variances below
+        half of the prior's) says how far from the neutral body it is.
+        """
+        if self.spare_in_use:
+            return
+        at = np.arange(self.spare.start)
+        x = (self.least_squares()[at].reshape(-1, 10) - neutral_body()) / PRIOR_STD
+        variance = diagonal[at].reshape(-1, 10) / PRIOR_STD**2
+        before = self.body_spread[:-1]
+        pulled = variance / before[:, None] ** 2  # share of the prior in what is known
+        shown = pulled < 0.5
+        away = np.where(shown, x / np.maximum(1.0 - pulled, 0.5), 0.0)  # as data alone have it
+        square = np.sum(away**2, axis=1) / np.maximum(shown.sum(axis=1), 1)
+        spread = np.clip(np.sqrt(square), before, WIDEST_BODY)
+        more = np.outer(1.0 / spread**2 - 1.0 / before**2, 1.0 / PRIOR_STD**2).ravel()
+        self.prior[at, at] += more
+        self.prior_rhs[at] += more * np.tile(neutral_body(), len(spread))
+        self.body_spread[:-1] = spread
+
+    def _adapt_effects(self, diagonal: Array) -> None:
         """Let the data say how large each effect is: the spread of its prior follows.
 
         Empirical Bayes, see `likely_spread`. An effect that is not there fades away, instead of
@@ -366,7 +397,7 @@ class Theta:
         if not self.effects:
             return
         n = self.tree.n
-        variance = self.covariance().diagonal()[self._effects_from :].reshape(-1, n)
+        variance = diagonal[self._effects_from :].reshape(-1, n)
         widest = np.array([effect.prior_std for effect in self.effects])
         values, free = self.effect_values, np.isnan(self._believed)
         found = [

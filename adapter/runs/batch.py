@@ -47,7 +47,7 @@ def learn_batch(
     for steps, share in THETA_POLISH:
         learner.set_rate(share * learner.settings.theta.rate)
         learner.learn_theta(_NO_STATES, steps)
-        learner.theta.adapt_effects()
+        learner.theta.adapt_prior()
     learner.follow_convergence()
 
 

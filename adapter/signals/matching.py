@@ -82,6 +82,11 @@ def matching(log: Log, documented: SelfModel) -> Log:
     links, more = _corresponding(tree.link_names, log.link_names, "link")
     heard = all(links) and log.twists is not None and log.accels is not None
     if tree.floating:  # see `twist`
+        if heard:
+            more.append(
+                f"{log.path}: the measured motion of links is not used where the base floats; it "
+                "is synthesized"
+            )
         heard = False
     elif log.link_names and not heard:
         more.append(

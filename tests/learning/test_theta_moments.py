@@ -490,6 +490,6 @@ def test_an_effect_that_no_data_show_may_still_be_there() -> None:
     of = case(1, False)
     theta = make(of)
     for _ in range(20):
-        theta.adapt_effects()
+        theta.adapt_prior()
     widest = [effect.prior_std for effect in theta.effects]
     assert np.allclose(theta.effect_spread, widest, rtol=1e-6)

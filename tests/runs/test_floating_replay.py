@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -138,6 +139,23 @@ def test_a_falling_tree_is_learned_as_well_as_by_least_squares(
     ours, batch, tau = errors_of(log, robot(), wrench, LEARNED_S)
     assert (ours**2).mean() < 1.1**2 * (batch**2).mean()
     assert (ours**2).mean() < 0.1**2 * (tau**2).mean()
+
+
+def test_the_prior_is_as_wide_as_bodies_are_heavy(folder: Path, tmp_path: Path) -> None:
+    """Twenty times the weight: no link of an arm."""
+    key = r'(mass value|effort|i[xyz]{2})="([^"]*)"'
+    heavy = re.sub(key, lambda m: f'{m[1]}="{20.0 * float(m[2])!r}"', text())
+    model, data = in_motion(heavy, True, WHOLE_S, 30, RATES.joints)
+    path = record(tmp_path / "heavy.mcap", data, 2, rates=RATES)
+    log = with_base_motion(matching(read_log(path, frames=True), model), model, "base")
+    spreads = []
+    for fall, arm in ((read(folder / "twist.mcap"), robot()), (log, model)):
+        settings = PipelineSettings(learner=LearnerSettings())
+        settings = replace(settings, filter=fitted_to(fall, settings.filter)[0])
+        theta = replay(fall, arm, settings, ReplayOptions(every=5)).pipeline.learner.theta
+        spreads.append(theta.body_spread[:-1].max())
+        assert np.allclose(theta.prior, theta._neutral_prior()[0])
+    assert spreads[1] > 2.0 * spreads[0]
 
 
 @pytest.mark.slow
