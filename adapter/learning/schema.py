@@ -47,8 +47,10 @@ from adapter.signals.filters import THIRD_DIFFERENCE_GAIN
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout
 
 PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
-# Curvature that counts as shown where nothing but rounding (some 1e-6) disturbs it.
-SHOWN_EXACTLY = 1.0
+# Curvature that counts as shown, and as known, where nothing but rounding (some 1e-6) disturbs it.
+SHOWN_EXACTLY, KNOWN_EXACTLY = 1.0, 1.6e5
+NEAR = 2.5e-3  # rad, m: from where the curvature alone finds the way, where nothing disturbs it
+SURE = 3.0  # standard deviations that may be left in directions that are not known yet
 # Times that λ has to stand still for where something shown is not known yet. Without noise that is
 # soon over, unless a brake holds a joint.
 PATIENCE = 5
@@ -288,12 +290,19 @@ class Schema:
         """Whether nothing but rounding disturbs what all moments say: synthesized motion."""
         return self.kind == LinkMotionKind.DOCUMENTED and not self.each_sample
 
+    @property
+    def _limits(self) -> tuple[float, float]:
+        """Curvatures above which a direction is shown, and known."""
+        if self._exact:
+            return SHOWN_EXACTLY, KNOWN_EXACTLY
+        # noise alone makes eigenvalues of the size sqrt(count); 400 is a std of 0.05 rad or m
+        return max(400.0, 10.0 * np.sqrt(self.count)), 1.0 / self.settings.std_goal**2
+
     def _judge(self) -> None:
         """Which directions the data show, how far the optimum is, whether λ has settled."""
         values, vectors = np.linalg.eigh(self.information)
-        # noise alone makes eigenvalues of the size sqrt(count); 400 is a std of 0.05 rad or m
-        least = SHOWN_EXACTLY if self._exact else max(400.0, 10.0 * np.sqrt(self.count))
-        shown, certain = values > least, values > 1.0 / self.settings.std_goal**2
+        least, enough = self._limits
+        shown, certain = values > least, values > enough
         for k, kind in enumerate((shown & certain, shown & ~certain)):
             kept = vectors * kind[:, None, :]
             self._may_move[:, k] = kept @ kept.transpose(0, 2, 1)
@@ -304,14 +313,14 @@ class Schema:
         self.rank, ranks = int(shown.sum()), (shown & certain).sum(axis=1)
         same = ranks.any() and bool((ranks == self.ranks).all())
         self.ranks[:] = ranks
-        inverse = self._inverse.sum(axis=1) if self._exact else self._inverse[:, 0]
-        left = np.einsum("jab,jb->ja", inverse, self.gradient)
-        std = 0.0 if self._exact else np.sqrt(np.einsum("jaa->ja", inverse))
-        self._there = (np.abs(left) < np.maximum(self.settings.distance_goal, std)).all(axis=1)
+        left = np.einsum("jkab,jb->jka", self._inverse, self.gradient)
+        std = np.sqrt(np.einsum("jkaa->jka", self._inverse)) * [[1.0], [SURE]]
+        tolerance = np.maximum(self.settings.distance_goal, 0.0 if self._exact else std)
+        self._there = (np.abs(left) < tolerance).all(axis=(1, 2))
         looked_ns, self._looked_ns = self._looked_ns, int(self.moments.last_stamps[0])
         since_ns = min(self._looked_ns - looked_ns, LONGEST_WAIT_NS)
         self._calm_ns = self._calm_ns + since_ns if same and self._there.all() else 0
-        self._settle(left)
+        self._settle(left.sum(axis=1))
 
     def _settle(self, left: Array) -> None:
         """Mend what stands wrong, and say whether λ has converged, with (n, 6) left to go."""
@@ -335,14 +344,14 @@ class Schema:
 
         ADAM forgets the large gradients of its way too slowly to come close soon.
         """
-        near = (np.abs(left) < self.settings.std_goal).all(axis=1)
+        near = (np.abs(left) < NEAR).all(axis=1)
         self.R0[near] = self.R0[near] @ exp_rotation(-left[near, :3])
         self.p[near] -= left[near, 3:]
         self.gradient[near] = 0.0
 
     def _check_valleys(self) -> None:
         """Start joints anew that stand in a wrong valley; ADAM goes on from there."""
-        least = 1.0 / self.settings.std_goal**2
+        least = self._limits[1 if self._exact else 0]
         clean = self._clean if self.kind == LinkMotionKind.MEASURED else self.moments.M
         still = self._there & (self.ranks > 0)
         urgent = self.ranks if self._calm_ns else None

@@ -34,7 +34,7 @@ class Evidence(NamedTuple):
 
     Attributes:
         sums, clean: (3, 15, 15) moments of so many samples, and what of them is motion.
-        rank: directions known. least: curvature of one that counts as known.
+        rank: directions known. least: curvature above which a direction follows the data.
         still: whether ADAM has arrived where the gradient leads it.
     """
 
@@ -111,4 +111,4 @@ class SchemaCheck:
         weights = profiled_weights(sums, count, found)
         freedom = hidden_freedom(known.clean, weights, found, known.least)
         held = nearest(sums, weights, found, start, freedom)
-        return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else None
+        return held if log_misfit(sums, count, held) < misfit - CLEARLY_BETTER else found

@@ -46,7 +46,7 @@ class SchemaSettings:
     start_rms: float = 0.01
     forget_s: float | None = None
     judge_every: int = 10
-    std_goal: float = 0.0025
+    std_goal: float = 0.00125
     distance_goal: float = 2.5e-4
     stable_s: float = 0.2
     spin_measured: bool = True

@@ -106,7 +106,7 @@ def course_errors(
             freedom = seen.freedom.joint(j)
             if rank < seen.ranks[j]:
                 hidden = clearest[:, : 6 - rank]
-                freedom = Freedom.of((hidden @ hidden.T)[None], reference.lam[one, 3:])
+                freedom = Freedom.of((hidden @ hidden.T)[None], outcome.lam[one, 3:])
             rows = known == rank
             errors = frame_errors(lam[rows, one], reference.lam[one], freedom)
             out[0, rows, j], out[1, rows, j] = errors[0][:, 0], errors[1][:, 0]
@@ -129,7 +129,7 @@ def schema_score(
     inside &= np.maximum.accumulate(outcome.schema_known[:, -1] > 0.0)
     at = settled_at(stamps_s(outcome.schema_trace), inside)
     hidden = np.eye(6) - outcome.lam_identifiable
-    freedom = Freedom.of(hidden, reference.lam[:, 3:])
+    freedom = Freedom.of(hidden, outcome.lam[:, 3:])
     last_turn, last_shift = frame_errors(completed.lam, reference.lam, freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
