@@ -95,7 +95,7 @@ class Trial:
         m, n = len(self.times), self.arm.n
         rng = np.random.default_rng([self.seed, DISTURBANCE_STREAM])
         keep = float(np.exp(-2 * np.pi * self.disturbance_hz * 1e-3))
-        return self.disturbance_nm * _first_order(rng.standard_normal((m, n)), keep)
+        return self.disturbance_nm * first_order(rng.standard_normal((m, n)), keep)
 
     def as_dict(self) -> dict[str, Any]:
         """What a truth file holds: enough to know, simulate and score the trial."""
@@ -189,20 +189,20 @@ def _wrong(theta: Array, rng: np.random.Generator) -> Array:
     for j, body in enumerate(theta):
         for _ in range(ATTEMPTS):
             wrong[j] = body * (1 + MODEL_ERROR * rng.standard_normal(10))
-            if _possible(wrong[j]):
+            if possible(wrong[j]):
                 break
         else:
             raise AssertionError(f"no possible body near that of link {j + 1}")
     return wrong
 
 
-def _possible(theta: Array) -> bool:
+def possible(theta: Array) -> bool:
     """Whether moments about the centre are those of some distribution of mass."""
     moments = np.linalg.eigvalsh(body_of(theta)[2])
     return bool(moments[0] > 0 and moments[0] + moments[1] > moments[2])
 
 
-def _first_order(white: Array, keep: float) -> Array:
+def first_order(white: Array, keep: float) -> Array:
     """AR(1) of unit variance along the first axis: x_k = keep x_{k-1} + sqrt(1 - keep^2) white."""
     gain = np.sqrt(1 - keep * keep)
     start = keep * white[:1]

@@ -1,0 +1,130 @@
+"""Twins of real logs, beside a plain weighted least squares: `make trials`.
+
+    python tests/benchmarks/twin_trials.py --first 0 --trials 200 --json FILE
+
+Even seeds are made by Pinocchio, odd ones by MuJoCo. True are a load above `NAMED_KG`, the last
+link's other reading of it, and whatever friction, offset, delay and inertia of links are; all
+other names are wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import traceback
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim.hidden.record import write_files
+from sim.hidden.trial import nominal_urdf
+from sim.hidden.twins import draw_twin
+from tests.helpers.gap_scorer import wilson
+from tests.helpers.twin_makers import by_mujoco, by_pinocchio
+from tests.helpers.weighed import weighed
+
+Row = dict[str, Any]
+TRUE = {
+    "coulomb_friction",
+    "viscous_friction",
+    "asymmetric_friction",
+    "stribeck_friction",
+    "bristle_friction",
+    "torque_offset",
+    "torque_filter",
+    "signal_delay",
+    "link_inertia",
+    "payload",
+}
+SURE_KG, NAMED_KG, RIGHT_KG, STDS = 0.5, 0.3, 0.1, 3.0
+
+
+def run(seed: int) -> Row:
+    """One twin: what `find_gap` says of it, and what least squares weighs."""
+    from adapter.gap.workflow import find_gap
+
+    twin = draw_twin(seed)
+    recording = (by_mujoco if seed % 2 else by_pinocchio)(twin)
+    row: Row = {**twin.as_dict(), "weighed_kg": weighed(recording, twin.nominal)}
+    with tempfile.TemporaryDirectory() as folder:
+        files = write_files(recording, nominal_urdf(twin.nominal), {}, Path(folder))
+        begun = time.process_time()
+        try:
+            found = find_gap([files[0]], files[1]).as_dict()
+        except Exception as error:
+            return {**row, "refused": str(error) or traceback.format_exc()}
+        row["processor_s"] = time.process_time() - begun
+    findings = found["findings"]
+    loads = [f for f in findings if f["effect"] == "payload"]
+    row["names"] = [[f["effect"], f["joints"], f["evidence"]] for f in findings]
+    if loads:
+        row["mass_kg"] = loads[0]["parameters"]["m"]
+        row["mass_std_kg"] = loads[0]["std"]["m"]
+    return row
+
+
+def judged(row: Row) -> Row:
+    """What of a row is right."""
+    names = {name for name, _, _ in row.get("names", [])}
+    mass, std = row.get("mass_kg", 0.0), row.get("mass_std_kg", 0.0)
+    off = abs(mass - row["load_kg"])
+    return {
+        "loaded": row["load_kg"] > SURE_KG,
+        "bare": row["load_kg"] == 0.0,
+        "named": "payload" in names,
+        "right": "payload" in names and off < max(RIGHT_KG, STDS * std),
+        "false_load": mass > NAMED_KG,
+        "push": "external_wrench" in names,
+        "wrong": bool(names - TRUE - {"external_wrench"}),
+        "refused": "refused" in row,
+    }
+
+
+def summary(rows: list[Row]) -> list[str]:
+    """The figures, each with its 95 % interval."""
+    marks = [judged(row) for row in rows]
+    loaded, bare = ([m for m in marks if m[key]] for key in ("loaded", "bare"))
+    lines = [
+        ("load named", [m["named"] for m in loaded]),
+        ("its mass right", [m["right"] for m in loaded]),
+        ("no load named on a bare arm", [not m["false_load"] for m in bare]),
+        ("false push", [m["push"] for m in marks]),
+        ("another wrong name", [m["wrong"] for m in marks]),
+        ("refused", [m["refused"] for m in marks]),
+    ]
+    said = []
+    for what, hits in lines:
+        low, high = wilson(sum(hits), len(hits))
+        said.append(f"{what}: {sum(hits)} of {len(hits)} ({low:.0%} to {high:.0%})")
+    off = [abs(r["weighed_kg"] - r["load_kg"]) for r in rows]
+    said.append(f"least squares is off by {np.median(off):.2f} kg (median), {max(off):.2f} at most")
+    return said
+
+
+def main() -> None:
+    """Run the seeds asked for and print a line each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--trials", type=int, default=200)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    rows: list[Row] = []
+    seeds = range(args.first, args.first + args.trials)
+    with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
+        for row in pool.map(run, seeds):
+            rows.append(row)
+            shown = {k: v for k, v in row.items() if k not in ("load_at",)}
+            print(json.dumps(shown), flush=True)
+            if args.json:
+                args.json.write_text(json.dumps(rows))
+    print("\n".join(summary(rows)))
+
+
+if __name__ == "__main__":
+    main()
