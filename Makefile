@@ -59,6 +59,7 @@ trials: $(STAMP)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/imu_trials.py --json runs/imu_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/simulate_trials.py --json runs/simulate_trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/twin_trials.py --json runs/twin_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/discover_trials.py --hard --json runs/discover_trials.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/mutations.py --json runs/mutations.json
 

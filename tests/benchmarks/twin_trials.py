@@ -1,6 +1,6 @@
 """Twins of real logs, beside a plain weighted least squares: `make trials`.
 
-    python tests/benchmarks/twin_trials.py --first 0 --trials 200 --json FILE
+    PYTHONPATH=. python tests/benchmarks/twin_trials.py --first 0 --trials 200 --json FILE
 
 Even seeds are made by Pinocchio, odd ones by MuJoCo. True are a load above `NAMED_KG`, the last
 link's other reading of it, and whatever friction, offset, delay and inertia of links are; all
