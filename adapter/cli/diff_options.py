@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from adapter.cli.options import add_joints, check_robot, locks_of
+from adapter.cli.options import add_joints, add_json, check_robot, locks_of
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +18,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("first", metavar="A", help="model file (.json), robot file or known name")
     add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
     add_joints(parser)
-    add("--json", type=Path, metavar="FILE|-", help="write the figures; - to the standard output")
+    add_json(parser, or_output=True)
     parser.set_defaults(check=_check)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_joints, check_files, check_robot, locks_of
+from adapter.cli.options import add_joints, add_json, check_files, check_robot, locks_of
 from adapter.errors import UsageError
 
 
@@ -29,7 +29,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="standard deviation of the model's inertial numbers, of their size (default 0.03; "
         "0.2 with --empty)",
     )
-    add("--json", type=Path, metavar="FILE|-", help="write the figures; - to the standard output")
+    add_json(parser, or_output=True)
     parser.set_defaults(check=_check)
 
 

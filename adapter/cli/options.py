@@ -88,9 +88,10 @@ def add_results(parser: argparse.ArgumentParser) -> None:
     add("--quiet", action="store_true", help="no progress")
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Where figures go."""
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+def add_json(parser: argparse.ArgumentParser, or_output: bool = False) -> None:
+    """Where figures go; of some commands to the standard output, too."""
+    metavar, more = ("FILE|-", "; - to the standard output") if or_output else ("FILE", "")
+    parser.add_argument("--json", type=Path, metavar=metavar, help=f"write the figures{more}")
 
 
 def check_learning(args: argparse.Namespace) -> None:

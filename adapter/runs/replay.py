@@ -179,10 +179,10 @@ def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[
             warnings.append(
                 f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter follows"
             )
-    open_noise = settings.dq_noise is None and settings.dq_drive is not None
-    noise = float(np.median(noise_levels(log)["dq"]))
-    if open_noise and np.isfinite(noise):
-        changes["dq_noise"] = noise
+    if settings.dq_noise is None and settings.dq_drive is not None:
+        noise = float(np.median(noise_levels(log)["dq"]))
+        if np.isfinite(noise):
+            changes["dq_noise"] = noise
     return replace(settings, **changes), warnings
 
 
