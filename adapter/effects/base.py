@@ -37,8 +37,10 @@ FEWEST_TO_FILTER = 100  # instants
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
 BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
 
-# Forms of friction that turns with the direction of motion; finer ones say which they refine.
+# Forms of friction that turns with the direction of motion, and of lateness; finer ones say which
+# they refine.
 LEVEL, LEVEL_BY_LOAD, TWO_LEVELS = "one level", "one level by load", "two levels"
+LATE = "late"
 
 JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 
@@ -163,7 +165,7 @@ class Effect(ABC):
         shows: what it shows in the experiments of `splits` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
-        form: of friction with the direction of motion, see `LEVEL`; empty for all else.
+        form: of what has finer forms, see `LEVEL`; empty for all else.
         simpler: forms of which it is a finer one, each with the share of the evidence that the
             finer form must add: no gear is exactly as an equation says.
         log_odds: ln of how much more often than the common ones it is met, before any data.

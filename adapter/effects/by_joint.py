@@ -39,6 +39,7 @@ class JointSignals(NamedTuple):
         q, dq, ddq: rad, rad/s, rad/s².
         tau: rigid torque, N m; left out where nothing depends on it.
         smoothing_s: how long the low-pass that the signals went through takes a step.
+        z: how far bristles are bent, -1 to 1; zero where nobody remembers the way.
     """
 
     q: Array
@@ -46,6 +47,7 @@ class JointSignals(NamedTuple):
     ddq: Array
     tau: Array = np.zeros(())
     smoothing_s: float = 0.0
+    z: Array = np.zeros(())
 
     @property
     def direction(self) -> Array:

@@ -10,6 +10,7 @@ from adapter.effects.asymmetric_friction import AsymmetricFriction
 from adapter.effects.backlash import Backlash
 from adapter.effects.base import Effect, LinearEffect
 from adapter.effects.base_tilt import BaseTilt
+from adapter.effects.bristle_friction import BristleFriction
 from adapter.effects.coulomb_friction import CoulombFriction
 from adapter.effects.encoder_offset import EncoderOffset
 from adapter.effects.encoder_ripple import EncoderRipple
@@ -23,6 +24,7 @@ from adapter.effects.motor_inertia import MotorInertia
 from adapter.effects.payload import Payload
 from adapter.effects.signal_delay import SignalDelay
 from adapter.effects.stribeck_friction import StribeckFriction
+from adapter.effects.torque_filter import TorqueFilter
 from adapter.effects.torque_gain import TorqueGain
 from adapter.effects.torque_offset import TorqueOffset
 from adapter.effects.torque_ripple import TorqueRipple
@@ -36,6 +38,7 @@ CATALOGUE: dict[str, Effect] = {
         CoulombFriction(),
         AsymmetricFriction(),
         StribeckFriction(),
+        BristleFriction(),
         LoadDependentFriction(),
         MotorInertia(),
         JointElasticity(),
@@ -44,6 +47,7 @@ CATALOGUE: dict[str, Effect] = {
         JointSpring(),
         TorqueOffset(),
         TorqueGain(),
+        TorqueFilter(),
         EncoderOffset(),
         EncoderRipple(),
         SignalDelay(),

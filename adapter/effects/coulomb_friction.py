@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from adapter.effects.base import LEVEL, Array, JointSignals, LinearEffect, Parameter
 from adapter.effects.phrases import Phrase
-from adapter.effects.splits import STILL
+from adapter.effects.splits import STILL, TURNS
 from adapter.model.urdf_text import FRICTION
 
 
@@ -20,7 +20,7 @@ class CoulombFriction(LinearEffect):
     inexact = 0.02
     phrase = Phrase.lacks("Fc", "Coulomb friction")
     form = LEVEL
-    shows = ((STILL, "fades or changes sign"),)
+    shows = ((STILL, "fades or changes sign"), (TURNS, "turns over at once"))
     sudden = True
     watched = True
     bundled = True

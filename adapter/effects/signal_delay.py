@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.effects.base import ALL, Array, Motion, Parameter, SensorEffect, Values
+from adapter.effects.base import ALL, LATE, Array, Motion, Parameter, SensorEffect, Values
 from adapter.effects.by_joint import EffectSums
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL
@@ -21,6 +21,7 @@ class SignalDelay(SensorEffect):
     parameters = (Parameter("d", "s", lower=-0.1, upper=0.1),)
     prior_std = 3e-3
     inexact = 0.02
+    form = LATE
     phrase = Phrase(
         "the torque of {who} comes {x} after the position",
         "d",

@@ -57,6 +57,13 @@ KNOWN_WEIGHT = DecidingExperiment(
     "hang a known weight on the flange and read the torque sensors", "leaves its reading right"
 )
 
+TURNS = DecidingExperiment(
+    "reverse the joint slowly and follow the torque over the first few mrad", "does not turn over"
+)
+SWINGS = DecidingExperiment(
+    "swing the joint's torque equally far at 1 to 10 Hz", "leaves the torque its size"
+)
+
 
 class Shown(Protocol):
     """What is asked of an effect here."""
@@ -79,6 +86,8 @@ SPLITS = (
     TURN,
     LEVELLED,
     KNOWN_WEIGHT,
+    TURNS,
+    SWINGS,
 )
 
 

@@ -16,7 +16,13 @@ from adapter.gap.result import Finding
 DASH = "–"
 MOST_DIGITS = 5  # of a value, however small its standard deviation
 SMALL_RAD = 0.1  # angles below it are shown in mrad
-SHOWN_UNITS = {"1": (100.0, "%"), "s": (1e3, "ms"), "m": (1e3, "mm"), "kg m2": (1.0, "kg m²")}
+SHOWN_UNITS = {
+    "1": (100.0, "%"),
+    "s": (1e3, "ms"),
+    "s2": (1e6, "ms²"),
+    "m": (1e3, "mm"),
+    "kg m2": (1.0, "kg m²"),
+}
 
 
 def plain(value: Any, digits: int = 3) -> str:

@@ -8,10 +8,14 @@ from itertools import combinations
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.integrate import solve_ivp
+from scipy.interpolate import interp1d
+from scipy.signal import lsim, lti
 
 from adapter.effects.active import active_effects, check_effects
 from adapter.effects.backlash import play
 from adapter.effects.base import Effect, Motion, polar
+from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.payload import parameters_of, theta_of
@@ -155,6 +159,43 @@ AT_JOINT = {
 def test_torque_at_a_joint(name: str) -> None:
     parameters, torque = AT_JOINT[name]
     assert relative(sensed(entry(name, **parameters)), on_joint(torque)) < 1e-9
+
+
+@pytest.mark.parametrize("s0", [5e-4, 5e-3, 0.05])
+def test_bristle_friction_is_dahls(s0: float) -> None:
+    """By an ODE solver; from any start, and with all of the motion behind it."""
+    z0 = 0.7
+    of = interp1d(T, DQ[:, J], "cubic")
+    grid = {"t_span": (0.0, T[-1]), "t_eval": T, "rtol": 1e-8, "atol": 1e-8, "max_step": 1e-3}
+    z = solve_ivp(lambda t, z: (of(t) - abs(of(t)) * z) / s0, y0=[z0], **grid).y[0]
+    ours, share = bending(Q[:, J], s0)
+    np.testing.assert_allclose(ours + z0 * share, z, atol=2e-3)
+    bristles = entry("bristle_friction", Fc=0.8, s0=s0)
+    assert relative(sensed(bristles), on_joint(0.8 * ours)) < 1e-9
+    late = sensed({**bristles, "interval_s": [2.0, None]})
+    assert relative(late, on_joint(0.8 * ours * (T >= 2.0))) < 1e-9
+
+
+def test_bristles_rest_where_they_are_and_slide_like_coulombs() -> None:
+    q = np.concatenate([np.linspace(0.0, 0.1, 50), np.full(30, 0.1), np.linspace(0.1, 0.099, 9)])
+    z, share = bending(q, 1e-3)
+    np.testing.assert_allclose(z[20:80], 1.0)
+    assert z[-1] == pytest.approx(2.0 * np.exp(-1.0) - 1.0)  # one s0 back from sliding
+    assert share[0] == 1.0 and share[49] < 1e-12
+
+
+def test_torque_filter_is_the_start_of_a_low_pass() -> None:
+    """Of second order, 20 Hz, solved as a differential equation."""
+    w, damping = 2.0 * np.pi * 20.0, 0.8
+    d = 2.0 * damping / w
+    start = np.concatenate([np.full(1000, RIGID[0, J]), RIGID[:, J]])
+    low_pass = lti([w**2], [1.0, 2.0 * damping * w, w**2])
+    theirs = lsim(low_pass, start - start[0], PERIOD_S * np.arange(len(start)))[1][1000:] + start[0]
+    ours = sensed(entry("torque_filter", d=d, c=d**2 - 1.0 / w**2))
+    inner = slice(300, -20)
+    gap = np.abs(theirs - RIGID[:, J])[inner].max()
+    assert gap > 0.1 and np.abs(ours[:, J] - theirs)[inner].max() < 0.03 * gap
+    assert relative(np.delete(ours, J, 1), np.delete(RIGID, J, 1)) < 1e-9
 
 
 def test_signs_of_friction_oppose_motion() -> None:
@@ -387,6 +428,9 @@ EXPERIMENTS = {
     ("coulomb_friction", "stribeck_friction"): "constant speeds",
     ("coulomb_friction", "asymmetric_friction"): "forwards and backwards",
     ("coulomb_friction", "friction_drift"): "ten minutes",
+    ("coulomb_friction", "bristle_friction"): "reverse the joint slowly",
+    ("bristle_friction", "stribeck_friction"): "constant speeds",
+    ("torque_filter", "signal_delay"): "1 to 10 Hz",
     ("asymmetric_friction", "torque_offset"): "hold the joint still",
     ("torque_offset", "torque_ripple"): "much of a turn",
     ("joint_spring", "torque_ripple"): "much of a turn",
@@ -419,6 +463,8 @@ POSSIBLE = {
         {"Fc": 0.1, "Fs": 0.4, "vs": 0.1},
         {"Fc": 0.4, "Fs": 0.1, "vs": 0.1},
     ),
+    "bristle_friction": ({"Fc": 0.1, "s0": 1e-3}, {"Fc": -0.1, "s0": 1e-3}),
+    "torque_filter": ({"d": -0.001, "c": 1e-5}, {"d": 0.002, "c": -1e-5}),
     "load_dependent_friction": ({"Fl": 0.1}, {"Fl": -0.1}),
     "motor_inertia": ({"B": 0.1}, {"B": -0.1}),
     "joint_elasticity": ({"k": 1e4}, {"k": -1e4}),

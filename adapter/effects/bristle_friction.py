@@ -1,0 +1,111 @@
+"""Bristle friction (Dahl): tau = Fc z, dz/dt = (dq - |dq| z) / s0. Positive Fc opposes motion.
+
+What rubs does not slide at once: it bends over a way of about s0 first. How far it is bent, z, is
+between -1 and 1, depends on the way alone, not on its speed, and stays where the joint rests: at
+rest it is the band of static friction. Source: P. Dahl, A Solid Friction Model, 1968.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import (
+    LEVEL,
+    Array,
+    JointSignals,
+    JointTorque,
+    Motion,
+    Parameter,
+    Template,
+    Values,
+    late_jit,
+    on_joint,
+)
+from adapter.effects.by_joint import EffectSums
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import STILL, TURNS
+from adapter.model.urdf_text import FRICTION, Additions
+
+WAYS_RAD = (3e-4, 1e-3, 3e-3, 1e-2)  # tried for s0
+
+
+@late_jit
+def bend(steps, s0, z, bent):
+    """Fill bent (m, n): how far the bristles of n joints are bent after each step of way.
+
+    Exact where the joint does not turn round within a step: z goes to the direction s as
+    s + (z - s) exp(-|step| / s0).
+
+    Args:
+        steps: (m, n) rad, from the instant before; s0: (n,) rad.
+        z: (n,) before the first step; holds afterwards what it is after the last.
+    """
+    for i in range(steps.shape[0]):
+        for j in range(steps.shape[1]):
+            way = np.sign(steps[i, j])
+            z[j] = way + (z[j] - way) * np.exp(-np.abs(steps[i, j]) / s0[j])
+            bent[i, j] = z[j]
+
+
+def bending(q: Array, s0: float) -> tuple[Array, Array]:
+    """Bristles along the way of a joint q (m,), rad.
+
+    Returns:
+        z (m,) that starts at zero, and the share (m,) of an unknown start that is left: bristles
+        that began at z0 are at z + z0 share.
+    """
+    steps = np.diff(q, prepend=q[:1])
+    z = np.empty((len(q), 1))
+    bend(steps[:, None], np.array([s0]), np.zeros(1), z)
+    return z[:, 0], np.exp(-np.cumsum(np.abs(steps)) / s0)
+
+
+class BristleFriction(JointTorque):
+    """Coulomb friction that winds up over a small way before the joint slides."""
+
+    name = "bristle_friction"
+    title = "bristle friction"
+    parameters = (
+        Parameter("Fc", "N m"),
+        Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1),
+    )
+    positive = ("Fc",)
+    inexact = 0.02
+    form = LEVEL
+    simpler = ((LEVEL, 0.01),)  # Coulomb friction, which is the same where s0 is small
+    phrase = Phrase("{who} {lacks} {Fc} of bristle friction, which winds up over {s0}")
+    shows = ((STILL, "fades or changes sign"), (TURNS, "turns over gradually"))
+
+    def templates(self) -> tuple[Template, ...]:
+        """The level, at several ways."""
+        return tuple(map(_template, WAYS_RAD))
+
+    def reshaped(self, values: Values, ratio: float) -> Template | None:
+        """Another s0."""
+        return _template(ratio * float(values["s0"]))
+
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """Fc z."""
+        return np.asarray(values["Fc"] * at.z)
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """Fc z, all of the motion behind it and z zero before its first instant."""
+        z, _ = bending(motion.q[:, joint], float(values["s0"]))
+        return on_joint(motion, joint, float(values["Fc"]) * z)
+
+    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+        """Nothing: one instant does not tell how far the bristles are bent."""
+        return False
+
+    def export(self, more: Additions, joint: int, values: Values) -> str | None:
+        """The level, as dry friction."""
+        return more.at_joint(FRICTION, joint, values["Fc"], "Fc is there as the joint's friction")
+
+
+def _template(s0: float) -> Template:
+    def decode(x: Array) -> dict[str, Any]:
+        return {"Fc": float(x[0]), "s0": s0}
+
+    return Template((1.0,), decode, f"s0 = {s0:.3g} rad")

@@ -1,0 +1,41 @@
+"""Torque sensor's low-pass: measured = tau - d dtau/dt + c d2tau/dt2.
+
+The start of the series of any low-pass that is fast against the motion: d is its mean delay, 2 c
+the mean square of its delays. A pure delay has c = d^2 / 2; one without phase has d = 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from adapter.effects.base import LATE, Array, Motion, Parameter, SensorEffect, Values
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
+
+
+class TorqueFilter(SensorEffect):
+    """A torque sensor that passes only what is slow."""
+
+    name = "torque_filter"
+    title = "torque sensor low-pass"
+    parameters = (Parameter("d", "s", lower=-0.1, upper=0.1), Parameter("c", "s2"))
+    prior_std = (3e-3, 1e-4)
+    positive = ("c",)
+    log_odds = -1.0
+    inexact = 0.02
+    simpler = ((LATE, 0.03),)
+    phrase = Phrase("the torque sensor of {who} is a low-pass, with d = {d} and c = {c}")
+    shows = (
+        (LOADS, "grows with the load"),
+        (SPEEDS, "rises in proportion to the speed"),
+        (STILL, "is gone"),
+        (SWINGS, "makes the torque smaller"),
+    )
+
+    def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """tau, its rate and the rate of that, on the joint."""
+        own = tau[:, joint]
+        rate = motion.rate(own)
+        out = tau.copy()
+        out[:, joint] += values["c"] * motion.rate(rate) - values["d"] * rate
+        return np.asarray(out)
