@@ -19,7 +19,7 @@ from adapter.errors import ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.screen import RecordingRefused
 from adapter.gap.words import as_json, console_summary
-from adapter.gap.workflow import GapSettings, find_gap
+from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
@@ -32,7 +32,7 @@ EXIT_REFUSED = 2
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    settings = GapSettings(validate_from_s=args.validate_from)
+    settings = GapSettings(validate_from_s=args.validate_from, hold_out=tuple(args.hold_out))
     if args.inertia_prior is not None:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         with _progress(args.quiet) as tell:
             result = find_gap(args.logs, nominal, settings, rollouts, model_out, tell)
     except RecordingRefused as refusal:
-        names, logs = nominal.tree.joint_names, [log.name for log in args.logs]
+        names, logs = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
         nothing = GapResult.untold(names, nominal.name, logs, args.model, str(refusal))
         _write(args, folder, nothing, {"refused": refusal.kind})
         console.print(f"[red]error:[/] {escape(str(refusal))}", soft_wrap=True)

@@ -174,6 +174,7 @@ class Effect(ABC):
         passing: whether it comes and goes by itself.
         watched: whether the monitor looks for it while an arm is learned: an effect of a joint
             with `columns`, a body or a wrench at the flange.
+        own_to_log: whether each recording has one of its own, where several are of one arm.
         bundled: whether friction and offsets of the same joint can hide it and be hidden by it.
         over_angle: whether it is a curve over the joint's angle.
         is_theta: whether its coefficients are the ten inertial parameters of a link.
@@ -195,6 +196,7 @@ class Effect(ABC):
     sudden: ClassVar[bool] = False
     passing: ClassVar[bool] = False
     watched: ClassVar[bool] = False
+    own_to_log: ClassVar[bool] = False
     bundled: ClassVar[bool] = False
     over_angle: ClassVar[bool] = False
     is_theta: ClassVar[bool] = False

@@ -39,6 +39,7 @@ class ExternalWrench(TorqueEffect):
     sudden = True
     passing = True
     watched = True
+    own_to_log = True
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """-J^T w."""

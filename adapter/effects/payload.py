@@ -34,6 +34,7 @@ class Payload(BodyEffect):
     shows = ((BARE, "is gone"),)
     sudden = True
     watched = True
+    own_to_log = True
     is_theta = True
 
     def decode(self, x: Array) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -36,11 +36,16 @@ def _joints(named: Named) -> list[int]:
     return [named.candidate.joint + 1] if own else []
 
 
-def entries(fit: Fit) -> list[dict[str, Any]]:
-    """Entries of a model file for the named effects of the catalogue."""
-    out = []
+def entries(fit: Fit, recording: int | None = None) -> list[dict[str, Any]]:
+    """Entries of a model file for the named effects of the catalogue.
+
+    Args:
+        recording: of several, whose own effects are among them; None: what is common alone.
+    """
+    out, alone = [], len(fit.recordings) == 1
     for named in fit.named:
-        if not isinstance(named.candidate.effect, Pattern):
+        here = alone or named.recording in (None, recording)
+        if here and not isinstance(named.candidate.effect, Pattern):
             begin, end = (None if not np.isfinite(x) else float(x) for x in named.interval_s)
             out.append(
                 {
@@ -83,19 +88,19 @@ def _flat(values: dict[str, Any]) -> Array:
 
 
 def told_of(
-    found: Found, ends: Sequence[float]
+    found: Found, ends: Mapping[str, float]
 ) -> tuple[tuple[Finding, ...], tuple[Leftover, ...]]:
     """Effects that the model lacks, and what no effect explains.
 
     Args:
-        found: of the search; ends: (recordings,) s, when each ends.
+        found: of the search; ends: recordings by name -> s, when each ends.
     """
-    left = leftovers_of(found, ends)
+    left = leftovers_of(found, list(ends.values()))
     return doubted(findings_of(found, ends), left), left
 
 
-def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
-    """Every named effect of the catalogue. `ends`: (recordings,) s, when each ends."""
+def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Every named effect of the catalogue. `ends`: recordings by name -> s, when each ends."""
     fit, covariance = found.fit, (found.known or found.carried).covariance()
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
@@ -103,6 +108,7 @@ def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
         if isinstance(effect, Pattern):
             continue
         recording = named.recording or 0
+        own, (name, last) = named.recording is not None, list(ends.items())[recording]
         begin, end = named.interval_s
         torque = fit.model.contribution(recording, k)
         t = fit.recordings[recording].t
@@ -113,7 +119,7 @@ def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
                 effect=effect.name,
                 title=effect.title,
                 joints=tuple(_joints(named)),
-                interval_s=(max(begin, 0.0), min(end, ends[recording])),
+                interval_s=(max(begin, 0.0), min(end, last)),
                 lasting=not np.isfinite(end),
                 parameters=named.values,
                 std=parameter_std(fit, covariance, k),
@@ -123,6 +129,7 @@ def findings_of(found: Found, ends: Sequence[float]) -> tuple[Finding, ...]:
                 split_by="; ".join(experiments(effect, [CATALOGUE[x] for x in overlaps])),
                 detectability=float(np.sqrt(standing.chi2)),
                 torque_rms_nm=np.sqrt(np.mean(torque[on] ** 2, axis=0)),
+                recording=name if own and len(ends) > 1 else "",
             )
         )
     return tuple(sorted(out, key=lambda f: -f.detectability))

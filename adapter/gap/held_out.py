@@ -31,21 +31,26 @@ THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
-def model_of(model: SelfModel, fit: Fit) -> SelfModel:
-    """The self model with the corrections and the named effects of a fit."""
+def model_of(model: SelfModel, fit: Fit, recording: int | None = None) -> SelfModel:
+    """The self model with the corrections and the named effects of a fit.
+
+    Of several recordings those that are common, and the own ones of the one that is asked for.
+    """
     theta = model.theta.copy()
     theta[len(theta) - len(fit.dtheta) :] += fit.dtheta  # a floating base comes before the links
-    return replace(model, theta=theta, effects=(*model.effects, *entries(fit)))
+    return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording)))
 
 
-def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[SelfModel]:
-    """One model per fold: the named effects refitted without that fold's blocks of time."""
-    models = []
+def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[list[SelfModel]]:
+    """Of each recording one model per fold: refitted without that fold's blocks of time."""
+    models: list[list[SelfModel]] = [[] for _ in fit.recordings]
     for known in Folds.of(fit, carried).known():
-        try:
-            models.append(model_of(model, possible(fit.at(known.x), known)))
-        except ModelError:  # a coefficient at its bound without these data
-            models.append(model_of(model, fit))
+        without = possible(fit.at(known.x), known)
+        for i, own in enumerate(models):
+            try:
+                own.append(model_of(model, without, i))
+            except ModelError:  # a coefficient at its bound without these data
+                own.append(model_of(model, fit, i))
     return models
 
 
@@ -218,12 +223,13 @@ def measure(
         after = held_out_models(task.model, found.fit, found.carried)
     else:
         model = model_of(task.model, found.fit)
-        after = [model if task.one_clock else lasting(model)]
-    errors = [torque_errors(r, task.model, after, block) for r in task.scored]
+        after = [[model if task.one_clock else lasting(model)]] * len(task.scored)
+    pairs = list(zip(task.scored, after, strict=True))
+    errors = [torque_errors(r, task.model, own, block) for r, own in pairs]
     runs: list[RolloutErrors] = []
     if simulate is not None:
         progress("simulating forward")
-        runs = [rollout_errors(r, task.model, after, simulate, block) for r in task.scored]
+        runs = [rollout_errors(r, task.model, own, simulate, block) for r, own in pairs]
 
     def rollout(key: str) -> Array | None:
         return rms([getattr(run, key) for run in runs]) if runs else None
@@ -253,8 +259,9 @@ def _corrected_where_it_pays(task: GapTask, found: Found) -> Found:
     level = noise_floor(found.fit)
     costs = []
     for own in (found, bare):
-        folds = held_out_models(task.model, own.fit, own.carried)
-        errors = [torque_errors(r, task.model, folds, block_s(own.fit)) for r in task.fitted]
+        block, models = block_s(own.fit), held_out_models(task.model, own.fit, own.carried)
+        pairs = zip(task.fitted, models, strict=True)
+        errors = [torque_errors(r, task.model, folds, block) for r, folds in pairs]
         costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
     return found if costs[0] <= costs[1] else bare
 

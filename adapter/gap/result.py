@@ -47,6 +47,7 @@ class Finding:
         split_by: the experiment that would tell them apart.
         detectability: z, its size in standard deviations of what else could explain it.
         torque_rms_nm: (n,) what it adds to each joint, rms while it acts.
+        recording: whose own it is; empty where it is common to all.
     """
 
     effect: str
@@ -62,6 +63,7 @@ class Finding:
     split_by: str
     detectability: float
     torque_rms_nm: Array
+    recording: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """As in the JSON file."""

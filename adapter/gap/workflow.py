@@ -47,12 +47,15 @@ class GapSettings:
     Attributes:
         inertia_prior: by which share the model's inertias may be off, one standard deviation.
         validate_from_s: with one recording: fit before it, score after it; None: by blocks.
+        hold_out: recordings to score on, among those that are given or not. All others are
+            fitted; where none is held out, blocks of time of all are in turn.
         rounds: of the search, each of which may name something; where they do not suffice the
             result says so. Counted, not timed: the same log gives the same result anywhere.
     """
 
     inertia_prior: float = 0.02
     validate_from_s: float | None = None
+    hold_out: tuple[Path | str | Log, ...] = ()
     rounds: int = ROUNDS
 
     def __post_init__(self) -> None:
@@ -60,6 +63,8 @@ class GapSettings:
             raise ValueError(f"the inertias' prior must be in (0, 1], got {self.inertia_prior}")
         if self.rounds < 1:
             raise ValueError(f"the search needs at least one round, got {self.rounds}")
+        if self.hold_out and self.validate_from_s is not None:
+            raise ValueError("score from a second on, or on recordings held out: not both")
 
 
 def find_gap(
@@ -73,7 +78,7 @@ def find_gap(
     """Find what the model lacks.
 
     Args:
-        logs: MCAP recordings, or read ones; of several the last one is held out.
+        logs: MCAP recordings of one arm, or read ones.
         model: self model, or a file of one, or a URDF, or a known robot's name.
         settings: see there.
         simulate: forward simulation; without it only torques are compared.
@@ -94,7 +99,7 @@ def find_gap(
     except RecordingRefused as refusal:
         if not refusal.kind.is_an_answer:
             raise
-        names = [_name(log) for log in logs]
+        names = names_of([*logs, *settings.hold_out])
         return GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
     progress("smoothing")
     fit = _nominal_fit(task, settings)
@@ -112,39 +117,56 @@ def _task(
     logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
 ) -> GapTask:
     """Read and screen. Raises Refusal."""
-    read, locked = [], []
-    for log in logs:
-        progress(f"reading {_name(log)}")
+    held = settings.hold_out
+    kept = [log for log in logs if not any(_same(log, other) for other in held)]
+    if not kept:
+        raise ValueError("nothing is left to fit: every recording is held out")
+    if settings.validate_from_s is not None and len(kept) > 1:
+        raise ValueError("validate_from_s splits one recording; of several, hold one out")
+    read, locked, names = [], [], names_of([*kept, *held])
+    for log, name in zip([*kept, *held], names, strict=True):
+        progress(f"reading {name}")
         read.append(log if isinstance(log, Log) else read_log(Path(log)))
-        model, said = present(model, read[-1].joint_names, read[-1].path.name)
+        model, said = present(model, read[-1].joint_names, name)
         locked += said
     arm = RigidArm.of(model)
     screened: list[Screened] = [refuse(log, model, arm) for log in read]
-    recordings = tuple(Recorded.of(x.log, lateness(x.timing)) for x in screened)
-    if len(recordings) > 1:
-        fitted, scored = recordings[:-1], recordings[-1:]
+    recordings = tuple(
+        replace(Recorded.of(x.log, lateness(x.timing)), name=name)
+        for x, name in zip(screened, names, strict=True)
+    )
+    fitted = scored = recordings
+    if held:
+        fitted, scored = recordings[: len(kept)], recordings[len(kept) :]
     elif settings.validate_from_s is not None:
         fitted, scored = _split(recordings[0], settings.validate_from_s)
-    else:
-        fitted = scored = recordings
+    said_of = zip(names, (x.notes for x in screened), strict=True)
+    notes = (f"{name}: {x}" if len(names) > 1 else x for name, own in said_of for x in own)
     return GapTask(
         model,
         fitted,
         scored,
         moving=tuple(x.moving for x in screened[: len(fitted)]),
         period_s=max(x.timing.period_s for x in screened),
-        one_clock=len(logs) == 1,
-        notes=tuple(locked)
-        + tuple(
-            f"{x.log.path.name}: {note}" if len(logs) > 1 else note
-            for x in screened
-            for note in x.notes
-        ),
+        one_clock=not held,
+        notes=(*dict.fromkeys(locked), *notes),
     )
 
 
-def _name(log: Path | str | Log) -> str:
-    return log.path.name if isinstance(log, Log) else Path(log).name
+def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
+    """What recordings are called: their files' names, with folders where two have the same."""
+    paths = [log.path if isinstance(log, Log) else Path(log) for log in logs]
+    short = [path.name for path in paths]
+    names = [str(p) if short.count(p.name) > 1 else p.name for p in paths]
+    again = [names[:k].count(name) for k, name in enumerate(names)]
+    return [f"{name} ({k + 1})" if k else name for name, k in zip(names, again, strict=True)]
+
+
+def _same(one: Path | str | Log, other: Path | str | Log) -> bool:
+    """Whether two stand for one recording."""
+    if isinstance(one, Log) or isinstance(other, Log):
+        return one is other
+    return Path(one).resolve() == Path(other).resolve()
 
 
 def lateness(timing: RecordingClock) -> float:
@@ -181,7 +203,7 @@ def _nominal_fit(task: GapTask, settings: GapSettings) -> Fit:
 def _result(task: GapTask, measured: HeldOut) -> GapResult:
     """All that was found and measured."""
     found, floor = measured.found, noise_floor(measured.found.fit)
-    findings, left = told_of(found, [float(r.t[-1]) for r in task.fitted])
+    findings, left = told_of(found, {r.name: float(r.t[-1]) for r in task.fitted})
     splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,

@@ -386,15 +386,17 @@ def find_gap(
     *,
     inertia_prior: float | None = None,
     validate_from_s: float | None = None,
+    hold_out: Sequence[Log | str | Path] = (),
     model_out: str | Path | None = None,
 ) -> GapResult:
     """Where recordings and a model disagree, and which effects the model lacks (`adapter gap`).
 
     Args:
-        logs: one or several recordings; of several the last is held out, of one blocks in turn.
+        logs: one or several recordings of one arm: what the hand carries is each one's own.
         model: never changed.
         inertia_prior: standard deviation of the model's inertial numbers, as a share of them.
         validate_from_s: of one recording, fit before this second and score after it.
+        hold_out: recordings to score on; where none is, blocks of time of all in turn.
         model_out: where the new model goes (.json).
 
     Returns:
@@ -410,7 +412,7 @@ def find_gap(
     GapResult(nothing found, torque error at most 0.0... -> 0.0... N m)
     """
     several = [logs] if isinstance(logs, Log | str | Path) else list(logs)
-    settings = GapSettings(validate_from_s=validate_from_s)
+    settings = GapSettings(validate_from_s=validate_from_s, hold_out=tuple(hold_out))
     if inertia_prior is not None:
         settings = replace(settings, inertia_prior=inertia_prior)
     out = None if model_out is None else Path(model_out)

@@ -173,12 +173,12 @@ def test_validate_from(data: Path, tmp_path: Path) -> None:
     assert main([str(word) for word in (*words, "--validate-from", 11.0)]) == 2
 
 
-def test_two_recordings_the_last_is_held_out(data: Path, tmp_path: Path) -> None:
+def test_one_of_two_recordings_is_held_out(data: Path, tmp_path: Path) -> None:
     figures = gap(
         tmp_path,
         data / "arm.urdf",
-        [data / "two.mcap", data / "one.mcap"],
-        *("--no-simulation", "--no-report"),
+        [data / "two.mcap"],
+        *("--hold-out", data / "one.mcap", "--no-simulation", "--no-report"),
     )
     assert figures["exit"] == 0 and figures["recordings"] == ["two.mcap", "one.mcap"]
     assert coulomb_on_joint_4(figures) == pytest.approx(2.0, rel=0.05)

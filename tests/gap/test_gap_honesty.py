@@ -163,7 +163,7 @@ def estimates(fit: Fit, seed: int) -> tuple[float, float]:
     read = own.low(tau) + level * rng.standard_normal(own.tau.shape)
     fit = replace(fit, model=replace(fit.model, recordings=(replace(own, tau=read),)))
     fit, carried = refitted(fit)
-    (found,) = findings_of(settled_as(fit, carried), [SECONDS])
+    (found,) = findings_of(settled_as(fit, carried), {"log": SECONDS})
     return found.parameters["B"], found.std["B"]
 
 
@@ -188,7 +188,7 @@ def test_inertias_left_alone_are_no_surer_for_that() -> None:
     free = settled_as(fit, carried)
     kept = uncorrected(free)
     assert not kept.fit.dtheta.any() and np.array_equal(kept.fit.prior, fit.prior)
-    (before,), (after,) = (findings_of(x, [SECONDS]) for x in (free, kept))
+    (before,), (after,) = (findings_of(x, {"log": SECONDS}) for x in (free, kept))
     assert after.std["B"] == pytest.approx(before.std["B"], rel=0.05)
     fast = kept.carried.std()[-1]  # with the inertias held fast
     assert after.std["B"] > 2.0 * fast
@@ -211,7 +211,7 @@ def test_what_is_told_of_a_shaken_joint_is_less_sure(shaken: bool) -> None:
         more += on_joint(JOINT, np.sin(2.0 * np.pi * 1.3 * T))
     fit = with_effect(nominal_fit(recording(6, more)), "coulomb_friction", JOINT, FC).with_noise()
     found = settled_as(fit, fit.carried())
-    (own,), left = told_of(found, [SECONDS])
+    (own,), left = told_of(found, {"log": SECONDS})
     assert {x.joint for x in left} == ({JOINT + 1} if shaken else set())
     assert own.evidence == pytest.approx(1.0) if not shaken else own.evidence < 0.5
 
