@@ -70,7 +70,26 @@ def bench(parser: argparse.ArgumentParser) -> None:
     parser.description = (
         "Times one update of λ and θ of a Panda beside autograd through the torch "
         "networks, Pinocchio's regressor with recursive least squares (if pin is installed) and "
-        "differentiable-robot-model (extra [peers], if installed)."
+        "differentiable-robot-model (extra [peers], if installed). With --log also compares the "
+        "torque that ours and figaroh (extra [peers]) leave on the part not learned from."
     )
-    parser.add_argument("--repeats", type=int, default=2000, metavar="N", help="default 2000")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    add = parser.add_argument
+    add("--repeats", type=int, default=2000, metavar="N", help="default 2000")
+    add("--log", type=Path, metavar="LOG", help="recording of an arm to compare held-out torque on")
+    add("--robot", default="panda", metavar="ROBOT", help="the arm of LOG; default panda")
+    add(
+        "--validate-from",
+        type=float,
+        default=14.0,
+        metavar="S",
+        help="learn before this second of LOG, score after it; default 14",
+    )
+    add("--json", type=Path, metavar="FILE", help="write the figures")
+    parser.set_defaults(check=_check_bench)
+
+
+def _check_bench(args: argparse.Namespace) -> None:
+    """Raises UsageError or OSError for what would end it minutes later."""
+    if args.log is not None and not args.log.is_file():
+        raise UsageError(f"{args.log}: no such recording")
+    check_writable(args.json)

@@ -14,11 +14,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.markup import escape
 from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.export import to_urdf
+from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
+from adapter.experiments.identification import MISSING, held_out, stated
 from adapter.learning.learner import Filtered, OnlineLearner
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import log_cholesky_from_theta
@@ -34,6 +37,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.terminal import console, write_json
 from adapter.signals.filters import JointFilter
+from drivers.files.mcap import read_log
 from drivers.interface import JointSample
 
 WARM_UP = 2500  # samples, so that λ has settled and θ is being learned
@@ -48,10 +52,24 @@ def run(args: argparse.Namespace) -> int:
     for row in rows:
         p50, p99 = row["p50_us"], row["p99_us"]
         shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
-        table.add_row(row["what"], *shown, row["note"])
+        table.add_row(row["what"], *shown, escape(row["note"]))
     console.print(table)
-    write_json(args.json, {"rows": rows})
+    unseen = _held_out(args)
+    table = Table("unseen torque", "rmse by joint, N m", "note", box=None, pad_edge=False)
+    for row in unseen:
+        table.add_row(
+            row["what"], " ".join(f"{x:.3f}" for x in row["rmse_nm"]), escape(row["note"])
+        )
+    console.print(table)
+    write_json(args.json, {"rows": rows, "held_out": unseen})
     return 0
+
+
+def _held_out(args: argparse.Namespace) -> list[dict[str, Any]]:
+    """What ours and figaroh leave on a log; without one what figaroh is known to leave."""
+    if args.log is None:
+        return [stated()]
+    return held_out(read_log(args.log), read_robot(args.robot), args.validate_from)
 
 
 def motion(robot: SelfModel, samples: int) -> tuple[Array, Array, Array, Array]:
@@ -175,7 +193,7 @@ def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
 def _peer(repeats: int) -> dict[str, Any]:
     what = "differentiable-robot-model, ADAM"
     if importlib.util.find_spec("differentiable_robot_model") is None:
-        return _row(what, None, "extra [peers] is not installed")
+        return _row(what, None, MISSING)
     return _row(what, _time_peer(repeats), "one sample, link masses alone")
 
 
