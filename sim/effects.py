@@ -2,7 +2,9 @@
 
 Sign of all of them: `tau_measured = tau_rigid(q, dq, ddq) + sum of effects`. Names, keys, units
 and frames of the catalogue are those of its table; names that begin with `x_` are in no
-catalogue: what is to be said of them is that something is unexplained.
+catalogue: what is to be said of them is that something is unexplained. A `torque_filter` is the
+low-pass of second order whose series begins with its d and c: b read'' + d read' + read = tau with
+b = d^2 - c, of first order where b is zero.
 
 | name | torque on the joint, or what its sensor makes of it | keys (unit) |
 |---|---|---|
@@ -11,10 +13,8 @@ catalogue: what is to be said of them is that something is unexplained.
 | x_position_friction | A (1 + sin(q + phase)) sign(dq) | A (N m), phase (rad) |
 | x_sine_disturbance | a sin(2 pi f t + phase) | a (N m), f (Hz), phase (rad) |
 | x_velocity_ripple | a sin(n q + phase) dq | a (N m s/rad), n (per turn), phase (rad) |
-| x_hysteresis | Dahl: dz/dq = sigma (1 - z/F sign(dq)), torque z | F (N m), sigma (N m/rad) |
 | x_cross_viscous | joints [i, j]: c dq_i on joint j | c (N m s/rad) |
 | x_torque_crosstalk | joints [i, j]: sensor j reads share tau_i on top | share (1) |
-| x_sensor_lowpass | the torque sensor lags: T d(read)/dt = tau - read | T (s) |
 | x_torque_deadband | the sensor reads tau - clip(tau, -w, w) | w (N m) |
 | x_torque_saturation | the sensor's curve bends: s tanh(tau/s) | s (N m) |
 """
@@ -39,6 +39,7 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "coulomb_friction": (MOTION, ("Fc",), ()),
     "asymmetric_friction": (MOTION, ("Fc_pos", "Fc_neg"), ()),
     "stribeck_friction": (MOTION, ("Fc", "Fs", "vs"), ()),
+    "bristle_friction": (MOTION, ("Fc", "s0"), ()),
     "load_dependent_friction": (MOTION, ("Fl",), ()),
     "friction_drift": (MOTION, ("dFc",), ()),
     "motor_inertia": (MOTION, ("B",), ()),
@@ -53,6 +54,7 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "encoder_offset": (ENCODER, ("o",), ()),
     "encoder_ripple": (ENCODER, ("a",), ("phase",)),
     "torque_gain": (TORQUE, ("g",), ()),
+    "torque_filter": (TORQUE, ("d", "c"), ()),
     "torque_offset": (TORQUE, ("o",), ()),
     "signal_delay": (TORQUE, ("d",), ()),
     "x_quadratic_drag": (MOTION, ("c",), ()),
@@ -60,10 +62,8 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "x_position_friction": (MOTION, ("A",), ("phase",)),
     "x_sine_disturbance": (MOTION, ("a", "f"), ("phase",)),
     "x_velocity_ripple": (MOTION, ("a", "n"), ("phase",)),
-    "x_hysteresis": (MOTION, ("F", "sigma"), ()),
     "x_cross_viscous": (MOTION, ("c",), ()),
     "x_torque_crosstalk": (TORQUE, ("share",), ()),
-    "x_sensor_lowpass": (TORQUE, ("T",), ()),
     "x_torque_deadband": (TORQUE, ("w",), ()),
     "x_torque_saturation": (TORQUE, ("s",), ()),
 }
@@ -72,8 +72,8 @@ LENGTHS = {"inertia": 6, "dtheta": 10}
 POSITIVE = {
     "joint_elasticity": "k",
     "stribeck_friction": "vs",
-    "x_hysteresis": "F",
-    "x_sensor_lowpass": "T",
+    "bristle_friction": "s0",
+    "torque_filter": "d",
     "x_torque_saturation": "s",
 }
 NOT_NEGATIVE = {"signal_delay": "d", "backlash": "b", "motor_inertia": "B"}

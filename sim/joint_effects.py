@@ -51,6 +51,7 @@ KINDS = {
     "coulomb_friction": (Row.COULOMB, ("Fc", "Fc")),
     "asymmetric_friction": (Row.COULOMB, ("Fc_pos", "Fc_neg")),
     "stribeck_friction": (Row.STRIBECK, ("Fc", "Fs", "vs")),
+    "bristle_friction": (Row.DAHL, ("Fc", "s0")),
     "load_dependent_friction": (Row.LOAD_DEPENDENT, ("Fl",)),
     "friction_drift": (Row.DRIFT, ("dFc",)),
     "motor_inertia": (Row.ARMATURE, ("B",)),
@@ -61,7 +62,6 @@ KINDS = {
     "x_position_friction": (Row.POSITION_FRICTION, ("A", "phase")),
     "x_sine_disturbance": (Row.SINE, ("a", "f", "phase")),
     "x_velocity_ripple": (Row.VELOCITY_RIPPLE, ("a", "n", "phase")),
-    "x_hysteresis": (Row.DAHL, ("F", "sigma")),
     "x_cross_viscous": (Row.CROSS_VISCOUS, ("c",)),
 }
 
@@ -174,12 +174,12 @@ def _torque(row: Array, q: float, t: float) -> float:
 
 @njit(cache=True)
 def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
-    """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,): dz/dq = sigma (1 - z/F s)."""
+    """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,), N m: s0 dz = Fc dq - z |dq|."""
     for r in range(len(rows)):
         if int(rows[r, 0]) == Row.DAHL:
-            speed, F, sigma = v[int(rows[r, 1])], rows[r, 3], rows[r, 4]
-            goal = F if speed > 0 else -F
-            bent[r] = goal + (bent[r] - goal) * np.exp(-sigma * abs(speed) * h / F)
+            speed, level, way = v[int(rows[r, 1])], rows[r, 3], rows[r, 4]
+            goal = level if speed > 0 else -level
+            bent[r] = goal + (bent[r] - goal) * np.exp(-abs(speed) * h / way)
 
 
 @njit(cache=True)

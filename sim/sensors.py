@@ -2,7 +2,7 @@
 
 The encoder sits on the motor's side of the gear: it reads the link angle plus the gear's twist
 tau/k plus the play, and has an offset and a ripple of its own. The torque sensor's chain is
-crosstalk, bent curve, gain and offset, deadband, lag, and last the delay of its signal.
+crosstalk, bent curve, gain and offset, deadband, low-pass, and last the delay of its signal.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.signal import cont2discrete, lfilter, lfilter_zi
 
 from sim.effects import ENCODER, TORQUE, Array, Effect
 from sim.truth import Truth
@@ -96,6 +97,30 @@ class Play:
         self.rate, self.gap = (moved - self.gap) / period_s, moved
 
 
+class LowPass:
+    """A `torque_filter` as it runs; what it is given is taken as straight between ticks.
+
+    Raises:
+        ValueError: c is above d^2, which no low-pass has.
+    """
+
+    def __init__(self, effect: Effect, period_s: float) -> None:
+        d, c = effect.number("d"), effect.number("c")
+        if c > d * d:
+            raise ValueError(f"torque_filter: c is {c}; needs no more than d^2, {d * d}")
+        poles = np.trim_zeros(np.array([d * d - c, d, 1.0]), "f")
+        b, self._a, _ = cont2discrete((np.ones(1), poles), period_s, "foh")
+        self._b = b[0]
+        self._state: Array | None = None
+
+    def __call__(self, tau: Array) -> Array:
+        """Torques (k,) of one tick more, slow; it has always been the first one before."""
+        if self._state is None:
+            self._state = lfilter_zi(self._b, self._a)[:, None] * tau
+        out, self._state = lfilter(self._b, self._a, tau[None], axis=0, zi=self._state)
+        return np.asarray(out[0])
+
+
 class Sensors:
     """The sensors of a running arm: told of every tick in order."""
 
@@ -104,7 +129,8 @@ class Sensors:
         self._n, self._period_s = truth.n, period_s
         self._play = Play(self._effects, truth.n)
         self._tau: Array | None = None
-        self._lagging: Array | None = None
+        slow = [e for e in self._effects if e.name == "torque_filter"]
+        self._slow = [(e, LowPass(e, period_s)) for e in slow]
         self._late = [e for e in self._effects if e.name == "signal_delay"]
         longest = max((e.number("d") for e in self._late), default=0.0)
         self._keep = int(np.ceil(len(self._late) * longest / period_s)) + 2
@@ -128,22 +154,11 @@ class Sensors:
                 if effect.name == name and effect.acts(t):
                     columns = effect.columns(self._n)
                     change(effect, columns, true, tau)
-        return self._lagged(t, tau)
-
-    def _lagged(self, t: float, tau: Array) -> Array:
-        """After the first-order lag of x_sensor_lowpass."""
-        last = self._lagging
-        slow = [e for e in self._effects if e.name == "x_sensor_lowpass" and e.acts(t)]
-        if not slow:
-            self._lagging = None
-            return tau
-        out = tau.copy()
-        for effect in slow:
-            for j in effect.columns(self._n):
-                keep = np.exp(-self._period_s / effect.number("T"))
-                out[j] = tau[j] if last is None else keep * last[j] + (1 - keep) * tau[j]
-        self._lagging = out
-        return out
+        for effect, low_pass in self._slow:
+            if effect.acts(t):
+                columns = effect.columns(self._n)
+                tau[columns] = low_pass(tau[columns])
+        return tau
 
     def _delayed(self, t: float, tau: Array) -> Array:
         """tau(t - d), linear between samples; the first value for what lies before the start."""

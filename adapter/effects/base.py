@@ -33,6 +33,7 @@ Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 FEWEST_TO_FILTER = 100  # instants
+BAND_MARGIN = 1.3  # of a band, over where power ends
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
 BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
@@ -114,16 +115,23 @@ class Motion:
             changed[name] = table
         return replace(self, **changed)
 
-    def inside_band(self, x: Array) -> Array:
-        """x (m,) without what lies above the motion's band, where further rates are noise."""
+    def inside_band(self, x: Array, share: float | None = None) -> Array:
+        """x (m,) without what lies above the motion's band, where further rates are noise.
+
+        `share`: and without what lies above this share of x's own power.
+        """
         if not math.isfinite(self.band_hz) or len(self.t) < FEWEST_TO_FILTER:
             return x
-        from scipy.signal import butter, sosfiltfilt  # takes long; the loop has no use for it
+        from scipy.signal import butter, periodogram, sosfiltfilt  # long to load; no loop needs it
 
-        fs = 1.0 / (self.t[1] - self.t[0])
-        if self.band_hz >= 0.5 * fs:
+        fs, band_hz = 1.0 / (self.t[1] - self.t[0]), self.band_hz
+        if share is not None:
+            f, power = periodogram(x, fs, "hann")
+            own = float(f[np.searchsorted(np.cumsum(power), share * power.sum())])
+            band_hz = min(band_hz, BAND_MARGIN * own)
+        if not 0.0 < band_hz < 0.5 * fs:
             return x
-        return np.asarray(sosfiltfilt(butter(4, self.band_hz, fs=fs, output="sos"), x, axis=0))
+        return np.asarray(sosfiltfilt(butter(4, band_hz, fs=fs, output="sos"), x, axis=0))
 
     def rate(self, x: Array) -> Array:
         """Time derivative of x (m, ...); zero where there is but one instant."""

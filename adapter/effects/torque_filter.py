@@ -12,6 +12,9 @@ from adapter.effects.base import LATE, Array, Motion, Parameter, SensorEffect, V
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
 
+MOST_AHEAD_S, MOST_S = 3e-3, 0.06  # velocities that come late make torque look early
+POWER_SHARE = 0.99  # of a torque: what is faster may be noise of the acceleration
+
 
 class TorqueFilter(SensorEffect):
     """A torque sensor that passes only what is slow."""
@@ -32,10 +35,17 @@ class TorqueFilter(SensorEffect):
         (SWINGS, "makes the torque smaller"),
     )
 
+    def possible(self, values: Values) -> bool:
+        """Smoother, and not much earlier."""
+        return -MOST_AHEAD_S < float(values["d"]) < MOST_S and super().possible(values)
+
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """tau, its rate and the rate of that, on the joint."""
-        own = tau[:, joint]
-        rate = motion.rate(own)
+        """tau, its rate and the rate of that, on the joint.
+
+        Fourth derivatives of q are nothing but noise above a band; noise in there would make any
+        measured torque look smoother than the one that the motion asks for.
+        """
+        rate = motion.rate(motion.inside_band(tau[:, joint], POWER_SHARE))
         out = tau.copy()
         out[:, joint] += values["c"] * motion.rate(rate) - values["d"] * rate
         return np.asarray(out)

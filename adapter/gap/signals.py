@@ -19,7 +19,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
-from adapter.effects.base import Motion
+from adapter.effects.base import BAND_MARGIN, Motion
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
@@ -31,7 +31,7 @@ DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
-BAND_REST, BAND_MARGIN = 1e-3, 1.3
+BAND_REST = 1e-3
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)

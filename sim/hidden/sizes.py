@@ -36,6 +36,8 @@ OFFSET = (0.2, 1.0)  # N m
 GAIN = (0.03, 0.1)
 ENCODER_OFFSET, ENCODER_RIPPLE = (5e-3, 20e-3), (2e-3, 10e-3)  # rad
 DELAY = (1e-3, 5e-3)  # s
+BRISTLE = (5e-4, 1e-2)  # rad over which friction winds up
+LOW_PASS, LOW_PASS_POLES = (0.015, 0.03), (0.75, 1.0)  # d, s; c / d^2: two equal poles to one
 MASS = (0.3, 3.0)  # kg
 FLANGE_M = 0.107  # m, from the frame of link 7 along z (franka_ros)
 BODY_M = (0.02, 0.06)  # half side of the box that a payload is
@@ -47,7 +49,6 @@ LINK_ERROR = (0.15, 0.4)  # of a link's mass, or of its centre's distance
 DRAG = (0.3, 1.5)  # N m s2/rad2, torque with the square of the speed
 CUBIC = (0.5, 3.0)  # N m/rad3
 SINE_HZ = (0.7, 4.0)
-BRISTLE = (0.02, 0.1)  # rad over which a Dahl friction reverses
 CROSSTALK = (0.03, 0.1)  # of another joint's torque
 DEADBAND = (0.15, 0.6)  # N m
 SATURATION = (0.6, 1.2)  # of the joint's effort limit
@@ -170,9 +171,13 @@ def _velocity_ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Number
     return {"a": torque_size(rng, joint, VISCOUS), "n": order, "phase": phase}
 
 
-def _hysteresis(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    F = torque_size(rng, joint, COULOMB)
-    return {"F": F, "sigma": F / log_uniform(rng, BRISTLE)}
+def _bristle(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
+    return {"Fc": torque_size(rng, joint, COULOMB), "s0": log_uniform(rng, BRISTLE)}
+
+
+def _low_pass(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
+    d = log_uniform(rng, LOW_PASS)
+    return {"d": d, "c": d * d * float(rng.uniform(*LOW_PASS_POLES))}
 
 
 def _saturation(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
@@ -201,17 +206,17 @@ CATALOGUE: dict[str, tuple[tuple[int, ...], Maker]] = {
     "base_tilt": ((), _tilt),
     "external_wrench": ((), _contact),
     "friction_drift": (ALL, _torque("dFc", DRIFT)),
+    "bristle_friction": (ALL, _bristle),
+    "torque_filter": (ALL, _low_pass),
 }
 
 # Effects that are in no list, by the names under which `sim.effects` simulates them.
-# `x_sensor_lowpass` is not among them: in what an arm does below 2 Hz it is a `signal_delay`.
 OUTSIDE: dict[str, tuple[tuple[int, ...], Maker]] = {
     "x_quadratic_drag": (ALL, _quadratic_drag),
     "x_cubic_spring": (ALL, _cubic_spring),
     "x_position_friction": (ALL, _position_friction),
     "x_sine_disturbance": (ALL, _sine_disturbance),
     "x_velocity_ripple": (ALL, _velocity_ripple),
-    "x_hysteresis": (ALL, _hysteresis),
     "x_cross_viscous": (ALL, _torque("c", VISCOUS)),
     "x_torque_crosstalk": (ALL, _plain("share", CROSSTALK, signed=True)),
     "x_torque_deadband": (ALL, _torque("w", DEADBAND)),

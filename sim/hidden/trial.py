@@ -47,12 +47,14 @@ FRICTION = {
     "stribeck_friction",
     "load_dependent_friction",
     "friction_drift",
+    "bristle_friction",
 }
 LOOK_ALIKE = (
     FRICTION,
     {"joint_spring", "torque_ripple", "torque_offset"},
     {"payload", "link_inertia", "base_tilt"},
     {"encoder_offset", "encoder_ripple", "torque_offset"},
+    {"signal_delay", "torque_filter"},
 )
 
 

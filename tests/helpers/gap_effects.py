@@ -18,6 +18,7 @@ from sim.truth import Truth
 Array = np.ndarray
 PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
 CROSSING_S = 0.02  # in which the motor crosses the play of a gear on reversal
+PAD = 2000  # samples before and after a recording, for its spectrum
 PUSH_SPEED = 0.01  # rad/s, below it the motor doesn't push in full
 
 
@@ -123,6 +124,8 @@ def link_side(effect: Effect, t: Array, q: Array, dq: Array, ddq: Array, tau: Ar
             return np.where(dq > 0, p["Fc_pos"], p["Fc_neg"]) * sign
         case "stribeck_friction":
             return (p["Fc"] + (p["Fs"] - p["Fc"]) * np.exp(-((dq / p["vs"]) ** 2))) * sign
+        case "bristle_friction":
+            return p["Fc"] * _dahl(q, dq, p["s0"])
         case "load_dependent_friction":
             return p["Fl"] * np.abs(tau) * sign
         case "friction_drift":
@@ -144,8 +147,6 @@ def link_side(effect: Effect, t: Array, q: Array, dq: Array, ddq: Array, tau: Ar
             return p["a"] * np.sin(2 * np.pi * p["f"] * t + p["phase"])
         case "x_velocity_ripple":
             return p["a"] * np.sin(p["n"] * q + p["phase"]) * dq
-        case "x_hysteresis":
-            return _dahl(q, dq, p["F"], p["sigma"])
     return np.zeros_like(q)
 
 
@@ -166,11 +167,11 @@ def joint_torque(
     return tau
 
 
-def _dahl(q: Array, dq: Array, F: float, sigma: float) -> Array:
-    """Bristle torque (m,): dz/dq = sigma (1 - z/F sign(dq)), solved exactly between samples."""
+def _dahl(q: Array, dq: Array, s0: float) -> Array:
+    """How far bristles are bent (m,): s0 dz/dq = 1 - z sign(dq), solved exactly between samples."""
     z, out = 0.0, np.zeros_like(q)
     path = np.abs(np.diff(q, prepend=q[0]))
-    for i, (goal, fade) in enumerate(zip(F * np.sign(dq), np.exp(-sigma / F * path), strict=True)):
+    for i, (goal, fade) in enumerate(zip(np.sign(dq), np.exp(-path / s0), strict=True)):
         z = goal + (z - goal) * fade
         out[i] = z
     return out
@@ -192,9 +193,21 @@ def _odd_sensor(effects: Sequence[Effect], tau: Array) -> Array:
     return read
 
 
+def _low_passed(t: Array, x: Array, d: float, c: float) -> Array:
+    """x (m,) behind 1 / (1 + d s + (d^2 - c) s^2), by its spectrum; constant before the start."""
+    padded = np.pad(x, PAD, mode="linear_ramp", end_values=x[0])
+    s = 2j * np.pi * np.fft.rfftfreq(len(padded), t[1] - t[0])
+    spectrum = np.fft.rfft(padded) / (1 + d * s + (d * d - c) * s**2)
+    return np.fft.irfft(spectrum, len(padded))[PAD:-PAD]
+
+
 def torque_sensor(effects: Sequence[Effect], t: Array, tau: Array) -> Array:
-    """What the torque sensors read (m, n): late first, then scaled, then shifted."""
+    """What the torque sensors read (m, n): low-passed and late, then scaled, then shifted."""
     read = _odd_sensor(effects, tau)
+    for effect in (e for e in effects if e.name == "torque_filter"):
+        d, c = effect.number("d"), effect.number("c")
+        for j in effect.columns(tau.shape[1]):
+            read[:, j] = np.where(effect.acts(t), _low_passed(t, read[:, j], d, c), read[:, j])
     for name in ("signal_delay", "torque_gain", "torque_offset"):
         for effect in (e for e in effects if e.name == name):
             p: dict[str, Any] = dict(effect.parameters)

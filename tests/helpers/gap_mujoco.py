@@ -113,7 +113,7 @@ class Arm:
             if effect.name == "x_cross_viscous":
                 source, j = effect.columns(n)
                 out[j] += effect.number("c") * v[source]
-            elif effect.name == "x_hysteresis":
+            elif effect.name == "bristle_friction":
                 self._bend(effect, out)
             elif effect.name in DRY or effect.name in PUSHES or effect.name.startswith("x_"):
                 target = level if effect.name in DRY else out
@@ -128,9 +128,8 @@ class Arm:
         """Dahl's bristles, one explicit step."""
         j = effect.joints[0] - 1
         z, v = self._bristles.get(j, 0.0), float(self._data.qvel[j])
-        F, sigma = effect.number("F"), effect.number("sigma")
-        self._bristles[j] = z + H_S * sigma * (v - abs(v) * z / F)
-        out[j] += self._bristles[j]
+        self._bristles[j] = z = z + H_S * (v - abs(v) * z) / effect.number("s0")
+        out[j] += effect.number("Fc") * z
 
     def _touch(self, t: float) -> None:
         """What touches the origin of the last link."""

@@ -24,7 +24,7 @@ SETTLED = 60  # samples, before that the torque has a corner
 NEAR = 5  # samples around a change in time
 STIFFNESS = np.array([100, 100, 100, 100, 40, 40, 20])  # N m/rad, against friction
 DAMPING = np.array([10, 10, 10, 10, 1, 1, 0.4])  # N m s/rad
-FRICTION = ("friction", "hysteresis", "backlash")
+FRICTION = ("friction", "backlash")
 
 
 class Record:
@@ -158,17 +158,18 @@ def test_cross_viscous_torque_acts_on_the_second_joint():
     assert rms(left[SETTLED:-2]).max() < 3e-3
 
 
-def test_hysteresis_follows_the_dahl_model():
-    F, sigma = 0.6, 60.0
-    record = Record(arm_with(Effect("x_hysteresis", (4,), {"F": F, "sigma": sigma})))
+@pytest.mark.parametrize("s0", [2e-3, 0.01])
+def test_bristles_follow_the_dahl_model(s0):
+    Fc = 0.6
+    record = Record(arm_with(Effect("bristle_friction", (4,), {"Fc": Fc, "s0": s0})))
     z, wanted = 0.0, []
     for move in np.diff(record.q[:, 3], prepend=record.q[0, 3]):
         for part in np.full(50, move / 50):
-            z += sigma * part * (1 - z / F * np.sign(part))
-        wanted.append(z)
+            z += part / s0 * (1 - z * np.sign(part))
+        wanted.append(Fc * z)
     left = (record.read_tau - record.rigid())[:, 3] - wanted
     assert rms(np.array(wanted)) > 0.3
-    assert rms(left[SETTLED:-2]) < 5e-3
+    assert rms(left[SETTLED:-2]) < 5e-3 * 0.01 / s0
 
 
 def payload_model(m, com, inertia):
@@ -311,13 +312,22 @@ def test_sensor_effects_keep_to_their_interval(name, numbers, key):
     assert extra == pytest.approx(one(on * numbers["o"], 4), abs=1e-12)
 
 
-def test_sensor_lag_is_of_first_order():
-    record = Record(arm_with(Effect("x_sensor_lowpass", (4,), {"T": 0.04})))
-    lag = record.read_tau[:, 3]
-    slope = np.gradient(lag, T_S)
-    left = 0.04 * slope - (record.u[:, 3] - lag)
-    assert rms((record.u - record.read_tau)[SETTLED:, 3]) > 0.1
-    assert rms(left[SETTLED:-2]) < 0.05 * rms((record.u - record.read_tau)[SETTLED:, 3])
+@pytest.mark.parametrize("c", [0.04**2, 0.75 * 0.04**2, 0.5 * 0.04**2])
+def test_a_torque_filter_is_a_low_pass(c):
+    """Of first order, with two equal poles, of second order: its differential equation."""
+    d = 0.04
+    record = Record(arm_with(Effect("torque_filter", (4,), {"d": d, "c": c})))
+    read = record.read_tau[:, 3]
+    rate = np.gradient(read, T_S)
+    left = (d * d - c) * np.gradient(rate, T_S) + d * rate + read - record.u[:, 3]
+    off = rms((record.u - record.read_tau)[SETTLED:, 3])
+    assert off > 0.1
+    assert rms(left[SETTLED:-2]) < 0.05 * off
+
+
+def test_a_torque_filter_that_looks_ahead_is_refused():
+    with pytest.raises(ValueError, match="no more than d"):
+        Record(arm_with(Effect("torque_filter", (4,), {"d": 0.001, "c": 1e-4})), 0.01)
 
 
 def test_link_lags_the_motor_by_the_play():
@@ -407,7 +417,8 @@ def test_effects_on_joints_that_are_not_there_are_refused():
 
 def test_every_effect_of_the_catalogue_is_tested_here():
     tested = {row[0] for row in TORQUES} | {row[0].name for row in BODIES + SENSORS}
-    tested |= {"x_cross_viscous", "x_hysteresis", "external_wrench", "backlash", "x_sensor_lowpass"}
+    tested |= {"x_cross_viscous", "external_wrench", "backlash"}
+    tested |= {"bristle_friction", "torque_filter"}
     assert tested == set(SPECS)
 
 
