@@ -80,9 +80,10 @@ class Bristles:
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """What a seed decides.
+    """What a seed decides, and of several logs of one arm its numbers.
 
     Attributes:
+        motion_number, load_number: which motion and which load of the arm.
         arm: the simulated arm, what it carries included; nominal: the documented one.
         load_kg: what it carries from the first sample on; 0 for nothing. load_at: (3,) its centre
             in the last link's frame, m.
@@ -102,6 +103,8 @@ class Twin:
     offset: Array
     sensor_hz: Array
     dq_late_s: float
+    motion_number: int = 0
+    load_number: int = 0
 
     @property
     def motion(self) -> tuple[Array, Array, Array]:
@@ -120,17 +123,20 @@ class Twin:
         }
 
 
-def draw_twin(seed: int) -> Twin:
-    """The twin of a seed."""
+def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
+    """The twin of a seed; of the same arm, any number of motions and of loads."""
     rng = np.random.default_rng([seed, STREAM])
     nominal = panda()
     n = nominal.n
     error = np.append(np.full(n - 1, rng.uniform(*MODEL_ERROR)), LAST_ERROR)
     theta = np.array([_other_body(*x, rng) for x in zip(nominal.theta, error, strict=True)])
-    load_kg = 0.0 if rng.random() < BARE_SHARE else log_uniform(rng, LOAD_KG)
-    load, load_at = _load(rng, load_kg)
-    theta[-1] += load
+    load_kg, body, load_at = _held(rng)
     q, kind = _motion(rng, nominal)
+    if load:
+        load_kg, body, load_at = _held(np.random.default_rng([seed, STREAM, 0, load]))
+    if motion:
+        q, kind = _motion(np.random.default_rng([seed, STREAM, motion]), nominal)
+    theta[-1] += body
     share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
     coulomb = share * _sizes(rng, COULOMB, n)
     return Twin(
@@ -152,7 +158,15 @@ def draw_twin(seed: int) -> Twin:
         offset=share * OFFSET_NM * rng.standard_normal(n),
         sensor_hz=_sizes(rng, SENSOR_HZ, n),
         dq_late_s=float(rng.uniform(*DQ_LATE_S)),
+        motion_number=motion,
+        load_number=load,
     )
+
+
+def _held(rng: np.random.Generator) -> tuple[float, Array, Array]:
+    """What the hand holds: its mass kg, its ten parameters, and its centre (3,) m."""
+    mass = 0.0 if rng.random() < BARE_SHARE else log_uniform(rng, LOAD_KG)
+    return mass, *_load(rng, mass)
 
 
 def _sizes(rng: np.random.Generator, span: tuple[float, float], n: int) -> Array:
@@ -224,7 +238,7 @@ def _hand(rng: np.random.Generator, t: Array, n: int) -> Array:
 
 def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Recording:
     """What the recorder makes of clean q, dq and drive torque (m, n), a row each `STEP_S`."""
-    rng = np.random.default_rng([twin.seed, NOISE_STREAM])
+    rng = np.random.default_rng([twin.seed, NOISE_STREAM, twin.motion_number, twin.load_number])
     m, n = q.shape
     keep = np.exp(-2 * np.pi * twin.sensor_hz * STEP_S)
     low = [lfilter([1 - k], [1, -k], x, zi=[k * x[0]])[0] for k, x in zip(keep, tau.T, strict=True)]
