@@ -15,12 +15,13 @@ from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern
 from adapter.gap.fit import Fit, Named, place_of
 from adapter.gap.result import Curves, Finding, Leftover
-from adapter.gap.rivals import Standing
+from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found
 from adapter.model.spatial import Array
 
 OVERLAP = 0.9
 MOST_RIVALS = 3
+OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
@@ -142,12 +143,19 @@ def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
         effect = rival.candidate.effect
         if isinstance(effect, Pattern) or effect.name == named.candidate.effect.name:
             continue
-        if rival.overlap >= OVERLAP:
+        if rival.overlap >= OVERLAP and _is_open(standing, rival, named):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
     # of rivals that explain all but the same, those that the data favour come first
     credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
     order = sorted(best, key=lambda name: (-round(best[name], 2), credible.get(name, 0)))
     return {name: best[name] for name in order[:MOST_RIVALS]}
+
+
+def _is_open(standing: Standing, rival: Rival, named: Named) -> bool:
+    """Whether the data leave a rival open that is a finer form of the named effect or a coarser."""
+    mine, other = named.candidate.effect, rival.candidate.effect
+    nested = mine.form in dict(other.simpler) or other.form in dict(mine.simpler)
+    return not nested or standing.gain(rival) > -OPEN_NATS
 
 
 def noise_floor(fit: Fit) -> Array:

@@ -23,7 +23,7 @@ from adapter.gap.evidence import ORDER, Carried
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, Named, theta_prior, under_own_noise
 from adapter.gap.screen import cleaned, judge_torque, moving_joints
 from adapter.gap.signals import Recorded, prepare
-from adapter.gap.workflow import TIMING_SHARE, lateness
+from adapter.gap.timing import TIMING_SHARE, lateness
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
@@ -139,10 +139,8 @@ def find_load(
     theta = fit.coefficients[at]
     notes += _judged(usable[0][0], model, theta)
     before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
-    found = _told(*_in_frame(theta, _covariance(fit, known)[at, at], riding))
-    return replace(
-        found, frame=riding.name, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes))
-    )
+    found = load_of(theta, _covariance(fit, known)[at, at], riding)
+    return replace(found, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes)))
 
 
 def _prepared(logs: Sequence[tuple[Log, float, float]], model: SelfModel, share: float) -> Fit:
@@ -152,16 +150,21 @@ def _prepared(logs: Sequence[tuple[Log, float, float]], model: SelfModel, share:
     """
     arm = RigidArm.of(model)
     signals = tuple(prepare(Recorded.of(log, late_s), arm) for log, late_s, _ in logs)
-    named = [_named(HELD, LOAD_STD, -1, 0)]
-    for name in REAL_ARM_EFFECTS:
-        effect = LEARNED[name]
-        named += [_named(effect, (effect.prior_std,), j, None) for j in range(arm.n)]
     known = active_effects(model.effects, arm.n)
     return Fit(
-        Model(signals, np.zeros_like(arm.theta), named=tuple(named), known=known),
+        Model(signals, np.zeros_like(arm.theta), named=with_a_load(arm.n), known=known),
         theta_prior(arm.theta, share),
         timing_std_s=max(TIMING_STD_S, TIMING_SHARE * max(period_s for *_, period_s in logs)),
     )
+
+
+def with_a_load(n: int) -> tuple[Named, ...]:
+    """A load in the first recording, then what may be beside it on an arm of n joints, at zero."""
+    named = [_named(HELD, LOAD_STD, -1, 0)]
+    for name in REAL_ARM_EFFECTS:
+        effect = LEARNED[name]
+        named += [_named(effect, (effect.prior_std,), j, None) for j in range(n)]
+    return tuple(named)
 
 
 def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:
@@ -212,14 +215,25 @@ def _body(theta: Array) -> Array:
     return np.r_[mass, com, six_from_tensor(inertia)]
 
 
-def _told(theta: Array, covariance: Array) -> HandLoad:
-    """Mass, centre and inertia, and how well each is known."""
+def load_of(theta: Array, covariance: Array, frame: FixedFrame) -> HandLoad:
+    """A load from its ten parameters (10,) about the last link's origin, and how well it is known.
+
+    Args:
+        covariance: (10, 10) of the parameters; frame: in whose axes the load is told.
+    """
+    theta, covariance = _in_frame(theta, covariance, frame)
     mass, com, inertia = body_from_theta(theta)
     steps = STEP * np.diag(np.sqrt(np.diagonal(covariance)))
     slopes = np.array([(_body(theta + d) - _body(theta - d)) / (2.0 * d.max()) for d in steps])
     std = np.sqrt(np.diagonal(slopes.T @ covariance @ slopes))
     return HandLoad(
-        float(mass), com, _possible(inertia), float(std[0]), std[1:4], tensor_from_six(std[4:])
+        float(mass),
+        com,
+        _possible(inertia),
+        float(std[0]),
+        std[1:4],
+        tensor_from_six(std[4:]),
+        frame.name,
     )
 
 

@@ -162,6 +162,8 @@ def listed(items: Sequence[str]) -> str:
 def phrase(finding: Finding) -> str:
     """What is missing and how much of it, without when."""
     known = phrase_of(finding)
+    if finding.two_readings:
+        return _two_readings(finding)
     main = finding.parameters.get(known.key)
     template = known.less if known.less and _number(main) < 0.0 else known.more
     several = len(finding.joints) > 1
@@ -184,6 +186,14 @@ def phrase(finding: Finding) -> str:
         length = next(shown, known.lengths[-1])
         derived["length"] = length.before + norm(finding, length)
     return template.format_map({**values, **derived})
+
+
+def _two_readings(finding: Finding) -> str:
+    """A load at the hand and a heavier last link, which are the same to the data."""
+    x = parameter(finding, "m", size=True)
+    if _number(finding.parameters.get("m")) < 0.0:
+        return f"{x} less at the hand (or the last link lighter by that: this log cannot tell)"
+    return f"a load of {x} at the hand (or the last link heavier by that: this log cannot tell)"
 
 
 def _worth(finding: Finding) -> str:

@@ -24,6 +24,8 @@ IN_FILE = (
     "simulator",
     "stopped_after_rounds",
     "notes",
+    "contradictions",
+    "in_sample",
     "recordings",
     "model_in",
     "joint_names",
@@ -65,6 +67,17 @@ class Finding:
     torque_rms_nm: Array
     recording: str = ""
 
+    @property
+    def throughout(self) -> bool:
+        """Whether it acts from the first sample to the last."""
+        return self.lasting and self.interval_s[0] <= 0.0
+
+    @property
+    def two_readings(self) -> bool:
+        """Whether it is a load at the hand or a last link that is heavier by that, all the same."""
+        common = self.throughout and not self.recording
+        return self.effect == "payload" and common and self.overlaps.get("link_inertia", 0) > 0.995
+
     def as_dict(self) -> dict[str, Any]:
         """As in the JSON file."""
         own = asdict(self)
@@ -90,6 +103,25 @@ class Leftover:
     noise_floor_nm: float
     depends_on: tuple[str, ...]
     interval_s: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class LogLoad:
+    """What the hand carries in one of several recordings, fitted together.
+
+    Attributes:
+        recording: its name; shown: whether it weighs more than the doubt.
+        mass_kg, mass_std_kg: of the load, beside what the model says is there.
+        com_m, com_std_m: its centre in axes of `frame`; None where the recordings do not show it.
+    """
+
+    recording: str
+    shown: bool
+    mass_kg: float
+    mass_std_kg: float
+    com_m: tuple[float, ...] | None
+    com_std_m: tuple[float, ...] | None
+    frame: str
 
 
 @dataclass(frozen=True)
@@ -150,6 +182,10 @@ class GapResult:
         findings, unexplained: see there.
         corrections: (n, 10) the small correction of the inertias; corrections_prior: (n, 10)
             what was allowed a priori, one standard deviation each.
+        loads: of several recordings, what the hand carries in each; empty for one.
+        contradictions: of several recordings, which are not of the arm of the others, a sentence
+            each.
+        in_sample: nothing could be held out; `before` and `after` are of what was fitted.
         notes: sentences about the log (timing, joints that stand still, ...).
         problem: why nothing could be told; None where something could.
         curves: one per recording; rollouts: one per recording that was simulated.
@@ -183,6 +219,9 @@ class GapResult:
     simulator: str | None = None
     stopped_after_rounds: int | None = None
     wall_s: float = 0.0
+    loads: tuple[LogLoad, ...] = ()
+    contradictions: tuple[str, ...] = ()
+    in_sample: bool = False
 
     def __repr__(self) -> str:
         if self.problem is not None:
@@ -212,6 +251,7 @@ class GapResult:
         for key in ("before", "after"):
             own[key] = asdict(own[key])
         own["findings"] = [finding.as_dict() for finding in self.findings]
+        own["loads"] = [asdict(load) for load in self.loads]
         own["unexplained"] = [asdict(leftover) for leftover in self.unexplained]
         return {**own, "inertial_correction": self._correction()}
 

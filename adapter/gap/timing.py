@@ -19,6 +19,8 @@ CUT_HZ = 8.0  # band in which velocity and position are compared: arms move belo
 MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
 STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
+SIGNIFICANT = 3.0  # standard deviations
+TIMING_SHARE = 0.4  # of a sample period: holds of half a sample are no effect of the arm
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
 Index = NDArray[np.int64]
@@ -125,6 +127,12 @@ class RecordingClock:
         if abs(abs(late) / self.period_s - 0.5) < 0.1 and std < 0.1 * self.period_s:
             sentence += ", half a sample: the mark of a simulator that holds torque over its step"
         return [*said, sentence + "."]
+
+
+def lateness(clock: RecordingClock) -> float:
+    """How much later dq is than q, where that is known, s."""
+    late, std = clock.lateness_s, clock.lateness_std_s
+    return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
 
 
 def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingClock:

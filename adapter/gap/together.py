@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from adapter.gap.evidence import ORDER, Carried
+from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit
 from adapter.model.spatial import Array
 
@@ -77,37 +78,47 @@ class Together:
 
     Args:
         parts: theirs, with the same common coefficients in the same order.
+        prior_std: (c,) of the common coefficients.
 
     Attributes:
-        x: (c,) the common coefficients; covariance: (c, c) of them, no smaller than what seconds
-            of the recordings disagree by (see `fit.honest_covariance`).
+        x: (c,) the common coefficients; covariance: (c, c) of them.
     """
 
-    def __init__(self, parts: Sequence[Part]) -> None:
-        self.parts = parts
-        std = parts[0].known.prior_std[parts[0].common]
-        self.G = np.sum([part.G for part in parts], axis=0) + np.diag(std**-2.0)
+    def __init__(self, parts: Sequence[Part], prior_std: Array) -> None:
+        self.parts, self.prior = parts, np.diag(prior_std**-2.0)
+        self.G = np.sum([part.G for part in parts], axis=0) + self.prior
         self.g = np.sum([part.g for part in parts], axis=0)
-        self.plain = np.linalg.inv(self.G)
-        self.x = self.plain @ self.g
-        self._scores = [part.scores(self.x) for part in parts]
-        self.spread = [common.T @ common for common, _ in self._scores]
-        self._all = np.sum(self.spread, axis=0) + np.diag(std**-2.0)
-        self.covariance = widened(self.plain, self.plain @ self._all @ self.plain)
+        self.covariance = np.linalg.inv(self.G)
+        self.x = self.covariance @ self.g
+
+    @cached_property
+    def scores(self) -> list[tuple[Array, Array]]:
+        """Of each part, see there."""
+        return [part.scores(self.x) for part in self.parts]
+
+    @cached_property
+    def spread(self) -> Array:
+        """(c, c) by how much the seconds of all recordings disagree, and the prior with them."""
+        return np.asarray(np.sum([x.T @ x for x, _ in self.scores], axis=0) + self.prior)
 
     def own(self, i: int) -> tuple[Array, Array]:
-        """(o,) the i-th recording's own coefficients, and (o, o) their covariance."""
-        part, (common, mine) = self.parts[i], self._scores[i]
-        H = part.free @ part.cross @ self.plain
+        """(o,) the i-th recording's own coefficients, and (o, o) their covariance.
+
+        By the noise, and no less than by what seconds disagree: what a model gets wrong does not
+        average out as noise does (White 1980, by clusters).
+        """
+        part, (common, mine) = self.parts[i], self.scores[i]
+        H = part.free @ part.cross @ self.covariance
         plain = part.free + H @ part.cross.T @ part.free
         off = mine @ part.free - common @ H.T
-        prior = part.known.prior_std[part.own]
-        robust = off.T @ off + H @ (self._all - self.spread[i]) @ H.T
-        robust += part.free @ np.diag(prior**-2.0) @ part.free
-        return part.own_at(self.x), widened(plain, robust)
+        prior = np.diag(part.known.prior_std[part.own] ** -2.0)
+        robust = off.T @ off + H @ (self.spread - common.T @ common) @ H.T
+        robust += part.free @ prior @ part.free
+        wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
+        return part.own_at(self.x), plain * np.outer(wider, wider)
 
-
-def widened(plain: Array, robust: Array) -> Array:
-    """A covariance whose standard deviations are those of another one where these are larger."""
-    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
-    return np.asarray(plain * np.outer(wider, wider))
+    def without(self, i: int) -> tuple[Array, Array]:
+        """(c,) the common coefficients by all recordings but the i-th, and (c, c) covariance."""
+        part = self.parts[i]
+        covariance = np.linalg.inv(self.G - part.G)
+        return covariance @ (self.g - part.g), covariance

@@ -10,12 +10,22 @@ import numpy as np
 from rich.markup import escape
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.gap.phrases import listed, numbered, phrase, phrase_of, plain, shown_unit, who
-from adapter.gap.result import Finding, GapResult, Leftover
+from adapter.gap.phrases import (
+    listed,
+    numbered,
+    phrase,
+    phrase_of,
+    plain,
+    plus_minus,
+    shown_unit,
+    who,
+)
+from adapter.gap.result import Finding, GapResult, Leftover, LogLoad
 from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
+WORSE = 0.05  # share by which a joint's error may grow unsaid
 NOT_EXPLAINED = "are not explained by any effect of the catalogue"
 SIGNALS = {
     "dq": "velocity",
@@ -31,11 +41,12 @@ def headline(result: GapResult) -> str:
     if result.problem is not None:
         return result.problem
     if not result.findings and not result.unexplained:
-        return "; ".join(filter(None, (_nothing(result), stopped(result))))
+        said = (_nothing(result), *result.contradictions, stopped(result))
+        return "; ".join(filter(None, said))
     parts = _finding_parts(result.findings)
     if result.findings:
-        parts.append(_shrink(result))
-    parts += [_left(result.unexplained), stopped(result)]
+        parts += [_shrink(result), worse(result)]
+    parts += [_left(result.unexplained), *result.contradictions, stopped(result)]
     return "; ".join(part for part in parts if part)
 
 
@@ -57,14 +68,14 @@ def sentence(finding: Finding) -> str:
 
 
 def span(finding: Finding) -> str:
-    """When it acts; empty where it does throughout."""
+    """In which of several recordings it acts, and when; empty where it does throughout all."""
     begin, end = finding.interval_s
     late, ends = begin > 0.0, not finding.lasting
-    if late and ends:
-        return f"from {_instant(begin)} to {_instant(end)} s"
+    when = f"until {_instant(end)} s" if ends else ""
     if late:
-        return f"from {_instant(begin)} s on"
-    return f"until {_instant(end)} s" if ends else ""
+        when = f"from {_instant(begin)} " + (f"to {_instant(end)} s" if ends else "s on")
+    where = f"in {finding.recording}" if finding.recording else ""
+    return " ".join(filter(None, (where, when)))
 
 
 def leftover_sentence(leftover: Leftover) -> str:
@@ -72,15 +83,34 @@ def leftover_sentence(leftover: Leftover) -> str:
     return f"joint {leftover.joint}: {plain(leftover.rmse_nm, 2)} N m {_follows(leftover)}"
 
 
-def rivals(finding: Finding) -> str:
-    """What else it could be and how to tell; empty where nothing else comes close."""
-    if not finding.overlaps:
+def rivals(findings: Sequence[Finding]) -> str:
+    """What else findings of one kind could be, and how to tell; empty where nothing comes close."""
+    shares = shares_of(findings)
+    if not shares:
         return ""
-    parts = [
-        f"{title_of(name)}, which explains {'all' if share >= 1.0 else percent(share)} of it here"
-        for name, share in finding.overlaps.items()
-    ]
-    return f"could also be {', or '.join(parts)}; to split: {finding.split_by}"
+    parts = [f"{title_of(name)}, which explains {share} of it here" for name, share in shares]
+    return f"could also be {', or '.join(parts)}; to split: {findings[0].split_by}"
+
+
+def shares_of(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Rivals of findings of one kind, and how much of these they explain: "91 to 97 %"."""
+    out = []
+    for name in findings[0].overlaps:
+        if name == "link_inertia" and findings[0].two_readings:
+            continue
+        low, high = (pick(f.overlaps[name] for f in findings) for pick in (min, max))
+        most = "all" if high >= 1.0 else percent(high)
+        least = "all" if low >= 1.0 else percent(low)
+        out.append((name, most if most == least else f"{least.removesuffix(' %')} to {most}"))
+    return out
+
+
+def alike(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Findings with the same rivals and the same way to tell, together; in order."""
+    groups: dict[tuple[object, ...], list[Finding]] = {}
+    for f in findings:
+        groups.setdefault((f.effect, tuple(f.overlaps), f.split_by, span(f)), []).append(f)
+    return list(groups.values())
 
 
 def title_of(effect: str) -> str:
@@ -138,7 +168,9 @@ def _finding_parts(findings: Sequence[Finding]) -> list[str]:
     """Findings in words, those of the same kind in one; the largest first where there are many."""
     by_kind: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
-        by_kind.setdefault((finding.effect, span(finding)), []).append(finding)
+        each = bool(finding.recording) and finding.throughout
+        key = (finding.effect, "in each" if each else span(finding))
+        by_kind.setdefault(key, []).append(finding)
     groups = list(by_kind.values())
     if len(groups) > MOST_PARTS:
         groups.sort(key=lambda group: -max(_size(f) for f in group))
@@ -156,11 +188,22 @@ def _group(findings: Sequence[Finding]) -> str:
     if len(findings) == 1:
         return sentence(findings[0])
     first = findings[0]
+    if first.recording and first.throughout:
+        return _in_recordings(findings)
     ordered = sorted(findings, key=lambda f: f.joints)
     joints = [j for f in ordered for j in f.joints]
     verb = phrase_of(first).verb
     said = f"{who(first.effect, joints)} {verb} {first.title}{_values(ordered)}"
     return f"{span(first)} {said}" if span(first) else said
+
+
+def _in_recordings(findings: Sequence[Finding]) -> str:
+    """What several recordings have, each for itself."""
+    key = phrase_of(findings[0]).key
+    values = [abs(float(f.parameters[key])) for f in findings if f.parameters.get(key) is not None]
+    unit = findings[0].units.get(key, "")
+    size = f" of {plain(min(values), 2)} to {plain(max(values), 2)} {unit}" if values else ""
+    return f"{findings[0].title}{size} in {len({f.recording for f in findings})} recordings"
 
 
 def _values(findings: Sequence[Finding]) -> str:
@@ -174,15 +217,30 @@ def _values(findings: Sequence[Finding]) -> str:
 
 
 def _shrink(result: GapResult) -> str:
-    """Torque error before and after, of the joint that is meant or that gains most."""
-    before, after = result.before.torque_rmse_nm, result.after.torque_rmse_nm
-    gain = np.asarray(before) - np.asarray(after)
-    if not np.isfinite(gain).any():
+    """Torque error before and after, of all joints together and of that which is left worst."""
+    before, after = (np.asarray(x.torque_rmse_nm) for x in (result.before, result.after))
+    known = np.isfinite(before) & np.isfinite(after)
+    if not known.any():
         return ""
-    best = int(np.nanargmax(gain))
-    meant = {j for finding in result.findings for j in finding.joints}
-    of = "" if meant == {best + 1} else f" of joint {best + 1}"
-    return f"torque error{of} {fall(before[best], after[best])} N m"
+    joint = max(np.flatnonzero(known), key=lambda j: (after[j], before[j]))
+    total = fall(*(float(np.sqrt(np.sum(x[known] ** 2))) for x in (before, after)))
+    seen = " (in sample only: nothing could be held out)" if result.in_sample else ""
+    if known.sum() == 1:
+        return f"torque error {total} N m{seen}"
+    worst = f"{fall(before[joint], after[joint])} of joint {joint + 1}, the worst"
+    return f"torque error {total} N m over all joints, {worst}{seen}"
+
+
+def worse(result: GapResult) -> str:
+    """Joints on which the new model is clearly worse than the old one; empty where none is."""
+    before, after = (np.asarray(x.torque_rmse_nm) for x in (result.before, result.after))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.where(before > 0.0, after / before - 1.0, 0.0)
+    joints = [int(j) + 1 for j in np.flatnonzero(share > WORSE)]
+    if not joints:
+        return ""
+    most = f"{'up to ' if len(joints) > 1 else ''}{plain(100.0 * float(np.nanmax(share)), 2)} %"
+    return f"but {most} worse on joint{'s' if len(joints) > 1 else ''} {numbered(joints)}"
 
 
 def fall(before: float, after: float) -> str:
@@ -223,8 +281,11 @@ def console_summary(result: GapResult) -> list[str]:
     """Headline, findings, figures by joint, what to do next; for `rich.console.Console.print`."""
     color = "red" if result.problem is not None else "bold"
     lines = [f"[{color}]{escape(headline(result))}[/{color}]"]
-    for finding in result.findings:
-        lines += _finding(finding)
+    for findings in alike(result.findings):
+        lines += [_finding(finding) for finding in findings]
+        lines += [f"  [dim]{escape(other)}[/dim]" for other in [rivals(findings)] if other]
+    lines += carried(result)
+    lines += [f"[red]![/red] {escape(text)}" for text in result.contradictions]
     lines += [f"[yellow]?[/yellow] {escape(leftover_sentence(x))}" for x in result.unexplained]
     lines += _figures(result)
     lines += [f"[cyan]next[/cyan] {escape(text)}" for text in result.what_next]
@@ -234,11 +295,32 @@ def console_summary(result: GapResult) -> list[str]:
     return lines
 
 
-def _finding(finding: Finding) -> list[str]:
-    sure = f"evidence {percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
-    lines = [f"[green]•[/green] {escape(sentence(finding))} [dim]({sure})[/dim]"]
-    other = rivals(finding)
-    return [*lines, f"  [dim]{escape(other)}[/dim]"] if other else lines
+def _finding(finding: Finding) -> str:
+    there = "that one of them is there " if finding.two_readings else ""
+    sure = f"evidence {there}{percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
+    return f"[green]•[/green] {escape(sentence(finding))} [dim]({sure})[/dim]"
+
+
+def carried(result: GapResult) -> list[str]:
+    """What each of several recordings carries, a line each; for a console."""
+    rows = [(load.recording, *carried_words(load)) for load in result.loads]
+    wide = max((len(name) for name, *_ in rows), default=0)
+    head = ["what each recording carries"] if rows else []
+    return head + [
+        f"  {escape(f'{name:<{wide}}  {mass}  {centre}'.rstrip())}" for name, mass, centre in rows
+    ]
+
+
+def carried_words(load: LogLoad) -> tuple[str, str]:
+    """Mass, and centre where it is shown."""
+    mass = f"{plus_minus(load.mass_kg, load.mass_std_kg)} kg"
+    if not load.shown:
+        return f"nothing shown ({mass})", ""
+    if load.com_m is None or load.com_std_m is None:
+        return mass, "centre not shown"
+    pairs = zip("xyz", load.com_m, load.com_std_m, strict=True)
+    centre = ", ".join(f"{axis} {plus_minus(1e3 * x, 1e3 * std)}" for axis, x, std in pairs)
+    return mass, f"centre {centre} mm in {load.frame}"
 
 
 def _figures(result: GapResult) -> list[str]:

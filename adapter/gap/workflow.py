@@ -22,19 +22,20 @@ from adapter.effects.robots import read_robot
 from adapter.gap.findings import disagreement, noise_floor, told_of
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
+from adapter.gap.load import hand_frame
 from adapter.gap.result import GapResult
 from adapter.gap.screen import RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
+from adapter.gap.several import Several
 from adapter.gap.signals import Recorded, prepare
-from adapter.gap.timing import RecordingClock
+from adapter.gap.timing import TIMING_SHARE, lateness
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
 from drivers.files.mcap import Log, read_log
 
-SIGNIFICANT = 3.0  # standard deviations
-TIMING_SHARE = 0.4  # of a sample period: holds of half a sample are no effect of the arm
+SEARCHED_S = 20.0  # of several recordings
 FIT_S, SCORE_S = 3.0, 2.0  # the least of a recording that is fitted; and scored
 
 Progress = Callable[[str], None]
@@ -103,10 +104,17 @@ def find_gap(
         return GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
     progress("smoothing")
     fit = _nominal_fit(task, settings)
+    several = None
+    if len(task.fitted) > 1:
+        progress("weighing what each recording carries")
+        several = Several.of(fit, [r.name for r in task.fitted], hand_frame(nominal))
+        task, fit = _searched(task, several.started(fit), [x.recording for x in several.odd])
     progress("searching")
     moving = sorted({j for joints in task.moving for j in joints})
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
     result = replace(_result(task, measured), model_in=name)
+    if several is not None:
+        result = several.told(result)
     if model_out is not None:
         save_model(model_of(task.model, measured.found.fit), model_out)
         result = replace(result, model_out=str(model_out))
@@ -169,12 +177,6 @@ def _same(one: Path | str | Log, other: Path | str | Log) -> bool:
     return Path(one).resolve() == Path(other).resolve()
 
 
-def lateness(timing: RecordingClock) -> float:
-    """How much later dq is than q, where that is known, s."""
-    late, std = timing.lateness_s, timing.lateness_std_s
-    return late if np.isfinite(late) and abs(late) > SIGNIFICANT * std else 0.0
-
-
 def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorded]]:
     if not whole.t[0] + FIT_S < at_s < whole.t[-1] - SCORE_S:
         raise ValueError(
@@ -198,6 +200,41 @@ def _nominal_fit(task: GapTask, settings: GapSettings) -> Fit:
         still=still,
         timing_std_s=max(TIMING_STD_S, TIMING_SHARE * task.period_s),
     ).with_noise()
+
+
+def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit]:
+    """The recordings that are searched: those in which most moves, for some time together.
+
+    What is common shows in those, and their own; a search through all would take long.
+
+    Args:
+        fit: on all of them; odd: places of recordings that are not of the arm of the others.
+    """
+    moved = [float(np.abs(r.motion.dq).sum()) for r in fit.recordings]
+    order = [int(i) for i in np.argsort(moved)[::-1] if i not in odd]
+    lengths = np.cumsum([task.fitted[i].t[-1] for i in order])
+    chosen = sorted(order[: max(int(np.searchsorted(lengths, SEARCHED_S)) + 1, 2)])
+    if len(chosen) == len(task.fitted):
+        return task, fit
+    named = [
+        e if e.recording is None else replace(e, recording=chosen.index(e.recording))
+        for e in fit.named
+        if e.recording is None or e.recording in chosen
+    ]
+    recordings = tuple(fit.recordings[i] for i in chosen)
+    model = replace(fit.model, recordings=recordings, named=tuple(named))
+    fitted = tuple(task.fitted[i] for i in chosen)
+    names = ", ".join(r.name for r in fitted)
+    note = f"searched, and scored by blocks: {names}, in which most moves; the others are weighed"
+    task = replace(
+        task,
+        fitted=fitted,
+        scored=fitted if task.folds else task.scored,
+        moving=tuple(task.moving[i] for i in chosen),
+        notes=(*task.notes, note),
+    )
+    still = tuple(fit.still[i] for i in chosen) if fit.still else ()
+    return task, replace(fit, model=model, still=still).with_noise()
 
 
 def _result(task: GapTask, measured: HeldOut) -> GapResult:

@@ -15,6 +15,7 @@ from adapter.model.spatial import Array
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
 from adapter.report.gap_tables import (
+    carried_table,
     correction_ratio,
     correction_table,
     error_table,
@@ -58,6 +59,8 @@ def context(result: GapResult) -> dict[str, Any]:
         "tiles": shown,
         "columns": max(len(shown), 1),
         "findings": finding_rows(result),
+        "carried": carried_table(result),
+        "contradictions": [_first_capital(text) for text in result.contradictions],
         "told": told,
         "error_table": error_table(result) if told else None,
         "after_words": _after_words(result),

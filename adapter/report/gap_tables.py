@@ -9,7 +9,7 @@ import numpy as np
 
 from adapter.gap.phrases import DASH, THETA, THETA_UNITS, parameter_lines, plain, who
 from adapter.gap.result import Finding, GapResult
-from adapter.gap.words import percent, span, title_of
+from adapter.gap.words import alike, carried_words, percent, shares_of, span, title_of
 from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW
@@ -67,16 +67,22 @@ def _first_capital(text: str) -> str:
 
 
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
-    """(finding, what else it could be and how much of it that explains, how to tell)."""
-    return [
-        (
-            f"{_first_capital(finding.title)}, {who(finding.effect, finding.joints)}",
-            ", ".join(f"{title_of(name)} {percent(x)}" for name, x in finding.overlaps.items()),
-            finding.split_by,
-        )
-        for finding in result.findings
-        if finding.overlaps
-    ]
+    """(findings, what else they could be and how much of them that explains, how to tell)."""
+    rows = []
+    for findings in alike(result.findings):
+        shares = shares_of(findings)
+        if shares:
+            joints = sorted(j for f in findings for j in f.joints)
+            where = f"{_first_capital(findings[0].title)}, {who(findings[0].effect, joints)}"
+            said = ", ".join(f"{title_of(name)} {share}" for name, share in shares)
+            rows.append((where, said, findings[0].split_by))
+    return rows
+
+
+def carried_table(result: GapResult) -> Table | None:
+    """What each of several recordings carries; None for one."""
+    rows = [[load.recording, *map(tied, carried_words(load))] for load in result.loads]
+    return Table(["Recording", "Load", "Where"], rows) if rows else None
 
 
 def error_table(result: GapResult) -> Table:

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.gap.result import GapResult
+from adapter.gap.result import GapResult, LogLoad
 from adapter.gap.words import (
     as_json,
     console_summary,
@@ -42,19 +42,21 @@ SECTIONS = {
 }
 SAID = {
     "one_finding": "joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; "
-    "torque error 1.92 -> 0.02 N m",
+    "torque error 1.92 -> 0.05 N m over all joints, 1.92 -> 0.02 of joint 4, the worst",
     "pair": "joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; "
-    "from 12.3 s on the flange carries 1.020 ± 0.010 kg; torque error 1.92 -> 0.02 N m",
+    "from 12.3 s on the flange carries 1.020 ± 0.010 kg; "
+    "torque error 1.92 -> 0.05 N m over all joints, 1.92 -> 0.02 of joint 4, the worst",
     "unexplained": "joint 3: 0.30 N m that follow dq3 and q1 are not explained by any effect of "
     "the catalogue",
     "nothing": "the model explains this recording down to its noise",
     "problem": "joints 1 to 7 hardly move; move each over 0.5 rad and more than 0.2 rad/s.",
     "two_joints": "the torque of all joints comes 2.10 ± 0.10 ms after the position; "
-    "torque error of joint 1 0.90 -> 0.03 N m",
+    "torque error 0.90 -> 0.04 N m over all joints, 0.90 -> 0.03 of joint 1, the worst",
     "many": "joints 1 to 7 lack Coulomb friction (0.27, 0.20, 0.14, 0.45, 0.30, 0.15 and "
     "0.25 N m); joints 1, 2 and 4 lack viscous friction (0.10, 0.20 and 0.40 N m s/rad); "
     "the torque sensor of joint 2 reads 0.310 ± 0.020 N m too little; 2 more findings; "
-    "torque error of joint 2 0.77 -> 0.29 N m; joints 3 and 6: 0.30 and 0.60 N m are not "
+    "torque error 1.18 -> 0.52 N m over all joints, 0.77 -> 0.29 of joint 2, the worst; "
+    "joints 3 and 6: 0.30 and 0.60 N m are not "
     "explained by any effect of the catalogue",
 }
 
@@ -116,7 +118,9 @@ def test_a_browser_shows_it_without_complaint(
 def test_page_tells_the_finding(pages: dict[str, str]) -> None:
     text = text_of(pages["one_finding"])
     for said in (
-        "Joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; torque error 1.92 → 0.02 N m.",
+        "Joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; torque error 1.92 → 0.05 N m over "
+        "all joints, "
+        "1.92 → 0.02 of joint 4, the worst.",
         "Fc = 2.000 ± 0.030 N m", "> 99.9 %", "load-dependent friction 97 %", "96.0",
         "repeat the motion with a ladder of loads", "Forward simulation", "Against velocity",
         "Against position", "Against load", "Against acceleration", "Over time",
@@ -208,13 +212,60 @@ def test_when() -> None:
 
 
 def test_rivals() -> None:
-    assert rivals(made_up.COULOMB) == (
+    assert rivals([made_up.COULOMB]) == (
         "could also be load-dependent friction, which explains 97 % of it here; "
         "to split: repeat the motion with a ladder of loads at the flange, at the same speed: "
         "the Coulomb friction stays, the load-dependent friction grows with the load"
     )
-    assert "explains all of it" in rivals(made_up.PAYLOAD)
-    assert rivals(replace(made_up.COULOMB, overlaps={})) == ""
+    assert "explains all of it" in rivals([made_up.PAYLOAD])
+    assert rivals([replace(made_up.COULOMB, overlaps={})]) == ""
+
+
+def test_a_load_and_a_heavier_last_link_are_one_finding_with_two_readings() -> None:
+    load = replace(made_up.PAYLOAD, interval_s=(0.0, made_up.LONG_S), evidence=0.9991)
+    assert sentence(load) == (
+        "a load of 1.020 ± 0.010 kg at the hand (or the last link heavier by that: this log cannot "
+        "tell)"
+    )
+    assert rivals([load]) == ""
+    result = replace(result_of("pair"), findings=(load,))
+    assert any("that one of them is there more than 99.9 %" in x for x in console_summary(result))
+
+
+def test_findings_of_one_kind_have_their_rivals_said_once() -> None:
+    other = replace(made_up.COULOMB, joints=(2,), overlaps={"load_dependent_friction": 0.91})
+    result = replace(result_of("one_finding"), findings=(made_up.COULOMB, other))
+    said = " ".join(console_summary(result))
+    assert said.count("could also be") == 1 and "explains 91 to 97 % of it" in said
+    assert "Coulomb friction, joints 2 and 4" in text_of(render_gap_page(result))
+
+
+def test_what_is_worse_or_in_sample_is_in_the_headline() -> None:
+    one = result_of("one_finding")
+    after = made_up.errors([0.02, 0.06, 0.02, 0.02, 0.031, 0.02, 0.02])
+    assert "but 20 % worse on joint 2" in headline(replace(one, after=after))
+    two = made_up.errors([0.02, 0.06, 0.02, 0.02, 0.06, 0.02, 0.02])
+    assert "but up to 100 % worse on joints 2 and 5" in headline(replace(one, after=two))
+    assert "in sample only" in headline(replace(one, in_sample=True))
+
+
+def test_what_each_recording_carries() -> None:
+    held = LogLoad("a.mcap", True, 2.351, 0.042, (0.001, 0.0, 0.06), (0.001, 0.002, 0.004), "hand")
+    bare = LogLoad("b.mcap", False, 0.02, 0.04, None, None, "hand")
+    loads = tuple(
+        replace(made_up.PAYLOAD, interval_s=(0.0, made_up.LONG_S), recording=name)
+        for name in ("a.mcap", "b.mcap")
+    )
+    clash = "b.mcap contradicts the other recordings: the friction of joint 3 differs"
+    result = replace(result_of("pair"), findings=loads, loads=(held, bare), contradictions=(clash,))
+    assert headline(result).startswith("payload of 1.0 to 1.0 kg in 2 recordings")
+    assert clash in headline(result)
+    said = " ".join(console_summary(result))
+    assert "a.mcap  2.351 ± 0.042 kg  centre x 1.0 ± 1.0" in said
+    assert "b.mcap  nothing shown (0.020 ± 0.040 kg)" in said
+    text = text_of(render_gap_page(result))
+    assert "What each recording carries" in text and clash.removeprefix("b.mcap ") in text
+    assert as_json(result)["loads"][1]["mass_kg"] == 0.02
 
 
 def test_what_follows_nothing_is_said_so() -> None:

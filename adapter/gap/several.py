@@ -1,0 +1,278 @@
+"""Several recordings of one arm: what each hand carries, and which recordings contradict the rest.
+
+Inertias, friction, offsets and motor inertia are common to all recordings, the load is each one's
+own; all are fitted together by `together`. Errors of the model that all recordings share cancel
+between them, so that loads compare far better than each is known by itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from adapter.effects.catalogue import HELD
+from adapter.gap.evidence import score
+from adapter.gap.fit import Fit, place_of
+from adapter.gap.load import LOAD_STD, SHOWN, HandLoad, load_of, with_a_load
+from adapter.gap.result import Finding, GapResult, LogLoad
+from adapter.gap.together import Part, Together
+from adapter.model.inertia import six_from_tensor
+from adapter.model.self_model import FixedFrame
+from adapter.model.spatial import Array
+
+SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias: another unit's are 5 to 30 % off
+FRICTION, OFFSET, LINK = "friction", "offset", "link"
+NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: more is another arm
+FEWEST = 3  # recordings: of two nobody can say which one is the odd one
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """A recording that is not of the arm of the others.
+
+    Attributes:
+        recording: place of it; kind: of the difference; what: differs, for people.
+    """
+
+    recording: int
+    kind: str
+    what: str
+
+
+@dataclass(frozen=True, eq=False)
+class Several:
+    """Recordings fitted together.
+
+    Attributes:
+        names: of them; frame: in whose axes loads are told.
+        fits: one a recording, its load named first, at the common solution.
+        together: their least squares.
+    """
+
+    names: tuple[str, ...]
+    frame: FixedFrame
+    fits: tuple[Fit, ...]
+    together: Together
+
+    @classmethod
+    def of(cls, nominal: Fit, names: Sequence[str], frame: FixedFrame) -> Several:
+        """Fit the load of every recording with all that is common.
+
+        Args:
+            nominal: the documented arm on all recordings, which are called `names`.
+            frame: in whose axes loads are told.
+        """
+        fits = [_apart(nominal, i) for i in range(len(nominal.recordings))]
+        for flat in (True, False):  # see `fit.under_own_noise`
+            noises = [fit.own_noise() for fit in fits]
+            fits = [
+                fit.with_noise([x.flat() for x in noise] if flat else noise)
+                for fit, noise in zip(fits, noises, strict=True)
+            ]
+            parts = [Part.of(fit, _own(fit)) for fit in fits]
+            together = _together(parts, nominal.prior.size)
+            fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
+        return cls(tuple(names), frame, tuple(fits), together)
+
+    @cached_property
+    def own(self) -> tuple[tuple[Array, Array], ...]:
+        """Ten parameters (10,) of each load and their covariance (10, 10)."""
+        found = (self.together.own(i) for i in range(len(self.fits)))
+        return tuple((x[-10:], covariance[-10:, -10:]) for x, covariance in found)
+
+    @cached_property
+    def loads(self) -> tuple[HandLoad, ...]:
+        """What the hand carries in each recording."""
+        return tuple(load_of(*own, self.frame) for own in self.own)
+
+    @cached_property
+    def odd(self) -> list[Contradiction]:
+        """Recordings that are not of the arm of the others, the worst first."""
+        return contradictions(self.fits[0], self.together)
+
+    @cached_property
+    def same_load(self) -> bool:
+        """Whether all show one and the same load, within three standard deviations."""
+        mass = np.array([load.mass for load in self.loads])
+        std = np.array([_alone_std(*x) for x in zip(*self._shares, strict=True)])
+        off = mass - np.average(mass, weights=std**-2.0)
+        there = all(load.is_there for load in self.loads)
+        return there and bool((np.abs(off) < SHOWN * std).all())
+
+    @property
+    def _shares(self) -> tuple[Sequence[Part], list[Array]]:
+        return self.together.parts, [own for _, own in self.together.scores]
+
+    def started(self, fit: Fit) -> Fit:
+        """A fit on the same recordings with the loads shown; one load where all are the same."""
+        if self.same_load:
+            return fit.with_named([replace(self.fits[0].named[0], recording=None)])
+        loads = [
+            replace(own.named[0], recording=i)
+            for i, (own, load) in enumerate(zip(self.fits, self.loads, strict=True))
+            if load.is_there
+        ]
+        return fit.with_named(loads)
+
+    def told(self, result: GapResult) -> GapResult:
+        """A result with what each recording carries, and with recordings that contradict."""
+        rows = tuple(map(_row, self.names, self.loads))
+        result = replace(result, loads=rows, contradictions=tuple(map(self._said, self.odd)))
+        if self.same_load:
+            return result
+        kept = [f for f in result.findings if f.effect != HELD.name or not f.throughout]
+        found = [self._finding(i) for i, load in enumerate(self.loads) if load.is_there]
+        return replace(result, findings=(*found, *kept))
+
+    def _finding(self, i: int) -> Finding:
+        """The load of a recording."""
+        load, fit, z = self.loads[i], self.fits[i], self.loads[i].mass / self.loads[i].mass_std
+        centre = zip(("cx", "cy", "cz"), map(float, load.com_std), strict=True)
+        spread = [float(x) for x in six_from_tensor(load.inertia_std)]
+        return Finding(
+            effect=HELD.name,
+            title=HELD.title,
+            joints=(),
+            interval_s=(0.0, float(fit.recordings[0].t[-1])),
+            lasting=True,
+            parameters=HELD.decode(self.own[i][0]),
+            std={"m": load.mass_std, **dict(centre), "inertia": spread},
+            units=HELD.units(),
+            evidence=math.erf(z / math.sqrt(2.0)),
+            overlaps={},
+            split_by="",
+            detectability=z,
+            torque_rms_nm=np.sqrt(np.mean(fit.model.contribution(0, 0) ** 2, axis=0)),
+            recording=self.names[i],
+        )
+
+    def _said(self, odd: Contradiction) -> str:
+        return (
+            f"{self.names[odd.recording]} contradicts the other recordings: {odd.what} differs by "
+            "more than recordings of one arm do; fit it alone"
+        )
+
+
+def _row(name: str, load: HandLoad) -> LogLoad:
+    com = tuple(map(float, load.com)) if load.com_shown else None
+    std = tuple(map(float, load.com_std)) if load.com_shown else None
+    return LogLoad(name, load.is_there, load.mass, load.mass_std, com, std, load.frame)
+
+
+def _alone_std(part: Part, scores: Array) -> float:
+    """How well a recording's mass is known beside the others', kg: without what is common."""
+    off = scores @ part.free[:, -10]
+    return float(np.sqrt(max(part.free[-10, -10], float(off @ off))))
+
+
+def _own(fit: Fit) -> np.ndarray:
+    """Places of what is a recording's own: all between the timing and the end of its load."""
+    return np.arange(fit.dtheta.size + 1, place_of(fit, 0)[-1] + 1)
+
+
+def _apart(nominal: Fit, i: int) -> Fit:
+    """One recording alone, with a load, and all that may be beside it."""
+    named = with_a_load(nominal.n)
+    model = replace(nominal.model, recordings=(nominal.recordings[i],), named=named)
+    return replace(nominal, model=model, still=(), noise=(), weights=())
+
+
+def _together(parts: Sequence[Part], inertias: int) -> Together:
+    """With the inertias as wrong as the recordings like best. `inertias`: how many come first."""
+    std = parts[0].known.prior_std[parts[0].common]
+    G, g = (np.sum([getattr(part, key) for part in parts], axis=0) for key in ("G", "g"))
+
+    def wider(share: float) -> Array:
+        return np.concatenate([share * std[:inertias], std[inertias:]])
+
+    best = max(SHARES, key=lambda share: score(G, g, wider(share)).log_evidence)
+    return Together(parts, wider(best))
+
+
+def contradictions(fit: Fit, together: Together) -> list[Contradiction]:
+    """Recordings that contradict the rest, the worst first, one after the other.
+
+    Each recording's own correction of a friction, an offset or a link's inertia, about what all
+    others say, is compared with such corrections of the others among themselves: the models of
+    friction and of sensors are not exact, and how inexact shows in how much these differ.
+
+    Args:
+        fit: any of the recordings'.
+    """
+    out: list[Contradiction] = []
+    std, places = np.diagonal(together.prior) ** -0.5, list(range(len(together.parts)))
+    while len(places) >= FEWEST:
+        odd = _odd_one(fit, [together.parts[i] for i in places], std)
+        if odd is None:
+            break
+        out.append(replace(odd, recording=places.pop(odd.recording)))
+    return out
+
+
+def _odd_one(fit: Fit, parts: Sequence[Part], std: Array) -> Contradiction | None:
+    """The recording that differs from all others by more than these do, if there is one."""
+    found = []
+    for worst in map(max, _differences(fit, Together(parts, std)).values()):
+        if worst.size < NOISE:
+            continue
+        others = Together([x for k, x in enumerate(parts) if k != worst.recording], std)
+        among = max(_differences(fit, others)[worst.kind]).size
+        if worst.size > OTHERS * max(among, 1.0):
+            found.append(worst)
+    if not found:
+        return None
+    worst = max(found, key=lambda x: x.chi2)
+    return Contradiction(worst.recording, worst.kind, worst.what)
+
+
+class _Difference(NamedTuple):
+    """One recording's correction of something: in units of the noise, and what it explains."""
+
+    size: float
+    chi2: float
+    recording: int
+    kind: str
+    what: str
+
+
+def _differences(fit: Fit, rest: Together) -> dict[str, list[_Difference]]:
+    """Of each kind, of every recording about all others."""
+    found: dict[str, list[_Difference]] = {FRICTION: [], OFFSET: [], LINK: []}
+    for i, part in enumerate(rest.parts):
+        x, covariance = rest.without(i)
+        left, unsure = part.g - part.G @ x, part.G + part.G @ covariance @ part.G
+        for kind, what, directions in _directions(fit, x):
+            C, d = directions @ unsure @ directions.T, directions @ left
+            inverse = np.linalg.inv(C + np.eye(len(C)))
+            chi2, shown = float(d @ inverse @ d), max(float(np.trace(C @ inverse)), 0.5)
+            found[kind].append(_Difference(math.sqrt(chi2 / shown), chi2, i, kind, what))
+    return found
+
+
+def _directions(fit: Fit, x: Array) -> Iterator[tuple[str, str, Array]]:
+    """Kind, words, and directions (k, c) in the common coefficients, of about unit deviation."""
+    unit, own = np.eye(len(x)), [e.candidate for e in fit.named[1:]]
+    first = len(x) - len(own)
+    rubs = np.array(["friction" in c.effect.name for c in own])
+    reads = np.array([c.effect.name == "torque_offset" for c in own])
+    joints = np.array([c.joint for c in own])
+    yield FRICTION, "the friction of all joints", _together_in(unit, first, rubs, x)
+    for j in range(fit.n):
+        at_joint = _together_in(unit, first, rubs & (joints == j), x)
+        yield FRICTION, f"the friction of joint {j + 1}", at_joint
+        places = first + np.flatnonzero(reads & (joints == j))
+        yield OFFSET, f"the offset of joint {j + 1}'s torque", unit[places]
+    for k in range(1, fit.n - 1):
+        moved = np.array(LOAD_STD)[:, None] * unit[10 * k : 10 * k + 10]
+        yield LINK, f"the inertia of link {k + 1}, or of one beside it,", moved
+
+
+def _together_in(unit: Array, first: int, chosen: Array, x: Array) -> Array:
+    """(1, c) coefficients from `first` on that are chosen, in the proportion that they have."""
+    places = first + np.flatnonzero(chosen)
+    return np.asarray((x[places] @ unit[places])[None])
