@@ -45,7 +45,7 @@ class TorqueFilter(SensorEffect):
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
         measured torque look smoother than the one that the motion asks for.
         """
-        rate = motion.rate(motion.inside_band(tau[:, joint], POWER_SHARE))
-        out = tau.copy()
-        out[:, joint] += values["c"] * motion.rate(rate) - values["d"] * rate
+        own, out = tau[:, joint], tau.copy()
+        bend = motion.rate(motion.rate(motion.inside_band(own, POWER_SHARE)))
+        out[:, joint] += values["c"] * bend - values["d"] * motion.rate(own)
         return np.asarray(out)
