@@ -309,6 +309,10 @@ class TorqueEffect(Effect):
     after_sensors: ClassVar[bool] = False
     by_load: ClassVar[bool] = False
 
+    def bristles(self, values: Values) -> tuple[float, float] | None:
+        """(level N m, way rad) of what bends along the way before it slides, if it does."""
+        return None
+
     @abstractmethod
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """(m, n) N m that it adds; tau (m, n) is the rigid torque."""
@@ -316,6 +320,10 @@ class TorqueEffect(Effect):
 
 class SensorEffect(Effect):
     """Makes the measured torque differ from the torque."""
+
+    def low_pass(self, values: Values) -> tuple[float, float] | None:
+        """(a s, b s²) of b measured'' + a measured' + measured = tau, if it is that."""
+        return None
 
     @abstractmethod
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:

@@ -95,6 +95,10 @@ class BristleFriction(JointTorque):
         z, _ = bending(motion.q[:, joint], float(values["s0"]))
         return on_joint(motion, joint, float(values["Fc"]) * z)
 
+    def bristles(self, values: Values) -> tuple[float, float]:
+        """Fc and s0."""
+        return float(values["Fc"]), float(values["s0"])
+
     def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """Nothing: one instant does not tell how far the bristles are bent."""
         return False

@@ -39,6 +39,11 @@ class TorqueFilter(SensorEffect):
         """Smoother, and not much earlier."""
         return -MOST_AHEAD_S < float(values["d"]) < MOST_S and super().possible(values)
 
+    def low_pass(self, values: Values) -> tuple[float, float]:
+        """The one whose series begins so; without phase there is none, and the nearest is taken."""
+        d = max(float(values["d"]), 0.0)
+        return d, max(d * d - float(values["c"]), 0.0)
+
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """tau, its rate and the rate of that, on the joint.
 

@@ -4,12 +4,13 @@ The motion is the simulator's own: what acts in the drives and joints comes as a
 joint (`Effects.__call__`), what encoders and torque sensors make of it as a reading
 (`Effects.measured`). Each effect says itself where it belongs, by its class in `effects.base`:
 
-    TorqueEffect   friction, springs, ripple, motor inertia, a wrench at the flange: torque
+    TorqueEffect   friction, springs, ripple, motor inertia, a wrench at the flange: torque. What
+                   bends before it slides remembers the way
     BodyEffect     payload, link inertia, base tilt: in the file; where they come or go in
                    mid-recording, the difference to the file as torque
     MotionEffect   encoder offset and ripple, elasticity, backlash: read q, dq. The encoder sits on
                    the motor's side of the gear, so the joint's torque moves the link as it is
-    SensorEffect   gain and delay of the torque sensors, and their offset: read tau
+    SensorEffect   gain, delay and low-pass of the torque sensors, and their offset: read tau
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from adapter.effects.active import Active, active_effects, by_joint, with_bodies
-from adapter.effects.base import BodyEffect, JointTorque, Motion, TorqueEffect
+from adapter.effects.base import BodyEffect, JointTorque, Motion, SensorEffect, TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ, ByJoint, JointSignals, smooth_sign
 from adapter.effects.export import additions
 from adapter.effects.torque import arm_between, moved_links
@@ -31,6 +32,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import ARMATURE, DAMPING, FRICTION, STIFFNESS, URDF_PLACES
 from adapter.physics.rigid_arm import RigidArm
+from adapter.simulate.bristles import Bristles, with_bristles
 from adapter.simulate.friction import speed_change
 
 # What the joints of a file have beside the bodies, by the format's name.
@@ -70,13 +72,15 @@ class _Stage:
     """What acts between two switches.
 
     Attributes:
-        arm: the rigid body; laws: torques of joints; others: torques that only a table knows.
+        arm: the rigid body; laws: torques of joints; others: torques that only a table knows;
+            bent: those of bristles.
         sensors: what encoders and torque sensors do; shifts: what the latter add last of all.
     """
 
     arm: RigidArm
     laws: ByJoint
     others: tuple[Active, ...]
+    bent: tuple[Active, ...]
     sensors: ByJoint
     shifts: ByJoint
 
@@ -84,13 +88,14 @@ class _Stage:
     def of(cls, arm: RigidArm, acting: Sequence[Active]) -> _Stage:
         """Of the effects that act in it."""
         torques = [a for a in acting if isinstance(a.effect, TorqueEffect)]
-        last = [a for a in torques if _after_sensors(a)]
-        laws = [a for a in torques if isinstance(a.effect, JointTorque) and a not in last]
+        last, bent = [a for a in torques if _after_sensors(a)], with_bristles(torques)
+        laws = [a for a in torques if isinstance(a.effect, JointTorque) and a not in last + bent]
         n = arm.n
         return cls(
             arm,
             by_joint(laws, n),
-            tuple(a for a in torques if a not in laws and a not in last),
+            tuple(a for a in torques if a not in laws + last + bent),
+            tuple(bent),
             by_joint([a for a in acting if a not in torques], n),
             by_joint(last, n),
         )
@@ -134,9 +139,9 @@ class _Asking:
 class Effects:
     """The effects of a model in a simulator that steps its rigid arm.
 
-    The torque is stateless and may be asked for as often as an integrator likes; what is read has
-    a memory (play of the gears, delay lines), so `measured` is called once a step and `reset` when
-    the arm is put somewhere else.
+    The torque remembers nothing but the way of joints with bristles and may be asked for as often
+    as an integrator likes; what is read has a memory (play of the gears, delay lines), so
+    `measured` is called once a step and `reset` when the arm is put somewhere else.
 
     Args:
         model: on a fixed base.
@@ -173,9 +178,11 @@ class Effects:
         ends = {float(x) for a in self._active for x in a.interval_s if np.isfinite(x)}
         self._switches = np.array(sorted(ends))
         self._stages: dict[int, _Stage] = {}
+        self._bristles = Bristles(self._active, n, period_s)
+        self._slow = [a for a in self._active if _low_pass(a)]
         kinds = TorqueEffect, BodyEffect
         silent = by_joint(self._active, n).left_out
-        told = {a.effect.name for a in self._active if isinstance(a.effect, kinds)}
+        told = {a.effect.name for a in self._active if isinstance(a.effect, kinds) or _low_pass(a)}
         self.left_out = tuple(name for name in silent if name not in told)
         self.reset()
 
@@ -183,6 +190,8 @@ class Effects:
         """Forget what the sensors remember."""
         self._gap: Array | None = None
         self._past: list[tuple[float, Array]] = []  # newest first: s, driving torque
+        self._read: dict[int, tuple[float, float]] = {}  # last two of each low-pass, N m
+        self._bristles.reset()
 
     def held(self, place: str) -> Array:
         """(n,) what the simulator's joints hold in one of its places, see `model.urdf_text`."""
@@ -202,7 +211,8 @@ class Effects:
                 an end act, as if long begun.
         """
         stage = self._stage(t)
-        if not stage.laws.laws and not stage.others and stage.arm is self._held:
+        acting = stage.laws.laws or stage.others or stage.bent
+        if not acting and stage.arm is self._held:
             return self._nothing.copy()
         return self.at_middle(q, dq, ddq, tau, t, 0.0)
 
@@ -232,8 +242,9 @@ class Effects:
         if part or stage.arm is not self._held:
             body, carried = _dynamics(stage.arm, link, dq + part * self.period_s * last)
         a, u = last, dq
+        bent = self._bristles.torque(q, dq, body, stage.bent)
         for _ in range(2 if stage.laws.by_load else 1):  # what a gear carries follows from a
-            asked = _Asking.of(self._said(stage, (link, dq, carried + body @ a), t), dq)
+            asked = _Asking.of(self._said(stage, (link, dq, carried + body @ a), t) + bent, dq)
             losses = np.array([asked.viscous, asked.forwards, asked.backwards])
             push = tau - carried - asked.rest
             dv, u = speed_change(body + np.diag(asked.armature), push, dq, losses, self.period_s)
@@ -268,11 +279,13 @@ class Effects:
         ddq = np.gradient(dq, t, axis=0)
         read = Motion(t, q, dq, ddq, self._arm, BAND_HZ)
         moved = moved_links(read, self._active, tau)
+        self._bristles.follow(t, moved.q, moved.dq)
         return moved.q + self._holds.offset, moved.dq
 
     def settle(self, q: Array, dq: Array, tau: Array, t: float, read: Array) -> None:
         """Start anew with the gears' play such that the encoders read `read` (n,) rad."""
         self.reset()
+        self._bristles.settle(t, q)
         half = self._stage(t).sensors.half_play
         if half.any():
             self._gap = self._nothing
@@ -283,8 +296,9 @@ class Effects:
     def driving(self, t: Array, read: Array) -> Array:
         """Driving torque (m, n) N m behind what the torque sensors read at t (m,) s."""
         stages = [self._stage(float(now)) for now in t]
-        if all(stage.reads_true for stage in stages):
+        if all(stage.reads_true for stage in stages) and not self._slow:
             return read
+        read = self._behind_low_pass(t, read)
         at = JointSignals(*np.zeros((3, *read[0].shape)))
         shift = np.array([stage.shifts.torque(at) + self._nothing for stage in stages])
         out = (read - shift) / (1.0 + np.array([stage.sensors.gain for stage in stages]))
@@ -349,14 +363,45 @@ class Effects:
             times, rows = (np.array(x[::-1]) for x in zip(*self._past, strict=True))
             each = zip(late, rows.T, strict=True)
             tau = np.array([np.interp(now - d, times, x) for d, x in each])
+        tau = self._low_passed(t, tau)
         at = JointSignals(*np.zeros((3, len(tau))))
         return np.asarray((1.0 + stage.sensors.gain) * tau + stage.shifts.torque(at))
+
+    def _low_passed(self, t: float | None, tau: Array) -> Array:
+        """What the sensors' low-passes leave of torques (n,), by the implicit Euler method."""
+        out, now = tau.copy(), self._clock(t)
+        for k, active in enumerate(self._slow):
+            a, b = _low_pass(active) or (0.0, 0.0)
+            before, last = self._read.get(k, (out[active.joint],) * 2)
+            a, b = a / self.period_s, b / self.period_s**2
+            new = (out[active.joint] + a * last + b * (2.0 * last - before)) / (1.0 + a + b)
+            self._read[k] = last, new
+            if active.interval_s[0] <= now < active.interval_s[1]:
+                out[active.joint] = new
+        return out
+
+    def _behind_low_pass(self, t: Array, read: Array) -> Array:
+        """Torques (m, n) of which the sensors' low-passes leave `read` (m, n)."""
+        out = read.copy()
+        for active in self._slow:
+            a, b = _low_pass(active) or (0.0, 0.0)
+            rate = np.gradient(out[:, active.joint], t)
+            more = a * rate + b * np.gradient(rate, t)
+            on = active.on(t)
+            out[:, active.joint] += more if on is None else more * on
+        return out
 
     def _clock(self, t: float | None) -> float:
         """t; without one, steps counted since the last reset."""
         if t is not None:
             return float(t)
         return self._past[0][0] + self.period_s if self._past else 0.0
+
+
+def _low_pass(active: Active) -> tuple[float, float] | None:
+    return (
+        active.effect.low_pass(active.values) if isinstance(active.effect, SensorEffect) else None
+    )
 
 
 def _dynamics(arm: RigidArm, q: Array, dq: Array) -> tuple[Array, Array]:

@@ -143,6 +143,8 @@ def test_what_has_no_place_is_in_one_comment() -> None:
         {"effect": "motor_inertia", "joints": [5], "parameters": {"B": 0.15}},
         {"effect": "viscous_friction", "joints": [6], "parameters": {"Fv": -0.01}},
         {"effect": "signal_delay", "parameters": {"d": 0.002}},
+        {"effect": "bristle_friction", "joints": [3], "parameters": {"Fc": 0.4, "s0": 1e-3}},
+        {"effect": "torque_filter", "joints": [3], "parameters": {"d": 0.004, "c": 1e-5}},
         {
             "effect": "torque_offset",
             "joints": [1],
@@ -154,6 +156,8 @@ def test_what_has_no_place_is_in_one_comment() -> None:
     for part in (
         "motor_inertia of panda_joint5, B = 0.15 kg m2",
         "signal_delay, d = 0.002 s",
+        "bristle_friction of panda_joint3, Fc = 0.4 N m, s0 = 0.001 rad (Fc is there",
+        "torque_filter of panda_joint3, d = 0.004 s, c = 1e-05 s2",
         "stribeck_friction of panda_joint2",
         "Fs = 0.7 N m",
         "Fc_pos = 0.6 N m",
@@ -162,8 +166,9 @@ def test_what_has_no_place_is_in_one_comment() -> None:
     ):
         assert part in said
     assert "coulomb_friction" not in said
-    names = ["asymmetric_friction", "motor_inertia", "signal_delay", "stribeck_friction"]
-    assert robot_urdf(carrying(*LOSSES, *left)).left_out == (*names, "torque_offset")
+    names = ["asymmetric_friction", "bristle_friction", "motor_inertia"]
+    names += ["signal_delay", "stribeck_friction", "torque_filter"]
+    assert robot_urdf(carrying(*LOSSES, *left)).left_out == tuple(sorted([*names, "torque_offset"]))
     assert comments(to_urdf(carrying(*BODIES, *LOSSES[:2]))) == []
     assert comments(to_urdf(documented("panda"))) == []
 

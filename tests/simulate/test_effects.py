@@ -129,6 +129,30 @@ def test_friction_holds_still_without_chattering(simulator: str) -> None:
 
 
 @pytest.mark.parametrize("simulator", list(SIMULATORS))
+@pytest.mark.parametrize("s0", [1e-5, 4e-3])
+def test_bristles_wind_up_and_hold(simulator: str, s0: float) -> None:
+    """A push that slowly rises to 0.6 Fc winds a joint up by -s0 ln(1 - 0.6), and no further."""
+    joints, level = tuple(range(1, 8)), 0.5
+    model = model_with(
+        Effect("bristle_friction", joints, {"Fc": level, "s0": s0}),
+        Effect("viscous_friction", joints, {"Fv": 5.0}),  # or the arm swings on its bristles
+    )
+    arm = SIMULATORS[simulator](model)
+    arm.place(READY, np.zeros(7))
+    rigid, way = pin_model(panda()), np.array([1, -1, 1, -1, 1, -1, 1])
+    data = rigid.createData()
+    for k in range(1000):
+        q, _ = arm.state()
+        weight = pin.rnea(rigid, data, q, np.zeros(7), np.zeros(7))
+        arm.step(weight + 0.6 * level * min(k / 700, 1.0) * way)
+    wound = (arm.state()[0] - READY) * way
+    arm.close()
+    assert (wound < 2e-4 + 1.2 * s0).all()  # a way below 0.1 mrad is taken as longer
+    if s0 > 1e-3:
+        np.testing.assert_allclose(wound, -s0 * np.log(0.4), rtol=0.15)
+
+
+@pytest.mark.parametrize("simulator", list(SIMULATORS))
 def test_a_joint_comes_to_rest(simulator: str) -> None:
     arm = SIMULATORS[simulator](model_with(*STICKING))
     arm.place(READY, 0.3 * DQ)

@@ -29,6 +29,8 @@ CASES = [
     Effect("asymmetric_friction", (6,), {"Fc_pos": 0.6, "Fc_neg": 0.3}),
     Effect("stribeck_friction", (2,), {"Fc": 0.5, "Fs": 1.2, "vs": 0.1}),
     Effect("load_dependent_friction", (2,), {"Fl": 0.05}),
+    Effect("bristle_friction", (4,), {"Fc": 1.0, "s0": 2e-3}),
+    Effect("bristle_friction", (7,), {"Fc": 0.3, "s0": 5e-3}),
     Effect("friction_drift", (1,), {"dFc": 0.8}),
     Effect("motor_inertia", (5,), {"B": 0.1}),
     Effect("joint_spring", (3,), {"k": 1.5, "q0": 0.5}),
@@ -45,6 +47,7 @@ SENSED = [
     Effect("torque_gain", (2,), {"g": 0.06}),
     Effect("torque_offset", (4,), {"o": 0.5}, (0.5, None)),
     Effect("signal_delay", (), {"d": 0.0045}),
+    Effect("torque_filter", (4,), {"d": 0.02, "c": 0.0003}),
 ]
 
 
