@@ -1,0 +1,52 @@
+"""Friction that winds up and torques that are late and smooth, named on recordings of Pinocchio's.
+
+That neither is named where it is not, and that Coulomb friction stays what it is, is in `test_gap`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from adapter.gap.result import Finding
+from adapter.gap.workflow import find_gap
+from sim.effects import Effect
+from sim.hidden import draw, write
+from tests.helpers.gap_tools import pinocchio_recording
+
+
+def named(effect: Effect, seed: int, folder: Path, seconds: float) -> tuple[Finding, ...]:
+    """What is found of an arm with an effect; the model's inertias are 2 % off."""
+    trial = replace(draw(seed, "null"), effects=(effect,), seconds=seconds)
+    log, model, _ = write(trial, folder, pinocchio_recording(trial))
+    return tuple(find_gap([log], model).findings)
+
+
+BRISTLES = [
+    (5, 0.3, 1e-3, 10.0),
+    pytest.param(2, 0.8, 1e-3, 20.0, marks=pytest.mark.slow),
+    pytest.param(2, 0.8, 5e-3, 20.0, marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("joint", "level", "way", "seconds"), BRISTLES)
+def test_bristles_are_named_with_their_way(
+    joint: int, level: float, way: float, seconds: float, tmp_path: Path
+) -> None:
+    hidden = Effect("bristle_friction", (joint,), {"Fc": level, "s0": way})
+    (found,) = named(hidden, 300 + joint, tmp_path, seconds)
+    assert (found.effect, found.joints) == (hidden.name, hidden.joints)
+    assert found.parameters["Fc"] == pytest.approx(level, rel=0.05)
+    assert found.parameters["s0"] == pytest.approx(way, rel=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("joint", "d", "share"), [(2, 0.02, 0.75), (4, 0.015, 1.0)])
+def test_a_sensors_low_pass_is_named(joint: int, d: float, share: float, tmp_path: Path) -> None:
+    """`share` of d²: 1/2 is a delay, 3/4 has two equal poles, 1 is of first order."""
+    hidden = Effect("torque_filter", (joint,), {"d": d, "c": share * d * d})
+    (found,) = named(hidden, 300 + joint, tmp_path, 20.0)
+    assert (found.effect, found.joints) == (hidden.name, hidden.joints)
+    assert found.parameters["d"] == pytest.approx(d, rel=0.1)
