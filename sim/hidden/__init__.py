@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from sim.hidden.record import Recording, pybullet_recording, simulate, write, write_files
-from sim.hidden.trial import KINDS, MODEL_ERROR, SHARES, Trial, draw, nominal_urdf, seal, unseal
+from sim.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf, seal, unseal
 
 __all__ = [
     "KINDS",
-    "MODEL_ERROR",
     "SHARES",
     "Recording",
     "Trial",

@@ -53,20 +53,23 @@ class Recording:
 
 
 class Follower:
-    """Torque that makes a nominal arm follow a motion: M (ddq + feedback) + bias."""
+    """Torque that makes a nominal arm follow a motion: M (ddq + feedback) + bias.
+
+    It knows the motors' inertias, as drives do: where links weigh little it would shake without.
+    """
 
     def __init__(self, trial: Trial) -> None:
         self._arm = trial.nominal
         self._sum = np.zeros(trial.nominal.n)
-        self._effort = trial.nominal.limits.effort
+        self._effort, self._motors = trial.nominal.limits.effort, trial.motor_inertia
 
     def torque(self, q: Array, dq: Array, wanted: tuple[Array, Array, Array]) -> Array:
         """Torque (n,) N m at q, dq (n,) for the wanted q, dq, ddq of the next instant."""
         behind = wanted[0] - q
         self._sum += PERIOD_S * behind
         push = RATE_S**2 * (behind + INTEGRAL_S * self._sum) + 2 * RATE_S * (wanted[1] - dq)
-        arm = self._arm
-        tau = torques(arm.frames, arm.theta, arm.base, q, dq, wanted[2] + push)
+        arm, ddq = self._arm, wanted[2] + push
+        tau = torques(arm.frames, arm.theta, arm.base, q, dq, ddq) + self._motors * ddq
         return np.clip(tau, -self._effort, self._effort)
 
 
@@ -80,7 +83,8 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
     wanted = trial.motion.at(PERIOD_S * np.arange(m + 1, dtype=float))
     truth = trial.arm.with_changes(effects=trial.effects)
     plant, follower = Plant(truth, noise=levels_of("none")), Follower(trial)
-    out = np.empty((4, m, truth.n))
+    out, rubs = np.empty((4, m, truth.n)), np.zeros((m + 1, truth.n))
+    bent = None if trial.friction is None else trial.friction.start * trial.friction.coulomb
     for k in range(m):
         sample = plant.read()
         if plant.fault is not None:
@@ -90,10 +94,13 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
         tau = follower.torque(q, dq, goal)
         out[0, k], out[1, k], out[2, k] = sample.q, sample.dq, sample.tau
         out[3, k] = tau
+        if trial.friction is not None and bent is not None:
+            bent = trial.friction.after(bent, dq, PERIOD_S)
+            rubs[k + 1] = bent + trial.friction.viscous * dq
         # What disturbs the arm is part of what the drive gives and of what its sensor reads.
-        plant.command(tau - disturbance[min(k + 1, m - 1)])
+        plant.command(tau - disturbance[min(k + 1, m - 1)] - rubs[k + 1])
     plant.close()
-    out[2] += disturbance
+    out[2] += disturbance + rubs[:-1]
     return out[0], out[1], out[2], out[3]
 
 

@@ -1,7 +1,7 @@
 """Which effects a hidden-effect trial plants, where, how large, and from when on.
 
-The ranges with a source in the issue are those of the issue; torques on joints 5 to 7 are four
-tenths of them. Sizes are log-uniform.
+Torques on joints 5 to 7 are four tenths of the ranges. Sizes are log-uniform over three times the
+range (the ratio of its ends): a learner that believes in the ranges is wrong about some.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from sim.effects import PAIRS, Effect
 from sim.truth import Array, Truth
 
 SECONDS = 20.0
+WIDER = np.sqrt(3.0)  # either end of a range of sizes is further out by this
 WRIST = 5  # joints from here on (counted from 1) get WRIST_SHARE of a torque
 WRIST_SHARE = 0.4
 START_S = (5.0, 15.0)  # of effects that begin mid-recording
@@ -63,13 +64,18 @@ def log_uniform(rng: np.random.Generator, span: tuple[float, float]) -> float:
     return float(np.exp(rng.uniform(np.log(span[0]), np.log(span[1]))))
 
 
+def wide(rng: np.random.Generator, span: tuple[float, float]) -> float:
+    """A size from three times a span, all orders of magnitude alike."""
+    return log_uniform(rng, (span[0] / WIDER, span[1] * WIDER))
+
+
 def _sign(rng: np.random.Generator) -> float:
     return 1.0 if rng.random() < 0.5 else -1.0
 
 
 def torque_size(rng: np.random.Generator, joint: int, span: tuple[float, float]) -> float:
-    """A size of a torque on `joint` (from 1): log-uniform, four tenths on joints 5 to 7."""
-    return log_uniform(rng, span) * (WRIST_SHARE if joint >= WRIST else 1.0)
+    """A size of a torque on `joint` (from 1), four tenths on joints 5 to 7; see `wide`."""
+    return wide(rng, span) * (WRIST_SHARE if joint >= WRIST else 1.0)
 
 
 def _torque(key: str, span: tuple[float, float], signed: bool = False) -> Maker:
@@ -81,7 +87,7 @@ def _torque(key: str, span: tuple[float, float], signed: bool = False) -> Maker:
 
 def _plain(key: str, span: tuple[float, float], signed: bool = False) -> Maker:
     def make(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-        return {key: log_uniform(rng, span) * (_sign(rng) if signed else 1.0)}
+        return {key: wide(rng, span) * (_sign(rng) if signed else 1.0)}
 
     return make
 
@@ -111,11 +117,11 @@ def _spring(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
 
 def _encoder_ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     phase = float(rng.uniform(-np.pi, np.pi))
-    return {"a": log_uniform(rng, ENCODER_RIPPLE), "phase": phase}
+    return {"a": wide(rng, ENCODER_RIPPLE), "phase": phase}
 
 
 def _payload(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    m = log_uniform(rng, MASS)
+    m = wide(rng, MASS)
     half = rng.uniform(*BODY_M, 3)
     xx, yy, zz = (m / 3 * (half @ half - half**2)).tolist()  # a box's, from its half sides
     x, y = rng.uniform(-ASIDE_M, ASIDE_M, 2).tolist()
@@ -127,7 +133,7 @@ def _link_inertia(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     """A link that weighs more or less by a share, all ten numbers in proportion, or whose centre
     is elsewhere (a body of the same inertia about its centre, moved)."""
     theta = arm.theta[joint - 1]
-    share = log_uniform(rng, LINK_ERROR) * _sign(rng)
+    share = wide(rng, LINK_ERROR) * _sign(rng)
     if rng.random() < 0.5:
         return {"dtheta": (share * theta).tolist()}
     m, c = theta[0], theta[1:4] / theta[0]
@@ -138,12 +144,12 @@ def _link_inertia(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
 
 
 def _tilt(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    size, way = log_uniform(rng, TILT), rng.uniform(0, 2 * np.pi)
+    size, way = wide(rng, TILT), rng.uniform(0, 2 * np.pi)
     return {"rx": float(size * np.cos(way)), "ry": float(size * np.sin(way))}
 
 
 def _contact(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    x, y, z = (log_uniform(rng, CONTACT_N) * direction(rng)).tolist()
+    x, y, z = (wide(rng, CONTACT_N) * direction(rng)).tolist()
     return {"fx": x, "fy": y, "fz": z, "mx": 0.0, "my": 0.0, "mz": 0.0}
 
 
@@ -172,11 +178,11 @@ def _velocity_ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Number
 
 
 def _bristle(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    return {"Fc": torque_size(rng, joint, COULOMB), "s0": log_uniform(rng, BRISTLE)}
+    return {"Fc": torque_size(rng, joint, COULOMB), "s0": wide(rng, BRISTLE)}
 
 
 def _low_pass(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    d = log_uniform(rng, LOW_PASS)
+    d = wide(rng, LOW_PASS)
     return {"d": d, "c": d * d * float(rng.uniform(*LOW_PASS_POLES))}
 
 

@@ -1,7 +1,9 @@
 """Hidden-effect trials: a seed decides what is wrong with an arm, the recording says no more.
 
-The nominal model is the documented Panda. The simulated arm differs from it by 2 % of every
-inertial number and by the effects drawn; a coloured disturbance torque acts on every joint.
+The nominal model is the documented Panda. The simulated arm differs from it by some share of every
+inertial number and by the effects drawn; a coloured disturbance torque acts on every joint. All of
+it is drawn wider than a search believes that takes inertias to be 2 % off, sizes to be usual and
+friction to follow a law of its own.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sim.effects import Effect
+from sim.hidden.bristles import Bristles, draw_bristles
 from sim.hidden.motion import DrawnMotion, draw_motion
 from sim.hidden.sizes import (
     CATALOGUE,
@@ -35,7 +38,8 @@ FORMAT, VERSION = "panda-adapter/hidden-truth", 1
 KINDS = ("null", "single", "pair", "outside")
 SHARES = (0.25, 0.40, 0.25, 0.10)
 COMMANDS_SHARE = 0.5  # of the recordings have /joint_commands
-MODEL_ERROR = 0.02  # rms error of each of the nominal model's inertial numbers, of its size
+MODEL_ERROR = (0.005, 0.05)  # rms error of the nominal model's inertial numbers, of their sizes
+FRICTION_SHARE = 0.4  # of the trials have friction in every joint beside what is hidden
 DISTURBANCE_NM = (0.02, 0.08)  # rms; WRIST_SHARE of it on joints 5 to 7
 DISTURBANCE_HZ = (0.3, 3.0)  # corner of the low-pass that colours it
 TRIAL_STREAM, DISTURBANCE_STREAM = 34, 35  # apart from the streams of the noise
@@ -49,6 +53,8 @@ FRICTION = {
     "friction_drift",
     "bristle_friction",
 }
+# Names for what every joint's friction does; of another one of them there only the sum is seen.
+RUBS = ("coulomb_friction", "viscous_friction", "stribeck_friction", "bristle_friction")
 LOOK_ALIKE = (
     FRICTION,
     {"joint_spring", "torque_ripple", "torque_offset"},
@@ -65,8 +71,10 @@ class Trial:
     Attributes:
         seed, kind: of the draw; one of `KINDS`.
         effects: what is hidden in the arm.
-        arm: the simulated arm without the effects; 2 % off the nominal one.
+        friction: in every joint beside them, by a law that no catalogue has; None for none.
+        arm: the simulated arm without the effects; `model_error` off the nominal one.
         nominal: the documented arm, the model that the workflow gets.
+        model_error: rms error of its inertial numbers, of their sizes.
         motion: that the arm is told to make.
         disturbance_nm: (n,) rms of the disturbance torque, N m.
         disturbance_hz: corner of its first-order low-pass.
@@ -78,8 +86,10 @@ class Trial:
     seed: int
     kind: str
     effects: tuple[Effect, ...]
+    friction: Bristles | None
     arm: Truth
     nominal: Truth
+    model_error: float
     motion: DrawnMotion
     disturbance_nm: Array
     disturbance_hz: float
@@ -91,6 +101,14 @@ class Trial:
     def times(self) -> Array:
         """(m,) s of the samples, 1 ms apart."""
         return np.arange(round(self.seconds * 1000), dtype=np.float64) * 1e-3
+
+    @property
+    def motor_inertia(self) -> Array:
+        """(n,) kg m2 that the effects add to the joints."""
+        out = np.zeros(self.arm.n)
+        for effect in (e for e in self.effects if e.name == "motor_inertia"):
+            out[effect.columns(self.arm.n)] += effect.number("B")
+        return out
 
     def disturbance(self) -> Array:
         """(m, n) N m: first-order low-passed noise, the same at every call."""
@@ -108,6 +126,8 @@ class Trial:
             "seed": self.seed,
             "kind": self.kind,
             "effects": [effect.as_dict() for effect in self.effects],
+            "rubs": [] if self.friction is None else list(RUBS),
+            "model_error": self.model_error,
             "seconds": self.seconds,
             "commands": self.commands,
             "motion": self.motion.as_dict(),
@@ -121,13 +141,22 @@ class Trial:
         }
 
 
-def draw(seed: int, kind: str | None = None, effect: str | None = None) -> Trial:
+def draw(
+    seed: int, kind: str | None = None, effect: str | None = None, rubs: bool | None = None
+) -> Trial:
     """The trial of a seed.
+
+    What a search is to reach on these draws: of single effects 95 % named, of all 90 % with the
+    right set and joints exactly, 2 % of the nulls given a name, in 80 % of the pairs both named,
+    80 % of what is in no list left unexplained. Beside friction in every joint: 95 % of the single
+    effects named, with at most 0.05 wrong names a log. Names said with 90 to 99 % are right in 85
+    to 100 %.
 
     Args:
         seed: decides everything.
         kind: one of `KINDS`; drawn by `SHARES` where None.
         effect: name of the single effect; drawn where None.
+        rubs: whether there is friction in every joint; drawn by `FRICTION_SHARE` where None.
 
     Raises:
         ValueError: unknown kind or effect; the message has the choices.
@@ -139,8 +168,11 @@ def draw(seed: int, kind: str | None = None, effect: str | None = None) -> Trial
         raise ValueError(f"no kind of trial {kind!r}; have: {', '.join(KINDS)}")
     if effect is not None and effect not in {**CATALOGUE, **OUTSIDE}:
         raise ValueError(f"no effect {effect!r}; have: {', '.join((*CATALOGUE, *OUTSIDE))}")
+    rubbed = bool(rng.random() < FRICTION_SHARE)
+    rubs = (rubbed and effect not in RUBS) if rubs is None else rubs
     nominal = panda()
-    arm = nominal.with_changes(theta=_wrong(nominal.theta, rng))
+    model_error = log_uniform(rng, MODEL_ERROR)
+    arm = nominal.with_changes(theta=wrong_bodies(nominal.theta, model_error, rng))
     motion = draw_motion(rng, arm.limits, arm.ready)
     arm = arm.with_changes(ready=motion.middle)
     share = np.where(np.arange(1, arm.n + 1) >= WRIST, WRIST_SHARE, 1.0)
@@ -150,26 +182,30 @@ def draw(seed: int, kind: str | None = None, effect: str | None = None) -> Trial
         disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, arm.n),
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
         commands=bool(rng.random() < COMMANDS_SHARE),
-        effects=_effects(rng, kind, arm, effect),
+        effects=_effects(rng, kind, arm, effect, RUBS if rubs else ()),
+        friction=draw_bristles(rng, arm.n) if rubs else None,
         arm=arm,
         nominal=nominal,
+        model_error=model_error,
         motion=motion,
         noise=levels_of("real"),
     )
 
 
 def _effects(
-    rng: np.random.Generator, kind: str, arm: Truth, name: str | None
+    rng: np.random.Generator, kind: str, arm: Truth, name: str | None, without: tuple[str, ...]
 ) -> tuple[Effect, ...]:
+    """What is hidden: `name` where it is given, else any but those `without`."""
+    names = [x for x in CATALOGUE if x not in without]
     if kind == "null":
         return ()
     if kind == "outside":
         return (draw_effect(rng, name or str(rng.choice(list(OUTSIDE))), arm),)
     if kind == "single":
-        return (draw_effect(rng, name or str(rng.choice(list(CATALOGUE))), arm),)
+        return (draw_effect(rng, name or str(rng.choice(names)), arm),)
     for _ in range(ATTEMPTS):
-        names = rng.choice(list(CATALOGUE), 2, replace=False)
-        pair = draw_effect(rng, name or str(names[0]), arm), draw_effect(rng, str(names[1]), arm)
+        both = rng.choice(names, 2, replace=False)
+        pair = draw_effect(rng, name or str(both[0]), arm), draw_effect(rng, str(both[1]), arm)
         if _apart(*pair):
             return pair
     raise AssertionError("no pair of distinct effects found")
@@ -185,12 +221,12 @@ def _apart(first: Effect, second: Effect) -> bool:
     return not (alike and (same_place or "payload" in names))
 
 
-def _wrong(theta: Array, rng: np.random.Generator) -> Array:
-    """θ (n, 10) with each number changed by `MODEL_ERROR` rms, every body still possible."""
+def wrong_bodies(theta: Array, error: float, rng: np.random.Generator) -> Array:
+    """θ (n, 10) with each number changed by `error` rms, every body still possible."""
     wrong = theta.copy()
     for j, body in enumerate(theta):
         for _ in range(ATTEMPTS):
-            wrong[j] = body * (1 + MODEL_ERROR * rng.standard_normal(10))
+            wrong[j] = body * (1 + error * rng.standard_normal(10))
             if possible(wrong[j]):
                 break
         else:

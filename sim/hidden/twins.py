@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from sim.hidden.bristles import Bristles, draw_bristles, sizes
+from sim.hidden.motion import MARGIN_RAD, hand, points
 from sim.hidden.record import Recording
 from sim.hidden.sizes import FLANGE_M, WRIST, WRIST_SHARE, log_uniform
 from sim.hidden.trial import ATTEMPTS, first_order, possible
@@ -28,9 +30,6 @@ MODEL_ERROR, LAST_ERROR = (0.05, 0.3), 0.05  # of links 1 to n - 1; of the last 
 BARE_SHARE = 0.3  # of the twins carry nothing
 LOAD_KG = (0.3, 4.4)
 LOAD_BEYOND_M, LOAD_ASIDE_M, LOAD_HALF_M = (0.0, 0.15), 0.05, (0.02, 0.06)
-COULOMB, VISCOUS = (0.2, 1.0), (0.05, 0.5)  # N m, N m s/rad
-STICTION, STRIBECK_SPEED = (1.0, 1.6), (0.02, 0.1)  # of Coulomb's; rad/s
-BRISTLE_RAD = (0.3e-3, 4e-3)  # over which a joint winds up
 OFFSET_NM = 0.3
 DISTURBANCE_NM, DISTURBANCE_HZ = (0.05, 0.3), (0.2, 5.0)
 SENSOR_HZ = (15.0, 80.0)  # where the torque sensor's low-pass begins
@@ -39,43 +38,9 @@ REPEATS = (0.06, 0.37)
 HOLES, HOLE_S = (2, 8), (17e-3, 53e-3)
 PERIOD_S, LONG_PERIOD_S, LONG_SHARE = (0.7e-3, 1.3e-3), (1.3e-3, 8.8e-3), 0.02
 MOTIONS = ("points", "sines", "hand")
-REST_S, MOVE_S = (0.2, 1.0), (0.6, 2.0)  # of motions from point to point
-REACH_RAD, MARGIN_RAD = (0.2, 1.0), 0.1
+REACH_RAD = (0.2, 1.0)
 SPEED_SHARE = 0.6  # of a joint's limit, at most
 SINES, SINES_HZ = 5, (0.1, 0.9)
-HAND_HZ = 0.6  # a hand guides an arm with noise below this
-
-
-@dataclass(frozen=True, eq=False)
-class Bristles:
-    """LuGre's friction (Canudas de Wit et al. 1995), without damping of the bristles.
-
-    Attributes:
-        coulomb, stiction, speed, viscous, deflection: (n,) N m, N m, rad/s, N m s/rad, rad.
-        start: (n,) deflection at the first sample, of the largest.
-    """
-
-    coulomb: Array
-    stiction: Array
-    speed: Array
-    viscous: Array
-    deflection: Array
-    start: Array
-
-    def along(self, dq: Array, step_s: float) -> Array:
-        """Torque (m, n) N m along joint velocities (m, n)."""
-        out, z = np.empty_like(dq), self.start * self.coulomb
-        for k, v in enumerate(dq):
-            z = self.after(z, v, step_s)
-            out[k] = z + self.viscous * v
-        return out
-
-    def after(self, z: Array, v: Array, step_s: float) -> Array:
-        """Torque (n,) of the bristles a step at velocity v (n,) later: exact for a constant v."""
-        level = self.coulomb + (self.stiction - self.coulomb) * np.exp(-np.square(v / self.speed))
-        rate = np.abs(v) * self.coulomb / (self.deflection * level)
-        end = np.sign(v) * level
-        return np.asarray(end + (z - end) * np.exp(-rate * step_s))
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +103,6 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
         q, kind = _motion(np.random.default_rng([seed, STREAM, motion]), nominal)
     theta[-1] += body
     share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
-    coulomb = share * _sizes(rng, COULOMB, n)
     return Twin(
         seed=seed,
         arm=nominal.with_changes(theta=theta, ready=q[0]),
@@ -147,16 +111,9 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
         load_at=load_at,
         q=q,
         kind=kind,
-        friction=Bristles(
-            coulomb,
-            coulomb * rng.uniform(*STICTION, n),
-            rng.uniform(*STRIBECK_SPEED, n),
-            share * _sizes(rng, VISCOUS, n),
-            _sizes(rng, BRISTLE_RAD, n),
-            rng.uniform(-1, 1, n),
-        ),
+        friction=draw_bristles(rng, n),
         offset=share * OFFSET_NM * rng.standard_normal(n),
-        sensor_hz=_sizes(rng, SENSOR_HZ, n),
+        sensor_hz=sizes(rng, SENSOR_HZ, n),
         dq_late_s=float(rng.uniform(*DQ_LATE_S)),
         motion_number=motion,
         load_number=load,
@@ -167,11 +124,6 @@ def _held(rng: np.random.Generator) -> tuple[float, Array, Array]:
     """What the hand holds: its mass kg, its ten parameters, and its centre (3,) m."""
     mass = 0.0 if rng.random() < BARE_SHARE else log_uniform(rng, LOAD_KG)
     return mass, *_load(rng, mass)
-
-
-def _sizes(rng: np.random.Generator, span: tuple[float, float], n: int) -> Array:
-    """(n,) sizes from a span, all orders of magnitude alike."""
-    return np.array([log_uniform(rng, span) for _ in range(n)])
 
 
 def _other_body(body: Array, error: float, rng: np.random.Generator) -> Array:
@@ -197,7 +149,7 @@ def _motion(rng: np.random.Generator, arm: Truth) -> tuple[Array, str]:
     """Positions (m, n), slower where a joint would come near its limits."""
     kind = str(rng.choice(MOTIONS))
     t = np.arange(0.0, rng.uniform(*SECONDS), STEP_S)
-    shape = {"points": _points, "sines": _sines, "hand": _hand}[kind](rng, t, arm.n)
+    shape = {"points": points, "sines": _sines, "hand": hand}[kind](rng, t, arm.n)
     middle = arm.ready + rng.uniform(-0.3, 0.3, arm.n)
     free = np.minimum(middle - arm.limits.lower, arm.limits.upper - middle) - MARGIN_RAD
     reach = np.minimum(rng.uniform(*REACH_RAD, arm.n), free)
@@ -206,34 +158,10 @@ def _motion(rng: np.random.Generator, arm: Truth) -> tuple[Array, str]:
     return middle + shape * np.minimum(1.0, SPEED_SHARE * arm.limits.velocity / speed.max()), kind
 
 
-def _points(rng: np.random.Generator, t: Array, n: int) -> Array:
-    """From point to point with rests; a joint or two alone, or all together."""
-    q, at, now = np.zeros((len(t), n)), np.zeros(n), 0.0
-    while now < t[-1]:
-        now += rng.uniform(*REST_S)
-        length, goal = rng.uniform(*MOVE_S), at.copy()
-        joints = rng.permutation(n)[: rng.choice([1, 2, n])]
-        goal[joints] = rng.uniform(-1, 1, len(joints))
-        x = np.clip((t - now) / length, 0, 1)[:, None]
-        q = np.where(x > 0, at + (goal - at) * x**3 * (10 - 15 * x + 6 * x**2), q)
-        at, now = goal, now + length
-    return q
-
-
 def _sines(rng: np.random.Generator, t: Array, n: int) -> Array:
     w = 2 * np.pi * rng.uniform(*SINES_HZ, (SINES, 1, n))
     sines = np.sin(w * t[:, None] + rng.uniform(0, 2 * np.pi, (SINES, 1, n)))
     return np.asarray((rng.standard_normal((SINES, 1, n)) / np.sqrt(w) * sines).sum(axis=0))
-
-
-def _hand(rng: np.random.Generator, t: Array, n: int) -> Array:
-    """Noise through four equal low-passes, each of the first order."""
-    keep = float(np.exp(-2 * np.pi * HAND_HZ * STEP_S))
-    early = round(2 / (HAND_HZ * STEP_S))
-    out: Array = rng.standard_normal((early + len(t), n))
-    for _ in range(4):
-        out = lfilter([1 - keep], [1, -keep], out, axis=0)
-    return np.asarray(out[early:] - out[early])
 
 
 def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Recording:

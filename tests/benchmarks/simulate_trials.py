@@ -68,7 +68,7 @@ def errors(log: Recording, truth: SelfModel, model: SelfModel, simulator: str) -
 
 def run_trial(seed: int, effect: str, maker: str) -> dict[str, Any]:
     """Find the effect in one recording, simulate along another."""
-    trial, begun = draw(seed, effect=effect), time.perf_counter()
+    trial, begun = draw(seed, effect=effect, rubs=False), time.perf_counter()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.json"
         found = find_gap([MAKERS[maker](trial).log()], "panda", model_out=path)

@@ -24,7 +24,7 @@ from drivers.files.mcap import read_log
 from sim.effects import Effect
 from sim.hidden import Recording, Trial, draw, nominal_urdf, pybullet_recording
 from sim.hidden.record import write_recording
-from tests.helpers.gap_tools import pinocchio_recording
+from tests.helpers.gap_tools import believed, pinocchio_recording
 
 COULOMB = Effect("coulomb_friction", (4,), {"Fc": 2.0})
 KEYS = {"noise_floor_nm", "before", "after", "findings", "unexplained", "model_out"}
@@ -36,7 +36,7 @@ FINDING_KEYS = {
 
 
 def trial(seed: int, seconds: float, effects: Sequence[Effect] = (COULOMB,)) -> Trial:
-    return replace(draw(seed, "null"), seconds=seconds, effects=tuple(effects))
+    return replace(believed(seed), seconds=seconds, effects=tuple(effects))
 
 
 def gap(folder: Path, model: Path | str, logs: Sequence[Path], *options: object) -> dict[str, Any]:

@@ -69,7 +69,8 @@ SINGLES = {
 OUTSIDE = {"x_sine_disturbance": Rule(170), "x_quadratic_drag": Rule(170)}
 NULLS = range(200, 204)
 QUICK = {"coulomb_friction", "payload", "motor_inertia", "x_sine_disturbance", 200}
-MOST_DRAWS = 20
+MOST_DRAWS = 40
+PRIOR = 0.02  # of the model's inertial numbers, what the search believes
 HELD_OUT, REPEATED = "motor_inertia", "torque_gain"  # of these there are two recordings
 
 
@@ -79,10 +80,11 @@ def some_slow(cases: Iterable[Any]) -> list[Any]:
 
 
 def clear_draw(kind: str, effect: str, rule: Rule) -> Trial:
-    """The first draw that leaves a clear trace and keeps the rule."""
+    """The first fair draw that leaves a clear trace and keeps the rule."""
     for seed in range(rule.seed, rule.seed + MOST_DRAWS):
-        trial = draw(seed, kind, effect)
-        if rule.holds(trial) and detectability(trial)[0] > Z_LEAST:
+        trial = draw(seed, kind, effect, rubs=False)
+        fair = trial.model_error < PRIOR and trial.motion.kind == "sines"
+        if fair and rule.holds(trial) and detectability(trial)[0] > Z_LEAST:
             return trial
     raise AssertionError(f"no clear draw of {effect} in {MOST_DRAWS}")
 
@@ -187,7 +189,7 @@ def test_a_name_says_how_sure_it_is(single: Told) -> None:
 
 @pytest.mark.parametrize("seed", some_slow(NULLS))
 def test_noise_and_a_slightly_wrong_model_have_no_name(seed: int, tmp_path: Path) -> None:
-    result = answer(draw(seed, "null"), tmp_path, pinocchio_recording)
+    result = answer(draw(seed, "null", rubs=False), tmp_path, pinocchio_recording)
     assert result["findings"] == []
 
 

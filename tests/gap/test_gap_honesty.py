@@ -37,8 +37,8 @@ from adapter.gap.words import as_json, console_summary, headline
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
-from sim.hidden import draw
 from tests.helpers import gap_results
+from tests.helpers.gap_tools import sines
 
 Array = np.ndarray
 PANDA = documented("panda")
@@ -47,7 +47,7 @@ N = ARM.n
 SECONDS, NOISE_NM, PRIOR = 8.0, 0.05, 0.02
 JOINT, FC = 3, 0.4  # joint (from 0), N m
 BASE_JOINT, B = 0, 0.03  # whose motor inertia links 1 and 2 can stand for, kg m2
-MOTION = draw(3, "null").motion
+MOTION = sines(3)
 T = np.arange(0.0, SECONDS, 1e-3)
 MOVED = MOTION.at(T)
 

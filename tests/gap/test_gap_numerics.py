@@ -47,12 +47,12 @@ from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth
 from adapter.model.inertia import is_consistent
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
-from sim.hidden import draw
+from tests.helpers.gap_tools import sines
 
 Array = np.ndarray
 ARM = RigidArm.of(documented("panda"))
 N = ARM.n
-DRAWN = draw(3, "null").motion
+DRAWN = sines(3)
 SECONDS = 8.0
 TAU_NOISE, RUBS, FC = 0.05, 3, 0.4  # N m; joint (from 0) with friction, N m
 EVERYWHERE = tuple(range(N))
@@ -186,7 +186,7 @@ def test_repeats_are_told_from_other_motions():
     first, again = (
         recorded(q, t, noisy(q, 1e-4, k), noisy(dq, 5e-3, k + 9), str(k)) for k in (1, 2)
     )
-    p, dp, _ = draw(4, "null").motion.at(t)
+    p, dp, _ = sines(4).at(t)
     other = recorded(p, t, p, dp, "other")
     assert first.repeated_in((first, other, again)) is again
     assert other.repeated_in((first, other, again)) is None

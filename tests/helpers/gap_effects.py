@@ -259,10 +259,16 @@ def slope(t: Array, x: Array) -> Array:
 
 
 def sense(
-    truth: Truth, effects: Sequence[Effect], t: Array, q: Array, dq: Array, ddq: Array
+    truth: Truth,
+    effects: Sequence[Effect],
+    t: Array,
+    q: Array,
+    dq: Array,
+    ddq: Array,
+    rubs: Array | float = 0.0,
 ) -> tuple[Array, Array, Array]:
-    """What noise-free sensors read of the arm's motion: q, dq, tau (m, n)."""
-    tau = joint_torque(truth, effects, t, q, dq, ddq)
+    """What noise-free sensors read of the arm's motion: q, dq, tau (m, n); `rubs` N m on top."""
+    tau = joint_torque(truth, effects, t, q, dq, ddq) + rubs
     error = encoder_error(effects, t, q, dq, tau)
     return q + error, dq + slope(t, error), torque_sensor(effects, t, tau)
 

@@ -31,9 +31,9 @@ def torque_judge(trial: Trial, recording: Recording, result: dict[str, Any], fol
     other = second(trial)
     unseen = Oracle(other, pinocchio_recording(other))
     fit = Oracle(trial, recording).fit()
-    best = rms(unseen.residual(fit.effects, fit.theta))
+    best = rms(unseen.residual(fit.effects, fit.theta, True))
     found = tuple(effect_from(finding) for finding in result["findings"])
-    ours = rms(unseen.residual(found, theta))
+    ours = rms(unseen.residual(found, theta, False))
     return {
         "torque_ratio": float(np.sqrt(np.mean(np.square(ours / best)))),
         "torque_rmse_nm": ours.tolist(),

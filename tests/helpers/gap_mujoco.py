@@ -71,11 +71,8 @@ class Arm:
 
     def __init__(self, trial: Trial) -> None:
         self._effects = trial.effects
-        armature = np.zeros(trial.arm.n)
-        for effect in (e for e in trial.effects if e.name == "motor_inertia"):
-            armature[effect.columns(trial.arm.n)] += effect.number("B")
         self._stages = [
-            (start, mujoco.MjModel.from_xml_string(mjcf(arm, armature)))
+            (start, mujoco.MjModel.from_xml_string(mjcf(arm, trial.motor_inertia)))
             for start, arm in rigid_stages(trial.arm, trial.effects)
         ]
         self._model = self._stages.pop(0)[1]
@@ -84,6 +81,9 @@ class Arm:
         mujoco.mj_forward(self._model, self._data)
         self._bristles: dict[int, float] = {}
         self._rigid = np.zeros(trial.arm.n)
+        self._friction = trial.friction
+        if trial.friction is not None:
+            self._bent = trial.friction.start * trial.friction.coulomb
 
     def state(self) -> tuple[Array, Array]:
         """q, dq (n,) at the stamp."""
@@ -107,6 +107,9 @@ class Arm:
         """Torques (n,) that smooth effects take; sets the levels of the dry ones."""
         q, v, n = self._data.qpos, self._data.qvel, len(self._rigid)
         out, level = np.zeros(n), np.full(n, 1e-9)
+        if self._friction is not None:
+            self._bent = self._friction.after(self._bent, v, H_S)
+            out += self._bent + self._friction.viscous * v
         if any(e.name == "load_dependent_friction" for e in self._effects):
             mujoco.mj_rne(self._model, self._data, 1, self._rigid)
         for effect in (e for e in self._effects if e.acts(t)):
@@ -146,7 +149,7 @@ class Controller:
 
     def __init__(self, trial: Trial) -> None:
         n = trial.nominal.n
-        self._model = mujoco.MjModel.from_xml_string(mjcf(trial.nominal, np.zeros(n)))
+        self._model = mujoco.MjModel.from_xml_string(mjcf(trial.nominal, trial.motor_inertia))
         self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         self._data = mujoco.MjData(self._model)
         self._sum, self._effort = np.zeros(n), trial.nominal.limits.effort

@@ -2,7 +2,8 @@
 data could possibly show it and what a fit of the right effect leaves.
 
 Everything is at 25 Hz after a sharp zero-phase low-pass of 10 Hz. Noise: one AR model per joint.
-Nuisance: every inertial number of the model off by 2 % of its size, a priori.
+Nuisance: every inertial number of the model off by the trial's share of its size, a priori, and
+where joints rub the levels of that friction, which nobody knows.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import fftconvolve, firwin
 
 from sim.effects import Effect
-from sim.hidden import MODEL_ERROR, Trial
+from sim.hidden import Trial
 from sim.hidden.motion import draw_motion
 from sim.truth import Truth
 from tests.helpers.gap_effects import Array, predict, regressor, rnea, sense, slope
@@ -104,9 +105,22 @@ def signatures(trial: Trial) -> list[Array]:
     return found
 
 
-def prior_columns(truth: Truth, q: Array, dq: Array, ddq: Array) -> Array:
+def prior_columns(truth: Truth, error: float, *motion: Array) -> Array:
     """Y sqrt(P) (k, n, 10 n): torque of one prior standard deviation of each number of θ."""
-    return regressor(truth, q, dq, ddq) * (MODEL_ERROR * np.abs(truth.theta).ravel())
+    return regressor(truth, *motion) * (error * np.abs(truth.theta).ravel())
+
+
+def rubbing(trial: Trial, dq: Array) -> tuple[Array, Array]:
+    """Torque (k, n) at 25 Hz of the friction in every joint, and its columns (k, n, 2 n).
+
+    Zero and none where there is no friction; by joint first what is dry, then what is viscous.
+    """
+    if trial.friction is None:
+        return np.zeros_like(thin(dq)), np.zeros((*thin(dq).shape, 0))
+    whole = trial.friction.along(dq, float(np.median(np.diff(trial.times))))
+    viscous = trial.friction.viscous * dq
+    parts = [slow(part)[:, :, None] * np.eye(dq.shape[1]) for part in (whole - viscous, viscous)]
+    return slow(whole), np.concatenate(parts, axis=2)
 
 
 def distance(s: Array, nuisance: Array) -> float:
@@ -118,11 +132,13 @@ def distance(s: Array, nuisance: Array) -> float:
 
 def detectability(trial: Trial) -> list[float]:
     """z of each effect: how many standard deviations its signature is away from nothing, given
-    the noise, the 2 % prior and, in a pair, not knowing the other effect's size."""
+    the noise, the prior and, in a pair, not knowing the other effect's size."""
     if not trial.effects:
         return []
     white = fit_noise(noise_residual(trial))
-    Y = prior_columns(trial.arm, *(thin(x) for x in trial.motion.at(trial.times)))
+    motion = trial.motion.at(trial.times)
+    Y = prior_columns(trial.arm, trial.model_error, *map(thin, motion))
+    Y = np.concatenate([Y, rubbing(trial, motion[1])[1]], axis=2)
     nuisance = white(Y).reshape(-1, Y.shape[2])
     parts = [white(s).ravel() for s in signatures(trial)]
     found = []
@@ -200,7 +216,8 @@ class Oracle:
         self._ddq = slope(self._t, self._dq)
         self._motion = self._q, self._dq, self._ddq
         self._read = thin(self._tau)
-        self._Y = prior_columns(trial.nominal, *map(thin, self._motion))
+        self._rubs = rubbing(trial, self._dq)[0]
+        self._Y = prior_columns(trial.nominal, trial.model_error, *map(thin, self._motion))
         self._white = fit_noise(noise_residual(trial))
         t = thin(self._t)
         self._held = (t // BLOCK_S) % BLOCKS == BLOCKS - 1
@@ -210,19 +227,18 @@ class Oracle:
         raw = predict(self._trial.nominal, effects, self._t, *self._motion, self._tau)
         return slow(raw)
 
-    def residual(self, effects: Sequence[Effect], theta: Array | None = None) -> Array:
-        """Torque residual (k, n) at 25 Hz."""
-        left = self._read - self.torque(effects)
-        if theta is None:
-            return left
+    def residual(self, effects: Sequence[Effect], theta: Array, knows_friction: bool) -> Array:
+        """Torque residual (k, n) at 25 Hz, less the friction of every joint where that is known."""
+        left = self._read - self.torque(effects) - (self._rubs if knows_friction else 0.0)
         share = (theta - self._trial.nominal.theta).ravel()
-        sizes = MODEL_ERROR * np.abs(self._trial.nominal.theta).ravel()
+        sizes = self._trial.model_error * np.abs(self._trial.nominal.theta).ravel()
         return left - self._Y @ (share / np.where(sizes, sizes, 1.0))
 
     def fit(self) -> OracleFit:
         """Gauss-Newton from the truth, which is also the middle of a prior as wide as each number:
         what the data don't show stays. `link_inertia` is kept as it is."""
-        effects, sizes = self._trial.effects, MODEL_ERROR * np.abs(self._trial.nominal.theta)
+        effects, read = self._trial.effects, self._read - self._rubs
+        sizes = self._trial.model_error * np.abs(self._trial.nominal.theta)
         truth, m = _numbers(effects), self._Y.shape[2]
         x, sizes_x = truth, np.maximum(np.abs(truth), 1e-6)
         keep = ~self._held[AR_ORDER:]
@@ -234,7 +250,7 @@ class Oracle:
             moved = (_with(effects, x + d) for d in np.diag(steps))
             J = np.array([(self.torque(e) - base) / h for e, h in zip(moved, steps, strict=True)])
             J = J.reshape(len(x), *base.shape).transpose(1, 2, 0)
-            left = self._white(self._read - base)[keep]
+            left = self._white(read - base)[keep]
             shown = self._white(J)[keep].reshape(left.size, len(x))
             left, A = left.ravel(), np.column_stack([shown, nuisance])
             tight = np.diag([*(1 / np.square(sizes_x)), *np.ones(m)])
@@ -244,7 +260,7 @@ class Oracle:
             x = truth + np.clip(x + step[: len(x)] - truth, -0.7 * sizes_x, 2 * sizes_x)
             y, cov = step[len(x) :], inverse[: len(x), : len(x)]
         fitted = _with(effects, x)
-        left = self._read - self.torque(fitted) - self._Y @ y
+        left = read - self.torque(fitted) - self._Y @ y
         before = self._read - self.torque(())
         std = _with(effects, np.sqrt(np.maximum(np.diag(cov), 0.0)))
         return OracleFit(

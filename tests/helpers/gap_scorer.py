@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,6 +15,8 @@ STRONG_Z = 8.0
 DATE_S = 0.3
 SHARE, STDS = 0.1, 3.0  # a parameter may be off by a tenth of its size or three deviations
 SURE = 0.9
+SUMS = ("asymmetric_friction", "load_dependent_friction", "friction_drift")
+EVIDENCE = (0.0, 0.5, 0.9, 0.99, 1.0)  # said with less than the second it should be no name
 WHOLE_ARM = {"payload", "base_tilt", "external_wrench"}
 # Numbers that are parts of one vector are judged by its length; angles by a radian.
 VECTORS = (("cx", "cy", "cz"), ("rx", "ry"), ("fx", "fy", "fz"))
@@ -55,6 +58,12 @@ def covers(finding: Entry, effect: Entry) -> bool:
     if right_name(finding, effect):
         return True
     return effect["effect"] in ambiguous_names(finding) and same_joints(finding, effect)
+
+
+def rubs_right(finding: Entry, truth: Entry) -> bool:
+    """Whether it may be a name for the friction that every joint of the truth has."""
+    rubs = set(truth.get("rubs") or [])
+    return bool(rubs & {finding["effect"], *ambiguous_names(finding)})
 
 
 def parameters_right(finding: Entry, effect: Entry) -> bool:
@@ -99,7 +108,11 @@ def score_trial(result: Entry, truth: Entry, z: Sequence[float]) -> Row:
     outside = truth["kind"] == "outside"
     known = [] if outside else effects
     strong = [e for e, size in zip(known, z, strict=False) if size > STRONG_Z]
-    wrong = [f for f in findings if not any(covers(f, e) for e in known)]
+    right = [rubs_right(f, truth) or any(covers(f, e) for e in known) for f in findings]
+    wrong = [f for f, ok in zip(findings, right, strict=True) if not ok]
+    evidence = [float(f.get("evidence") or 0.0) for f in findings]
+    # beside friction in every joint the size of another one is that of the sum
+    sized = [e for e in strong if not (truth.get("rubs") and e["effect"] in SUMS)]
     exact = [(f, e) for e in known for f in findings if right_name(f, e)]
     dates = [error for f, e in exact for error in date_errors(f, e)[:1]]
     matched = [e for e in strong if any(right_name(f, e) for f in findings)]
@@ -113,9 +126,11 @@ def score_trial(result: Entry, truth: Entry, z: Sequence[float]) -> Row:
         "named": sum(any(covers(f, e) for f in findings) for e in strong),
         "exact": bool(strong) and len(matched) == len(strong) and not wrong,
         "wrong": [f["effect"] for f in wrong],
-        "sure_wrong": sum((f.get("evidence") or 0.0) > SURE for f in wrong),
+        "rubs": bool(truth.get("rubs")),
+        "evidence": list(zip(evidence, right, strict=True)),
+        "sure_wrong": sum(x > SURE and not ok for x, ok in zip(evidence, right, strict=True)),
         "unexplained": bool(result.get("unexplained")),
-        "parameters": [parameters_right(f, e) for f, e in exact if any(e is s for s in strong)],
+        "parameters": [parameters_right(f, e) for f, e in exact if any(e is x for x in sized)],
         "date_errors_s": dates,
     }
 
@@ -130,6 +145,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
     pairs = [r for r in rows if r["kind"] == "pair"]
     outside = [r for r in rows if r["kind"] == "outside"]
     singles = [r for r in rows if r["kind"] == "single" and _strong(r)]
+    rubbed = [r for r in rows if r["rubs"]]
     weak = [r for r in rows if r["kind"] in ("single", "pair") and not _strong(r)]
     both = [r for r in pairs if r["strong"] == len(r["effects"])]
     seen = [r for r in outside if _strong(r)]
@@ -140,7 +156,9 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "single_exact": [r["exact"] for r in singles],
         "single_false_extra": [bool(r["wrong"]) for r in singles],
         "parameters": parameters,
-        "null_false": [bool(r["found"]) for r in nulls],
+        "null_false": [bool(r["wrong"]) for r in nulls],
+        "rubbed_named": [r["named"] > 0 for r in singles if r["rubs"]],
+        "rubbed_clean": [not r["wrong"] for r in rubbed if r["kind"] != "outside"],
         "pair_both_named": [r["named"] == r["strong"] for r in both],
         "pair_strong_named": [n < r["named"] for r in pairs for n in range(r["strong"])],
         "dated": [error <= DATE_S for error in dates],
@@ -151,7 +169,21 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
         "rollout_ratio": [r["rollout_ratio"] <= 1.3 for r in rows if r.get("rollout_ratio")],
     }
     shares = {key: _share(hits) for key, hits in counts.items()}
-    return {"shares": shares, "confusion": confusion(rows), "trials": len(rows)}
+    return {
+        "shares": shares,
+        "calibration": calibration(rows),
+        "confusion": confusion(rows),
+        "trials": len(rows),
+    }
+
+
+def calibration(rows: Sequence[Row]) -> dict[str, list[Any]]:
+    """How often names are right, by the evidence they were said with: see `_share`."""
+    said = [pair for row in rows for pair in row["evidence"]]
+    return {
+        f"{low:g} to {high:g}": _share([ok for x, ok in said if low <= x < high or x == high == 1])
+        for low, high in itertools.pairwise(EVIDENCE)
+    }
 
 
 def _share(hits: Sequence[bool]) -> list[Any]:
@@ -180,6 +212,8 @@ GOALS = {
     "single_false_extra": ("single effects with a wrong name on top", ""),
     "parameters": ("parameters within 10 % or 3 std", ">= 90 %"),
     "null_false": ("nulls given a name", "<= 2 %"),
+    "rubbed_named": ("beside friction in every joint: single named", ">= 95 %"),
+    "rubbed_clean": ("beside friction in every joint: no wrong name", ">= 95 %"),
     "pair_both_named": ("pairs: both named", ">= 80 %"),
     "pair_strong_named": ("pairs: strong members named", ""),
     "dated": ("starts dated within 0.3 s", ">= 90 %"),
@@ -199,6 +233,12 @@ def table(figures: Mapping[str, Any]) -> str:
         if of:
             told = f"{100 * share:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
             lines.append(f"{what:50s} {told:24s} {hits}/{of}  {goal}")
+    for key, (share, low, high, hits, of) in figures["calibration"].items():
+        if of:
+            told = f"{100 * share:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
+            lines.append(
+                f"{'names said with ' + key + ' that are right':50s} {told:24s} {hits}/{of}"
+            )
     lines.append("truth -> said")
     for name, said in figures["confusion"].items():
         parts = sorted(said.items(), key=lambda item: -item[1])

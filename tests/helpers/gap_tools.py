@@ -6,6 +6,7 @@ arm does exactly what it was told; everything else is as in `sim.hidden`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,47 @@ import numpy as np
 from scipy.signal import butter, sosfilt
 
 from sim.hidden import Trial, draw, nominal_urdf
+from sim.hidden.motion import DrawnMotion, draw_motion
 from sim.hidden.record import Recording, write_files
+from sim.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
+from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM, wrong_bodies
 from sim.noise_levels import NoiseLevels
+from sim.truth import panda
 from tests.helpers.gap_effects import Array, sense
 
 NOISE_STREAM = 1 << 35
+
+
+def believed(seed: int) -> Trial:
+    """Nothing hidden in an arm 2 % off its model, as a search believes; a multi-sine, no friction.
+
+    Drawn in an order of its own: the tests' bounds were measured on it.
+    """
+    nominal, rng = panda(), np.random.default_rng([seed, TRIAL_STREAM])
+    rng.random()
+    theta = wrong_bodies(nominal.theta, 0.02, rng)
+    motion = draw_motion(rng, nominal.limits, nominal.ready, "sines")
+    share = np.where(np.arange(1, nominal.n + 1) >= WRIST, WRIST_SHARE, 1.0)
+    return replace(
+        draw(seed, "null", rubs=False),
+        arm=nominal.with_changes(theta=theta, ready=motion.middle),
+        model_error=0.02,
+        motion=motion,
+        disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, nominal.n),
+        disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
+    )
+
+
+def sines(seed: int) -> DrawnMotion:
+    """A multi-sine in every joint of the Panda."""
+    return believed(seed).motion
+
+
+def with_sines(trial: Trial) -> Trial:
+    """The trial on a multi-sine, whatever its motion was."""
+    motion = sines(trial.seed)
+    arm = trial.arm.with_changes(ready=motion.middle)
+    return replace(trial, motion=motion, arm=arm)
 
 
 def sensor_noise(levels: NoiseLevels, shape: tuple[int, int], seed: int) -> tuple[Array, ...]:
@@ -47,7 +84,9 @@ def recorded(trial: Trial, q: Array, dq: Array, tau: Array, commands: Array | No
 
 def pinocchio_recording(trial: Trial) -> Recording:
     """The recording of a trial, by Pinocchio alone."""
-    q, dq, tau = sense(trial.arm, trial.effects, trial.times, *trial.motion.at(trial.times))
+    motion = trial.motion.at(trial.times)
+    rubs = 0.0 if trial.friction is None else trial.friction.along(motion[1], 1e-3)
+    q, dq, tau = sense(trial.arm, trial.effects, trial.times, *motion, rubs)
     return recorded(trial, q, dq, tau + trial.disturbance(), None)
 
 
