@@ -23,6 +23,7 @@ from adapter.runs.replay import (
     fitted_to,
     held_out_rmse,
     noise_levels,
+    one_after_other,
     seconds,
 )
 from adapter.runs.replay import replay as learn_from
@@ -38,7 +39,8 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    whole = read_log(args.log, frames=args.base is not None, imus=True)
+    first, *more = args.logs
+    whole = read_log(first, frames=args.base is not None, imus=True)
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -46,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
     log = _joined(args, whole, robot)
+    if more:
+        log = one_after_other([log, *(matching(read_log(path), robot) for path in more)])
     imus: tuple[str, ...] = ()
     if args.base is None:
         log, imus = with_link_imus(log, robot, args.imu)
@@ -58,10 +62,10 @@ def run(args: argparse.Namespace) -> int:
     config = replace(config, pipeline=with_imus(pipeline, imus))
     compile_first(robot, config.pipeline, args.every, console.print)
     result = _learn(args, log, robot, config)
-    front_end = result.pipeline.front_end
+    front_end, source = result.pipeline.front_end, ", ".join(map(str, args.logs))
     numbers = _figures(args, log, robot, reference, result)
     if front_end.first_moving_ns is None:
-        warn([f"{args.log}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
+        warn([f"{source}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
     held_out = _held_out(args, log, robot)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
@@ -69,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         numbers["theta"]["validation_torque_rmse_nm"] = rmse.tolist()
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
-    conclude(args, folder, learned, numbers, str(args.log))
+    conclude(args, folder, learned, numbers, source)
     console.print(f"{numbers['times_real_time']:.1f} times faster than real time")
     return 0
 
@@ -91,7 +95,7 @@ def _figures(
         reference,
         course,
         warnings=[*log.warnings, *front_end.messages, *result.outcome.lam_notes],
-        recording=str(args.log),
+        recording=", ".join(map(str, args.logs)),
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),

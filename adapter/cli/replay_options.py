@@ -16,7 +16,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "result is the same), or in batches."
     )
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="MCAP recording, ours or not")
+    add(
+        "logs",
+        nargs="+",
+        type=Path,
+        metavar="LOG",
+        help="MCAP recording, ours or not; several of one arm are learned from in order",
+    )
     add_learning(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
     add(
@@ -51,5 +57,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def _check(args: argparse.Namespace) -> None:
     if args.every > 1 and args.mode == "sample":
         raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
+    alone = {"--base": args.base, "--imu": args.imu, "--validate-from": args.validate_from}
+    given = [option for option, value in alone.items() if value]
+    if given and len(args.logs) > 1:
+        raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
     check_learning(args)
-    check_files(args.log, args.validate)
+    check_files(*args.logs, args.validate)

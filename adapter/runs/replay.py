@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from drivers.interface import DriverError, JointSample, LinkMotion
 
 FEWEST_FOR_NOISE = 50  # samples
 AT_ONCE = 2000  # samples that pass the front end in one table: as much as a processor's cache holds
+BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
 Progress = Callable[[int], None]
@@ -53,6 +54,36 @@ class Replay:
     tick_ns: NDArray[np.int64]
     wall_s: float
     span_s: float
+
+
+def one_after_other(logs: Sequence[Log]) -> Log:
+    """Recordings of one arm as one, in the order given, with a hole between them.
+
+    The filter starts anew behind the hole, and what the hand carries may have changed in it; all
+    that is learned goes on. What links say is kept where every recording has it.
+
+    Args:
+        logs: as `matching.matching` returns them, at least one.
+
+    Raises:
+        DriverError: one of them holds no samples.
+    """
+    stamps: list[NDArray[np.int64]] = []
+    for log in logs:
+        if not len(log):
+            raise DriverError(f"{log.path}: no samples to learn from")
+        first = int(log.stamp_ns.min())
+        begin = int(stamps[-1].max()) + BETWEEN_NS if stamps else first
+        stamps.append(log.stamp_ns - first + begin)
+    kept = {key: [getattr(log, key) for log in logs] for key in ("q", "dq", "tau")}
+    alike = len({log.link_names for log in logs}) == 1
+    for key in ("twists", "accels"):
+        own = [getattr(log, key) for log in logs]
+        kept[key] = own if alike and all(x is not None for x in own) else []
+    tables: dict[str, Any] = {key: np.concatenate(x) if x else None for key, x in kept.items()}
+    warnings = [text for log in logs for text in log.warnings]
+    left: dict[str, Any] = {"frames": (), "commands": None, "warnings": warnings}
+    return replace(logs[0], stamp_ns=np.concatenate(stamps), **tables, **left)
 
 
 class ReplayOptions(NamedTuple):

@@ -12,7 +12,7 @@ from adapter.learning.settings import LearnerSettings
 from adapter.model.spatial import log_rotation, matrix_from_zxz
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import Pipeline
-from adapter.runs.replay import MOST_PER_UPDATE, Replay, ReplayOptions, replay
+from adapter.runs.replay import MOST_PER_UPDATE, Replay, ReplayOptions, one_after_other, replay
 from adapter.runs.score import theta_score
 from adapter.signals.matching import matching
 from drivers.files.mcap import Log, McapWriter, read_log
@@ -262,3 +262,16 @@ def test_links_in_another_order_are_put_in_order() -> None:
     )
     found = matching(mixed, panda_model())
     assert np.array_equal(found.twists, log.twists) and np.array_equal(found.accels, log.accels)
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_several_recordings_are_learned_from_in_order(every: int) -> None:
+    """The filter starts anew between them, the learner goes on."""
+    log = matching(data(seconds=2.5).log(), panda_model())
+    both = one_after_other([log, log])
+    options = ReplayOptions(every=every)
+    one, two = (replay(x, panda_model(), settings(), options) for x in (log, both))
+    assert len(both) == 2 * len(log) == two.samples
+    assert [round(length, 3) for _, length in two.pipeline.front_end.gaps] == [1.0]
+    assert two.outcome.learned == pytest.approx(2 * one.outcome.learned, abs=10)
+    assert one_after_other([log]).stamp_ns.tolist() == log.stamp_ns.tolist()
