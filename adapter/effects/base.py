@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, wraps
 from typing import Any, ClassVar, Protocol, TypeVar, cast
 
@@ -151,11 +151,14 @@ class Template:
         prior_std: of each coefficient; the prior's mean is zero, where the effect is absent.
         decode: coefficients (k,) to parameters.
         label: what is fixed, for people ("n = 3"); empty where nothing is.
+        theta: (k, 10) inertial parameters of its link per unit of each coefficient, of an effect
+            `is_theta`; None where its coefficients are these parameters themselves.
     """
 
     prior_std: tuple[float, ...]
     decode: Callable[[Array], dict[str, Any]]
     label: str = ""
+    theta: Array | None = field(default=None, compare=False)
 
 
 class Effect(ABC):

@@ -33,14 +33,16 @@ from adapter.effects.base import (
     on_joint,
 )
 from adapter.effects.by_joint import smooth_sign
+from adapter.effects.catalogue import HELD
 from adapter.effects.torque import added, bodies, moved_links, sensors
+from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
 PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
 ALONE_NATS = 4.0  # signals of one bus are late together, not one joint's alone
-ALWAYS_NATS = 6.0  # what pushes for a whole recording is rather a tilted base
+ALWAYS_NATS = 60.0  # what pushes for a whole recording is rather weight or a tilted base
 STEP = 0.02  # of a coefficient's typical size, for the differences
 
 
@@ -68,8 +70,13 @@ class Candidate:
 
     @property
     def columns_are_theta(self) -> bool:
-        """Whether its coefficients are inertial parameters of a link."""
+        """Whether its coefficients are, or stand for, inertial parameters of a link."""
         return self.effect.is_theta
+
+    @property
+    def theta(self) -> Array:
+        """(k, 10) inertial parameters of its link per unit of each coefficient."""
+        return np.eye(10) if self.template.theta is None else self.template.theta
 
     @property
     def prior_std(self) -> Array:
@@ -132,8 +139,16 @@ def places(effect: Effect, n: int) -> tuple[int, ...]:
     return (-1, *range(n)) if effect.scope == ALL else tuple(range(n))
 
 
+def templates(effect: Effect, hand: Hand) -> tuple[Template, ...]:
+    """Ways to look for an effect on an arm with this hand."""
+    return hand.templates() if effect is HELD else effect.templates()
+
+
 def signatures(
-    at: Stages, joints: Sequence[int], extra: Sequence[tuple[Effect, int]] = ()
+    at: Stages,
+    joints: Sequence[int],
+    extra: Sequence[tuple[Effect, int]] = (),
+    hand: Hand = ANYWHERE,
 ) -> tuple[Array, list[Candidate]]:
     """Every signature in the band, and what each belongs to.
 
@@ -141,6 +156,7 @@ def signatures(
         at: the model as it stands on a recording.
         joints: (from 0) that move; effects of others cannot be told.
         extra: further effects, each with its joint.
+        hand: where a load is.
 
     Returns:
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
@@ -153,24 +169,26 @@ def signatures(
         for effect in CATALOGUE.values()
         for joint in places(effect, n)
         if joint < 0 or effect.scope == LINK or joint in joints
-        for template in effect.templates()
+        for template in templates(effect, hand)
     ]
     ways += [(effect, joint, effect.templates()[0]) for effect, joint in extra]
     for effect, joint, template in ways:
-        if effect.is_theta:
+        if effect.is_theta and template.theta is None:
             k = 10 * (joint if joint >= 0 else n - 1)
             columns = tuple(range(k, k + 10))
         else:
             tables.append(_signatures(at, effect, template, joint))
             columns = tuple(range(size, size + len(template.prior_std)))
             size += len(columns)
-        odds = _log_odds(effect, joint, n)
+        odds = _log_odds(effect, joint, n, len(templates(effect, hand)))
         candidates.append(Candidate(effect, template, joint, columns, odds))
     return np.concatenate(tables), candidates
 
 
 def _signatures(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
     """(c, k, n) of one effect; those that hang on the measured motion alone are kept."""
+    if template.theta is not None:
+        return np.tensordot(template.theta, at.low_regressor(joint % at.links.arm.n), 1)
     if isinstance(effect, TorqueEffect) and not effect.by_load and at.unmoved:
         key = effect.name, template.label, joint
         return at.signals.once(key, lambda: _differences(at, effect, template, joint))
@@ -358,9 +376,9 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     return float(odds)
 
 
-def _log_odds(effect: Effect, joint: int, n: int) -> float:
-    """Of one effect of all, at one joint of n, in one of the ways to look for it."""
-    odds = effect.log_odds - np.log(len(CATALOGUE)) - np.log(len(effect.templates()))
+def _log_odds(effect: Effect, joint: int, n: int, ways: int) -> float:
+    """Of one effect of all, at one joint of n, in one of so many ways to look for it."""
+    odds = effect.log_odds - np.log(len(CATALOGUE)) - np.log(ways)
     if joint >= 0:
         odds -= np.log(n)
         if effect.scope == ALL:

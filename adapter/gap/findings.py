@@ -10,10 +10,11 @@ import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
 from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern
-from adapter.gap.fit import Fit, Named, place_of
+from adapter.gap.evidence import Carried, score
+from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found
@@ -22,6 +23,8 @@ from adapter.model.spatial import Array
 OVERLAP = 0.9
 MOST_RIVALS = 3
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
+SINGLED_OUT = 0.9  # probability of a link's correction
+ODD = 4.0  # standard deviations from which on a correction is a finding
 DIFFERENCE = 1e-4  # of a coefficient's prior
 DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
@@ -89,20 +92,62 @@ def _flat(values: dict[str, Any]) -> Array:
 
 
 def told_of(
-    found: Found, ends: Mapping[str, float]
+    found: Found, ends: Mapping[str, float], trusted: Array
 ) -> tuple[tuple[Finding, ...], tuple[Leftover, ...]]:
     """Effects that the model lacks, and what no effect explains.
 
     Args:
         found: of the search; ends: recordings by name -> s, when each ends.
+        trusted: (n, 10) standard deviation of the model's inertias as they were believed.
     """
     left = leftovers_of(found, list(ends.values()))
-    return doubted(findings_of(found, ends), left), left
+    findings = *findings_of(found, ends), *corrected_links(found, max(ends.values()), trusted)
+    return doubted(sorted(findings, key=lambda f: -f.detectability), left), left
+
+
+def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]:
+    """Links whose inertias were corrected by more than they were believed to be wrong.
+
+    Only those that the data single out: torques that one link's error explains, another's does
+    too. What the hand holds is not told again as a heavier last link.
+    """
+    fit, known = found.fit, found.known or found.carried
+    odd = np.abs(fit.dtheta / trusted).max(axis=1) > ODD
+    odd[-1] &= not any(e.candidate.effect is HELD for e in fit.named)
+    told = [_wrong_link(fit, known, int(k), end_s, trusted) for k in np.flatnonzero(odd)]
+    return [f for f in told if f.evidence > SINGLED_OUT]
+
+
+def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, trusted: Array) -> Finding:
+    """The correction of the k-th link as a finding."""
+    own, std = np.arange(10 * k, 10 * k + 10), known.prior_std.copy()
+    std[own] = trusted[k]
+    gain = score(known.G, known.g, known.prior_std).log_evidence
+    gain -= score(known.G, known.g, std).log_evidence
+    covariance = honest_covariance(fit, known)[np.ix_(own, own)]
+    torque = np.tensordot(fit.dtheta[k], fit.recordings[0].low_regressor[own], 1)
+    key = WRONG_LINK.parameters[0].key
+    return Finding(
+        effect=WRONG_LINK.name,
+        title=WRONG_LINK.title,
+        joints=(k + 1,),
+        interval_s=(0.0, end_s),
+        lasting=True,
+        parameters={key: [float(x) for x in fit.dtheta[k]]},
+        std={key: [float(x) for x in np.sqrt(np.diagonal(covariance))]},
+        units=WRONG_LINK.units(),
+        evidence=float(1.0 / (1.0 + np.exp(-np.clip(gain, -700.0, 700.0)))),
+        overlaps={},
+        split_by="; ".join(experiments(WRONG_LINK, [])),
+        detectability=float(np.sqrt(known.worth(own, np.delete(np.arange(len(std)), own)).chi2)),
+        torque_rms_nm=np.sqrt(np.mean(torque**2, axis=0)),
+    )
 
 
 def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     """Every named effect of the catalogue. `ends`: recordings by name -> s, when each ends."""
-    fit, covariance = found.fit, (found.known or found.carried).covariance()
+    fit = found.fit
+    covariance = honest_covariance(fit, found.known or found.carried)
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
         effect = named.candidate.effect
@@ -184,7 +229,7 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
     rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
     for j in range(fit.n):
         surprise = float(noise.sigma[j])
-        if (fit.still and j in fit.still[0]) or noise.level[j] < SMOOTH * surprise:
+        if noise.level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
         shares = {name: explained(residual[:, j], x) for name, x in signals.items()}

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,18 @@ from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
 from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of
+from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
+START_NM = 0.5  # of static friction, published values of a Panda's joints are 0.2 to 0.5
 TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump: friction turns round more softly than its equation
 JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BAND_HZ = 25.0  # samples a second
+BLOCK = 25  # samples: errors of the model last so long, noise does not
 LIGHT_KG, SMALL_M = 0.1, 0.05
 SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
@@ -103,6 +107,8 @@ class Model:
         delay_s: by how much torques are late, within the timing of a sample.
         named: effects named so far.
         known: effects that the nominal model has already.
+        hand: where a load is.
+        start_nm: (recordings, n) friction that each joint held at the first sample, N m.
     """
 
     recordings: tuple[Signals, ...]
@@ -110,7 +116,14 @@ class Model:
     delay_s: float = 0.0
     named: tuple[Named, ...] = ()
     known: tuple[Active, ...] = ()
+    hand: Hand = ANYWHERE
+    start_nm: Array = field(default_factory=lambda: np.zeros((0, 0)))
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.start_nm.size:
+            size = len(self.recordings), len(self.dtheta)
+            object.__setattr__(self, "start_nm", np.zeros(size))
 
     @cached_property
     def arm(self) -> ArmDynamics:
@@ -120,18 +133,22 @@ class Model:
 
     @property
     def coefficients(self) -> Array:
-        """All that is fitted: corrections, delay, coefficients of the named effects."""
-        return np.concatenate([self.dtheta.ravel(), [self.delay_s], *(e.x for e in self.named)])
+        """All that is fitted: corrections, delay, starts, coefficients of the named effects."""
+        always = self.dtheta.ravel(), [self.delay_s], self.start_nm.ravel()
+        return np.concatenate([*always, *(e.x for e in self.named)])
 
     def at(self, x: Array) -> Model:
         """The same model with other coefficients."""
         size = self.dtheta.size
-        named, k = [], size + 1
+        named, k = [], size + 1 + self.start_nm.size
+        start = x[size + 1 : k].reshape(self.start_nm.shape)
         for e in self.named:
             named.append(e.at(x[k : k + len(e.x)]))
             k += len(e.x)
         dtheta = x[:size].reshape(self.dtheta.shape)
-        return replace(self, dtheta=dtheta, delay_s=float(x[size]), named=tuple(named))
+        return replace(
+            self, dtheta=dtheta, delay_s=float(x[size]), start_nm=start, named=tuple(named)
+        )
 
     def actives(self, recording: int, but: int | None = None) -> tuple[Active, ...]:
         """Effects at work in a recording, the timing's error among them; one may be left out."""
@@ -157,10 +174,11 @@ class Model:
 
     def predicted(self, recording: int) -> Array:
         """(k, n) torque in the band, N m."""
-        own = self.recordings[recording]
-        return np.asarray(
-            self._once(("low", recording), lambda: own.low(self.stages(recording).sensed))
-        )
+        return np.asarray(self._once(("low", recording), lambda: self._predicted(recording)))
+
+    def _predicted(self, recording: int) -> Array:
+        own, held = self.recordings[recording], self.start_nm[recording]
+        return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
 
     def residual(self, recording: int) -> Array:
         """(k, n) measured less predicted, N m."""
@@ -192,7 +210,10 @@ class Model:
 
     def _signatures(self, recording: int) -> Array:
         own, at = self.recordings[recording], self.stages(recording)
+        starts = np.zeros((*self.start_nm.shape, *own.tau.shape))
+        starts[recording] = own.low_start
         tables = [at.low_regressor(), -own.low(own.motion.rate(at.sensed))[None]]
+        tables.append(starts.reshape(-1, *own.tau.shape))
         for place, e in enumerate(self.named):
             if e.recording not in (None, recording):
                 tables.append(np.zeros((len(e.x), *own.tau.shape)))
@@ -201,13 +222,32 @@ class Model:
             elif e.candidate.columns_are_theta:
                 link = e.candidate.joint if e.candidate.joint >= 0 else len(self.dtheta) - 1
                 gate = None if e.interval_s == WHOLE else e.gate(at.links.t)
-                tables.append(at.low_regressor(link, gate))
+                tables.append(np.tensordot(e.candidate.theta, at.low_regressor(link, gate), 1))
             else:
                 tables.append(self._slopes(recording, place))
         return np.concatenate(tables)
 
+    def slopes_of(self, e: Named) -> list[Array]:
+        """(c, k, n) of each recording: change of an added torque per unit of its coefficients."""
+        return [
+            self._torque_slopes(e, self.stages(i))
+            if e.recording in (None, i)
+            else np.zeros((len(e.x), *own.tau.shape))
+            for i, own in enumerate(self.recordings)
+        ]
+
     def _torque_slopes(self, e: Named, at: Stages) -> Array:
-        """(c, k, n) change of an added torque per unit of each of its coefficients."""
+        """(c, k, n) change of an added torque per unit of each of its coefficients.
+
+        Those of an effect that hangs on the measured motion alone are the same in every fit.
+        """
+        if e.candidate.effect.by_load or not at.unmoved:  # type: ignore[attr-defined]
+            return self._torque_differences(e, at)
+        shape = repr(e.candidate.template.decode(e.candidate.prior_std))
+        key = "slopes", e.candidate.key, shape, e.interval_s
+        return at.signals.once(key, lambda: self._torque_differences(e, at))
+
+    def _torque_differences(self, e: Named, at: Stages) -> Array:
         effect, decode, joint = e.candidate.effect, e.candidate.template.decode, e.candidate.joint
         assert isinstance(effect, TorqueEffect)
         links = at.links
@@ -242,18 +282,17 @@ class Fit:
         model: that is fitted.
         prior: (n, 10) standard deviation of the nominal inertias.
         noise: one model per recording.
-        still: joints (from 0) that stand, per recording: their friction takes whatever torque
-            there is.
         timing_std_s: how far the torques' timing may be off without being an effect.
+        start_std: (n,) N m, what static friction may hold at the first sample.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
     model: Model
     prior: Array
     noise: tuple[Noise, ...] = ()
-    still: tuple[tuple[int, ...], ...] = ()
     timing_std_s: float = TIMING_STD_S
     weights: tuple[Array, ...] = ()
+    start_std: float | Array = START_NM
 
     @property
     def recordings(self) -> tuple[Signals, ...]:
@@ -292,7 +331,8 @@ class Fit:
     def prior_std(self) -> Array:
         """Of the coefficients."""
         own = [e.candidate.prior_std for e in self.named]
-        return np.concatenate([self.prior.ravel(), [self.timing_std_s], *own])
+        held = np.broadcast_to(self.start_std, self.model.start_nm.shape)
+        return np.concatenate([self.prior.ravel(), [self.timing_std_s], held.ravel(), *own])
 
     def at(self, x: Array) -> Fit:
         """The same with other coefficients."""
@@ -330,8 +370,6 @@ class Fit:
         """
         own, level = self.recordings[recording], self.noise[recording].level
         weight = np.ones_like(own.tau)
-        if self.still:
-            weight[:, self.still[recording]] = 0.0
         for k, e in enumerate(self.named):
             if e.recording not in (None, recording):
                 continue
@@ -384,6 +422,23 @@ def _jumps(torque: Array) -> Array:
     return np.asarray(high - minimum_filter1d(torque, size, axis=0, origin=shift))
 
 
+def honest_covariance(fit: Fit, known: Carried) -> Array:
+    """Of all coefficients: by the noise, and no less than by what seconds of the log disagree.
+
+    What a model gets wrong does not average out as noise does. The information of the rows is
+    replaced by the spread of the gradients of whole seconds (White 1980, by clusters).
+    """
+    plain = known.covariance()
+    white = known.data - known.x @ known.N
+    ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
+    size = BLOCK * fit.n
+    cuts = [np.arange(a, b, size) for a, b in pairwise([0, *ends])]
+    scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
+    robust = plain @ (scores @ scores.T + np.diag(known.prior_std**-2.0)) @ plain
+    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
+    return plain * np.outer(wider, wider)
+
+
 def worth(fit: Fit, carried: Carried, place: int) -> Score:
     """Evidence of one of the named effects, what is carried with it eliminated."""
     return carried.worth(*beside(fit, place))
@@ -404,7 +459,7 @@ def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
 
 def place_of(fit: Fit, k: int) -> np.ndarray:
     """Where the coefficients of the k-th named effect are among all."""
-    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:k])
+    begin = fit.dtheta.size + 1 + fit.model.start_nm.size + sum(len(e.x) for e in fit.named[:k])
     return np.arange(begin, begin + len(fit.named[k].x))
 
 
@@ -450,17 +505,42 @@ def dated_anew(fit: Fit) -> Fit:
 
 def shaped(fit: Fit, place: int) -> Fit:
     """A named effect with the nonlinear setting that the data like best."""
+    effect = fit.named[place].candidate.effect
+    if effect.reshaped(fit.named[place].values, 1.0) is None:
+        return fit
+    if fit.is_linear and isinstance(effect, TorqueEffect) and not effect.by_load:
+        return _reshaped(fit, place)
     for step in SHAPE_STEPS:
         named = fit.named[place]
         trials = [fit]
-        for ratio in (step**-2, 1.0 / step, step, step**2):
-            template = named.candidate.effect.reshaped(named.values, ratio)
-            if template is None:
-                return fit
-            other = replace(named, candidate=replace(named.candidate, template=template))
+        for other in _other_shapes(named, step):
             trials.append(refitted(fit.instead(place, other), 1)[0])
         fit = min(trials, key=_distance)
     return fit
+
+
+def _other_shapes(named: Named, step: float) -> list[Named]:
+    """A named effect with a setting up to two steps larger or smaller."""
+    out = []
+    for ratio in (step**-2, 1.0 / step, step, step**2):
+        template = named.candidate.effect.reshaped(named.values, ratio)
+        assert template is not None
+        out.append(replace(named, candidate=replace(named.candidate, template=template)))
+    return out
+
+
+def _reshaped(fit: Fit, place: int) -> Fit:
+    """The same where all is linear but the setting: its own columns are all that changes."""
+    carried, own = fit.carried(), place_of(fit, place)
+    best, named = carried, fit.named[place]
+    for step in SHAPE_STEPS:
+        for other in _other_shapes(named, step):
+            N = carried.N.copy()
+            N[own] = fit.whiten(fit.model.slopes_of(other))
+            trial = Carried(N, carried.prior_std, carried.data)
+            if trial.g @ trial.x > best.g @ best.x:
+                best, named = trial, other
+    return fit.instead(place, named).at(best.x)
 
 
 def _moved(fit: Fit, place: int, side: int, t: float) -> Fit:

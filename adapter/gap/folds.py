@@ -16,13 +16,16 @@ from adapter.model.spatial import Array
 
 FOLDS = 4
 FOLD_S, SHORTEST_S = 2.0, 0.2  # of a block
+LARGEST_SHARE = 0.125  # of a recording: what is left must tell what the model tells
 TIE_CHI2 = 2.0  # by which held-out data may be worse and still leave it to the evidence
 
 
 def block_s(fit: Fit) -> float:
     """Length of the blocks that are held out: what lasts but a second is in several of them."""
     spans = [e.interval_s[1] - e.interval_s[0] for e in fit.named]
-    return float(max(min([FOLD_S, *(x / (2 * FOLDS) for x in spans)]), SHORTEST_S))
+    spans = [x / (2 * FOLDS) for x in spans]
+    spans += [LARGEST_SHARE * float(np.ptp(own.t)) for own in fit.recordings]
+    return float(max(min([FOLD_S, *spans]), SHORTEST_S))
 
 
 def fold_of(t: Array, block: float) -> np.ndarray:

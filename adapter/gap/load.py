@@ -8,37 +8,33 @@ common to both, so that the arm's own errors cancel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
-from adapter.effects.active import active_effects
-from adapter.effects.base import Effect, Template
-from adapter.effects.catalogue import HELD, LEARNED, REAL_ARM_EFFECTS
-from adapter.errors import ModelError
-from adapter.gap.candidates import Candidate
-from adapter.gap.evidence import ORDER, Carried
-from adapter.gap.fit import TIMING_STD_S, Fit, Model, Named, theta_prior, under_own_noise
-from adapter.gap.screen import cleaned, judge_torque, moving_joints
-from adapter.gap.signals import Recorded, prepare
-from adapter.gap.timing import TIMING_SHARE, lateness
+from adapter.gap.fit import (
+    honest_covariance,
+    place_of,
+)
+from adapter.gap.hand import hand_frame
+from adapter.gap.nominal import nominal_fit
+from adapter.gap.real_arm import SHARES, real_arm
+from adapter.gap.screen import MOVES_DQ, cleaned, judge_torque, moving_joints
+from adapter.gap.signals import RATE_HZ, Recorded
+from adapter.gap.timing import lateness
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
-from adapter.signals.validation import smooth
+from adapter.signals.validation import GRID_S, smooth
 from drivers.files.mcap import Log
 
-LOAD_STD = (5.0, *[0.5] * 3, *[0.15] * 6)  # of a load: kg, kg m, kg m2
-DOCUMENTED_STD, SHARED_STD = 0.03, 0.2  # of the inertias: alone, and with a log without the load
-FLANGES = ("tool0", "flange")  # what makers call the face that a tool is bolted to
+DOCUMENTED_STD, SHARED_STD = 0.02, 0.2  # of the inertias: alone, and with a log without the load
+MOVES_S = 1.0  # of motion, or the arm hardly moves
 SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
-STEP = 1e-6
-BLOCK = 25  # samples at 25 Hz: errors of the model last so long, noise does not
+STEP, STEP_S = 1e-6, 1.0 / RATE_HZ
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,29 +77,6 @@ class HandLoad:
         return self.com_shown and bool(self.inertia_std.max() < INERTIA_SHARE * size)
 
 
-def hand_frame(model: SelfModel, name: str | None = None) -> FixedFrame:
-    """The frame in which the load is told: the flange of the last link, where it has one.
-
-    Args:
-        name: of the frame or of the last link; where None, the one called as makers call it, else
-            the first that rides on the last link, else the link itself.
-
-    Raises:
-        ModelError: nothing of that name rides on the last link; names what does.
-    """
-    last = model.tree.link_names[-1]
-    own = FixedFrame(last, "", last, np.eye(3), np.zeros(3))
-    riding = [frame for frame in model.frames if frame.parent == last]
-    if name is not None:
-        for frame in (own, *riding):
-            if frame.name == name:
-                return frame
-        have = ", ".join(frame.name for frame in (own, *riding))
-        raise ModelError(f"no frame '{name}' rides on the last link; have: {have}")
-    called = [frame for key in FLANGES for frame in riding if frame.name.endswith(key)]
-    return (*called, *riding, own)[0]
-
-
 def find_load(
     log: Log,
     model: SelfModel,
@@ -129,77 +102,40 @@ def find_load(
         model, said = present(model, one.joint_names, one.path.name)
         notes += said
     riding = hand_frame(model, frame)
-    share = inertia_prior or (DOCUMENTED_STD if empty is None else SHARED_STD)
+    if inertia_prior is None:
+        inertia_prior, shares = (DOCUMENTED_STD, SHARES) if empty is None else (SHARED_STD, (1.0,))
+    else:
+        shares = (1.0,)
     cleaned_logs = [cleaned(one, model) for one in logs]
     notes += [note for *_, said in cleaned_logs for note in said]
-    usable = [(one, lateness(clock), clock.period_s) for one, clock, _ in cleaned_logs]
-    start = _prepared(usable, model, share)
-    fit, known = under_own_noise(start)
-    at = slice(fit.dtheta.size + 1, fit.dtheta.size + 11)
-    theta = fit.coefficients[at]
-    notes += _judged(usable[0][0], model, theta)
-    before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
-    found = load_of(theta, _covariance(fit, known)[at, at], riding)
-    return replace(found, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes)))
-
-
-def _prepared(logs: Sequence[tuple[Log, float, float]], model: SelfModel, share: float) -> Fit:
-    """The documented arm on the smoothed recordings, with all that may be beside it at zero.
-
-    `logs` come with how much later dq is than q and with their sample period, s.
-    """
-    arm = RigidArm.of(model)
-    signals = tuple(prepare(Recorded.of(log, late_s), arm) for log, late_s, _ in logs)
-    known = active_effects(model.effects, arm.n)
-    return Fit(
-        Model(signals, np.zeros_like(arm.theta), named=with_a_load(arm.n), known=known),
-        theta_prior(arm.theta, share),
-        timing_std_s=max(TIMING_STD_S, TIMING_SHARE * max(period_s for *_, period_s in logs)),
+    start = nominal_fit(
+        [Recorded.of(one, lateness(clock)) for one, clock, _ in cleaned_logs],
+        model,
+        inertia_prior,
+        max(clock.period_s for _, clock, _ in cleaned_logs),
     )
-
-
-def with_a_load(n: int) -> tuple[Named, ...]:
-    """A load in the first recording, then what may be beside it on an arm of n joints, at zero."""
-    named = [_named(HELD, LOAD_STD, -1, 0)]
-    for name in REAL_ARM_EFFECTS:
-        effect = LEARNED[name]
-        named += [_named(effect, (effect.prior_std,), j, None) for j in range(n)]
-    return tuple(named)
+    moving = {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq, STEP_S)}
+    arm = real_arm(start, sorted(moving), (0,), shares)
+    fit, at = arm.fit, place_of(arm.fit, 0)
+    turn = fit.named[0].candidate.theta
+    theta = fit.coefficients[at] @ turn
+    covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
+    notes += _judged(cleaned_logs[0][0], model, theta)
+    before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
+    found = load_of(theta, covariance, riding)
+    return replace(found, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes)))
 
 
 def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:
     """Refuse torques that even the loaded arm has in another unit, sign or order; notes on rest."""
     smoothed = smooth(1e-9 * (log.stamp_ns - log.stamp_ns[0]), log.q, log.dq, log.tau)
-    if not moving_joints(*smoothed[:2]):
+    if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
         return ["the arm hardly moves: static friction in its joints counts as load"]
     loaded = model.theta.copy()
     loaded[-1] += theta
     loaded_model = replace(model, theta=loaded)
     judge_torque(log, loaded_model, RigidArm.of(loaded_model), smoothed)
     return []
-
-
-def _named(effect: Effect, std: tuple[float, ...], joint: int, recording: int | None) -> Named:
-    """An effect at zero, to be fitted."""
-    candidate = Candidate(effect, Template(std, effect.decode), joint, ())
-    return Named(candidate, np.zeros(len(std)), recording=recording)
-
-
-def _covariance(fit: Fit, known: Carried) -> Array:
-    """Of all coefficients: by the noise, and no less than by what seconds of the log disagree.
-
-    What a model gets wrong does not average out as noise does. The information of the rows is
-    replaced by the spread of the gradients of whole seconds (White 1980, by clusters).
-    """
-    plain = known.covariance()
-    white = known.data - known.x @ known.N
-    ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
-    size = BLOCK * fit.n
-    cuts = [np.arange(a, b, size) for a, b in pairwise([0, *ends])]
-    scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
-    robust = plain @ (scores @ scores.T + np.diag(known.prior_std**-2.0)) @ plain
-    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
-    return plain * np.outer(wider, wider)
 
 
 def _in_frame(theta: Array, covariance: Array, frame: FixedFrame) -> tuple[Array, Array]:

@@ -64,6 +64,7 @@ def _bodies(fit: Fit) -> tuple[Array, Array]:
     parts = [part for part in parts if is_consistent(theta[part[0]])]
     change = np.zeros((size, len(parts), 10))
     for b, (j, named) in enumerate(parts):
-        for first in (10 * j, *(place_of(fit, k)[0] for k in named)):
-            change[first : first + 10, b] = np.eye(10)
+        change[10 * j : 10 * j + 10, b] = np.eye(10)
+        for k in named:
+            change[place_of(fit, k), b] = fit.named[k].candidate.theta
     return theta[[j for j, _ in parts]], change

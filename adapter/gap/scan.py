@@ -120,7 +120,7 @@ class SignatureTable:
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
-            table, self.candidates = signatures(fit.model.stages(i), joints, extra)
+            table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
                 noise.append(rich_noise(table, self.candidates, fit.model.residual(i)))
@@ -260,12 +260,12 @@ class SignatureTable:
         return leads
 
     def passing(self, candidates: Sequence[Candidate]) -> list[Lead]:
-        """The best interval of each candidate in each recording: it comes and goes."""
+        """The best interval of each candidate inside each recording: it comes and goes."""
         leads = []
         longest = round(LONGEST_CONTACT_S / BLOCK_S)
         for i, t in enumerate(self.times):
             last = len(_edges(t)) - 1
-            ends = [(a, min(a + longest, last)) for a in range(last)]
+            ends = [(a, min(a + longest, last - 1)) for a in range(1, last)]
             pairs = [(a, b) for a, end in ends for b in range(a + FEWEST_BLOCKS, end + 1)]
             leads += self._best_intervals(i, candidates, pairs, passing=True)
         return leads

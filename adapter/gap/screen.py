@@ -21,7 +21,8 @@ from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
-MOTION_S = 2.0  # of motion faster than half MOVES_DQ; less tells nothing
+MOTION_S = 0.2  # of motion faster than half MOVES_DQ; less tells nothing of a joint
+SHORTEST_S = 1.5  # of a recording
 WANTED_RAD, WANTED_DQ = 0.3, 0.3  # what to ask for
 DEGREES = 180.0 / np.pi
 TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
@@ -123,11 +124,11 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
-    if timing.span_s < MOTION_S or len(log) < 100:
+    if timing.span_s < SHORTEST_S or len(log) < 100:
         raise RecordingRefused(
             RecordingFault.DATA,
             f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
-            f"{timing.samples}; record at least {MOTION_S:g} s, better 20 s, of motion.",
+            f"{timing.samples}; record at least {SHORTEST_S:g} s, better 20 s, of motion.",
         )
     _check_motion_units(log, model, timing)
     renamed = not set(model.tree.joint_names) <= set(recorded)

@@ -12,9 +12,21 @@ from adapter.effects.base import TorqueEffect
 from adapter.effects.catalogue import WRONG_LINK
 from adapter.gap.candidates import PATTERN_SHARE, Candidate, Pattern
 from adapter.gap.evidence import Carried, Noise
-from adapter.gap.fit import Fit, Named, dated, dated_anew, refitted, shaped, under_own_noise, worth
+from adapter.gap.fit import (
+    Fit,
+    Named,
+    dated,
+    dated_anew,
+    honest_covariance,
+    place_of,
+    refitted,
+    shaped,
+    under_own_noise,
+    worth,
+)
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.rivals import Standing, price, standings
+from adapter.gap.real_arm import start
+from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
     BELIEF,
     CATALOGUED,
@@ -29,6 +41,7 @@ TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 4, 1.0  # names that are exchanged for better ones, and by how much
+CLEAR = 3.0  # standard deviations of a force
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
@@ -89,7 +102,8 @@ def search(
         progress: hears what is being tried.
     """
     nominal, budget = fit, Budget(rounds)
-    fit, _ = refitted(fit)
+    progress("a load at the hand")
+    fit = start(fit, joints)
     fit = settled(_extended(fit, joints, CATALOGUED, budget, progress), joints).fit
     if fit.named:  # noise that was taken for the first effect's may have hidden another one
         fit = _extended(fit, joints, CATALOGUED, budget, progress)
@@ -217,26 +231,44 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
             value < BELIEF
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.candidate.effect.possible(e.values)
+            or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
             or not pays_held_out(fit, folds, k)
         ):
             values[k] = value
     return min(values, key=values.__getitem__) if values else None
 
 
+def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
+    """Whether the force of what pushes for a time is clearly above its doubt."""
+    own = place_of(fit, k)[:3]
+    force, doubt = fit.coefficients[own], honest_covariance(fit, carried)[np.ix_(own, own)]
+    square = float(force @ force)
+    return square**2 > CLEAR**2 * float(force @ doubt @ force)
+
+
 def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
-    """The model with its worst named effect under a better name, if there is one."""
-    best, gain = None, SWAP_NATS
+    """The model with the worst named effect of each joint under a better name, if there is one.
+
+    What is not of one joint goes alone.
+    """
+    best: dict[int, tuple[float, int, Rival]] = {}
     for k, own in enumerate(standings):
         if isinstance(own.candidate.effect, Pattern):
             continue
         for rival in own.rivals:
-            better = own.gain(rival)
-            if rival.credible and better > gain:
-                best, gain = (k, rival), better
-    if best is None:
+            better, joint = own.gain(rival), own.candidate.joint
+            if joint != rival.candidate.joint:
+                joint = -1
+            if rival.credible and better > best.get(joint, (SWAP_NATS,))[0]:
+                best[joint] = better, k, rival
+    if not best:
         return None
-    k, rival = best
-    return fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x))
+    first = max(best, key=lambda joint: best[joint][0])
+    together = [joint for joint in best if joint >= 0] if first >= 0 else [first]
+    for joint in together:
+        _, k, rival = best[joint]
+        fit = fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x))
+    return fit
 
 
 WIDE = 25.0  # times the prior: inertias of which next to nothing is known

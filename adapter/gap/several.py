@@ -18,14 +18,15 @@ import numpy as np
 from adapter.effects.catalogue import HELD
 from adapter.gap.evidence import score
 from adapter.gap.fit import Fit, place_of
-from adapter.gap.load import LOAD_STD, SHOWN, HandLoad, load_of, with_a_load
+from adapter.gap.load import SHOWN, HandLoad, load_of
+from adapter.gap.real_arm import SHARES, fitting_way, with_a_load
 from adapter.gap.result import Finding, GapResult, LogLoad
 from adapter.gap.together import Part, Together
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import Array
 
-SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias: another unit's are 5 to 30 % off
+LINK_STD = (5.0, *[0.5] * 3, *[0.15] * 6)  # of what a link may differ by: kg, kg m, kg m2
 FRICTION, OFFSET, LINK = "friction", "offset", "link"
 NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: more is another arm
 FEWEST = 3  # recordings: of two nobody can say which one is the odd one
@@ -76,14 +77,16 @@ class Several:
             ]
             parts = [Part.of(fit, _own(fit)) for fit in fits]
             together = _together(parts, nominal.prior.size)
-            fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
+            solved = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
+            fits = [fit.instead(0, fitting_way(fit, fit.named[0])) for fit in solved]
         return cls(tuple(names), frame, tuple(fits), together)
 
     @cached_property
     def own(self) -> tuple[tuple[Array, Array], ...]:
         """Ten parameters (10,) of each load and their covariance (10, 10)."""
         found = (self.together.own(i) for i in range(len(self.fits)))
-        return tuple((x[-10:], covariance[-10:, -10:]) for x, covariance in found)
+        turn = self.fits[0].named[0].candidate.theta
+        return tuple((x[-10:] @ turn, turn.T @ C[-10:, -10:] @ turn) for x, C in found)
 
     @cached_property
     def loads(self) -> tuple[HandLoad, ...]:
@@ -177,9 +180,9 @@ def _own(fit: Fit) -> np.ndarray:
 
 def _apart(nominal: Fit, i: int) -> Fit:
     """One recording alone, with a load, and all that may be beside it."""
-    named = with_a_load(nominal.n)
+    named = with_a_load(nominal)
     model = replace(nominal.model, recordings=(nominal.recordings[i],), named=named)
-    return replace(nominal, model=model, still=(), noise=(), weights=())
+    return replace(nominal, model=model, noise=(), weights=())
 
 
 def _together(parts: Sequence[Part], inertias: int) -> Together:
@@ -268,7 +271,7 @@ def _directions(fit: Fit, x: Array) -> Iterator[tuple[str, str, Array]]:
         places = first + np.flatnonzero(reads & (joints == j))
         yield OFFSET, f"the offset of joint {j + 1}'s torque", unit[places]
     for k in range(1, fit.n - 1):
-        moved = np.array(LOAD_STD)[:, None] * unit[10 * k : 10 * k + 10]
+        moved = np.array(LINK_STD)[:, None] * unit[10 * k : 10 * k + 10]
         yield LINK, f"the inertia of link {k + 1}, or of one beside it,", moved
 
 

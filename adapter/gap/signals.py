@@ -32,9 +32,12 @@ CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
 BAND_REST = 1e-3
+LEAST_S = 1.2  # of a recording
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
+
+SLIDE_RAD = 1e-3  # over which a joint winds up before it slides, as on a real Panda
 
 # Splines through a motion.
 SPLINE_DEGREE = 5
@@ -108,6 +111,20 @@ class Signals:
         """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""
         return self.once("regressor", self._low_regressor)
 
+    @property
+    def low_start(self) -> Array:
+        """(n, k, n) what is left of a unit of friction that a joint held at the first sample.
+
+        A joint that rests holds what static friction lets it, and forgets it as it slides.
+        """
+        return self.once("start", self._low_start)
+
+    def _low_start(self) -> Array:
+        q = self.motion.q
+        gone = np.cumsum(np.abs(np.diff(q, axis=0, prepend=q[:1])), axis=0) / SLIDE_RAD
+        left = low(np.exp(-gone))
+        return np.asarray(left.T[:, :, None] * np.eye(q.shape[1])[:, None])
+
     def _low_regressor(self) -> Array:
         m = self.motion
         return np.ascontiguousarray(np.moveaxis(low(m.arm.regressor(m.q, m.dq, m.ddq)), 2, 0))
@@ -122,11 +139,11 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
             has nothing to do with that of this recording's torques and positions.
 
     Raises:
-        ValueError: less than two seconds of data.
+        ValueError: less data than the filters need.
     """
     t = recording.t
-    if t[-1] - t[0] < 2.0:
-        raise ValueError(f"the search needs 2 s of data, got {t[-1] - t[0]:.2f} s")
+    if t[-1] - t[0] < LEAST_S:
+        raise ValueError(f"the search needs {LEAST_S:g} s of data, got {t[-1] - t[0]:.2f} s")
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
     smoothed = (repeat or recording).smoothed().at(grid)
     motion = Motion(grid, *smoothed, arm, _band(smoothed[1]))

@@ -17,18 +17,18 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.effects.active import active_effects
 from adapter.effects.robots import read_robot
 from adapter.gap.findings import disagreement, noise_floor, told_of
-from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
+from adapter.gap.fit import Fit, theta_prior
+from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
-from adapter.gap.load import hand_frame
+from adapter.gap.nominal import nominal_fit
 from adapter.gap.result import GapResult
 from adapter.gap.screen import RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
-from adapter.gap.signals import Recorded, prepare
-from adapter.gap.timing import TIMING_SHARE, lateness
+from adapter.gap.signals import Recorded
+from adapter.gap.timing import lateness
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -103,7 +103,8 @@ def find_gap(
         names = names_of([*logs, *settings.hold_out])
         return GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
     progress("smoothing")
-    fit = _nominal_fit(task, settings)
+    prior = settings.inertia_prior
+    fit = nominal_fit(task.fitted, task.model, prior, task.period_s, task.scored)
     several = None
     if len(task.fitted) > 1:
         progress("weighing what each recording carries")
@@ -112,7 +113,7 @@ def find_gap(
     progress("searching")
     moving = sorted({j for joints in task.moving for j in joints})
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
-    result = replace(_result(task, measured), model_in=name)
+    result = replace(_result(task, measured, settings), model_in=name)
     if several is not None:
         result = several.told(result)
     if model_out is not None:
@@ -187,21 +188,6 @@ def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorde
     return (whole.part(slice(cut)),), (whole.part(slice(cut, None)),)
 
 
-def _nominal_fit(task: GapTask, settings: GapSettings) -> Fit:
-    """The nominal model on the smoothed recordings, under the noise that it leaves."""
-    arm = RigidArm.of(task.model)
-    everything = tuple(dict.fromkeys((*task.fitted, *task.scored)))
-    signals = tuple(prepare(r, arm, r.repeated_in(everything)) for r in task.fitted)
-    known = active_effects(task.model.effects, arm.n)
-    still = tuple(tuple(j for j in range(arm.n) if j not in m) for m in task.moving)
-    return Fit(
-        Model(signals, np.zeros_like(arm.theta), known=known),
-        theta_prior(arm.theta, settings.inertia_prior),
-        still=still,
-        timing_std_s=max(TIMING_STD_S, TIMING_SHARE * task.period_s),
-    ).with_noise()
-
-
 def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit]:
     """The recordings that are searched: those in which most moves, for some time together.
 
@@ -233,14 +219,15 @@ def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit
         moving=tuple(task.moving[i] for i in chosen),
         notes=(*task.notes, note),
     )
-    still = tuple(fit.still[i] for i in chosen) if fit.still else ()
-    return task, replace(fit, model=model, still=still).with_noise()
+    return task, replace(fit, model=model).with_noise()
 
 
-def _result(task: GapTask, measured: HeldOut) -> GapResult:
+def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResult:
     """All that was found and measured."""
     found, floor = measured.found, noise_floor(measured.found.fit)
-    findings, left = told_of(found, {r.name: float(r.t[-1]) for r in task.fitted})
+    ends = {r.name: float(r.t[-1]) for r in task.fitted}
+    trusted = theta_prior(RigidArm.of(task.model).theta, settings.inertia_prior)
+    findings, left = told_of(found, ends, trusted)
     splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,

@@ -12,7 +12,7 @@ from adapter.effects.active import Active, lasting_effects, with_bodies
 from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
-from adapter.gap.load import hand_frame
+from adapter.gap.hand import hand_frame
 from adapter.model.inertia import body_from_theta
 from adapter.model.locking import LOCKED
 from adapter.model.onto import SAME_PLACE

@@ -18,7 +18,16 @@ from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
 from adapter.gap.evidence import Noise
 from adapter.gap.findings import doubted, findings_of, parameter_std, told_of
 from adapter.gap.fit import Fit, Model, Named, refitted, theta_prior, worth
-from adapter.gap.folds import FOLD_S, FOLDS, Folds, block_s, fold_of, fold_rows, pays_held_out
+from adapter.gap.folds import (
+    FOLD_S,
+    FOLDS,
+    LARGEST_SHARE,
+    Folds,
+    block_s,
+    fold_of,
+    fold_rows,
+    pays_held_out,
+)
 from adapter.gap.held_out import (
     GapTask,
     _curves,
@@ -141,7 +150,8 @@ def test_curves_show_what_a_fit_without_their_own_block_predicts() -> None:
 @pytest.mark.parametrize("throughout", [True, False])
 def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     """Evidence is ample both times; blocks that the fit has not seen pay for the one alone."""
-    on = np.ones_like(T) if throughout else ((T > 2.0) & (T < 4.0)).astype(float)
+    block = LARGEST_SHARE * SECONDS
+    on = np.ones_like(T) if throughout else ((2 * block < T) & (3 * block > T)).astype(float)
     fit = with_effect(nominal_fit(recording(3, on_joint(6, 0.5 * on))), "torque_offset", 6, 0.5)
     fit, carried = refitted(fit)
     assert worth(fit, carried, 0).log_evidence > BELIEF + 20.0
@@ -211,7 +221,7 @@ def test_what_is_told_of_a_shaken_joint_is_less_sure(shaken: bool) -> None:
         more += on_joint(JOINT, np.sin(2.0 * np.pi * 1.3 * T))
     fit = with_effect(nominal_fit(recording(6, more)), "coulomb_friction", JOINT, FC).with_noise()
     found = settled_as(fit, fit.carried())
-    (own,), left = told_of(found, {"log": SECONDS})
+    (own,), left = told_of(found, {"log": SECONDS}, fit.prior)
     assert {x.joint for x in left} == ({JOINT + 1} if shaken else set())
     assert own.evidence == pytest.approx(1.0) if not shaken else own.evidence < 0.5
 

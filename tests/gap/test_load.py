@@ -13,7 +13,8 @@ import pytest
 
 from adapter.cli import main
 from adapter.errors import ModelError
-from adapter.gap.load import HandLoad, find_load, hand_frame
+from adapter.gap.hand import hand_frame
+from adapter.gap.load import HandLoad, find_load
 from adapter.gap.load_words import as_json, robot_lines, sentence
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame

@@ -1,0 +1,164 @@
+"""What comes before any search: the load, and inertias as wrong as the data say they are.
+
+Documented inertias are those of another unit, every joint has friction, every sensor an offset,
+and the commonest thing that a model lacks is what the hand holds. All of these are fitted together
+before anything rarer is looked for: one by one they would be taken for springs, pushes and delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from adapter.effects.base import Effect, Template
+from adapter.effects.catalogue import CATALOGUE, HELD
+from adapter.gap.candidates import Candidate
+from adapter.gap.evidence import Carried, score
+from adapter.gap.fit import (
+    Fit,
+    Named,
+    honest_covariance,
+    place_of,
+    refitted,
+    under_own_noise,
+    worth,
+)
+from adapter.gap.hand import MASSES_KG
+from adapter.gap.rivals import price
+from adapter.gap.scan import BELIEF
+from adapter.model.spatial import Array
+
+BRISTLES = CATALOGUE["bristle_friction"].templates()[1]  # a Panda's
+WHERE_IT_MOVES = (
+    (CATALOGUE["bristle_friction"], BRISTLES),
+    *(
+        (CATALOGUE[name], CATALOGUE[name].templates()[0])
+        for name in ("viscous_friction", "motor_inertia")
+    ),
+)
+OFFSET = CATALOGUE["torque_offset"]
+SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
+OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
+OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of another unit
+WAY_ROUNDS = 3
+LIGHTEST_KG = 0.1
+SHOWN = 2.5  # standard deviations of its mass from which on a load is there
+
+
+@dataclass(frozen=True, eq=False)
+class RealArm:
+    """All that any arm may have, fitted together.
+
+    Attributes:
+        fit: with the loads first, then friction, motor inertia and offsets.
+        known: of its coefficients.
+        loads: how many loads there may be, one in each of so many recordings.
+    """
+
+    fit: Fit
+    known: Carried
+    loads: int
+
+    @cached_property
+    def mass_std(self) -> Array:
+        """(loads,) kg, one standard deviation of the loads' masses."""
+        at = [place_of(self.fit, k)[0] for k in range(self.loads)]
+        return np.sqrt(np.diagonal(honest_covariance(self.fit, self.known))[at])
+
+    def is_there(self, k: int) -> bool:
+        """Whether the k-th load is."""
+        found = worth(self.fit, self.known, k).log_evidence + price(self.fit.named[k])
+        return found > BELIEF and bool(self.fit.named[k].x[0] > SHOWN * self.mass_std[k])
+
+
+def real_arm(
+    fit: Fit, joints: Sequence[int], loaded: Sequence[int], shares: Sequence[float] = SHARES
+) -> RealArm:
+    """The nominal model with all that any arm may have.
+
+    Args:
+        fit: the nominal model on the recordings; joints: (from 0) that move.
+        loaded: recordings (from 0) in which the hand may hold something.
+        shares: times the prior of the inertias that are tried, least first.
+    """
+    loads = [_load(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
+    for _ in range(WAY_ROUNDS):
+        found, known = _as_wide_as_open(_beside(fit.with_named(loads), joints), shares)
+        before = [e.candidate.template.label for e in loads]
+        loads = [fitting_way(fit, e) for e in found.named[: len(loads)]]
+        if before == [e.candidate.template.label for e in loads]:
+            break
+    return RealArm(found, known, len(loads))
+
+
+def with_a_load(fit: Fit) -> tuple[Named, ...]:
+    """A load in the first recording, then what may be beside it in every joint, at zero."""
+    return _beside(fit.with_named([_load(fit, 0)]), range(fit.n)).named
+
+
+def fitting_way(fit: Fit, load: Named) -> Named:
+    """A load, looked for as one of about its mass."""
+    mass = max(float(load.x[0]), LIGHTEST_KG)
+    way = min(range(len(MASSES_KG)), key=lambda k: abs(float(np.log(mass / MASSES_KG[k]))))
+    template = fit.model.hand.templates()[way]
+    return replace(load, candidate=replace(load.candidate, template=template))
+
+
+def _as_wide_as_open(fit: Fit, shares: Sequence[float]) -> tuple[Fit, Carried]:
+    """A fit with the widest prior of the inertias that its data do not speak against."""
+    wide, known = under_own_noise(replace(fit, prior=shares[-1] * fit.prior))
+    std, worths = known.prior_std.copy(), []
+    for share in shares:
+        std[: fit.dtheta.size] = share * fit.prior.ravel()
+        worths.append(score(known.G, known.g, std).log_evidence)
+    share = shares[int(np.flatnonzero(np.array(worths) > max(worths) - OPEN_NATS)[-1])]
+    return refitted(replace(wide, prior=share * fit.prior))
+
+
+def start(fit: Fit, joints: Sequence[int]) -> Fit:
+    """What a search starts from.
+
+    That is the nominal model itself, unless the hand holds something or the inertias are those of
+    another unit: then it has what is worth having of all that any arm may have.
+
+    Args:
+        fit: the nominal model on the recordings, with their loads where these are known already.
+        joints: (from 0) that move.
+    """
+    every = range(len(fit.recordings))
+    if fit.named:
+        loaded = list(range(len(fit.named)))
+        arm = RealArm(*_as_wide_as_open(_beside(fit, joints), SHARES), len(loaded))
+    else:
+        arm = real_arm(fit, joints, every)
+        loaded = [k for k in every if arm.is_there(k)]
+    if len(loaded) < arm.loads:
+        arm = real_arm(fit, joints, loaded)
+    if not loaded and arm.fit.prior[0, 0] < OTHER_UNIT * fit.prior[0, 0]:
+        return refitted(fit)[0]
+    kept = [
+        e
+        for k, e in enumerate(arm.fit.named)
+        if k < len(loaded) or worth(arm.fit, arm.known, k).log_evidence + price(e) > 0.0
+    ]
+    return refitted(arm.fit.with_named(kept).with_noise())[0]
+
+
+def _named(effect: Effect, template: Template, joint: int, recording: int | None = None) -> Named:
+    """An effect at zero, to be fitted."""
+    x = np.zeros(len(template.prior_std))
+    return Named(Candidate(effect, template, joint, ()), x, recording=recording)
+
+
+def _load(fit: Fit, recording: int | None) -> Named:
+    return _named(HELD, fit.model.hand.templates()[1], -1, recording)
+
+
+def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
+    """With friction and motors of the joints (from 0) that move, and offsets of all, at zero."""
+    own = [_named(effect, way, j) for effect, way in WHERE_IT_MOVES for j in joints]
+    own += [_named(OFFSET, OFFSET.templates()[0], j) for j in range(fit.n)]
+    return fit.with_named([*fit.named, *own])
