@@ -77,8 +77,9 @@ class Several:
             ]
             parts = [Part.of(fit, _own(fit)) for fit in fits]
             together = _together(parts, nominal.prior.size)
-            solved = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
-            fits = [fit.instead(0, fitting_way(fit, fit.named[0])) for fit in solved]
+            fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
+            if flat:
+                fits = [fit.instead(0, fitting_way(fit, fit.named[0])) for fit in fits]
         return cls(tuple(names), frame, tuple(fits), together)
 
     @cached_property
