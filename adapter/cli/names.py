@@ -22,20 +22,19 @@ def check_run(args: argparse.Namespace) -> None:
 
 
 def effects_named(text: str) -> tuple[str, ...]:
-    """Names of the effects to learn: none, real, or a list with commas between.
+    """Names of the effects to learn: none, or a list with commas between, real being several.
 
     Raises:
         SettingsError: no such effect; with the choices.
     """
     if text == "none":
         return ()
-    if text == "real":
-        return REAL_ARM_EFFECTS
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
-    for name in names:
-        if name not in LEARNED:
+    names: dict[str, None] = {}
+    for name in (name.strip() for name in text.split(",") if name.strip()):
+        if name != "real" and name not in LEARNED:
             raise SettingsError(f"no effect '{name}'; have: none, real, {', '.join(LEARNED)}")
-    return names
+        names.update(dict.fromkeys(REAL_ARM_EFFECTS if name == "real" else [name]))
+    return tuple(names)
 
 
 def check_learning(args: argparse.Namespace) -> None:

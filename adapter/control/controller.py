@@ -289,7 +289,7 @@ class ExcitationController:
     def _of_model(self, model: Feedforward, ref: RandomMotion) -> Array:
         tau = model(ref.q, ref.dq, ref.ddq)
         if self._adds_gravity:
-            tau = tau - model(ref.q, self._still, self._still)
+            tau = tau - model.unbent(ref.q)
         return tau
 
     def _limited(self, tau: Array, most: Array) -> Array:

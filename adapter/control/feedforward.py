@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
+from adapter.effects.by_joint import WAYS_RAD, ByJoint, JointSignals, smooth_sign
 from adapter.effects.catalogue import effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.errors import SettingsError
@@ -16,6 +16,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, torques, wrench_torques
+from adapter.signals.bristles import Bristles, wind
 
 
 class Feedforward(Protocol):
@@ -40,6 +41,9 @@ class Feedforward(Protocol):
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion (n,) rad, rad/s, rad/s². Raises nothing."""
 
+    def unbent(self, q: Array) -> Array:
+        """Torques (n,) N m of holding still with nothing bent: gravity. Raises nothing."""
+
 
 class ModelFeedforward:
     """Inverse dynamics of a fixed-base model, compiled; some 7 µs a call for 7 joints.
@@ -47,7 +51,7 @@ class ModelFeedforward:
     What a model's effects do to a motion is computed from one instant: the links follow the
     encoders without the rates of a gear's twist, a gear with play leans on the flank that pushes
     it, and what needs time (a late sensor, friction that drifts) is left out. `torque.ModelTorque`
-    does all of it over tables.
+    does all of it over tables. Bristles wind up along the motions asked for, one after the other.
 
     Args:
         tree: N and A.
@@ -74,8 +78,11 @@ class ModelFeedforward:
         # position, velocity, acceleration, torque: a table of one instant each
         self._signals, self._still = np.zeros((4, 1, n)), np.zeros(n)
         self._motion = JointMotion(*self._signals[:3])
+        self._bristles, self._bent = Bristles.unknown(n), np.zeros(len(WAYS_RAD) * n)
+        self._straight = np.zeros((len(WAYS_RAD), n))
         self.set(np.zeros((n, 6)), np.zeros((n, 10)), np.zeros((len(self._effects), n)))
         self(*np.zeros((3, n)))  # compiled now, not in the first tick
+        self._bristles.place[:] = np.nan
 
     @classmethod
     def of(cls, model: SelfModel) -> ModelFeedforward:
@@ -100,14 +107,28 @@ class ModelFeedforward:
     def refresh(self) -> None:
         """Nothing is ever new."""
 
-    def set(self, lam: Array, theta: Array, effect_values: Array) -> None:
-        """Take parameters: λ (n, 6), θ (n, 10) of arm and tool, (e, n) of the named effects."""
+    def set(
+        self, lam: Array, theta: Array, effect_values: Array, shapes: Array | None = None
+    ) -> None:
+        """Take parameters: λ (n, 6), θ (n, 10) of arm and tool, (e, n) of the named effects.
+
+        `shapes` (e, n) of effects that have several, as `Theta.shapes`.
+        """
         self._frames = frames_of(self._parent, lam)
         self._theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
         self._values = np.array(effect_values, dtype=np.float64)
+        self._shapes = np.full(self._values.shape, np.nan) if shapes is None else shapes.copy()
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Torques (n,) N m of a motion."""
+        """Torques (n,) N m of a motion, which goes on from the one asked for before."""
+        wind(np.inf, q, dq, self._bristles, self._bent)
+        return self._torque(q, dq, ddq, self._bent.reshape(-1, len(q)))
+
+    def unbent(self, q: Array) -> Array:
+        """Torques (n,) N m of holding still with nothing bent."""
+        return self._torque(q, self._still, self._still, self._straight)
+
+    def _torque(self, q: Array, dq: Array, ddq: Array, bent: Array) -> Array:
         signals, known = self._signals, self._known
         signals[0, 0], signals[1, 0], signals[2, 0] = q, dq, ddq
         if known is not None and known.moves:
@@ -115,15 +136,15 @@ class ModelFeedforward:
         tau = self._rigid()
         if known is not None:
             link, speed, pull = signals[0, 0], signals[1, 0], signals[2, 0]
-            total = tau + known.torque(JointSignals(link, speed, pull, tau))
+            total = tau + known.torque(JointSignals(link, speed, pull, tau, bent=bent))
             if known.pushed:
                 push = np.empty((1, len(tau), 1))
                 wrench_torques(self._frames, signals[0], known.wrench[:, None], push)
                 total = total - push[0, :, 0]
             tau = total + known.gain * total
-        at = JointSignals(q, dq, ddq)
-        for effect, value in zip(self._effects, self._values, strict=True):
-            tau = tau + value * effect.column(at)
+        at = JointSignals(q, dq, ddq, bent=bent)
+        for effect, value, shape in zip(self._effects, self._values, self._shapes, strict=True):
+            tau = tau + value * effect.torque_per_unit(at, shape)
         return tau
 
     def _rigid(self) -> Array:

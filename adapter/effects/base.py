@@ -383,7 +383,58 @@ class JointTorque(TorqueEffect):
         return {p.key: np.full(n, np.clip(0.0, p.lower, p.upper)) for p in self.parameters}
 
 
-class LinearEffect(JointTorque):
+class LearnedEffect(Effect):
+    """One that the learner can carry beside θ: one parameter per joint in which it is linear.
+
+    Attributes:
+        learned: number of that parameter in `parameters`.
+        shape_key, shapes: a parameter in which it is not linear, and the rising values that have
+            a column each in the learner, which chooses one between them; none where there is none.
+        step: a usual size of the parameter, for ADAM.
+        by_rates: whether it depends on rates of the model's torque.
+    """
+
+    learned: ClassVar[int] = 0
+    shape_key: ClassVar[str] = ""
+    shapes: ClassVar[tuple[float, ...]] = ()
+    step: ClassVar[float] = 1.0
+    by_rates: ClassVar[bool] = False
+
+    @property
+    def key(self) -> str:
+        """Name of the parameter."""
+        return self.parameters[self.learned].key
+
+    @property
+    def unit(self) -> str:
+        """Unit of the parameter."""
+        return self.parameters[self.learned].unit
+
+    @property
+    def learned_std(self) -> float:
+        """How large the parameter may well be."""
+        return float(np.atleast_1d(self.prior_std)[self.learned])
+
+    @abstractmethod
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """Torque per unit of the parameter, of the signals' shape: for each of `shapes`, or one."""
+
+    def shares(self, shape: Array) -> Array:
+        """(K, ...) how far each of `basis` acts where the other parameter is `shape`."""
+        return np.ones((1, *np.shape(shape)))
+
+    def torque_per_unit(self, at: JointSignals, shape: Array) -> Array:
+        """Torque per unit of the parameter where the other one is `shape` (NaN without one)."""
+        parts = zip(self.shares(shape), self.basis(at), strict=True)
+        return np.asarray(sum(share * column for share, column in parts))
+
+    def numbers(self, value: float, shape: float) -> dict[str, float]:
+        """All parameters, of what was learned."""
+        known = {self.key: value, self.shape_key: shape}
+        return {p.key: known.get(p.key, 0.0) for p in self.parameters}
+
+
+class LinearEffect(LearnedEffect, JointTorque):
     """A torque effect with one parameter per joint in which it is linear: its law is its column.
 
     The learner has those that do not depend on the rigid torque, see `catalogue.LEARNED`.
@@ -391,19 +442,13 @@ class LinearEffect(JointTorque):
 
     prior_std: ClassVar[float]
 
-    @property
-    def key(self) -> str:
-        """Name of the parameter."""
-        return self.parameters[0].key
-
-    @property
-    def unit(self) -> str:
-        """Unit of the parameter."""
-        return self.parameters[0].unit
-
     @abstractmethod
     def column(self, at: JointSignals) -> Array:
         """Torque per unit of the parameter, of the signals' shape."""
+
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """The one column."""
+        return (self.column(at),)
 
     def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """The one column."""

@@ -16,6 +16,7 @@ from adapter.effects.base import (
     Array,
     JointSignals,
     JointTorque,
+    LearnedEffect,
     Motion,
     Parameter,
     Template,
@@ -23,12 +24,10 @@ from adapter.effects.base import (
     late_jit,
     on_joint,
 )
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import WAYS_RAD, shares_of_ways, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL, TURNS
 from adapter.model.urdf_text import FRICTION, Additions
-
-WAYS_RAD = (3e-4, 1e-3, 3e-3, 1e-2)  # tried for s0
 
 
 @late_jit
@@ -62,7 +61,7 @@ def bending(q: Array, s0: float) -> tuple[Array, Array]:
     return z[:, 0], np.exp(-np.cumsum(np.abs(steps)) / s0)
 
 
-class BristleFriction(JointTorque):
+class BristleFriction(LearnedEffect, JointTorque):
     """Coulomb friction that winds up over a small way before the joint slides."""
 
     name = "bristle_friction"
@@ -71,6 +70,8 @@ class BristleFriction(JointTorque):
         Parameter("Fc", "N m"),
         Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1),
     )
+    prior_std = 1.0  # of Fc, as of Coulomb friction
+    shape_key, shapes = "s0", WAYS_RAD
     positive = ("Fc",)
     inexact = 0.02
     form = LEVEL
@@ -88,20 +89,26 @@ class BristleFriction(JointTorque):
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""
-        return np.asarray(values["Fc"] * at.z)
+        return np.asarray(values["Fc"] * self.torque_per_unit(at, values["s0"]))
+
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """z of each of the ways."""
+        return tuple(at.bent)
+
+    def shares(self, shape: Array) -> Array:
+        """Those of the ways around s0."""
+        return shares_of_ways(shape)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """Fc z, all of the motion behind it and z zero before its first instant."""
+        """Fc z, all of the motion behind it and z zero before it; of one instant as if it slid."""
         z, _ = bending(motion.q[:, joint], float(values["s0"]))
+        if len(z) == 1:
+            z = smooth_sign(motion.dq[:, joint])
         return on_joint(motion, joint, float(values["Fc"]) * z)
 
     def bristles(self, values: Values) -> tuple[float, float]:
         """Fc and s0."""
         return float(values["Fc"]), float(values["s0"])
-
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
-        """Nothing: one instant does not tell how far the bristles are bent."""
-        return False
 
     def export(self, more: Additions, joint: int, values: Values) -> str | None:
         """The level, as dry friction."""

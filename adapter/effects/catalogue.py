@@ -8,7 +8,7 @@ from typing import TypeGuard
 
 from adapter.effects.asymmetric_friction import AsymmetricFriction
 from adapter.effects.backlash import Backlash
-from adapter.effects.base import Effect, LinearEffect
+from adapter.effects.base import Effect, LearnedEffect
 from adapter.effects.base_tilt import BaseTilt
 from adapter.effects.bristle_friction import BristleFriction
 from adapter.effects.coulomb_friction import CoulombFriction
@@ -60,18 +60,21 @@ CATALOGUE: dict[str, Effect] = {
 }
 
 
-def learnable(effect: Effect) -> TypeGuard[LinearEffect]:
-    """Whether the learner can carry it beside θ from nothing: linear, from the motion alone."""
-    return isinstance(effect, LinearEffect) and not effect.by_load
+def learnable(effect: Effect) -> TypeGuard[LearnedEffect]:
+    """Whether the learner can carry it beside θ from nothing: linear, and not by the load."""
+    return isinstance(effect, LearnedEffect) and not getattr(effect, "by_load", False)
 
 
-LEARNED: dict[str, LinearEffect] = {
+LEARNED: dict[str, LearnedEffect] = {
     name: effect for name, effect in CATALOGUE.items() if learnable(effect)
 }
 
 # What a real arm's joints have, as far as anybody knows before it has moved. Those that the data
 # do not show fade.
-REAL_ARM_EFFECTS = ("viscous_friction", "coulomb_friction", "torque_offset", "motor_inertia")
+REAL_ARM_EFFECTS = (
+    *("viscous_friction", "bristle_friction", "torque_offset", "motor_inertia"),
+    "torque_filter",
+)
 
 # Effects that parts of the program need as such.
 LATENESS = CATALOGUE["signal_delay"]  # what samples look like whose torques come late
@@ -97,7 +100,7 @@ def registered(effect: Effect) -> Iterator[Effect]:
         LEARNED.pop(effect.name, None)
 
 
-def effects_by_name(names: Iterable[str]) -> tuple[LinearEffect, ...]:
+def effects_by_name(names: Iterable[str]) -> tuple[LearnedEffect, ...]:
     """The learner's effects of these names, in order. Raises SettingsError with the choices."""
     chosen = list(names)
     for name in chosen:

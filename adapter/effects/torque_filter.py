@@ -8,7 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from adapter.effects.base import LATE, Array, Motion, Parameter, SensorEffect, Values
+from adapter.effects.base import (
+    LATE,
+    Array,
+    JointSignals,
+    LearnedEffect,
+    Motion,
+    Parameter,
+    SensorEffect,
+    Values,
+)
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
 
@@ -16,13 +25,15 @@ MOST_AHEAD_S, MOST_S = 3e-3, 0.06  # velocities that come late make torque look 
 POWER_SHARE = 0.99  # of a torque: what is faster may be noise of the acceleration
 
 
-class TorqueFilter(SensorEffect):
+class TorqueFilter(LearnedEffect, SensorEffect):
     """A torque sensor that passes only what is slow."""
 
     name = "torque_filter"
     title = "torque sensor low-pass"
     parameters = (Parameter("d", "s", lower=-0.1, upper=0.1), Parameter("c", "s2"))
     prior_std = (3e-3, 1e-4)
+    by_rates = True
+    learned, step = 1, 1e-4  # c; how late a torque is, is for `gap` to say
     positive = ("c",)
     log_odds = -1.0
     inexact = 0.02
@@ -54,3 +65,7 @@ class TorqueFilter(SensorEffect):
         bend = motion.rate(motion.rate(motion.inside_band(own, POWER_SHARE)))
         out[:, joint] += values["c"] * bend - values["d"] * motion.rate(own)
         return np.asarray(out)
+
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """The second rate of the model's torque."""
+        return (at.rates[1],)

@@ -40,12 +40,12 @@ class Blocks:
 
     def __init__(self, n: int) -> None:
         at = StateLayout(n)
-        self._n, self._signals = n, slice(at.q.start, at.tau.stop)
-        self._sum = np.zeros(4 * n)
+        self._signals = slice(at.q.start, at.memory.stop)
+        self._sum = np.zeros(at.memory.stop - at.q.start)
         self._count, self._begin_ns, self._last_ns, self._stamps = 0, 0, 0, 0
 
     def add(self, table: Array) -> list[tuple[float, Array]]:
-        """Take states (m, size); rows (s, (4 n,)) of the blocks that they complete."""
+        """Take states (m, size); rows (s, states from q to `memory`)."""
         return [row for state in table if (row := self._add_one(state)) is not None]
 
     def _add_one(self, state: Array) -> tuple[float, Array] | None:
@@ -84,7 +84,7 @@ class Monitor:
         delay_s: float = 0.0,
         say: Callable[[str], None] | None = None,
     ) -> None:
-        self._n, self._delay_s = n, delay_s
+        self._n, self._delay_s, self._layout = n, delay_s, StateLayout(n)
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
         self._blocks, self._found = Blocks(n), DisagreementList(say)
         self._frames: LearnedFrames | None = None
@@ -155,15 +155,17 @@ class Monitor:
     def _group(
         self, learner: OnlineLearner, frames: LearnedFrames, t: Array, table: Array
     ) -> RowGroup:
-        q, dq, ddq, tau = (np.ascontiguousarray(x) for x in np.split(table, 4, axis=1))
+        states = np.zeros((len(table), self._layout.before_links.stop))
+        states[:, self._layout.q.start :] = table
+        at = self._layout.signals(states, learner.theta.smoothing_s)
+        q, dq, ddq, tau = (np.ascontiguousarray(x) for x in at[:4])
         Y = frames.regressor(q, dq, ddq)
         tool = Y[:, :, -10:] @ self._tool
         Z = np.zeros((len(t), self._n, self._size))
         links, joints = Y.shape[2], np.arange(self._n)
         Z[:, :, :links] = Y
-        columns = learner.theta.effect_columns(q, dq, ddq)
-        for k in range(columns.shape[1]):
-            Z[:, joints, links + k * self._n + joints] = columns[:, k]
+        for k, column in enumerate(learner.theta.torque_per_unit(at)):
+            Z[:, joints, links + k * self._n + joints] = column
         model = Z @ self._belief.mean()[: self._size] + tool
         return RowGroup(t, Z, frames.signatures(q, dq, ddq, model, Y), tau - tool)
 

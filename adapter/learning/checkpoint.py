@@ -20,7 +20,7 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 
-VERSION = 6
+VERSION = 7
 MORE = "schema.more."  # before the names of what some kinds of schema hold
 
 # What each part would not be the same learner without. Everything else follows from the settings.
@@ -28,7 +28,7 @@ _STATE = {
     "": (
         *("learned", "refused", "stamp_ns", "theta_started_ns", "theta_converged", "rebuilds"),
         *("_held_from", "_held_to", "_R0", "_p", "_alarm_ns", "_shadow_at", "_since_update"),
-        "_judged",
+        *("_judged", "_rates_known"),
     ),
     "schema": (
         *("R0", "p", "start_lam", "kind", "updates", "information", "identifiable", "certain"),
@@ -49,14 +49,15 @@ _STATE = {
     "schema.moments": MotionMoments._fields,
     "theta": (
         *("x", "mean", "th", "count", "prior", "prior_rhs", "_ranges", "floor", "floor_count"),
-        *("spare_in_use", "updates", "effect_spread", "body_spread", "model_variance"),
+        *("spare_in_use", "updates", "effect_spread", "body_spread", "model_variance", "shapes"),
     ),
-    "theta.rows": ("place", "base_place"),
+    "theta.rows": ("place", "share", "base_place"),
     "theta.moments": Moments._fields,
     "theta.newest": ("A", "C"),
     "_shadow": ("A", "C"),
     "adam": ("first", "second", "rate"),
     "known": ("clock", "memory"),
+    "rates": ("rows", "tau", "stamps", "marks", "bends"),
     "change": ("recent", "level", "samples", "_peaks", "_block", "_block_samples", "_armed_at"),
     "schema_trace": ("_rows", "_used", "_offers", "stride"),
     "theta_trace": ("_rows", "_used", "_offers", "stride"),

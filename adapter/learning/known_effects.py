@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import LEARNED, effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.model.self_model import SelfModel
@@ -106,12 +105,22 @@ def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Arr
         effect = LEARNED[active.effect.name]
         at = names.index(effect.name), active.joint
         std = active.std.get(effect.key)
-        widest = effect.prior_std
+        widest = effect.learned_std
         spread = widest if std is None or not np.isfinite(std) else max(std, SMALLEST_STD * widest)
         total[at] += float(active.values[effect.key])
         variance[at] = np.nan_to_num(variance[at]) + spread**2
     told = np.isfinite(variance)
     return (np.where(told, total, np.nan), np.sqrt(variance)) if told.any() else None
+
+
+def told_shapes(known: Sequence[Active], names: Sequence[str], n: int) -> Array:
+    """(e, n) shapes that a model gives of learned effects, NaN where it gives none."""
+    shapes = np.full((len(names), n), np.nan)
+    for active in known:
+        key = getattr(active.effect, "shape_key", "")
+        if key and active.effect.name in names:
+            shapes[names.index(active.effect.name), active.joint] = float(active.values[key])
+    return shapes
 
 
 class KnownEffects:
@@ -153,10 +162,10 @@ class KnownEffects:
         if self._sensed:
             stamps = stamps_of(table)
             to_joints(stamps, table, self._sensors, self._gears, self.clock, self.memory)
-        q, dq, ddq, tau = table[:, at.q], table[:, at.dq], table[:, at.ddq], table[:, at.tau]
+        q, tau = table[:, at.q], table[:, at.tau]
         if own.pushed:
             tau += self._arm.wrench_torque(q, own.wrench)
-        signals = JointSignals(q, dq, ddq, tau, self._smoothing_s)
+        signals = at.signals(table, self._smoothing_s)
         if self._by_load:
             signals = signals._replace(tau=tau - own.torque(signals))
         if own.laws:

@@ -18,11 +18,12 @@ from adapter.errors import ModelError, SettingsError
 from adapter.learning.adam import FlatAdam
 from adapter.learning.change import ChangeDetector
 from adapter.learning.imu_schema import ImuSchema
-from adapter.learning.known_effects import KnownEffects, believed
+from adapter.learning.known_effects import KnownEffects, believed, told_shapes
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
 from adapter.learning.theta import Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import Moments
+from adapter.learning.torque_rates import TorqueRates
 from adapter.learning.trace import Trace
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
@@ -32,6 +33,7 @@ from adapter.signals.records import StateLayout, stamp_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
+RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
@@ -139,9 +141,14 @@ class OnlineLearner:
             known.hand,
             known.tool_theta,
             told,
+            told_shapes(known.effects, s.effects, tree.n),
             s.base_wrench,
         )
         self.theta = Theta(tree, before, effects_by_name(s.effects), s.theta, each_sample)
+        by_rates = any(effect.by_rates for effect in self.theta.effects)
+        rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
+        self.rates = rates if by_rates else None
+        self._rates_known = False
         self.given = tuple(known.effects)
         self.known = _taken_off(known, s.effects, self.theta.smoothing_s, tree.floating)
         self.change = ChangeDetector(tree.n, s.change)
@@ -167,7 +174,9 @@ class OnlineLearner:
         self.schema_trace = Trace(2 + 13 * tree.n)
         self.theta_trace = Trace(1 + self.theta.P, capacity=3000)
         moving = 12 if tree.floating else 0  # numbers of the base's motion
-        self.score_trace = Trace(1 + 5 * tree.n + moving, capacity=12_000)
+        memory = self.layout.memory.stop - self.layout.memory.start
+        self.score_trace = Trace(1 + 5 * tree.n + moving + memory, capacity=12_000)
+        self._torque_states = np.zeros((0, self.layout.before_links.stop))
 
     def _schema(self, rest: RestingBase | None, lam: Array | None) -> Schema:
         s = self.settings
@@ -216,13 +225,14 @@ class OnlineLearner:
         if updating:
             self._since_update = 0
             self._schema_gradient()
-        theta_too = self._theta_is_due(table) and self._take_torque(table)
+        due = self._theta_is_due(table)
+        theta_too = due and self._take_torque(table)
         if updating:
             self._update(theta_too)
         self.learned += len(table)
         self._trace_schema(table)
         if self.watch is not None:
-            self.watch(self, table)
+            self.watch(self, self._torque_states if due else table)
         return len(table)
 
     def _sound(self, table: Array) -> Array:
@@ -343,6 +353,9 @@ class OnlineLearner:
 
     def _take_torque(self, table: Array) -> bool:
         """Add states to θ's moments; whether θ may be stepped on."""
+        table = self._torque_states = self._with_rates(table)
+        if not len(table):
+            return not self.change.waiting
         if self.change.waiting:
             self._look_on(table, self.theta.errors(self.frames, table))
             return False
@@ -357,6 +370,18 @@ class OnlineLearner:
         self._judge_theta()
         return True
 
+    def _with_rates(self, table: Array) -> Array:
+        """The states whose rates of torque are known, where an effect asks for those.
+
+        Until θ has seen enough they count as zero, and nothing has to wait for them.
+        """
+        if self.rates is None:
+            return table
+        self._rates_known = self._rates_known or self.theta.count >= RATES_FROM
+        if not self._rates_known:
+            return table
+        return self.rates.follow(table, self.frames, self.theta.theta, self.base)
+
     def _judge_theta(self) -> None:
         """θ has converged when it predicts the last seconds as well as it fits all samples."""
         now = self.theta.updates // JUDGE_THETA_EVERY
@@ -364,7 +389,7 @@ class OnlineLearner:
             return
         self._judged = now
         if now % (ADAPT_EVERY // JUDGE_THETA_EVERY) == 0 and self.theta.count >= ADAPT_EVERY:
-            self.theta.adapt_prior()
+            self.theta.adapt_prior(None if self.rates is None else self.rates.noise)
         excess = float(np.mean(self.change.level / self.theta.variance()))
         limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
         self.theta_converged = self.change.samples >= self.change.settings.slow and excess < limit
@@ -374,7 +399,7 @@ class OnlineLearner:
         for k in self.score_trace.due(len(table)):
             state, at = table[k], self.layout
             parts = state[at.q.start : at.ddq.stop], state[at.joint_tau], error[k, -self.tree.n :]
-            self.score_trace.keep(stamp_of(state), *parts, state[at.base])
+            self.score_trace.keep(stamp_of(state), *parts, state[at.base], state[at.memory])
         if self.theta_trace.due(len(table)):
             self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
         alarmed_before = self.change.waiting

@@ -229,7 +229,7 @@ def absorb(parent, base, table, moments, kind, keep):
         if table[m, KIND] != kind:
             continue
         if base.shape[0] == 0:
-            motion[0] = table[m, at.base : at.motion_q]
+            motion[0] = table[m, at.base : at.bent]
         motion[1:] = table[m, at.motion : at.size].reshape((n, 12))
         if counts[Count.VELOCITIES] == 0.0 and motion[:, :3].any():
             counts[Count.VELOCITIES] = 1.0
@@ -286,7 +286,7 @@ def carry_spin(frames, base, table):
             elif base.shape[0]:
                 up = base
             else:
-                up = table[m, at.base : at.motion_q]
+                up = table[m, at.base : at.bent]
             q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
             cs = math.cos(q), math.sin(q)
             rates = dq, table[m, at.ddq + j]

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.base import LinearEffect
+from adapter.effects.base import LearnedEffect
 from adapter.effects.by_joint import JointSignals
 from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
@@ -48,11 +48,17 @@ NEUTRAL_INERTIA = 0.02  # kg m², about every axis
 PRIOR_STD = np.array([5.0, *[0.5] * 3, *[0.3] * 6])  # kg, kg m, kg m²
 WIDEST_BODY = 100.0  # times these, where data say that a body is so heavy
 
-REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.025, 0.001  # N m
+REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
 SPREAD_STEPS = 50  # at each look at how large the effects are
+# Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
+# what another must be better, in squares of standard deviations.
+FIRST_SHAPE, SHAPES_TRIED, SHAPE_EVIDENCE = 1, 25, 2.0
+# Effects of the torque's rates must explain so many times the variance that noise of the motion
+# puts on the model's torque, which is the most that they could explain of that alone.
+RATES_OVER_NOISE, TINY = 4.0, 1e-30
 
 # A step of friction that has gone through the filter looks like tanh over this share of its delay
 # (fitted on simulated reversals; 1 for a tanh as wide as the delay).
@@ -84,6 +90,7 @@ class ThetaKnowledge:
         tool_theta: (10,) of a known tool, kept out of θ.
         believed: (e, n) values of the effects' parameters and their standard deviations, from a
             model; NaN where it says nothing, which is held for absent until data show it.
+        shapes: (e, n) of the effects as the model has them, NaN where it says nothing.
         wrench: whether the wrench on a floating base is known.
     """
 
@@ -93,6 +100,7 @@ class ThetaKnowledge:
     hand: int | None = None
     tool_theta: Array | None = None
     believed: tuple[Array, Array] | None = None
+    shapes: Array | None = None
     wrench: bool = True
 
 
@@ -115,6 +123,8 @@ class Theta:
             all that was known then.
         hand, spare: (slices of P) the hand's body, and the one that stands in for it after a
             change, when `spare_in_use`.
+        shapes: (e, n) of the effects that have several columns, chosen between their shapes by what
+            the data say; NaN for the others.
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
@@ -124,7 +134,7 @@ class Theta:
         self,
         tree: Tree,
         known: ThetaKnowledge,
-        effects: Sequence[LinearEffect] = (),
+        effects: Sequence[LearnedEffect] = (),
         settings: ThetaSettings | None = None,
         each_sample: bool = False,
     ) -> None:
@@ -140,20 +150,23 @@ class Theta:
         self.hand = self._body(int(tree.floating) + hand)
         self.spare = self._body(self.bodies - 1)
         self._parent = np.array(tree.parent, dtype=np.int64)
-        self.rows = rows_of(tree, e)
+        self.columns = sum(len(effect.shapes) or 1 for effect in self.effects)
+        self.rows = rows_of(tree, self.effects)
+        self.shapes = np.full((e, n), np.nan)
+        self._choose_shapes(known.shapes)
         self._rows = tuple(self.rows)  # numba takes 3 µs longer for a named tuple
         self._places = self.rows.place.copy(), self.rows.base_place.copy()
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
         self.moments, self.newest = self.empty_moments(), self.empty_moments()
         self.count = 0.0
         self.body_spread = np.ones(self.bodies)
-        self.effect_spread = np.array([effect.prior_std for effect in self.effects])
+        self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
         self._believed, self._belief_std = known.believed or (nothing, nothing)
         self._set_prior(*self._neutral_prior())
         self.x, self.gradient = self._neutral(), np.zeros(self.P)
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
-        values(self.mean, self.bodies, self.th)
+        values(self.mean, self.rows.steps, self.th)
         if known.base is None and not tree.floating:
             raise SettingsError("a tree whose base does not float needs its base's motion")
         base = np.empty(0) if known.base is None or tree.floating else known.base
@@ -179,7 +192,7 @@ class Theta:
     def _neutral(self) -> Array:
         x = np.zeros(self.P)
         x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
-        x[self._effects_from :] = np.nan_to_num(self._believed).ravel()
+        x[self._effects_from :] = np.nan_to_num(self._believed).ravel() / self.rows.steps
         return x
 
     def _neutral_prior(self) -> tuple[Array, Array]:
@@ -195,13 +208,19 @@ class Theta:
         information = 1.0 / std**2
         return np.diag(information), information * mean
 
-    def effect_columns(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """(m, e, n) columns of the effects for tables (m, n)."""
-        out = np.empty((len(q), len(self.effects), self.tree.n))
-        at = JointSignals(q, dq, ddq, smoothing_s=self.smoothing_s)
-        for k, effect in enumerate(self.effects):
-            out[:, k] = effect.column(at)
+    def effect_columns(self, table: Array) -> Array:
+        """(m, c, n) columns of the effects for states (m, size), or their `before_links`."""
+        at = self.layout.signals(table, self.smoothing_s)
+        columns = [column for effect in self.effects for column in effect.basis(at)]
+        out = np.empty((len(table), len(columns), self.tree.n))
+        for k, column in enumerate(columns):
+            out[:, k] = column
         return out
+
+    def torque_per_unit(self, at: JointSignals) -> list[Array]:
+        """Torques (m, n) per unit of each effect's parameter, by signals (m, n)."""
+        pairs = zip(self.effects, self.shapes, strict=True)
+        return [effect.torque_per_unit(at, shape) for effect, shape in pairs]
 
     def empty_moments(self) -> Moments:
         """Moments of no samples, to be filled by `absorb` and put in place by `replace_moments`."""
@@ -239,8 +258,7 @@ class Theta:
         return self._absorb(frames, table, Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL))
 
     def _absorb(self, frames: tuple[Array, Array], table: Array, into: Moments) -> Array:
-        at, forget = self.layout, self.settings.forget_s
-        columns = self.effect_columns(table[:, at.q], table[:, at.dq], table[:, at.ddq])
+        forget, columns = self.settings.forget_s, self.effect_columns(table)
         rate = 0.0 if forget is None else 1e-3 / forget
         placed = self._parent, *frames
         return absorb(placed, self._rows, self._given, table, columns, (tuple(into), rate))
@@ -311,7 +329,7 @@ class Theta:
         if min_eigenvalue(link + load) <= 0.0:
             return
         self.x[spare] = self.mean[spare] = log_cholesky_from_theta(link + load)
-        values(self.mean, self.bodies, self.th)
+        values(self.mean, self.rows.steps, self.th)
         self.updates = 0
 
     def after_step(self, settled: bool, samples: float = 1.0) -> None:
@@ -319,7 +337,7 @@ class Theta:
         self.updates += 1
         s = self.settings
         span = max((s.settled_average if settled else s.average) / samples, 1.0)
-        follow(self.x, float(min(self.updates, span)), self.bodies, self.mean, self.th)
+        follow(self.x, float(min(self.updates, span)), self.rows.steps, self.mean, self.th)
 
     def variance(self, th: Array | None = None) -> Array:
         """(n,) variance that weighs each joint: its residual's plus the model error's, (N m)².
@@ -344,9 +362,8 @@ class Theta:
         That of a floating base is what its wrench tells when the links are what they are now.
         """
         H, rhs = self.prior.copy(), self.prior_rhs.copy()
-        for j, weight in enumerate(1.0 / (self.noise_gain * self.variance())):
-            at = self.rows.place[j, : self.rows.sizes[j]]
-            moments = self.joint_moments(j)
+        for j, weight in enumerate(self._weights()):
+            at, moments = self._parameter_moments(j)
             H[np.ix_(at, at)] += weight * moments[:-1, :-1]
             rhs[at] += weight * moments[:-1, -1]
         if self.tree.floating:
@@ -355,12 +372,31 @@ class Theta:
             rhs[:10] += wrench[:, -1] - wrench[:, 10:-1] @ self.th[self.rows.base_place[10:]]
         return H, rhs
 
+    def _weights(self) -> Array:
+        """(n,) information of a sample of each joint's torque, 1/(N m)²."""
+        return np.asarray(1.0 / (self.noise_gain * self.variance()))
+
+    def _parameter_moments(self, j: int) -> tuple[NDArray[np.intp], Array]:
+        """Joint j's parameters (p,), and moments (p + 1, p + 1) of them and its torque."""
+        size = self.rows.sizes[j]
+        at, which = np.unique(self.rows.place[j, :size], return_inverse=True)
+        to = np.zeros((size + 1, len(at) + 1))
+        to[np.arange(size), which], to[-1, -1] = self.rows.share[j, :size], 1.0
+        return at, to.T @ self.joint_moments(j) @ to
+
     def _base_information(self) -> Array:
         """(10, 10 (n + 1) + 1) information of the base's wrench: base by [base, links, wrench]."""
         return np.einsum("h,hab->ab", self.base_weights(), self.moments.C[:, :10])
 
-    def adapt_prior(self) -> None:
-        """Let the data say how wide the prior is, of bodies and of effects."""
+    def adapt_prior(self, motion_noise: Array | None = None) -> None:
+        """Let the data say how wide the prior is, of bodies and of effects, and of what shape.
+
+        `motion_noise` (n,) is the variance, (N m)², that noise of the measured motion puts on
+        the model's torque, where that is known.
+        """
+        self._look_at_shapes()
+        if motion_noise is not None:
+            self._look_at_rates(motion_noise)
         diagonal = self.covariance().diagonal()
         self._adapt_bodies(diagonal)
         self._adapt_effects(diagonal)
@@ -398,11 +434,13 @@ class Theta:
             return
         n = self.tree.n
         variance = diagonal[self._effects_from :].reshape(-1, n)
-        widest = np.array([effect.prior_std for effect in self.effects])
+        widest = np.array([effect.learned_std for effect in self.effects])
         values, free = self.effect_values, np.isnan(self._believed)
         found = [
-            likely_spread(x[f], v[f], before) if f.any() else 0.0
-            for x, v, f, before in zip(values, variance, free, self.effect_spread, strict=True)
+            likely_spread(x[f & on], v[f & on], before) if (f & on).any() else before * f.any()
+            for x, v, f, on, before in zip(
+                values, variance, free, self._acting(), self.effect_spread, strict=True
+            )
         ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
         at = np.arange(self._effects_from, self.P)
@@ -413,6 +451,97 @@ class Theta:
             size = np.sqrt(np.mean(values**2 + variance, axis=1))
             real = bool((np.where(free.all(axis=1), spread, size) > REAL_EFFECT).any())
             self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
+
+    def _choose_shapes(self, shapes: Array | None) -> None:
+        """Let effects act with shapes (e, n) from now on; with their first where there are none."""
+        for k, effect in enumerate(self.effects):
+            if effect.shapes:
+                told = np.full(self.tree.n, np.nan) if shapes is None else shapes[k]
+                self.shapes[k] = np.where(np.isfinite(told), told, effect.shapes[FIRST_SHAPE])
+        first = 0
+        for effect, shape in zip(self.effects, self.shapes, strict=True):
+            shares = effect.shares(shape)
+            for j, size in enumerate(self.rows.sizes if effect.shapes else ()):
+                begin = size - self.columns + first
+                self.rows.share[j, begin : begin + len(shares)] = shares[:, j]
+            first += len(shares)
+
+    def _look_at_shapes(self) -> None:
+        """Choose shapes anew where others explain all samples better, whatever the rest is then.
+
+        With all other parameters integrated out a joint's columns k of an effect have information
+        S and right side y; a parameter that acts through them with shares s then explains
+        (s·y)² / s·S s, which is compared over a grid of shapes.
+        """
+        if not any(effect.shapes for effect in self.effects):
+            return
+        H, rhs = self.information()
+        chosen, first = self.shapes.copy(), 0
+        for k, effect in enumerate(self.effects):
+            columns = len(effect.shapes) or 1
+            if effect.shapes:
+                grid = np.geomspace(effect.shapes[0], effect.shapes[-1], SHAPES_TRIED)
+                for j in range(self.tree.n):
+                    S, y = self._reduced(j, k, slice(first, first + columns), H, rhs)
+                    tried = np.r_[self.shapes[k, j], grid]
+                    s = effect.shares(tried).T
+                    gain = np.maximum(s @ y, 0.0) ** 2 / np.einsum("ga,ab,gb->g", s, S, s)
+                    if gain.max() > gain[0] + SHAPE_EVIDENCE:
+                        chosen[k, j] = tried[gain.argmax()]
+            first += columns
+        self._choose_shapes(chosen)
+
+    def _acting(self) -> NDArray[np.bool_]:
+        """(e, n) whether an effect acts at all; of one that does not no data speak."""
+        shares = [
+            self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
+        ]
+        first = np.cumsum([0, *(len(effect.shapes) or 1 for effect in self.effects)])[:-1]
+        return np.asarray(np.add.reduceat(np.array(shares), first, axis=1).T > 0.0)
+
+    def _look_at_rates(self, motion_noise: Array) -> None:
+        """Let effects of the torque's rates act where they explain more than noise of motion can.
+
+        Noise of ddq is in the model's torque and, with the other sign, in its second rate: without
+        anything there the one takes off what the other puts on, and is learned for that.
+        """
+        H, rhs = self.information()
+        first, weights = 0, self._weights()
+        for k, effect in enumerate(self.effects):
+            for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
+                S, y = self._reduced(j, k, slice(first, first + 1), H, rhs)
+                explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / (weights[j] * self.count)
+                there = explained > RATES_OVER_NOISE * motion_noise[j] + REAL_MODEL_ERROR**2
+                self.rows.share[j, size - self.columns + first] = float(there)
+                if not there:
+                    own = self._effects_from + k * self.tree.n + j
+                    self.x[own] = self.mean[own] = 0.0
+            first += len(effect.shapes) or 1
+        values(self.mean, self.rows.steps, self.th)
+
+    def _reduced(self, j: int, k: int, columns: slice, H: Array, rhs: Array) -> tuple[Array, Array]:
+        """(K, K) and (K,) information of joint j's columns of effect k, all else integrated out.
+
+        Args:
+            columns: among those of the effects; H, rhs: all that is known.
+        """
+        P, size, count = self.P, self.rows.sizes[j], columns.stop - columns.start
+        weight, (at, folded) = self._weights()[j], self._parameter_moments(j)
+        G, b = np.zeros((P + count, P + count)), np.zeros(P + count)
+        G[:P, :P], b[:P] = H, rhs
+        G[np.ix_(at, at)] -= weight * folded[:-1, :-1]
+        b[at] -= weight * folded[:-1, -1]
+        begin = size - self.columns + columns.start
+        place, share = self.rows.place[j, :size].copy(), self.rows.share[j, :size].copy()
+        place[begin : begin + count], share[begin : begin + count] = P + np.arange(count), 1.0
+        moments = weight * self.joint_moments(j)
+        np.add.at(G, (place[:, None], place), np.outer(share, share) * moments[:-1, :-1])
+        np.add.at(b, place, share * moments[:-1, -1])
+        own = self._effects_from + k * self.tree.n + j
+        others, ours = np.setdiff1d(self.known(), own), slice(P, None)
+        gain = np.linalg.solve(G[np.ix_(others, others)], np.c_[G[others, ours], b[others]])
+        left = np.c_[G[ours, ours], b[ours]] - G[ours][:, others] @ gain
+        return left[:, :-1], left[:, -1]
 
     def known(self) -> NDArray[np.intp]:
         """Indices of the parameters that have any information (the idle spare body has none)."""
@@ -492,7 +621,7 @@ class Theta:
         self._set_prior(H, rhs)
         self.moments.A[:], self.moments.C[:], self.count = 0.0, 0.0, 0.0
         self.x[spare] = self.mean[spare] = self.mean[hand]
-        values(self.mean, self.bodies, self.th)
+        values(self.mean, self.rows.steps, self.th)
         # columns of the hand are the spare body's from here on
         for place, before in zip(
             (self.rows.place, self.rows.base_place), self._places, strict=True
@@ -526,19 +655,20 @@ def likely_spread(x: Array, variance: Array, spread: float) -> float:
     return math.sqrt(square)
 
 
-def rows_of(tree: Tree, effects: int) -> Rows:
-    """Which parameters each torque row of a tree touches, so many effects a joint beside θ."""
+def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
+    """Which parameters each torque row of a tree touches, those of effects beside θ."""
     n, first = tree.n, int(tree.floating)
     bodies = tree.bodies + 1
     beyond = [[k for k in range(n) if j in tree.path_to(k)] for j in range(n)]
-    sizes = np.array([10 * len(links) + effects for links in beyond], dtype=np.int64)
+    owner = [k for k, effect in enumerate(effects) for _ in range(len(effect.shapes) or 1)]
+    sizes = np.array([10 * len(links) + len(owner) for links in beyond], dtype=np.int64)
     place = np.zeros((n, int(sizes.max())), dtype=np.int64)
     slot = np.full((n, n), -1, dtype=np.int64)
     for j, links in enumerate(beyond):
         for number, k in enumerate(links):
             slot[j, k] = 10 * number
             place[j, 10 * number : 10 * (number + 1)] = 10 * (k + first) + np.arange(10)
-        place[j, 10 * len(links) : sizes[j]] = 10 * bodies + n * np.arange(effects) + j
+        place[j, 10 * len(links) : sizes[j]] = 10 * bodies + n * np.array(owner, dtype=int) + j
     triangles = (sizes + 1) * (sizes + 2) // 2
     starts = np.concatenate([[0], np.cumsum(triangles)[:-1]]).astype(np.int64)
     near: list[int] = []
@@ -546,8 +676,19 @@ def rows_of(tree: Tree, effects: int) -> Rows:
         hanging = [k + 1 for k, i in enumerate(tree.parent) if i == BASE]
         near = [10 * body + i for body in (0, *hanging) for i in range(10)]
     every = np.arange(10 * (n + 1) if tree.floating else 0)
+    share = np.ones(place.shape)
+    for j, size in enumerate(sizes):  # nothing is known of rates at first
+        share[j, size - len(owner) : size] = [not effects[k].by_rates for k in owner]
+    steps = np.repeat([effect.step for effect in effects], n)
     return Rows(
-        slot, sizes, starts, place, every, np.array(near, dtype=np.int64), np.array([bodies])
+        slot,
+        sizes,
+        starts,
+        place,
+        share,
+        every,
+        np.array(near, dtype=np.int64),
+        steps.astype(np.float64),
     )
 
 

@@ -56,19 +56,22 @@ class Rows(NamedTuple):
             beyond j.
         sizes: (n,) columns of each joint's row, its effects last; its torque sits behind them.
         starts: (n,) where its triangle starts in the flat moments.
-        place: (n, S) which parameter each column belongs to.
+        place: (n, S) which parameter each column belongs to; several columns have one parameter
+            where they stand for an effect of several shapes.
+        share: (n, S) how far the parameter acts through the column.
         base_place: (10 (n + 1),) the same for the rows of the base's wrench: base, links.
         near: (K,) columns of these that have moments, the base's ten first.
-        bodies: (1,) how many bodies come before the effects in the parameters.
+        steps: (P - 10 bodies,) of the effects' parameters, what ADAM takes for one.
     """
 
     slot: Indices
     sizes: Indices
     starts: Indices
     place: Indices
+    share: Array
     base_place: Indices
     near: Indices
-    bodies: Indices
+    steps: Array
 
 
 class Given(NamedTuple):
@@ -194,20 +197,21 @@ def pull_back(U, g, gx):
 
 
 @jit
-def values(x, bodies, th):
+def values(x, steps, th):
     """theta and effects, th (P,), of the flat parameters x (P,)."""
     U = np.empty((4, 4))
-    for b in range(bodies):
+    effects = x.shape[0] - steps.shape[0]
+    for b in range(effects // 10):
         body_from_log_cholesky(x[10 * b : 10 * b + 10], U, th[10 * b : 10 * b + 10])
-    th[10 * bodies :] = x[10 * bodies :]
+    th[effects:] = steps * x[effects:]
 
 
 @jit
-def follow(x, span, bodies, mean, th):
+def follow(x, span, steps, mean, th):
     """Carry the running mean (P,) over `span` iterates along with x; th (P,) are its values."""
     for i in range(x.shape[0]):
         mean[i] += (x[i] - mean[i]) / span
-    values(mean, bodies, th)
+    values(mean, steps, th)
 
 
 @jit
@@ -224,7 +228,7 @@ def sample_rows(frames, rows, given, state, effects, into):
     z, base_z = into
     n, six, links = z.shape[0], base_z.shape[0], 10 * (z.shape[0] + 1)
     at = columns(n, six > 0)
-    base = state[at.base : at.motion_q] if six else given.base
+    base = state[at.base : at.bent] if six else given.base
     q = state[at.q : at.dq]
     motion, R, o = np.empty((n, 12)), np.empty((n, 3, 3)), np.empty((n, 3))
     W, B = np.empty((6, 10)), np.empty((6, 10))
@@ -280,7 +284,7 @@ def row_errors(rows, th, z, base_z, error):
     for j in range(z.shape[0]):
         t = 0.0
         for k in range(rows.sizes[j]):
-            t += z[j, k] * th[rows.place[j, k]]
+            t += z[j, k] * rows.share[j, k] * th[rows.place[j, k]]
         error[six + j] = z[j, rows.sizes[j]] - t
 
 
@@ -427,7 +431,7 @@ def _times_row(rows, j, th, A, t, v):
     """Fill t with [th of joint j's row, -1] and v with A t; the cost tᵀ A t, at least 0."""
     s = rows.sizes[j]
     for k in range(s):
-        t[k] = th[rows.place[j, k]]
+        t[k] = rows.share[j, k] * th[rows.place[j, k]]
     t[s] = -1.0
     times_moments(A, rows.starts[j], t[: s + 1], v[: s + 1])
     cost = 0.0
@@ -451,7 +455,7 @@ def add_joint_slopes(rows, A, weighing, th, g):
         variance = (cost + w.floor_count * w.floor[j]) / (w.samples + w.floor_count)
         weight = 1.0 / (w.noise_gain * (variance + w.error))
         for k in range(rows.sizes[j]):
-            g[rows.place[j, k]] += weight * v[k]
+            g[rows.place[j, k]] += weight * rows.share[j, k] * v[k]
 
 
 @jit
@@ -479,8 +483,8 @@ def gradient(x, rows, moments, prior, weighing, out):
     at, before, weigh = Rows(*rows), Prior(*prior), Weighing(*weighing)
     A, C = moments
     th, g, gx = out
-    bodies = at.bodies[0]
-    values(x, bodies, th)
+    effects = x.shape[0] - at.steps.shape[0]
+    values(x, at.steps, th)
     for a in range(x.shape[0]):
         d = -before.rhs[a]
         for b in range(before.ranges[a, 0], before.ranges[a, 1]):
@@ -490,11 +494,11 @@ def gradient(x, rows, moments, prior, weighing, out):
     add_base_slopes(at, C, weigh, th, g)
     U = np.empty((4, 4))
     body = np.empty(10)
-    for b in range(bodies):
+    for b in range(effects // 10):
         body_from_log_cholesky(x[10 * b : 10 * b + 10], U, body)
         pull_back(U, g[10 * b : 10 * b + 10], gx[10 * b : 10 * b + 10])
         for i in range(1, 4):
             away = x[10 * b + i] - LOG_RADIUS
             gx[10 * b + i] += before.radius * away / LOG_RADIUS_STD**2
-    gx[10 * bodies :] = g[10 * bodies :]
+    gx[effects:] = at.steps * g[effects:]
     gx *= 1.0 / max(weigh.samples, 1.0)

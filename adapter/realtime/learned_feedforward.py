@@ -68,9 +68,13 @@ class LearnedFeedforward:
         theta = snapshot.theta + self._tool
         if np.isfinite(theta).all() and np.isfinite(snapshot.lam).all():
             effects = np.nan_to_num(snapshot.effects)
-            self._model.set(snapshot.lam, theta, effects)
+            self._model.set(snapshot.lam, theta, effects, snapshot.effect_shapes)
             self._ready, self._version = True, snapshot.version
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion."""
         return self._model(q, dq, ddq)
+
+    def unbent(self, q: Array) -> Array:
+        """Torques (n,) N m of holding still with nothing bent."""
+        return self._model.unbent(q)

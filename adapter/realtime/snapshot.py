@@ -22,7 +22,7 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.realtime.shared import SharedBlock, SharedMemoryError, fence
 
-MAGIC = 0x5041534E41503031  # "PASNAP01"
+MAGIC = 0x5041534E41503032  # "PASNAP02"
 VERSION, KIND, N, BODIES, EFFECTS, PID, TEXT = 0, 8, 9, 10, 11, 12, 13  # words of the header
 HEADER_WORDS, TEXT_BYTES = 16, 8192
 SEQUENCE, STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(6)  # words of a slot
@@ -89,6 +89,7 @@ class Board:
             "theta_std": (bodies, 10),
             "effects": (effects, n),
             "effects_std": (effects, n),
+            "effect_shapes": (effects, n),
         }
         size = value_count(n, bodies, effects)
         start = head + TEXT_BYTES
@@ -104,7 +105,7 @@ class Board:
 
 
 def value_count(n: int, bodies: int, effects: int) -> int:
-    return 12 * n + 20 * bodies + 2 * effects * n
+    return 12 * n + 20 * bodies + 3 * effects * n
 
 
 def allocate(size: int, name: str | None) -> SharedBlock:
@@ -148,6 +149,8 @@ class Snapshot:
         theta_std: (b, 10) its standard deviations.
         effects: (e, n) parameters of the effects, in the order of `effect_names`.
         effects_std: (e, n) their standard deviations.
+        effect_shapes: (e, n) the parameter beside it that was chosen (s0 of bristle friction); NaN
+            for effects without one.
         lam_converged: λ is valid to work with.
         theta_converged: θ and the effects are valid to work with.
         stamp_ns: of the newest filtered state learned from, on the arm's clock.
@@ -163,6 +166,7 @@ class Snapshot:
     theta_std: Array
     effects: Array
     effects_std: Array
+    effect_shapes: Array
     lam_converged: bool = False
     theta_converged: bool = False
     stamp_ns: int = 0
@@ -337,4 +341,4 @@ def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
     """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
     per_joint, per_body = np.full((n, 6), np.nan), np.full((bodies, 10), np.nan)
     per_effect = np.full((effects, n), np.nan)
-    return Snapshot(per_joint, per_joint, per_body, per_body, per_effect, per_effect)
+    return Snapshot(per_joint, per_joint, per_body, per_body, per_effect, per_effect, per_effect)

@@ -47,7 +47,7 @@ def learn_batch(
     for steps, share in THETA_POLISH:
         learner.set_rate(share * learner.settings.theta.rate)
         learner.learn_theta(_NO_STATES, steps)
-        learner.theta.adapt_prior()
+        learner.theta.adapt_prior(None if learner.rates is None else learner.rates.noise)
     learner.follow_convergence()
 
 

@@ -113,6 +113,7 @@ class Publisher:
             theta_std=self._std[1],
             effects=learner.theta.effect_values,
             effects_std=self._std[2],
+            effect_shapes=learner.theta.shapes,
             lam_converged=learner.schema.converged,
             theta_converged=learner.theta_converged,
             stamp_ns=learner.stamp_ns,

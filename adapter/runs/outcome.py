@@ -43,6 +43,7 @@ class Outcome:
         lam_notes: what is wrong with sensors on links, a sentence each.
         lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
         theta: (bodies, 10), the base first if it floats; effects: (e, n).
+        shapes: (e, n) of the effects that have several (`LearnedEffect`), NaN for the others.
         variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
@@ -51,7 +52,8 @@ class Outcome:
         schema_known: (k, n + 1) of the rows of schema_trace: directions known by joint, and
             whether λ was said to have converged. lam_information: (n, 6, 6) at last.
         score_trace: rows [stamp ns, q, dq, ddq, tau, torque error before learning], and behind
-            them the motion (12,) of a base that floats.
+            them the motion (12,) of a base that floats, then how far bristles are bent and rates of
+            the torque (`StateLayout.memory`).
         frames: (R0, p) that θ's moments were taken with.
         smoothing_s: how long the filter takes a step of torque.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
@@ -73,6 +75,7 @@ class Outcome:
     lam_count: float
     theta: Array
     effects: Array
+    shapes: Array
     variance: Array
     theta_started_ns: int | None
     covariance: Array
@@ -116,6 +119,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         lam_count=schema.count,
         theta=theta.theta,
         effects=theta.effect_values.copy(),
+        shapes=theta.shapes.copy(),
         variance=theta.variance(),
         theta_started_ns=learner.theta_started_ns,
         covariance=theta.covariance(),
@@ -276,9 +280,11 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
                 {
                     "effect": effect.name,
                     "joints": [j + 1],
-                    "parameters": {effect.key: float(outcome.effects[k, j])},
+                    "parameters": effect.numbers(
+                        float(outcome.effects[k, j]), float(outcome.shapes[k, j])
+                    ),
                     "std": {effect.key: float(std[k, j])},
-                    "units": {effect.key: effect.unit},
+                    "units": effect.units(),
                 }
             )
     return entries

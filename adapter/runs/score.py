@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adapter.effects.active import with_bodies
-from adapter.effects.by_joint import JointSignals
+from adapter.effects.by_joint import WAYS_RAD, JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
 from adapter.model.model_file import load_model
@@ -168,7 +168,9 @@ class ScoreRows:
         self.q, self.dq, self.ddq, self.tau, self.error = (
             np.ascontiguousarray(rows[:, 1 + k * n : 1 + (k + 1) * n]) for k in range(5)
         )
-        self._base = rows[:, 1 + 5 * n :] if documented.tree.floating else None
+        memory = len(rows[0]) - (len(WAYS_RAD) + 2) * n
+        self._base = rows[:, 1 + 5 * n : memory] if documented.tree.floating else None
+        self._memory = rows[:, memory:].reshape(len(rows), -1, n).swapaxes(0, 1)
         self._outcome, self._documented = outcome, with_bodies(documented)
         first = outcome.changes_ns[0] if outcome.changes_ns else np.inf
         self.before_change = rows[:, 0] < first
@@ -187,10 +189,12 @@ class ScoreRows:
         arm = RigidArm.of(learned)
         arm = arm if self._base is None else arm.moving(self._base)
         tau = arm.torque(self.q, self.dq, self.ddq)
-        at = JointSignals(self.q, self.dq, self.ddq, smoothing_s=self._outcome.smoothing_s)
-        names = self._outcome.settings.effects
-        for gain, effect in zip(effects, effects_by_name(names), strict=True):
-            tau += gain * effect.column(at)
+        bent, rates = self._memory[:-2], self._memory[-2:]
+        smoothing_s = self._outcome.smoothing_s
+        at = JointSignals(self.q, self.dq, self.ddq, self.tau, smoothing_s, bent, rates)
+        known = effects_by_name(self._outcome.settings.effects)
+        for gain, effect, shape in zip(effects, known, self._outcome.shapes, strict=True):
+            tau += gain * effect.torque_per_unit(at, shape)
         return tau
 
 

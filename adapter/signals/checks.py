@@ -13,9 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.by_joint import WAYS_RAD
 from adapter.model.self_model import Limits
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
+from adapter.signals.bristles import Bristles
 from adapter.signals.filters import NEVER, FilterState, Gains, JointFilter
 from adapter.signals.settings import FrontEndSettings
 
@@ -81,10 +83,11 @@ class Memory(NamedTuple):
         good, doubted: (3, n) the last believed reading, the last one that was not.
         usual: (3, n) squares of the readings' usual changes.
         since: (n,) int64 stamps at which the joints' readings last changed.
-        ahead: (3 n + b,) the reading whose stamp lay far ahead, with the base's b numbers.
+        ahead: (c,) the reading whose stamp lay far ahead, as it goes into the filter.
         marks: (10,) int64, see `Mark`.
         filter: of the filter.
         fastest: (n,) highest filtered |dq|, rad/s.
+        bristles: in the joints.
     """
 
     last: Array
@@ -96,6 +99,7 @@ class Memory(NamedTuple):
     marks: NDArray[np.int64]
     filter: FilterState
     fastest: Array
+    bristles: Bristles
 
 
 class Mark(IntEnum):
@@ -144,11 +148,17 @@ def packed(rules: Rules) -> Array:
     return np.concatenate([*tables, [rules.rest_dq, rules.gap_ns, *rules.gains]])
 
 
+def room(n: int, base: int) -> int:
+    """Numbers that `Memory` of n joints and so many of a base takes."""
+    bent = len(WAYS_RAD) * n
+    return 16 * n + bent + 4 * (3 * n + base + bent)
+
+
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 6,), (25 n + 4 b,) and (n + 12,).
+    """`Rules` and `Memory` as views of (8 n + 6,), (`room`,) and (n + 12,).
 
-    The base's motion, b numbers, passes the filter behind the joints' 3 n.
+    Behind the joints' 3 n the base's motion, b numbers, and the bristles', K n, pass the filter.
     """
     n = whole.shape[0] - 12
     at = 8 * n
@@ -160,16 +170,17 @@ def unpacked(rules, memory, whole):
     since, marks, times = whole[:n], whole[n : n + 10], whole[n + 10 :]
     tables = memory[: 12 * n].reshape(4, 3, n)
     last, good, doubted, usual = tables[0], tables[1], tables[2], tables[3]
-    wide = memory[12 * n : memory.shape[0] - n]
-    size = wide.shape[0] // 4
+    size = (memory.shape[0] - (16 + len(WAYS_RAD)) * n) // 4
+    wide = memory[12 * n : 12 * n + 4 * size]
     ahead, old, y, dy = (
         wide[:size],
         wide[size : 2 * size],
         wide[2 * size : 3 * size],
         wide[3 * size :],
     )
-    state, fastest = FilterState(times, old, y, dy), memory[memory.shape[0] - n :]
-    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, fastest)
+    rest = memory[12 * n + 4 * size :].reshape(4 + len(WAYS_RAD), n)
+    state, bristles = FilterState(times, old, y, dy), Bristles(rest[1], rest[2], rest[3], rest[4:])
+    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, rest[0], bristles)
 
 
 @jit

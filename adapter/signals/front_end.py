@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
+from adapter.signals.bristles import wind
 from adapter.signals.checks import (
     STREAK,
     Mark,
@@ -19,6 +20,7 @@ from adapter.signals.checks import (
     in_order,
     judge,
     packed,
+    room,
     rules_of,
     unpacked,
 )
@@ -85,7 +87,7 @@ def taken(samples, i, rules, memory, answers):
     if verdict == Verdict.GOOD:
         verdict = in_order(stamp, rules.gap_ns, times, marks)
     if verdict == Verdict.TIME_AHEAD:
-        memory.ahead[:] = signals
+        memory.ahead[: signals.shape[0]] = signals
     if verdict != Verdict.GOOD:
         return verdict
     gap = times[0] != NEVER and (
@@ -100,6 +102,7 @@ def taken(samples, i, rules, memory, answers):
         if verdict != Verdict.GOOD:
             return verdict
     memory.good[:] = x
+    dt_s = np.inf if gap or times[0] == NEVER else 1e-9 * (stamp - times[0])
     marks[Mark.DOUBTED] = NEVER
     marks[Mark.AHEAD] = NEVER
     if gap:
@@ -107,9 +110,23 @@ def taken(samples, i, rules, memory, answers):
         times[0] = NEVER
         if ahead_ns != NEVER and 0 < stamp - ahead_ns <= rules.gap_ns:  # it began there
             answers.holes[i, 1] = ahead_ns
-            filter_step(ahead_ns, memory.ahead, gains, memory.filter)
-    settled = filter_step(stamp, signals, gains, memory.filter)
+            filtered(ahead_ns, np.inf, memory.ahead[: signals.shape[0]].copy(), gains, memory)
+            dt_s = 1e-9 * (stamp - ahead_ns)
+    settled = filtered(stamp, dt_s, signals, gains, memory)
     return worth(stamp, x, settled, rules, memory)
+
+
+@jit
+def filtered(stamp, dt_s, signals, gains, memory):
+    """Take a sample dt_s after the one before, with the bristles; whether the filter has settled.
+
+    What has a memory is made of raw readings and then filtered as they are.
+    """
+    n, known = memory.good.shape[1], signals.shape[0]
+    whole = np.empty(memory.filter.y.shape[0])
+    whole[:known] = signals
+    wind(dt_s, signals[:n], signals[n : 2 * n], memory.bristles, whole[known:])
+    return filter_step(stamp, whole, gains, memory.filter)
 
 
 @jit
@@ -165,8 +182,9 @@ def process(signals, rules, memory, whole, records, answers):
             row[at.ddq : at.tau] = dy[n : 2 * n]
             row[at.base - n : at.base] = y[2 * n : 3 * n]
             if floating:
-                row[at.base : at.base + BASE] = y[3 * n :]
-                row[at.base + BASE : at.motion_q] = dy[3 * n + 3 : 3 * n + 6]  # rate of w
+                row[at.base : at.base + BASE] = y[3 * n : 3 * n + BASE]
+                row[at.base + BASE : at.bent] = dy[3 * n + 3 : 3 * n + 6]  # rate of w
+            row[at.bent : at.rates] = y[signals.shape[1] :]
 
 
 class FrontEnd:
@@ -197,9 +215,10 @@ class FrontEnd:
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0
-        self._kept, self._whole = np.zeros(25 * n + 4 * base), np.zeros(n + 12, dtype=np.int64)
+        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + 12, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
+        self._memory.bristles.place[:] = np.nan
         self._memory.filter.times[:] = NEVER
         for mark in UNSEEN:
             self._memory.marks[mark] = NEVER

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.by_joint import WAYS_RAD, JointSignals
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 
@@ -39,6 +40,8 @@ class StateColumns(NamedTuple):
     ddq: int
     tau: int
     base: int
+    bent: int
+    rates: int
     motion_q: int
     motion_dq: int
     motion: int
@@ -50,16 +53,19 @@ def columns(n, floating):
     """Where each signal of a filtered state begins; compiled code and `StateLayout` ask here.
 
     Behind the stamp and the kind of link motion come, all of the filtered instant: q, dq, ddq
-    (n each), tau (n, or 6 + n with the wrench on a floating base first) and, of a floating base
-    alone, its motion (12). Then what the body schema learns from, all of one instant of its own:
-    q, dq (n each) and the links' motion (n, 12). A motion is [v, w, a, dw].
+    (n each), tau (n, or 6 + n with the wrench on a floating base first), of a floating base alone
+    its motion (12), how far bristles are bent (K n, see `bristles`) and rates of the model's torque
+    (2 n, which the learner fills in). Then what the body schema learns from, all of one instant of
+    its own: q, dq (n each) and the links' motion (n, 12). A motion is [v, w, a, dw].
     """
     tau = 2 + 3 * n
     base = tau + n + (6 if floating else 0)
-    motion_q = base + (12 if floating else 0)
+    bent = base + (12 if floating else 0)
+    rates = bent + len(WAYS_RAD) * n
+    motion_q = rates + 2 * n
     motion = motion_q + 2 * n
     return StateColumns(
-        2, 2 + n, 2 + 2 * n, tau, base, motion_q, motion_q + n, motion, motion + 12 * n
+        2, 2 + n, 2 + 2 * n, tau, base, bent, rates, motion_q, motion_q + n, motion, motion + 12 * n
     )
 
 
@@ -71,8 +77,9 @@ class StateLayout:
         floating: whether the base moves; then its motion is part of the state.
 
     Attributes:
-        q, dq, ddq, tau, base, motion_q, motion_dq, motion: slices, as `columns` has them; `base`
-            is empty where the base does not float.
+        q, dq, ddq, tau, base, bent, rates, motion_q, motion_dq, motion: slices, as `columns` has
+            them; `base` is empty where the base does not float.
+        memory: `bent` and `rates`, what a column with a memory is made of.
         joint_tau: the joints' torques, behind the wrench on a floating base.
         before_links: all columns before what the body schema learns from.
     """
@@ -81,12 +88,21 @@ class StateLayout:
         self.n, self.floating = n, floating
         at = columns(n, floating)
         self.size = at.size
-        self.q, self.dq, self.ddq, self.tau, self.base, self.motion_q, self.motion_dq = (
-            slice(at[k], at[k + 1]) for k in range(7)
-        )
+        parts = [slice(at[k], at[k + 1]) for k in range(9)]
+        self.q, self.dq, self.ddq, self.tau, self.base = parts[:5]
+        self.bent, self.rates, self.motion_q, self.motion_dq = parts[5:]
+        self.memory = slice(at.bent, at.motion_q)
         self.motion = slice(at.motion, at.size)
         self.joint_tau = slice(at.base - n, at.base)
         self.before_links = slice(0, at.motion_q)
+
+    def signals(self, table: Array, smoothing_s: float = 0.0) -> JointSignals:
+        """What the torques of states (m, size), or of their columns `before_links`, depend on."""
+        m, n = len(table), self.n
+        bent = table[:, self.bent].reshape(m, -1, n).swapaxes(0, 1)
+        rates = table[:, self.rates].reshape(m, 2, n).swapaxes(0, 1)
+        q, dq, ddq, tau = (table[:, x] for x in (self.q, self.dq, self.ddq, self.joint_tau))
+        return JointSignals(q, dq, ddq, tau, smoothing_s, bent, rates)
 
     def new(self, rows: int | None = None) -> Array:
         """An empty record, or a table of them."""

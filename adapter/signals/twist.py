@@ -109,5 +109,5 @@ def synthesize(frames, base, records):
         row[KIND] = LinkMotionKind.DOCUMENTED.value
         row[at.motion_q : at.motion] = row[at.q : at.ddq]
         joints = JointMotion(row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau])
-        moves = row[at.base : at.motion_q] if base.shape[0] == 0 else base
+        moves = row[at.base : at.bent] if base.shape[0] == 0 else base
         link_motion(arm, joints, moves, row[at.motion :].reshape((n, 12)))

@@ -23,6 +23,7 @@ from adapter.cli.run import controller_of, open_arm, run_plan
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.torque import ModelTorque
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.theta import Theta
@@ -155,7 +156,7 @@ def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> 
         unit[k] = 1.0
         out[..., k] = ModelTorque(replace(robot, theta=unit.reshape(7, 10)))(q, dq, ddq)
     joint = np.arange(7)
-    for k, column in enumerate(theta.effect_columns(q, dq, ddq).swapaxes(0, 1)):
+    for k, column in enumerate(theta.torque_per_unit(JointSignals(q, dq, ddq))):
         out[:, joint, 80 + 7 * k + joint] = column
     return out
 

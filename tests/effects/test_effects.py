@@ -14,9 +14,9 @@ from scipy.signal import lsim, lti
 
 from adapter.effects.active import active_effects, check_effects
 from adapter.effects.backlash import play
-from adapter.effects.base import Effect, Motion, polar
+from adapter.effects.base import Effect, JointTorque, Motion, polar
 from adapter.effects.bristle_friction import bending
-from adapter.effects.by_joint import JointSignals, smooth_sign
+from adapter.effects.by_joint import WAYS_RAD, JointSignals, smooth_sign
 from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.payload import parameters_of, theta_of
 from adapter.effects.splits import experiments
@@ -403,10 +403,15 @@ def test_payload_parameters_are_there_and_back() -> None:
 @pytest.mark.parametrize("name", LEARNED)
 def test_columns_are_the_laws_derivative(name: str) -> None:
     effect = LEARNED[name]
-    at = JointSignals(Q, DQ, DDQ)
-    np.testing.assert_allclose(
-        effect.law(at, {effect.key: np.full(N, 2.0)}), 2.0 * effect.column(at)
-    )
+    rng = np.random.default_rng(5)
+    bent, rates = rng.uniform(-1.0, 1.0, (len(WAYS_RAD), *Q.shape)), rng.normal(size=(2, *Q.shape))
+    at = JointSignals(Q, DQ, DDQ, Q, 0.0, bent, rates)
+    shape = np.full(N, effect.shapes[2] if effect.shapes else np.nan)
+    column = effect.torque_per_unit(at, shape)
+    np.testing.assert_allclose(column, effect.basis(at)[2 if effect.shapes else 0])
+    if isinstance(effect, JointTorque):
+        values = {effect.key: np.full(N, 2.0), effect.shape_key: shape}
+        np.testing.assert_allclose(effect.law(at, values), 2.0 * column)
 
 
 @pytest.mark.parametrize(

@@ -37,17 +37,22 @@ def held_out_error(learner: OnlineLearner) -> float:
     q, dq, ddq = (x[::20] for x in trajectory(Motion(10.0, seed=99)))
     model = ModelTorque(replace(panda_model(), theta=learner.theta.theta))
     tau = model(q, dq, ddq)
-    for gain, effect in zip(learner.theta.effect_values, learner.theta.effects, strict=True):
-        tau = tau + gain * effect.column(JointSignals(q, dq, ddq))
+    at = JointSignals(q, dq, ddq)
+    for gain, column in zip(
+        learner.theta.effect_values, learner.theta.torque_per_unit(at), strict=True
+    ):
+        tau = tau + gain * column
     return float(np.sqrt(np.mean((tau - rnea(pin_model(arm()), q, dq, ddq)) ** 2)))
 
 
 def test_what_is_not_there_fades() -> None:
     plain, looking = learned(()), learned(REAL_ARM_EFFECTS, rows=1)  # spreads adapt by the update
     theta = looking.theta
-    widest = np.array([effect.prior_std for effect in theta.effects])
-    assert (theta.effect_spread < 0.02 * widest).all()
+    widest = np.array([effect.learned_std for effect in theta.effects])
+    by_rates = np.array([effect.by_rates for effect in theta.effects])  # these do not act at all
+    assert (theta.effect_spread < 0.02 * widest)[~by_rates].all()
     assert np.abs(theta.effect_values[:3]).max() < 0.02
+    assert np.abs(theta.effect_values[by_rates]).max() < 1e-6
     assert theta.model_variance == pytest.approx(0.001**2)
     assert held_out_error(looking) < 1.25 * held_out_error(plain)
 

@@ -48,7 +48,7 @@ def test_panda_in_one_pass(panda_log: Path, tmp_path: Path) -> None:
     assert (error <= 0.92 * TOOL).all(), error / TOOL
     assert figures["theta"]["changes"] == []  # bursts where friction reverses are no loads
     assert figures["refused"]["repeated"] > 700
-    friction = np.array(figures["theta"]["effects"]["coulomb_friction"])
+    friction = np.array(figures["theta"]["effects"]["bristle_friction"])
     assert (friction > 0.1).all() and (friction < 0.6).all()
 
 

@@ -119,7 +119,7 @@ def full_rows(theta: Theta, of: Case) -> np.ndarray:
         out[:, :, theta.hand] = 0.0
     joint, first = np.arange(n), of.tree.rows - n
     for k, effect in enumerate(theta.effects):
-        column = effect.column(JointSignals(of.data.q, of.data.dq, of.data.ddq))
+        (column,) = effect.basis(JointSignals(of.data.q, of.data.dq, of.data.ddq))
         out[:, first + joint, 10 * theta.bodies + k * n + joint] = column
     return out
 

@@ -178,7 +178,9 @@ def test_a_gap_restarts_the_filter() -> None:
     hole = (stamps > samples[1999].stamp_ns) & (stamps < samples[2050].stamp_ns + settle)
     assert not hole.any()
     fresh, _ = run(after)
-    assert np.array_equal(states[-len(fresh) :], fresh)
+    at = front_end.layout  # bristles remember how far they were bent before the gap
+    same = np.r_[: at.bent.start, at.bent.stop : at.size]
+    assert np.array_equal(states[-len(fresh) :, same], fresh[:, same])
 
 
 def test_short_holes_are_bridged() -> None:

@@ -1,0 +1,172 @@
+"""Rates of the model's own torque around each state, for effects that need them.
+
+A rate of a torque is far noisier than the torque, so differences are taken over a span in which
+the filter lets next to nothing happen; the second one needs what comes that much later. States
+therefore wait for as long before θ learns from them. What the torque sensors' low-pass is of does
+not matter much: friction is left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.model.spatial import Array
+from adapter.model.tree import Tree
+from adapter.physics.kernels import Frames, JointMotion, inverse_dynamics, jit, link_motion
+from adapter.signals.records import StateLayout, columns
+
+LEAST_SPAN_S = 5e-3  # where states did not go through a filter
+LONGEST_STEP_NS = 20_000_000  # between two states that a torque is interpolated between
+ROOM = 512  # states that can wait
+
+
+class Waiting(NamedTuple):
+    """States that wait, in a ring.
+
+    Attributes:
+        rows: (ROOM, w); tau: (ROOM, n) N m by the model; stamps: (ROOM,) int64 ns.
+        marks: (2,) int64 running numbers of the first state that waits, and of the next to come.
+        bends: (n + 1,) sums of squares of the torque's second differences over their steps,
+            (N m)²/s, and how many there are.
+    """
+
+    rows: Array
+    tau: Array
+    stamps: NDArray[np.int64]
+    marks: NDArray[np.int64]
+    bends: Array
+
+
+@jit
+def torque_at(stamp, near, ring, out):
+    """Fill out (n,) with the torque at a stamp, searched for from the state `near` on."""
+    first = max(ring.marks[1] - ROOM, 0)
+    k = near
+    while k > first and ring.stamps[k % ROOM] > stamp:
+        k -= 1
+    while k + 1 < ring.marks[1] and ring.stamps[(k + 1) % ROOM] <= stamp:
+        k += 1
+    a, b = k % ROOM, (k + 1) % ROOM
+    step = ring.stamps[b] - ring.stamps[a]
+    if ring.stamps[a] > stamp or k + 1 >= ring.marks[1]:
+        exact = ring.stamps[a] == stamp
+        out[:] = ring.tau[a]
+        return exact
+    if step <= 0 or step > LONGEST_STEP_NS:
+        return False
+    share = (stamp - ring.stamps[a]) / step
+    for j in range(out.shape[0]):
+        out[j] = ring.tau[a, j] + share * (ring.tau[b, j] - ring.tau[a, j])
+    return True
+
+
+@jit
+def let_go(span_ns, ring, at, out):
+    """Give the oldest state into out (w,), with its rates where its neighbours tell them."""
+    n, number = ring.tau.shape[1], ring.marks[0]
+    here = number % ROOM
+    out[:] = ring.rows[here]
+    before, behind = np.empty(n), np.empty(n)
+    stamp, span_s = ring.stamps[here], 1e-9 * span_ns
+    rates = out[at.rates : at.rates + 2 * n]
+    rates[:] = 0.0
+    known = torque_at(stamp - span_ns, number, ring, before)
+    if known and torque_at(stamp + span_ns, number, ring, behind):
+        for j in range(n):
+            rates[j] = (behind[j] - before[j]) / (2.0 * span_s)
+            rates[n + j] = (behind[j] - 2.0 * ring.tau[here, j] + before[j]) / span_s**2
+    ring.marks[0] += 1
+
+
+@jit
+def follow(arm, table, span_ns, waiting, out):
+    """Take states (m, w); fill out with those that need not wait any more, and count them.
+
+    Args:
+        arm: parent, R0, p, θ (bodies, 10), and the motion (12,) of a base that rests, or nothing.
+        waiting: `Waiting`, as a plain tuple.
+    """
+    parent, R0, p, theta, rest = arm
+    frames, ring = Frames(parent, R0, p), Waiting(*waiting)
+    n, six, count = parent.shape[0], 0 if rest.shape[0] else 6, 0
+    at = columns(n, six > 0)
+    motion, tau = np.empty((n, 12)), np.empty(n + six)
+    for m in range(table.shape[0]):
+        row = table[m]
+        stamp = row[:1].view(np.int64)[0]
+        last = ring.stamps[(ring.marks[1] - 1) % ROOM]
+        if ring.marks[1] and not 0 < stamp - last <= LONGEST_STEP_NS:
+            while ring.marks[0] < ring.marks[1]:
+                let_go(span_ns, ring, at, out[count])
+                count += 1
+            ring.marks[:] = 0
+        here = ring.marks[1] % ROOM
+        base = row[at.base : at.bent] if six else rest
+        q, dq, ddq = row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau]
+        link_motion(frames, JointMotion(q, dq, ddq), base, motion)
+        inverse_dynamics(frames, theta, q, motion, base, tau)
+        ring.rows[here], ring.tau[here], ring.stamps[here] = row, tau[six:], stamp
+        ring.marks[1] += 1
+        if ring.marks[1] > 2:
+            one, two = (here - 1) % ROOM, (here - 2) % ROOM
+            step_s = 0.5e-9 * (stamp - ring.stamps[two])
+            for j in range(n):
+                bend = tau[six + j] - 2.0 * ring.tau[one, j] + ring.tau[two, j]
+                ring.bends[j] += bend * bend / step_s
+            ring.bends[n] += 1.0
+        while ring.marks[0] < ring.marks[1] and (
+            stamp - ring.stamps[ring.marks[0] % ROOM] >= span_ns
+            or 2 * (ring.marks[1] - ring.marks[0]) >= ROOM
+        ):
+            let_go(span_ns, ring, at, out[count])
+            count += 1
+    return count
+
+
+class TorqueRates:
+    """States with the rates of their torque, as soon as those can be told.
+
+    Args:
+        tree: N; smoothing_s: how long the filter before takes a step of torque.
+        delay_s: of that filter.
+
+    Attributes:
+        rows, tau, stamps, marks, bends: see `Waiting`.
+    """
+
+    def __init__(self, tree: Tree, smoothing_s: float, delay_s: float) -> None:
+        layout = StateLayout(tree.n, tree.floating)
+        self._parent = np.array(tree.parent, dtype=np.int64)
+        self._width = layout.before_links.stop
+        self._span_ns = round(1e9 * max(smoothing_s, LEAST_SPAN_S))
+        rows, tau = np.zeros((ROOM, self._width)), np.zeros((ROOM, tree.n))
+        stamps, marks, bends = np.zeros(ROOM, np.int64), np.zeros(2, np.int64), np.zeros(tree.n + 1)
+        self._ring = Waiting(rows, tau, stamps, marks, bends)
+        self.rows, self.tau, self.stamps, self.marks, self.bends = self._ring
+        self._delay_s = delay_s
+        self._one = np.empty((ROOM + 1, self._width))
+
+    @property
+    def noise(self) -> Array:
+        """(n,) variance, (N m)², that noise of the measured motion puts on the model's torque.
+
+        White noise of dq that leaves the filter as ddq bends from sample to sample in a known
+        proportion to its size (poles at 45 degrees, k1 = 2 / delay); motion hardly bends there.
+        """
+        return np.asarray(self.bends[:-1] / max(self.bends[-1], 1.0) * self._delay_s / 8.0)
+
+    def follow(self, table: Array, frames: tuple[Array, Array], theta: Array, base: Array) -> Array:
+        """States (k, columns `before_links`) that are complete now; the next call may reuse them.
+
+        Args:
+            table: (m, size) states, or their `before_links`, that follow those before.
+            frames: R0 (n, 3, 3) and p (n, 3); theta: (bodies, 10).
+            base: (12,) motion of a base that rests; empty where the states have it.
+        """
+        table = table[:, : self._width]
+        out = self._one if len(table) == 1 else np.empty((ROOM + len(table), self._width))
+        arm = self._parent, *frames, theta, base
+        return out[: follow(arm, table, self._span_ns, tuple(self._ring), out)]
