@@ -28,6 +28,12 @@ def block_s(fit: Fit) -> float:
     return float(max(min([FOLD_S, *spans]), SHORTEST_S))
 
 
+def holds_out(fit: Fit) -> bool:
+    """Whether its blocks leave enough of each recording to fit."""
+    spans = [float(np.ptp(own.t)) for own in fit.recordings]
+    return block_s(fit) <= LARGEST_SHARE * min(spans) * (1.0 + 1e-9)
+
+
 def fold_of(t: Array, block: float) -> np.ndarray:
     """(m,) fold of each instant: blocks of time in turn."""
     return np.asarray((t // block).astype(int) % FOLDS)

@@ -13,7 +13,7 @@ from adapter.errors import ModelError
 from adapter.gap.evidence import Carried
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
-from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of
+from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import Curves, RolloutCurves, Shortfall
@@ -219,8 +219,10 @@ def measure(
     fit = possible(found.fit, found.carried)
     found = replace(found, fit=replace(fit, noise=searched.noise, weights=searched.weights))
     block = block_s(found.fit)
-    if task.folds:
+    if task.folds and holds_out(found.fit):
         after = held_out_models(task.model, found.fit, found.carried)
+    elif task.folds:  # too short: in sample only
+        after = [[model_of(task.model, found.fit, i)] for i in range(len(task.fitted))]
     else:
         model = model_of(task.model, found.fit)
         after = [[model if task.one_clock else lasting(model)]] * len(task.scored)

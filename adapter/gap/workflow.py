@@ -17,13 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
+from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
-from adapter.gap.findings import disagreement, noise_floor, told_of
+from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
 from adapter.gap.fit import Fit, theta_prior
+from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
 from adapter.gap.nominal import nominal_fit
-from adapter.gap.result import GapResult
+from adapter.gap.result import Finding, GapResult
 from adapter.gap.screen import RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
@@ -36,6 +38,11 @@ from adapter.signals.matching import present
 from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
+NO_NAME = 0.5  # probability below which an effect is not told by name
+UNPLACED = (
+    "the inertias were corrected by more than 4 prior standard deviations; which link it is, these "
+    "data do not tell"
+)
 FIT_S, SCORE_S = 3.0, 2.0  # the least of a recording that is fitted; and scored
 
 Progress = Callable[[str], None]
@@ -227,7 +234,11 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     found, floor = measured.found, noise_floor(measured.found.fit)
     ends = {r.name: float(r.t[-1]) for r in task.fitted}
     trusted = theta_prior(RigidArm.of(task.model).theta, settings.inertia_prior)
-    findings, left = told_of(found, ends, trusted)
+    told, left = told_of(found, ends, trusted)
+    findings = tuple(f for f in told if f.evidence >= NO_NAME)
+    notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]
+    if np.abs(found.fit.dtheta / trusted).max() > ODD and not any(map(_of_a_body, findings)):
+        notes.append(UNPLACED)
     splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,
@@ -243,8 +254,21 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
         corrections=found.fit.dtheta,
         corrections_prior=found.fit.prior,
         stopped_after_rounds=found.rounds if found.ran_out else None,
-        notes=task.notes,
+        notes=(*task.notes, *notes),
         curves=measured.curves,
         rollouts=measured.rollouts,
         what_next=tuple(dict.fromkeys(splits)),
+        in_sample=task.folds and not holds_out(found.fit),
     )
+
+
+def unnamed(title: str, joints: Sequence[int]) -> str:
+    """A note on what is in the model without being told by name."""
+    where = f"of joint {joints[0]} " if joints else ""
+    return (
+        f"the model has a {title} {where}that is no surer than its rivals: it is not told by name"
+    )
+
+
+def _of_a_body(finding: Finding) -> bool:
+    return CATALOGUE[finding.effect].is_theta
