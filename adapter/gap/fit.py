@@ -27,7 +27,7 @@ from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
 START_NM = 0.5  # of static friction, published values of a Panda's joints are 0.2 to 0.5
-TIMING_STD_S = 4e-4  # half a sample of hold is no effect of the arm
+TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump: friction turns round more softly than its equation
 JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it

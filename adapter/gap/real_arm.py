@@ -139,12 +139,15 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         arm = real_arm(fit, joints, loaded)
     if not loaded and arm.fit.prior[0, 0] < OTHER_UNIT * fit.prior[0, 0]:
         return refitted(fit)[0]
-    kept = [
-        e
-        for k, e in enumerate(arm.fit.named)
-        if k < len(loaded) or worth(arm.fit, arm.known, k).log_evidence + price(e) > 0.0
-    ]
+    kept = [e for k, e in enumerate(arm.fit.named) if k < len(loaded) or _is_worth_having(arm, k)]
     return refitted(arm.fit.with_named(kept).with_noise())[0]
+
+
+def _is_worth_having(arm: RealArm, k: int) -> bool:
+    """Whether what any arm may have is there, as far as one can say before the search."""
+    e = arm.fit.named[k]
+    possible = e.candidate.effect.possible(e.values)
+    return possible and worth(arm.fit, arm.known, k).log_evidence + price(e) > 0.0
 
 
 def _named(effect: Effect, template: Template, joint: int, recording: int | None = None) -> Named:

@@ -356,11 +356,13 @@ class Move:
 def leads_of(table: SignatureTable) -> list[Lead]:
     """The best leads first, no two of one effect on one joint and of one kind of interval."""
     best: dict[tuple[str, int, str], Lead] = {}
+    always: dict[tuple[str, int, str], Lead] = {}
     for lead in table.whole():
+        _keep(always, lead, "whole")
         if lead.candidate.effect.possible(_values(lead)):
             _keep(best, lead, "whole")
     # a pattern may change in mid-recording as well, but then it is a pattern all the more
-    chosen = [x.candidate for x in best.values() if not isinstance(x.candidate.effect, Pattern)]
+    chosen = [x.candidate for x in always.values() if not isinstance(x.candidate.effect, Pattern)]
     for lead in table.timed(chosen):
         if lead.candidate.effect.possible(_values(lead)):
             _keep(best, lead, "timed")

@@ -40,7 +40,7 @@ from adapter.gap.scan import (
 TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
-MOST_SWAPS, SWAP_NATS = 4, 1.0  # names that are exchanged for better ones, and by how much
+MOST_SWAPS, SWAP_NATS = 4, 0.0  # names that are exchanged for better ones, and by how much
 CLEAR = 3.0  # standard deviations of a force
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 

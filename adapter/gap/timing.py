@@ -20,7 +20,7 @@ MOVES_DQ = 0.02  # rad/s; slower is noise
 FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
 STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
 SIGNIFICANT = 3.0  # standard deviations
-TIMING_SHARE = 0.4  # of a sample period: holds of half a sample are no effect of the arm
+TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
 Index = NDArray[np.int64]

@@ -51,6 +51,11 @@ def over_a_wide_range(trial: Trial) -> bool:
     return bool(np.ptp(trial.motion.at(trial.times)[0][:, joint]) > WIDE_RAD)
 
 
+def clear_beside_friction(trial: Trial) -> bool:
+    """Viscous friction explains most of such a drag; what it does not must show as well."""
+    return detectability(trial)[0] > 3 * Z_LEAST
+
+
 SINGLES = {
     "coulomb_friction": Rule(20, mujoco_recording, on_a_heavy_joint),
     "payload": Rule(40, holds=in_mid_recording),
@@ -66,7 +71,10 @@ SINGLES = {
     "joint_spring": Rule(130, pybullet_recording),
     "external_wrench": Rule(140),
 }
-OUTSIDE = {"x_sine_disturbance": Rule(170), "x_quadratic_drag": Rule(170)}
+OUTSIDE = {
+    "x_sine_disturbance": Rule(170),
+    "x_quadratic_drag": Rule(170, holds=clear_beside_friction),
+}
 NULLS = range(200, 204)
 QUICK = {"coulomb_friction", "payload", "motor_inertia", "x_sine_disturbance", 200}
 MOST_DRAWS = 40
