@@ -114,6 +114,7 @@ def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]
     fit, known = found.fit, found.known or found.carried
     odd = np.abs(fit.dtheta / trusted).max(axis=1) > ODD
     odd[-1] &= not any(e.candidate.effect is HELD for e in fit.named)
+    odd[[e.candidate.joint for e in fit.named if e.candidate.effect is WRONG_LINK]] = False
     told = [_wrong_link(fit, known, int(k), end_s, trusted) for k in np.flatnonzero(odd)]
     return [f for f in told if f.evidence > SINGLED_OUT]
 

@@ -41,6 +41,7 @@ WHERE_IT_MOVES = (
 )
 OFFSET = CATALOGUE["torque_offset"]
 SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
+MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
 OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
 OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of another unit
 WAY_ROUNDS = 3
@@ -115,6 +116,10 @@ def _as_wide_as_open(fit: Fit, shares: Sequence[float]) -> tuple[Fit, Carried]:
         std[: fit.dtheta.size] = share * fit.prior.ravel()
         worths.append(score(known.G, known.g, std).log_evidence)
     share = shares[int(np.flatnonzero(np.array(worths) > max(worths) - OPEN_NATS)[-1])]
+    std[: fit.dtheta.size] = MADE_UP * fit.prior.ravel()
+    made_up = score(known.G, known.g, std).log_evidence > max(worths) + MADE_UP_NATS
+    if made_up and len(shares) > 1:
+        return under_own_noise(replace(fit, prior=MADE_UP * fit.prior))
     return refitted(replace(wide, prior=share * fit.prior))
 
 

@@ -13,13 +13,13 @@ import pytest
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect
-from sim.hidden import draw, write
-from tests.helpers.gap_tools import pinocchio_recording
+from sim.hidden import write
+from tests.helpers.gap_tools import believed, pinocchio_recording
 
 
 def named(effect: Effect, seed: int, folder: Path, seconds: float) -> tuple[Finding, ...]:
     """What is found of an arm with an effect; the model's inertias are 2 % off."""
-    trial = replace(draw(seed, "null"), effects=(effect,), seconds=seconds)
+    trial = replace(believed(seed), effects=(effect,), seconds=seconds)
     log, model, _ = write(trial, folder, pinocchio_recording(trial))
     return tuple(find_gap([log], model).findings)
 

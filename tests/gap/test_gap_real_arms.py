@@ -21,9 +21,10 @@ pytestmark = pytest.mark.skipif(
 )
 SPLIT_S = 14.0
 BEFORE = np.array([0.28, 0.77, 0.37, 0.58, 0.34, 0.21, 0.28])  # N m, of the model as it is
-AFTER = np.array([0.23, 0.29, 0.19, 0.28, 0.10, 0.07, 0.07])  # N m, at most
+AFTER = np.array([0.16, 0.26, 0.16, 0.17, 0.08, 0.05, 0.05])  # N m, at most
 COULOMB = np.array([0.27, 0.20, 0.14, 0.45, 0.30, 0.15, 0.25])  # N m, of a plain fit
 RUBBING = (1, 2, 4, 5, 7)
+DRY = ("coulomb_friction", "bristle_friction")  # a real arm's has a memory
 NEAR_NOISE = 1.6  # times the noise: no more is left without a word (1.44 on joint 1)
 ROOM = 0.15  # N m by which a size may be off, and half of it: what else is named has a share
 
@@ -60,7 +61,7 @@ def test_gap_after_is_small(published: GapResult) -> None:
 
 @pytest.mark.parametrize("joint", RUBBING)
 def test_friction_is_named(published: GapResult, joint: int) -> None:
-    own = [f for f in published.findings if f.effect == "coulomb_friction" and f.joints == (joint,)]
+    own = [f for f in published.findings if f.effect in DRY and f.joints == (joint,)]
     assert own, [(f.effect, f.joints) for f in published.findings]
     size, plain = sum(f.parameters["Fc"] for f in own), COULOMB[joint - 1]
     assert abs(size - plain) < max(ROOM, 0.5 * plain)
@@ -78,10 +79,12 @@ def test_what_is_left_is_noise_or_is_said(published: GapResult) -> None:
     assert {int(j) + 1 for j in np.flatnonzero(over > NEAR_NOISE)} <= said, over
 
 
-def test_dummy_inertias_are_said_to_be_wrong_and_friction_is_not(log: Path) -> None:
+def test_dummy_inertias_are_said_to_be_wrong_and_no_load_is(log: Path) -> None:
     urdf = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
     result = told(log, urdf)
-    names = {f.effect for f in result.findings}
-    assert names == {"link_inertia"}, names
+    told_of = [(f.effect, f.joints) for f in result.findings]
+    wrong = {joint for effect, joints in told_of for joint in joints if effect == "link_inertia"}
+    assert len(wrong) >= 5, told_of
+    assert {"payload", "external_wrench"}.isdisjoint(dict(told_of)), told_of
     before, after = result.before.torque_rmse_nm, result.after.torque_rmse_nm
     assert np.sum(after**2) < 0.1 * np.sum(before**2), (before, after)
