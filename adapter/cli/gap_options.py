@@ -32,7 +32,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--inertia-prior",
         type=float,
         metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.02)",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.02; "
+        "it may turn out to be up to 8 times that)",
     )
     add(
         "--hold-out",
