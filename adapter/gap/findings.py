@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from adapter.gap.evidence import Carried, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
-from adapter.gap.search import Found
+from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
 
 OVERLAP = 0.9
@@ -161,6 +162,9 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
         overlaps = _overlaps(standing, named)
+        spread, evidence = parameter_std(fit, covariance, k), standing.probability
+        if from_the_start(named):  # that it is there, whatever else could stand for it
+            evidence = math.erf(named.values["m"] / spread["m"] / math.sqrt(2.0))
         out.append(
             Finding(
                 effect=effect.name,
@@ -169,9 +173,9 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 interval_s=(max(begin, 0.0), min(end, last)),
                 lasting=not np.isfinite(end),
                 parameters=named.values,
-                std=parameter_std(fit, covariance, k),
+                std=spread,
                 units=effect.units(),
-                evidence=standing.probability,
+                evidence=evidence,
                 overlaps=overlaps,
                 split_by="; ".join(experiments(effect, [CATALOGUE[x] for x in overlaps])),
                 detectability=float(np.sqrt(standing.chi2)),

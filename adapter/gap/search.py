@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.effects.base import TorqueEffect
-from adapter.effects.catalogue import WRONG_LINK
+from adapter.effects.base import Effect, TorqueEffect
+from adapter.effects.catalogue import HELD, WRONG_LINK
 from adapter.gap.candidates import PATTERN_SHARE, Candidate, Pattern
 from adapter.gap.evidence import Carried, Noise
 from adapter.gap.fit import (
@@ -41,6 +41,7 @@ TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 4, 0.0  # names that are exchanged for better ones, and by how much
+FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 CLEAR = 3.0  # standard deviations of a force
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
@@ -232,10 +233,24 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.candidate.effect.possible(e.values)
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
-            or not pays_held_out(fit, folds, k)
+            or not (from_the_start(e) or pays_held_out(fit, folds, k))
         ):
             values[k] = value
     return min(values, key=values.__getitem__) if values else None
+
+
+def _is_common(effect: Effect) -> bool:
+    """Whether any joint may well have it: friction, an offset."""
+    return effect.bundled or bool(effect.form)
+
+
+def from_the_start(e: Named) -> bool:
+    """Whether it is a load from the first sample on.
+
+    Nothing is commoner, and what looks like one is called one: heavier links and rarer effects
+    could stand for it, each at a price that the evidence has asked for.
+    """
+    return e.candidate.effect is HELD and e.interval_s == WHOLE
 
 
 def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
@@ -253,13 +268,16 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
     """
     best: dict[int, tuple[float, int, Rival]] = {}
     for k, own in enumerate(standings):
-        if isinstance(own.candidate.effect, Pattern):
+        if isinstance(own.candidate.effect, Pattern) or from_the_start(fit.named[k]):
             continue
         for rival in own.rivals:
             better, joint = own.gain(rival), own.candidate.joint
+            asked = SWAP_NATS
             if joint != rival.candidate.joint:
-                joint = -1
-            if rival.credible and better > best.get(joint, (SWAP_NATS,))[0]:
+                joint, asked = -1, FAR_NATS
+            elif _is_common(own.candidate.effect) and not _is_common(rival.candidate.effect):
+                asked = FAR_NATS
+            if rival.credible and better > max(asked, best.get(joint, (asked,))[0]):
                 best[joint] = better, k, rival
     if not best:
         return None
