@@ -284,6 +284,8 @@ class Fit:
         noise: one model per recording.
         timing_std_s: how far the torques' timing may be off without being an effect.
         start_std: (n,) N m, what static friction may hold at the first sample.
+        caution: nats that what is rare must be worth beside all else, where the inertias are those
+            of another unit.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -293,6 +295,7 @@ class Fit:
     timing_std_s: float = TIMING_STD_S
     weights: tuple[Array, ...] = ()
     start_std: float | Array = START_NM
+    caution: float = 0.0
 
     @property
     def recordings(self) -> tuple[Signals, ...]:

@@ -45,12 +45,12 @@ def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[list[S
     """Of each recording one model per fold: refitted without that fold's blocks of time."""
     models: list[list[SelfModel]] = [[] for _ in fit.recordings]
     for known in Folds.of(fit, carried).known():
-        without = possible(fit.at(known.x), known)
-        for i, own in enumerate(models):
-            try:
-                own.append(model_of(model, without, i))
-            except ModelError:  # a coefficient at its bound without these data
-                own.append(model_of(model, fit, i))
+        try:
+            own = [model_of(model, possible(fit.at(known.x), known), i) for i in range(len(models))]
+        except ModelError:  # a coefficient at its bound without these data
+            own = [model_of(model, fit, i) for i in range(len(models))]
+        for each, one in zip(models, own, strict=True):
+            each.append(one)
     return models
 
 

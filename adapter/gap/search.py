@@ -31,6 +31,7 @@ from adapter.gap.scan import (
     BELIEF,
     CATALOGUED,
     PATTERNS,
+    Lead,
     Move,
     SignatureTable,
     honest_moves,
@@ -123,6 +124,8 @@ def _extended(
         table = SignatureTable(fit, joints, kind)
         fit, accepted = table.fit, False
         moves = honest_moves(table, refused | {e.candidate.key for e in fit.named})
+        if fit.caution:  # whether the hand held something from the start has been judged
+            moves = [x for x in moves if not any(map(_is_a_load_from_the_start, x.leads))]
         for move in moves[:TRIED]:
             trial = _with(fit, move, table.fit.noise, progress)
             if trial is None:
@@ -228,8 +231,9 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e)
+        rare = not (_is_common(e.candidate.effect) or e.candidate.columns_are_theta)
         if (
-            value < BELIEF
+            value < BELIEF + rare * fit.caution
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.candidate.effect.possible(e.values)
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
@@ -237,6 +241,10 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
         ):
             values[k] = value
     return min(values, key=values.__getitem__) if values else None
+
+
+def _is_a_load_from_the_start(lead: Lead) -> bool:
+    return lead.candidate.effect is HELD and lead.interval_s == WHOLE
 
 
 def _is_common(effect: Effect) -> bool:
