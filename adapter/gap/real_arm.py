@@ -44,7 +44,7 @@ SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
 OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
 OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of another unit
-CAUTION = 60.0  # nats that what is rare must be worth more in an arm that no model describes well
+CAUTION = 300.0  # nats times seconds: what is rare must show the more, the shorter a log is
 WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
 SHOWN = 2.5  # standard deviations of its mass from which on a load is there
@@ -147,7 +147,8 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         return refitted(fit)[0]
     kept = [e for k, e in enumerate(arm.fit.named) if k < len(loaded) or _is_worth_having(arm, k)]
     begun = refitted(arm.fit.with_named(kept).with_noise())[0]
-    return replace(begun, caution=CAUTION if _is_another_unit(arm, fit) else 0.0)
+    seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
+    return replace(begun, caution=CAUTION / seconds if _is_another_unit(arm, fit) else 0.0)
 
 
 def _is_another_unit(arm: RealArm, fit: Fit) -> bool:

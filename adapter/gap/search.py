@@ -133,7 +133,7 @@ def _extended(
                 continue
             fit, accepted = _alongside(trial, move, moves, table, progress), True
             break
-        if not accepted:
+        if not accepted and not (fit.caution and moves):  # else those that were refused hid others
             break
     return fit
 
