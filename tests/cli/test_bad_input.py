@@ -152,7 +152,7 @@ def test_a_load_needs_more_than_one_reading(tmp_path, capsys, count: int) -> Non
     still = motion(1)[0]
     samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(count)]
     said = refused(capsys, "load", record(tmp_path / "log.mcap", samples))
-    assert "log.mcap: only" in said and "record at least 2 s" in said
+    assert "log.mcap: only" in said and "record at least 1.5 s" in said
 
 
 def test_a_folder_cannot_be_written_to(tmp_path, capsys) -> None:

@@ -286,7 +286,7 @@ def test_nothing_found_is_not_called_noise_where_more_is_left() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_console_summary(kind: str) -> None:
     result = replace(result_of(kind), notes=("[bold] is not markup here",))
-    console = Console(width=400, record=True, file=io.StringIO())
+    console = Console(width=800, record=True, file=io.StringIO())
     for line in console_summary(result):
         console.print(line, highlight=False)
     shown = console.export_text()
