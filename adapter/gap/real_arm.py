@@ -70,10 +70,13 @@ class RealArm:
         at = [place_of(self.fit, k)[0] for k in range(self.loads)]
         return np.sqrt(np.diagonal(honest_covariance(self.fit, self.known))[at])
 
+    def value(self, k: int) -> float:
+        """Nats that the k-th effect is worth, what it was worth before the data included."""
+        return worth(self.fit, self.known, k).log_evidence + price(self.fit.named[k])
+
     def is_there(self, k: int) -> bool:
         """Whether the k-th load is."""
-        found = worth(self.fit, self.known, k).log_evidence + price(self.fit.named[k])
-        return found > BELIEF and bool(self.fit.named[k].x[0] > SHOWN * self.mass_std[k])
+        return self.value(k) > BELIEF and bool(self.fit.named[k].x[0] > SHOWN * self.mass_std[k])
 
 
 def real_arm(
@@ -158,8 +161,7 @@ def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
 def _is_worth_having(arm: RealArm, k: int) -> bool:
     """Whether what any arm may have is there, as far as one can say before the search."""
     e = arm.fit.named[k]
-    possible = e.candidate.effect.possible(e.values)
-    return possible and worth(arm.fit, arm.known, k).log_evidence + price(e) > 0.0
+    return e.candidate.effect.possible(e.values) and arm.value(k) > 0.0
 
 
 def _named(effect: Effect, template: Template, joint: int, recording: int | None = None) -> Named:

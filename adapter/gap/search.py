@@ -125,7 +125,7 @@ def _extended(
         fit, accepted = table.fit, False
         moves = honest_moves(table, refused | {e.candidate.key for e in fit.named})
         if fit.caution:  # whether the hand held something from the start has been judged
-            moves = [x for x in moves if not any(map(_is_a_load_from_the_start, x.leads))]
+            moves = [x for x in moves if not any(map(from_the_start, x.leads))]
         for move in moves[:TRIED]:
             trial = _with(fit, move, table.fit.noise, progress)
             if trial is None:
@@ -243,16 +243,12 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
     return min(values, key=values.__getitem__) if values else None
 
 
-def _is_a_load_from_the_start(lead: Lead) -> bool:
-    return lead.candidate.effect is HELD and lead.interval_s == WHOLE
-
-
 def _is_common(effect: Effect) -> bool:
     """Whether any joint may well have it: friction, an offset."""
     return effect.bundled or bool(effect.form)
 
 
-def from_the_start(e: Named) -> bool:
+def from_the_start(e: Named | Lead) -> bool:
     """Whether it is a load from the first sample on.
 
     Nothing is commoner, and what looks like one is called one: heavier links and rarer effects

@@ -20,6 +20,7 @@ from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
 from adapter.effects.base import BAND_MARGIN, Motion
+from adapter.effects.bristle_friction import bending
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
@@ -121,8 +122,7 @@ class Signals:
 
     def _low_start(self) -> Array:
         q = self.motion.q
-        gone = np.cumsum(np.abs(np.diff(q, axis=0, prepend=q[:1])), axis=0) / SLIDE_RAD
-        left = low(np.exp(-gone))
+        left = low(np.column_stack([bending(column, SLIDE_RAD)[1] for column in q.T]))
         return np.asarray(left.T[:, :, None] * np.eye(q.shape[1])[:, None])
 
     def _low_regressor(self) -> Array:
