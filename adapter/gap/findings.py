@@ -44,12 +44,15 @@ def _joints(named: Named) -> list[int]:
 def entries(fit: Fit, recording: int | None = None) -> list[dict[str, Any]]:
     """Entries of a model file for the named effects of the catalogue.
 
+    What was assumed and is as no arm has it (without some blocks of the data, say) is not there.
+
     Args:
         recording: of several, whose own effects are among them; None: what is common alone.
     """
     out, alone = [], len(fit.recordings) == 1
     for named in fit.named:
         here = alone or named.recording in (None, recording)
+        here &= not named.assumed or named.possible
         if here and not isinstance(named.candidate.effect, Pattern):
             begin, end = (None if not np.isfinite(x) else float(x) for x in named.interval_s)
             out.append(
@@ -153,7 +156,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
         effect = named.candidate.effect
-        if isinstance(effect, Pattern):
+        if isinstance(effect, Pattern) or k in found.weak:
             continue
         recording = named.recording or 0
         own, (name, last) = named.recording is not None, list(ends.items())[recording]

@@ -47,12 +47,15 @@ class Named:
     Attributes:
         candidate: what and where; x: (k,) its coefficients.
         interval_s: when; recording: in which one, None in all.
+        assumed: whether any arm has it: it stays in the model, and is told by name where it is
+            worth it.
     """
 
     candidate: Candidate
     x: Array
     interval_s: tuple[float, float] = WHOLE
     recording: int | None = None
+    assumed: bool = False
 
     @property
     def is_pattern(self) -> bool:
@@ -63,6 +66,11 @@ class Named:
     def values(self) -> dict[str, Any]:
         """Its parameters."""
         return self.candidate.template.decode(self.x)
+
+    @property
+    def possible(self) -> bool:
+        """Whether physics allows its parameters."""
+        return self.candidate.effect.possible(self.values)
 
     def active(self) -> Active:
         """As the model uses it."""

@@ -42,12 +42,13 @@ WHERE_IT_MOVES = (
 OFFSET = CATALOGUE["torque_offset"]
 SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
+LAST_SHARE = 2.5  # of the last link at most: an error of it that looks like a load is called one
 OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
 OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of another unit
 CAUTION = 300.0  # nats times seconds: what is rare must show the more, the shorter a log is
 WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
-SHOWN = 2.5  # standard deviations of its mass from which on a load is there
+SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,8 @@ class RealArm:
 
     def is_there(self, k: int) -> bool:
         """Whether the k-th load is."""
-        return self.value(k) > BELIEF and bool(self.fit.named[k].x[0] > SHOWN * self.mass_std[k])
+        shown = self.fit.named[k].x[0] / self.mass_std[k]
+        return bool(shown > SURE or (shown > SHOWN and self.value(k) > BELIEF))
 
 
 def real_arm(
@@ -114,24 +116,31 @@ def fitting_way(fit: Fit, load: Named) -> Named:
 
 def _as_wide_as_open(fit: Fit, shares: Sequence[float]) -> tuple[Fit, Carried]:
     """A fit with the widest prior of the inertias that its data do not speak against."""
-    wide, known = under_own_noise(replace(fit, prior=shares[-1] * fit.prior))
+    wide, known = under_own_noise(replace(fit, prior=_shared(fit, shares[-1])))
     std, worths = known.prior_std.copy(), []
-    for share in shares:
-        std[: fit.dtheta.size] = share * fit.prior.ravel()
+    for share in (*shares, MADE_UP):
+        std[: fit.dtheta.size] = _shared(fit, share).ravel()
         worths.append(score(known.G, known.g, std).log_evidence)
-    share = shares[int(np.flatnonzero(np.array(worths) > max(worths) - OPEN_NATS)[-1])]
-    std[: fit.dtheta.size] = MADE_UP * fit.prior.ravel()
-    made_up = score(known.G, known.g, std).log_evidence > max(worths) + MADE_UP_NATS
-    if made_up and len(shares) > 1:
-        return under_own_noise(replace(fit, prior=MADE_UP * fit.prior))
-    return refitted(replace(wide, prior=share * fit.prior))
+    *open_to, made_up = worths
+    if made_up > max(open_to) + MADE_UP_NATS and len(shares) > 1:
+        return under_own_noise(replace(fit, prior=_shared(fit, MADE_UP)))
+    share = shares[int(np.flatnonzero(np.array(open_to) > max(open_to) - OPEN_NATS)[-1])]
+    return refitted(replace(wide, prior=_shared(fit, share)))
+
+
+def _shared(fit: Fit, share: float) -> Array:
+    """(n, 10) prior of the inertias, so many times as wide."""
+    times = np.full((fit.n, 10), share)
+    times[-1, : 1 if share == MADE_UP else 10] = min(share, LAST_SHARE)
+    return np.asarray(times * fit.prior)
 
 
 def start(fit: Fit, joints: Sequence[int]) -> Fit:
     """What a search starts from.
 
     That is the nominal model itself, unless the hand holds something or the inertias are those of
-    another unit: then it has what is worth having of all that any arm may have.
+    another unit: then it has all that any arm may have. None of that is dropped for being weak:
+    what all offsets together leave open of a load's mass, they would leave to the inertias alone.
 
     Args:
         fit: the nominal model on the recordings, with their loads where these are known already.
@@ -148,8 +157,7 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         arm = real_arm(fit, joints, loaded)
     if not loaded and not _is_another_unit(arm, fit):
         return refitted(fit)[0]
-    kept = [e for k, e in enumerate(arm.fit.named) if k < len(loaded) or _is_worth_having(arm, k)]
-    begun = refitted(arm.fit.with_named(kept).with_noise())[0]
+    begun = without_impossible(arm.fit.with_noise())[0]
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
     return replace(begun, caution=CAUTION / seconds if _is_another_unit(arm, fit) else 0.0)
 
@@ -158,24 +166,31 @@ def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
     return bool(arm.fit.prior[0, 0] >= OTHER_UNIT * fit.prior[0, 0])
 
 
-def _is_worth_having(arm: RealArm, k: int) -> bool:
-    """Whether what any arm may have is there, as far as one can say before the search."""
-    e = arm.fit.named[k]
-    return e.candidate.effect.possible(e.values) and arm.value(k) > 0.0
+def without_impossible(fit: Fit) -> tuple[Fit, Carried]:
+    """A fit without what was assumed and came out as no arm has it: friction that drives."""
+    while True:
+        fit, known = refitted(fit)
+        kept = [e for e in fit.named if not e.assumed or e.possible]
+        if len(kept) == len(fit.named):
+            return fit, known
+        fit = fit.with_named(kept)
 
 
-def _named(effect: Effect, template: Template, joint: int, recording: int | None = None) -> Named:
+def _named(effect: Effect, template: Template, joint: int) -> Named:
     """An effect at zero, to be fitted."""
-    x = np.zeros(len(template.prior_std))
-    return Named(Candidate(effect, template, joint, ()), x, recording=recording)
+    return Named(Candidate(effect, template, joint, ()), np.zeros(len(template.prior_std)))
+
+
+def _assumed(effect: Effect, template: Template, joint: int) -> Named:
+    return replace(_named(effect, template, joint), assumed=True)
 
 
 def _load(fit: Fit, recording: int | None) -> Named:
-    return _named(HELD, fit.model.hand.templates()[1], -1, recording)
+    return replace(_named(HELD, fit.model.hand.templates()[1], -1), recording=recording)
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
     """With friction and motors of the joints (from 0) that move, and offsets of all, at zero."""
-    own = [_named(effect, way, j) for effect, way in WHERE_IT_MOVES for j in joints]
-    own += [_named(OFFSET, OFFSET.templates()[0], j) for j in range(fit.n)]
+    own = [_assumed(effect, way, j) for effect, way in WHERE_IT_MOVES for j in joints]
+    own += [_assumed(OFFSET, OFFSET.templates()[0], j) for j in range(fit.n)]
     return fit.with_named([*fit.named, *own])

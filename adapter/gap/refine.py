@@ -20,7 +20,7 @@ from adapter.effects.base import TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, noise_of
 from adapter.gap.fit import Fit, Named, refitted, shaped, unsure
-from adapter.gap.search import Found, worst
+from adapter.gap.search import Found, weak, worst
 from adapter.model.spatial import Array
 
 ROUNDS, NOISE_ROUNDS = 2, 3
@@ -94,7 +94,8 @@ def refined(found: Found) -> Found:
         fit, carried = _refitted(fit, counted)
         bad = worst(fit, carried)
         if bad is None:
-            return replace(found, fit=fit, carried=carried, standings=tuple(standings))
+            named = frozenset(weak(fit, carried))
+            return replace(found, fit=fit, carried=carried, standings=tuple(standings), weak=named)
         fit = fit.without(bad)
         del standings[bad]
 

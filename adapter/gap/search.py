@@ -56,6 +56,7 @@ class Found:
     Attributes:
         fit: the model, under its own noise; carried: what is known of its coefficients.
         standings: of each named effect among its rivals.
+        weak: places of named effects that any arm has and these data do not single out.
         known: what is known of them with the inertias free within their prior, where `carried`
             holds these fast.
         rounds: that were made; ran_out: and there was none left where one was wanted.
@@ -65,6 +66,7 @@ class Found:
     carried: Carried
     standings: tuple[Standing, ...]
     known: Carried | None = None
+    weak: frozenset[int] = frozenset()
     rounds: int = 0
     ran_out: bool = False
 
@@ -148,7 +150,9 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         names = [
             e
             for e in fit.named
-            if e.candidate.joint == joint and isinstance(e.candidate.effect, TorqueEffect)
+            if e.candidate.joint == joint
+            and isinstance(e.candidate.effect, TorqueEffect)
+            and not e.assumed
         ]
         words = [e for e in names if not e.is_pattern and e.interval_s == WHOLE]
         curve = len({e.candidate.effect.name for e in words if e.candidate.effect.over_angle}) > 1
@@ -205,7 +209,7 @@ def _with(
         trial = trial.without(bad)
         if len(trial.named) == before:
             return None
-    return trial if all(e.candidate.effect.possible(e.values) for e in trial.named) else None
+    return trial if all(e.assumed or e.possible for e in trial.named) else None
 
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
@@ -221,12 +225,22 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         ranked = standings(fit, carried, table)
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
-            return Found(fit, carried, ranked)
+            return Found(fit, carried, ranked, weak=frozenset(weak(fit, carried)))
         fit, swaps = dated_anew(swapped), swaps + 1
 
 
 def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
-    """Of the named effects from `first` on the one that is least worth having, if one is not."""
+    """Of the named effects from `first` on the one that is least worth having, if one is not.
+
+    What any arm has stays, unless no arm has it so.
+    """
+    values = weak(fit, carried, first)
+    losing = [k for k in values if not (fit.named[k].assumed and fit.named[k].possible)]
+    return min(losing, key=values.__getitem__, default=None)
+
+
+def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
+    """Places of named effects from `first` on that are not worth a name, and their nats."""
     values, folds = {}, Folds.of(fit, carried)
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
@@ -235,12 +249,12 @@ def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
         if (
             value < BELIEF + rare * fit.caution
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
-            or not e.candidate.effect.possible(e.values)
+            or not e.possible
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
             or not (from_the_start(e) or pays_held_out(fit, folds, k))
         ):
             values[k] = value
-    return min(values, key=values.__getitem__) if values else None
+    return values
 
 
 def _is_common(effect: Effect) -> bool:
@@ -289,7 +303,8 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
     together = [joint for joint in best if joint >= 0] if first >= 0 else [first]
     for joint in together:
         _, k, rival = best[joint]
-        fit = fit.instead(k, replace(fit.named[k], candidate=rival.candidate, x=rival.x))
+        other = replace(fit.named[k], candidate=rival.candidate, x=rival.x, assumed=False)
+        fit = fit.instead(k, other)
     return fit
 
 

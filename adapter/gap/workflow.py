@@ -38,6 +38,10 @@ from adapter.signals.matching import present
 from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
+ASSUMED = (
+    "the model has what any arm has (friction, motor inertia, offsets) where these data do not "
+    "single it out, too: it is not told by name"
+)
 NO_NAME = 0.5  # probability below which an effect is not told by name
 UNPLACED = (
     "the inertias were corrected by more than 4 prior standard deviations; which link it is, these "
@@ -239,6 +243,8 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]
     if np.abs(found.fit.dtheta / trusted).max() > ODD and not any(map(_of_a_body, findings)):
         notes.append(UNPLACED)
+    if found.weak:
+        notes.append(ASSUMED)
     splits = (x for f in findings if f.split_by for x in f.split_by.split("; "))
     return GapResult(
         joint_names=task.model.tree.joint_names,
