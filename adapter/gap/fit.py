@@ -536,6 +536,7 @@ def _other_shapes(named: Named, step: float) -> list[Named]:
     for ratio in (step**-2, 1.0 / step, step, step**2):
         template = named.candidate.effect.reshaped(named.values, ratio)
         assert template is not None
+        template = replace(template, prior_std=named.candidate.template.prior_std)
         out.append(replace(named, candidate=replace(named.candidate, template=template)))
     return out
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
@@ -17,7 +18,7 @@ from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import Curves, RolloutCurves, Shortfall
-from adapter.gap.search import Found
+from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -27,6 +28,8 @@ from adapter.simulate import DrivenMotion, Simulate
 
 SEGMENT_S = 0.5
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
+WORSE = 1.05  # times its error before: a joint that has become worse
+ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
 THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
@@ -215,7 +218,7 @@ def measure(
     task: GapTask, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
-    searched, found = found.fit, _corrected_where_it_pays(task, refined(found))
+    searched, found = found.fit, _paying(task, refined(found))
     fit = possible(found.fit, found.carried)
     found = replace(found, fit=replace(fit, noise=searched.noise, weights=searched.weights))
     block = block_s(found.fit)
@@ -255,17 +258,67 @@ def lasting(model: SelfModel) -> SelfModel:
     return replace(model, effects=tuple(kept))
 
 
-def _corrected_where_it_pays(task: GapTask, found: Found) -> Found:
-    """Without the corrections of the inertias where they do not pay on held-out data."""
-    bare = uncorrected(found)
-    level = noise_floor(found.fit)
-    costs = []
-    for own in (found, bare):
-        block, models = block_s(own.fit), held_out_models(task.model, own.fit, own.carried)
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """What was found, and its errors on the blocks that it was fitted without.
+
+    Attributes:
+        before, after: (n,) rms N m, of the nominal model and of the new one; level: of the noise.
+    """
+
+    found: Found
+    before: Array
+    after: Array
+    level: Array
+
+    @classmethod
+    def of(cls, task: GapTask, found: Found, level: Array) -> _Scored:
+        """Scored by folds of the fitted recordings."""
+        block, models = block_s(found.fit), held_out_models(task.model, found.fit, found.carried)
         pairs = zip(task.fitted, models, strict=True)
         errors = [torque_errors(r, task.model, folds, block) for r, folds in pairs]
-        costs.append(np.sum((rms([e.after for e in errors]) / level) ** 2))
-    return found if costs[0] <= costs[1] else bare
+        before, after = (rms([getattr(e, key) for e in errors]) for key in ("before", "after"))
+        return cls(found, before, after, level)
+
+    @property
+    def cost(self) -> float:
+        """Of all joints."""
+        return float(np.sum((self.after / self.level) ** 2))
+
+    @property
+    def worse(self) -> NDArray[np.bool_]:
+        """(n,) joints that the new model makes worse."""
+        return np.asarray(self.after > WORSE * self.before)
+
+
+def _paying(task: GapTask, found: Found) -> Found:
+    """Without what does not pay on held-out data: corrections of the inertias, single effects."""
+    level = noise_floor(found.fit)
+    best = min(
+        (_Scored.of(task, x, level) for x in (found, uncorrected(found))), key=lambda x: x.cost
+    )
+    while best.worse.any() and best.found.fit.named:
+        fewer = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
+        if not fewer or min(x.cost for x in fewer) > best.cost:
+            break
+        best = min(fewer, key=lambda x: x.cost)
+    return best.found
+
+
+def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
+    """What was found less one effect that acts on one of these joints (n,), for each of those."""
+    fit, out = found.fit, []
+    for k in range(len(fit.named)):
+        if from_the_start(fit.named[k]):
+            continue
+        size = np.abs(fit.model.contribution(fit.named[k].recording or 0, k)).max(axis=0)
+        if (size[joints] > ACTS * size.max()).any():
+            rest, carried = refitted(fit.without(k))
+            standings = found.standings[:k] + found.standings[k + 1 :]
+            weak = frozenset(i - (i > k) for i in found.weak if i != k)
+            less = replace(found, fit=rest, carried=carried, standings=standings, weak=weak)
+            out.append(uncorrected(less) if not fit.dtheta.any() else replace(less, known=None))
+    return out
 
 
 def uncorrected(found: Found) -> Found:

@@ -48,6 +48,7 @@ OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of anot
 CAUTION = 300.0  # nats times seconds: what is rare must show the more, the shorter a log is
 WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
+LARGER = 2.0  # times what is believed of friction: an arm that has it has larger joints
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
 
@@ -92,12 +93,13 @@ def real_arm(
         shares: times the prior of the inertias that are tried, least first.
     """
     loads = [_load(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
+    trial = _beside(fit.with_named(loads), joints)
     for _ in range(WAY_ROUNDS):
-        found, known = _as_wide_as_open(_beside(fit.with_named(loads), joints), shares)
-        before = [e.candidate.template.label for e in loads]
-        loads = [fitting_way(fit, e) for e in found.named[: len(loads)]]
-        if before == [e.candidate.template.label for e in loads]:
+        found, known = _as_wide_as_open(trial, shares)
+        fitting = [_fitting(fit, e) for e in found.named]
+        if list(map(_way, fitting)) == list(map(_way, trial.named)):
             break
+        trial = fit.with_named(fitting)
     return RealArm(found, known, len(loads))
 
 
@@ -112,6 +114,21 @@ def fitting_way(fit: Fit, load: Named) -> Named:
     way = min(range(len(MASSES_KG)), key=lambda k: abs(float(np.log(mass / MASSES_KG[k]))))
     template = fit.model.hand.templates()[way]
     return replace(load, candidate=replace(load.candidate, template=template))
+
+
+def _way(e: Named) -> tuple[str, tuple[float, ...]]:
+    return e.candidate.template.label, tuple(e.candidate.template.prior_std)
+
+
+def _fitting(fit: Fit, e: Named) -> Named:
+    """An effect, looked for as one of about its size: arms are small and large."""
+    if not e.assumed:
+        return fitting_way(fit, e)
+    own, size = np.array(e.candidate.prior_std), np.abs(e.x)
+    if np.all(size < LARGER * own):
+        return e
+    template = replace(e.candidate.template, prior_std=tuple(map(float, np.maximum(own, size))))
+    return replace(e, candidate=replace(e.candidate, template=template))
 
 
 def _as_wide_as_open(fit: Fit, shares: Sequence[float]) -> tuple[Fit, Carried]:

@@ -44,6 +44,7 @@ CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 4, 0.0  # names that are exchanged for better ones, and by how much
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 CLEAR = 3.0  # standard deviations of a force
+WEIGHTLESS = 1e-9  # m/s², least gravity
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
@@ -272,9 +273,19 @@ def from_the_start(e: Named | Lead) -> bool:
 
 
 def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
-    """Whether the force of what pushes for a time is clearly above its doubt."""
+    """Whether the force of what pushes is clearly above its doubt, and is no weight.
+
+    What never comes nor goes is weight, unless most of it points another way than down.
+    """
     own = place_of(fit, k)[:3]
     force, doubt = fit.coefficients[own], honest_covariance(fit, carried)[np.ix_(own, own)]
+    if fit.named[k].interval_s == WHOLE:
+        gravity = fit.model.arm.gravity
+        down = gravity / max(float(np.linalg.norm(gravity)), WEIGHTLESS)
+        aside = force - (force @ down) * down
+        if aside @ aside < (force @ down) ** 2:
+            return False
+        force = aside
     square = float(force @ force)
     return square**2 > CLEAR**2 * float(force @ doubt @ force)
 
