@@ -33,7 +33,6 @@ Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 FEWEST_TO_FILTER = 100  # instants
-BAND_MARGIN = 1.3  # of a band, over where power ends
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
 BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
@@ -91,7 +90,8 @@ class Motion:
         t: (m,) s since the recording began, increasing.
         q, dq, ddq: (m, n) rad, rad/s, rad/s².
         arm: the rigid body that moves.
-        band_hz: where the motion is smooth but for noise: it holds next to nothing above this.
+        bands_hz: (n,) above which what the joints' torques hold is noise of the motion; None where
+            nobody asked.
     """
 
     t: Array
@@ -99,7 +99,7 @@ class Motion:
     dq: Array
     ddq: Array
     arm: ArmDynamics
-    band_hz: float = math.inf
+    bands_hz: Array | None = None
 
     @property
     def direction(self) -> Array:
@@ -115,20 +115,13 @@ class Motion:
             changed[name] = table
         return replace(self, **changed)
 
-    def inside_band(self, x: Array, share: float | None = None) -> Array:
-        """x (m,) without what lies above the motion's band, where further rates are noise.
-
-        `share`: and without what lies above this share of x's own power.
-        """
-        if not math.isfinite(self.band_hz) or len(self.t) < FEWEST_TO_FILTER:
+    def inside_band(self, x: Array, joint: int) -> Array:
+        """Torque x (m,) of a joint without what lies above its band: further rates are noise."""
+        if self.bands_hz is None or len(self.t) < FEWEST_TO_FILTER:
             return x
-        from scipy.signal import butter, periodogram, sosfiltfilt  # long to load; no loop needs it
+        from scipy.signal import butter, sosfiltfilt  # long to load; no loop needs it
 
-        fs, band_hz = 1.0 / (self.t[1] - self.t[0]), self.band_hz
-        if share is not None:
-            f, power = periodogram(x, fs, "hann")
-            own = float(f[np.searchsorted(np.cumsum(power), share * power.sum())])
-            band_hz = min(band_hz, BAND_MARGIN * own)
+        fs, band_hz = 1.0 / (self.t[1] - self.t[0]), float(self.bands_hz[joint])
         if not 0.0 < band_hz < 0.5 * fs:
             return x
         return np.asarray(sosfiltfilt(butter(4, band_hz, fs=fs, output="sos"), x, axis=0))

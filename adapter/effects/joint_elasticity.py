@@ -29,7 +29,7 @@ class JointElasticity(MotionEffect):
 
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """q - tau/k with two derivatives: fourth ones of q, nothing but noise above a band."""
-        twist = -motion.inside_band(tau[:, joint]) / float(values["k"])
+        twist = -motion.inside_band(tau[:, joint], joint) / float(values["k"])
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import (
+    ALL,
     LATE,
     Array,
     JointSignals,
@@ -22,14 +23,14 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
 
 MOST_AHEAD_S, MOST_S = 3e-3, 0.06  # velocities that come late make torque look early
-POWER_SHARE = 0.99  # of a torque: what is faster may be noise of the acceleration
 
 
 class TorqueFilter(LearnedEffect, SensorEffect):
-    """A torque sensor that passes only what is slow."""
+    """A torque sensor that passes only what is slow; all joints' alike, or one's."""
 
     name = "torque_filter"
     title = "torque sensor low-pass"
+    scope = ALL
     parameters = (Parameter("d", "s", lower=-0.1, upper=0.1), Parameter("c", "s2"))
     prior_std = (3e-3, 1e-4)
     by_rates = True
@@ -56,14 +57,15 @@ class TorqueFilter(LearnedEffect, SensorEffect):
         return d, max(d * d - float(values["c"]), 0.0)
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """tau, its rate and the rate of that, on the joint.
+        """tau, its rate and the rate of that, on the joint or all of them.
 
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
         measured torque look smoother than the one that the motion asks for.
         """
-        own, out = tau[:, joint], tau.copy()
-        bend = motion.rate(motion.rate(motion.inside_band(own, POWER_SHARE)))
-        out[:, joint] += values["c"] * bend - values["d"] * motion.rate(own)
+        out = tau.copy()
+        for j in range(tau.shape[1]) if joint < 0 else (joint,):
+            bend = motion.rate(motion.rate(motion.inside_band(tau[:, j], j)))
+            out[:, j] += values["c"] * bend - values["d"] * motion.rate(tau[:, j])
         return np.asarray(out)
 
     def basis(self, at: JointSignals) -> tuple[Array, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from adapter.effects.active import WHOLE, Active
-from adapter.effects.base import ArmDynamics, TorqueEffect
+from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
 from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
@@ -209,6 +209,8 @@ class Model:
         if isinstance(e.candidate.effect, TorqueEffect):  # bodies and motion stay as they are
             alone = added(at.links, at.rigid, (e.active(),)) - at.rigid
             return own.low(at.sensed - sensors(at.links, at.total - alone, others))
+        if isinstance(e.candidate.effect, SensorEffect):
+            return own.low(at.sensed - sensors(at.links, at.total, others))
         return own.low(at.sensed - stages_of(own, others, self.arm).sensed)
 
     def signatures(self, recording: int) -> Array:
@@ -273,12 +275,16 @@ class Model:
     def _slopes(self, recording: int, place: int) -> Array:
         """(c, k, n) change of the whole torque per unit of each coefficient of an effect."""
         e, own, out = self.named[place], self.recordings[recording], []
+        at = self.stages(recording)
         for i, std in enumerate(e.candidate.prior_std):
             x = e.x.copy()
             x[i] += STEP * std
             other = replace(self, named=(*self.named[:place], e.at(x), *self.named[place + 1 :]))
-            change = other.stages(recording).sensed - self.stages(recording).sensed
-            out.append(own.low(change / (STEP * std)))
+            if isinstance(e.candidate.effect, SensorEffect):  # what they read stays as it is
+                sensed = sensors(at.links, at.total, other.actives(recording))
+            else:
+                sensed = other.stages(recording).sensed
+            out.append(own.low((sensed - at.sensed) / (STEP * std)))
         return np.array(out)
 
 
@@ -333,8 +339,16 @@ class Fit:
     @property
     def is_linear(self) -> bool:
         """Whether the predicted torque is linear in all coefficients (a delay of 1 ms is)."""
+        return self.links_stay and not any(
+            isinstance(e.candidate.effect, SensorEffect) for e in self.named
+        )
+
+    @property
+    def links_stay(self) -> bool:
+        """Whether the torque that the sensors read is linear in all coefficients."""
         return all(
-            isinstance(e.candidate.effect, TorqueEffect) or e.candidate.columns_are_theta
+            isinstance(e.candidate.effect, TorqueEffect | SensorEffect)
+            or e.candidate.columns_are_theta
             for e in self.named
         )
 
@@ -519,7 +533,7 @@ def shaped(fit: Fit, place: int) -> Fit:
     effect = fit.named[place].candidate.effect
     if effect.reshaped(fit.named[place].values, 1.0) is None:
         return fit
-    if fit.is_linear and isinstance(effect, TorqueEffect) and not effect.by_load:
+    if fit.links_stay and isinstance(effect, TorqueEffect) and not effect.by_load:
         return _reshaped(fit, place)
     for step in SHAPE_STEPS:
         named = fit.named[place]

@@ -39,7 +39,7 @@ WHERE_IT_MOVES = (
         for name in ("viscous_friction", "motor_inertia")
     ),
 )
-OFFSET = CATALOGUE["torque_offset"]
+OFFSET, SENSORS_BAND = CATALOGUE["torque_offset"], CATALOGUE["torque_filter"]
 SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
 LAST_SHARE = 2.5  # of the last link at most: an error of it that looks like a load is called one
@@ -174,7 +174,11 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         arm = real_arm(fit, joints, loaded)
     if not loaded and not _is_another_unit(arm, fit):
         return refitted(fit)[0]
-    begun = without_impossible(arm.fit.with_noise())[0]
+    begun = arm.fit
+    if _is_another_unit(arm, fit):  # a real arm's: what its torques lack of the motion's band
+        band = _named(SENSORS_BAND, SENSORS_BAND.templates()[0], -1)
+        begun = begun.with_named([*begun.named, band])
+    begun = without_impossible(begun.with_noise())[0]
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
     return replace(begun, caution=CAUTION / seconds if _is_another_unit(arm, fit) else 0.0)
 

@@ -47,12 +47,14 @@ class Standing:
         candidate: the named effect.
         log_evidence: nats over nothing, its odds included; chi2: fall of the squared distance.
         rivals: the most credible first.
+        assumed: whether any arm has it: then nothing is better for being simpler.
     """
 
     candidate: Candidate
     log_evidence: float
     chi2: float
     rivals: tuple[Rival, ...]
+    assumed: bool = False
 
     @property
     def probability(self) -> float:
@@ -65,7 +67,7 @@ class Standing:
         mine, other = (self.candidate, self.chi2), (rival.candidate, rival.chi2)
         if simpler_wins(mine, other):
             return -np.inf
-        if simpler_wins(other, mine):
+        if not self.assumed and simpler_wins(other, mine):
             return np.inf
         return rival.log_evidence - self.log_evidence
 
@@ -118,7 +120,8 @@ def _standing(
     best.pop(named.candidate.key, None)
     taken = {e.candidate.key for e in fit.named}
     rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
-    return Standing(named.candidate, mine.log_evidence + price(named), mine.chi2, tuple(rivals))
+    value = mine.log_evidence + price(named)
+    return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.assumed)
 
 
 class _Reduced(NamedTuple):

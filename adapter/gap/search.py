@@ -43,6 +43,7 @@ ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 4, 0.0  # names that are exchanged for better ones, and by how much
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
+SAME_SHARE = 0.5  # of a signature that another name for it explains
 CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
@@ -306,7 +307,8 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
                 joint, asked = -1, FAR_NATS
             elif _is_common(own.candidate.effect) and not _is_common(rival.candidate.effect):
                 asked = FAR_NATS
-            if rival.credible and better > max(asked, best.get(joint, (asked,))[0]):
+            alike = rival.overlap > SAME_SHARE  # else it is another effect, no other name
+            if alike and rival.credible and better > max(asked, best.get(joint, (asked,))[0]):
                 best[joint] = better, k, rival
     if not best:
         return None

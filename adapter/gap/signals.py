@@ -8,6 +8,7 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,7 +20,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
-from adapter.effects.base import BAND_MARGIN, Motion
+from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -32,7 +33,9 @@ DECIMATION = 10  # from there to the band: 25 Hz
 CUT_HZ = 10.0
 TAPS = 101  # of the low-pass: 0.9 at 8 Hz, 0.5 at 10, 0.05 at 12.5
 RAW_HZ = 1000.0
-BAND_REST = 1e-3
+BAND_MARGIN = 1.3  # of a torque's band, over where it no longer stands out of noise
+CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at least
+MASSES = 20  # instants at which the mass matrix is asked for
 LEAST_S = 1.2  # of a recording
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
@@ -145,17 +148,37 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     if t[-1] - t[0] < LEAST_S:
         raise ValueError(f"the search needs {LEAST_S:g} s of data, got {t[-1] - t[0]:.2f} s")
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
-    smoothed = (repeat or recording).smoothed().at(grid)
-    motion = Motion(grid, *smoothed, arm, _band(smoothed[1]))
+    source = repeat or recording
+    smoothed = source.smoothed()
+    q, dq, ddq = smoothed.at(grid)
+    noise = 2.0 * float(np.median(np.diff(source.t))) * smoothed.dq_noise**2
+    motion = Motion(grid, q, dq, ddq, arm)
+    motion = replace(motion, bands_hz=_bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
     return Signals(motion, low(_at(grid, t, recording.tau)), band_t)
 
 
-def _band(dq: Array) -> float:
-    """Frequency below which all but a thousandth of every joint's speed lies, with a margin, Hz."""
-    f, power = periodogram(dq, fs=RATE_HZ, window="hann", axis=0)
-    share = np.cumsum(power, axis=0) / power.sum(axis=0)
-    return BAND_MARGIN * float(f[np.argmax(share > 1.0 - BAND_REST, axis=0)].max())
+def _bands_of(motion: Motion, noise: Array) -> Array:
+    """(n,) Hz above which a joint's torque does not stand out of the noise of the motion.
+
+    Infinite where it does as far as torques are compared. `noise` is (n,) rad²/s²/Hz, of dq.
+    """
+    arm = motion.arm
+    some = motion.q[:: max(len(motion.q) // MASSES, 1)]
+    rest = np.zeros_like(some)
+    held = arm.torque(some, rest, rest)
+    mass = [arm.torque(some, rest, rest + unit) - held for unit in np.eye(arm.n)]
+    made = np.mean(np.square(mass), axis=1).T @ noise  # times the square of the circular frequency
+    tau = arm.torque(motion.q, motion.dq, motion.ddq)
+    f, power = periodogram(tau, fs=RATE_HZ, window="hann", axis=0)
+    inside = f < 0.5 * RATE_HZ / DECIMATION
+    f, power = f[inside], power[inside]
+    theirs = np.cumsum((2.0 * np.pi * f[::-1]) ** 2)[::-1, None] * made
+    clear = np.cumsum(power[::-1], axis=0)[::-1] > CLEAR * theirs
+    clear &= (f <= f[-1] - TOP_HZ)[:, None]
+    last = len(f) - 1 - np.argmax(clear[::-1], axis=0)
+    band = np.where(f[last] + 2.0 * f[1] > f[-1] - TOP_HZ, math.inf, BAND_MARGIN * f[last])
+    return np.where(clear.any(axis=0), band, 0.0)
 
 
 def _at(grid: Array, t: Array, tau: Array) -> Array:

@@ -16,7 +16,7 @@ joint (`Effects.__call__`), what encoders and torque sensors make of it as a rea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -179,7 +179,12 @@ class Effects:
         self._switches = np.array(sorted(ends))
         self._stages: dict[int, _Stage] = {}
         self._bristles = Bristles(self._active, n, period_s)
-        self._slow = [a for a in self._active if _low_pass(a)]
+        self._slow = [
+            replace(a, joint=j)
+            for a in self._active
+            if _low_pass(a)
+            for j in (range(n) if a.joint < 0 else (a.joint,))
+        ]
         kinds = TorqueEffect, BodyEffect
         silent = by_joint(self._active, n).left_out
         told = {a.effect.name for a in self._active if isinstance(a.effect, kinds) or _low_pass(a)}
