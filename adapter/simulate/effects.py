@@ -282,7 +282,7 @@ class Effects:
             tau: (m, n) driving torque, N m.
         """
         ddq = np.gradient(dq, t, axis=0)
-        read = Motion(t, q, dq, ddq, self._arm, BAND_HZ)
+        read = Motion(t, q, dq, ddq, self._arm, np.full_like(q[0], BAND_HZ))
         moved = moved_links(read, self._active, tau)
         self._bristles.follow(t, moved.q, moved.dq)
         return moved.q + self._holds.offset, moved.dq
