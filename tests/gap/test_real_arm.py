@@ -26,6 +26,7 @@ from tests.helpers.arm_data import panda_model
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
 
 PRIOR = 0.02
+DRY = ("coulomb_friction", "bristle_friction", "stribeck_friction", "asymmetric_friction")
 TWINS = (700, 701, 702, 703, 704, 705, 706, 707, 708, 709)
 
 
@@ -90,6 +91,17 @@ def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
     (load,) = (f for f in found.findings if f.effect == HELD.name)
     assert abs(load.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * load.std["m"])
     assert "external_wrench" not in {f.effect for f in found.findings}
+
+
+def test_friction_of_large_joints_is_told_once() -> None:
+    """Twenty times a Panda's: its size is no reason to split it into two effects."""
+    twin = draw_twin(704)
+    large = {key: 20.0 * getattr(twin.friction, key) for key in ("coulomb", "viscous")}
+    log = by_pinocchio(replace(twin, friction=replace(twin.friction, **large))).log()
+    found = find_gap([log], documented())
+    dry = [f for f in found.findings if f.effect in DRY]
+    assert dry and len({f.joints for f in dry}) == len(dry)
+    assert max(f.parameters["Fc"] for f in dry) > 5.0
 
 
 def test_where_a_load_is_likely_to_be() -> None:

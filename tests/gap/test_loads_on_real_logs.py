@@ -1,0 +1,88 @@
+"""A load added to pieces of a real Panda's log (Gaz et al. 2019): all else is the real arm's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pybullet_data
+import pytest
+from scipy.signal import butter, sosfiltfilt
+
+from adapter.effects.robots import read_robot
+from adapter.gap.nominal import nominal_fit
+from adapter.gap.real_arm import RealArm, real_arm
+from adapter.gap.screen import refuse
+from adapter.gap.signals import Recorded
+from adapter.gap.timing import lateness
+from adapter.model.self_model import SelfModel
+from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import Log
+from sim.hidden.record import Recording
+from sim.hidden.trial import nominal_urdf
+from sim.truth import Array, panda
+from tests.helpers.gap_effects import regressor
+
+DATA = Path(__file__).parents[2].parent / "shared" / "data" / "panda_gaz2019"
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the folder of real logs is not beside the project"
+)
+PIECES_S = ((0.5, 4.5), (6.0, 10.0), (12.0, 15.5), (16.0, 20.0))
+LOADS_KG = (0.0, 1.2, 2.5, 4.0)
+BAND_HZ = 15.0
+PRIOR = 0.02
+CENTRE_M, HALF_M = np.array([0.01, -0.02, 0.17]), 0.04  # in the last link's frame; of a cube
+
+
+@pytest.fixture(scope="module")
+def signals() -> tuple[Array, ...]:
+    """t (m,) s; q, dq, tau (m, n)."""
+    names = ("time", "positions", "velocity", "torques")
+    t, *rest = (np.loadtxt(DATA / f"exciting_traj_{name}.txt") for name in names)
+    return t, *(x.reshape(len(t), -1) for x in rest)
+
+
+def loaded(signals: tuple[Array, ...], mass: float, piece: tuple[float, float]) -> Log:
+    """A piece of the log, with what a cube of so many kg adds to the torques."""
+    t, q, dq, tau = signals
+    grid = np.arange(t[0], t[-1], 1e-3)
+    low = butter(2, BAND_HZ, fs=1000, output="sos")
+    way = sosfiltfilt(low, np.column_stack([np.interp(grid, t, x) for x in q.T]), axis=0)
+    speed = np.gradient(way, 1e-3, axis=0)
+    own = HALF_M**2 * 2 / 3 * np.eye(3) + CENTRE_M @ CENTRE_M * np.eye(3)
+    inertia = (own - np.outer(CENTRE_M, CENTRE_M))[np.triu_indices(3)]
+    body = mass * np.concatenate([[1.0], CENTRE_M, inertia])
+    more = regressor(panda(), way, speed, np.gradient(speed, 1e-3, axis=0))[:, :, -10:] @ body
+    tau = tau + np.column_stack([np.interp(t, grid, x) for x in more.T])
+    on = (t >= piece[0]) & (t < piece[1])
+    stamps = np.round(1e9 * t[on]).astype(np.int64)
+    return Recording(panda().joint_names, stamps, q[on], dq[on], tau[on]).log()
+
+
+def weighed(log: Log, model: SelfModel) -> RealArm:
+    screened = refuse(log, model, RigidArm.of(model))
+    own = Recorded.of(screened.log, lateness(screened.timing))
+    return real_arm(
+        nominal_fit([own], model, PRIOR, screened.timing.period_s), screened.moving, (0,)
+    )
+
+
+def test_loads_are_weighed_and_a_bare_hand_is_bare(
+    signals: tuple[Array, ...], tmp_path: Path
+) -> None:
+    urdf = tmp_path / "panda.urdf"
+    urdf.write_text(nominal_urdf(panda()))
+    model = read_robot(str(urdf))
+    for mass, piece in zip(LOADS_KG, PIECES_S, strict=True):
+        arm = weighed(loaded(signals, mass, piece), model)
+        assert arm.is_there(0) is (mass > 0.0), mass
+        assert abs(arm.fit.named[0].x[0] - mass) < 0.3, mass
+
+
+@pytest.mark.filterwarnings("ignore::adapter.errors.ModelWarning")
+def test_a_load_is_told_from_inertias_that_somebody_made_up(signals: tuple[Array, ...]) -> None:
+    """Those of PyBullet's Panda: a heavier last link would explain as much."""
+    model = read_robot(str(Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"))
+    arm = weighed(loaded(signals, 4.0, PIECES_S[3]), model)
+    assert arm.is_there(0)
+    assert abs(arm.fit.named[0].x[0] - 4.0) < 3.0 * arm.mass_std[0] < 2.0
