@@ -39,6 +39,7 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     log_odds = -1.0
     inexact = 0.02
     simpler = ((LATE, 0.03),)
+    form = LATE
     phrase = Phrase("the torque sensor of {who} is a low-pass, with d = {d} and c = {c}")
     shows = (
         (LOADS, "grows with the load"),

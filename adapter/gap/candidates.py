@@ -19,6 +19,7 @@ from adapter.effects.base import (
     ALL,
     BASE,
     FLANGE,
+    LATE,
     LINK,
     ArmDynamics,
     BodyEffect,
@@ -215,8 +216,9 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
     if isinstance(effect, TorqueEffect):
         return effect.torque(links, at.rigid, joint, values)
     if isinstance(effect, SensorEffect):
-        # not of the total: friction that was named would make a gain look like friction
-        return effect.measured(links, at.rigid, joint, values) - at.rigid
+        # friction that was named is late as well, but would make a gain look like friction
+        tau = at.total if effect.form == LATE else at.rigid
+        return effect.measured(links, tau, joint, values) - tau
     if isinstance(effect, MotionEffect):
         moved = effect.link_side(links, at.rigid, joint, values)
         return links.arm.torque(moved.q, moved.dq, moved.ddq) - at.bare
