@@ -15,7 +15,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, wraps
+from functools import cache, lru_cache, wraps
 from typing import Any, ClassVar, Protocol, TypeVar, cast
 
 import numpy as np
@@ -33,6 +33,7 @@ Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 FEWEST_TO_FILTER = 100  # instants
+RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
 BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
@@ -119,18 +120,26 @@ class Motion:
         """Torque x (m,) of a joint without what lies above its band: further rates are noise."""
         if self.bands_hz is None or len(self.t) < FEWEST_TO_FILTER:
             return x
-        from scipy.signal import butter, sosfiltfilt  # long to load; no loop needs it
+        from scipy.signal import sosfiltfilt  # long to load; no loop needs it
 
         fs, band_hz = 1.0 / (self.t[1] - self.t[0]), float(self.bands_hz[joint])
         if not 0.0 < band_hz < 0.5 * fs:
             return x
-        return np.asarray(sosfiltfilt(butter(4, band_hz, fs=fs, output="sos"), x, axis=0))
+        return np.asarray(sosfiltfilt(_low_pass(band_hz, round(fs, RATE_DIGITS)), x, axis=0))
 
     def rate(self, x: Array) -> Array:
         """Time derivative of x (m, ...); zero where there is but one instant."""
         if len(self.t) < 2:
             return np.zeros_like(x)
         return np.asarray(np.gradient(x, self.t, axis=0))
+
+
+@lru_cache
+def _low_pass(band_hz: float, rate_hz: float) -> Array:
+    """Second-order sections of a low-pass; the search asks for the same few again and again."""
+    from scipy.signal import butter
+
+    return np.asarray(butter(4, band_hz, fs=rate_hz, output="sos"))
 
 
 @dataclass(frozen=True)
