@@ -9,8 +9,8 @@ import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, TorqueEffect
-from adapter.effects.catalogue import HELD, WRONG_LINK
-from adapter.gap.candidates import PATTERN_SHARE, Candidate, Pattern
+from adapter.effects.catalogue import HELD
+from adapter.gap.candidates import PATTERN_SHARE, Pattern
 from adapter.gap.evidence import Carried, Noise
 from adapter.gap.fit import (
     Fit,
@@ -98,8 +98,7 @@ def search(
     """Name what is missing.
 
     The catalogue goes first. What is left then may follow a pattern that no effect has; and
-    where an effect was named for want of a better word, the pattern takes its place. Where all
-    links' inertias turn out to be wrong, these are the findings.
+    where an effect was named for want of a better word, the pattern takes its place.
 
     Args:
         fit: the nominal model on the recordings, with any noise model.
@@ -107,7 +106,7 @@ def search(
         rounds: that may be made, each with the best of what is worth naming.
         progress: hears what is being tried.
     """
-    nominal, budget = fit, Budget(rounds)
+    budget = Budget(rounds)
     progress("a load at the hand")
     fit = start(fit, joints)
     fit = settled(_extended(fit, joints, CATALOGUED, budget, progress), joints).fit
@@ -115,7 +114,6 @@ def search(
         fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
     found = settled(_renamed(fit, joints), joints)
-    found = wrong_inertias(nominal, found) or found
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)
 
 
@@ -319,57 +317,3 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
         other = replace(fit.named[k], candidate=rival.candidate, x=rival.x, assumed=False)
         fit = fit.instead(k, other)
     return fit
-
-
-WIDE = 25.0  # times the prior: inertias of which next to nothing is known
-FEWEST_LINKS = 3  # fewer wrong links than that can be named one by one
-RATIO = 8.0  # of the squared torque of wrong bodies over that of all else that was named
-ODD = 3.0  # prior deviations from which on a link's inertia is wrong
-
-
-def wrong_inertias(fit: Fit, found: Found) -> Found | None:
-    """The links' inertias as findings, where they explain more than all that was named.
-
-    Args:
-        fit: the nominal model; found: what a search with trusted inertias ended with.
-    """
-    if not _all_over(found.fit):
-        return None
-    wide, carried = refitted(replace(fit, prior=WIDE * fit.prior))
-    for _ in range(2):
-        wide, carried = refitted(wide.with_noise())
-    return _as_findings(fit, wide, carried)
-
-
-def _all_over(fit: Fit) -> bool:
-    """Whether bodies are what is wrong, on several links, and anything else is small beside."""
-    sizes = [float(np.mean(fit.model.contribution(0, k) ** 2)) for k in range(len(fit.named))]
-    wrong = [e.candidate.columns_are_theta and e.interval_s == WHOLE for e in fit.named]
-    bodies = sum(size for size, body in zip(sizes, wrong, strict=True) if body)
-    others = sum(size for size, body in zip(sizes, wrong, strict=True) if not body)
-    return sum(wrong) >= FEWEST_LINKS and bodies > RATIO * others
-
-
-def _standing(wide: Fit, carried: Carried, named: Named) -> Standing:
-    """What the link's correction is worth, the other links' carried along."""
-    own = np.array(named.candidate.columns)
-    found = carried.worth(own, np.delete(np.arange(len(carried.x)), own))
-    return Standing(named.candidate, found.log_evidence, found.chi2, ())
-
-
-def _as_findings(fit: Fit, wide: Fit, carried: Carried) -> Found:
-    """Links that are off by more than their prior allows, named one by one."""
-    named, standings, dtheta = [], [], wide.dtheta.copy()
-    for k in range(fit.n):
-        if np.abs(wide.dtheta[k] / fit.prior[k]).max() < ODD:
-            continue
-        effect = WRONG_LINK
-        columns = tuple(range(10 * k, 10 * k + 10))
-        scale = tuple(float(x) for x in wide.prior[k])
-        template = replace(effect.templates()[0], prior_std=scale)
-        named.append(Named(Candidate(effect, template, k, columns), wide.dtheta[k].copy()))
-        standings.append(_standing(wide, carried, named[-1]))
-        dtheta[k] = 0.0
-    model = replace(wide.model, dtheta=dtheta, named=tuple(named))
-    final = replace(wide, model=model, prior=fit.prior)
-    return Found(final, final.carried(), tuple(standings))
