@@ -130,6 +130,7 @@ def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, trusted: Array) 
     gain = score(known.G, known.g, known.prior_std).log_evidence
     gain -= score(known.G, known.g, std).log_evidence
     covariance = honest_covariance(fit, known)[np.ix_(own, own)]
+    gain /= float(np.max(np.diagonal(covariance) / np.diagonal(known.covariance())[own]))
     torque = np.tensordot(fit.dtheta[k], fit.recordings[0].low_regressor[own], 1)
     key = WRONG_LINK.parameters[0].key
     return Finding(

@@ -300,6 +300,7 @@ class Fit:
         start_std: (n,) N m, what static friction may hold at the first sample.
         caution: nats that what is rare must be worth beside all else, where the inertias are those
             of another unit.
+        hand_judged: whether it is settled what the hand held from the first sample on.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -310,6 +311,7 @@ class Fit:
     weights: tuple[Array, ...] = ()
     start_std: float | Array = START_NM
     caution: float = 0.0
+    hand_judged: bool = False
 
     @property
     def recordings(self) -> tuple[Signals, ...]:

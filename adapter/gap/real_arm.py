@@ -180,7 +180,8 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         begun = begun.with_named([*begun.named, band])
     begun = without_impossible(begun.with_noise())[0]
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
-    return replace(begun, caution=CAUTION / seconds if _is_another_unit(arm, fit) else 0.0)
+    caution = CAUTION / seconds if _is_another_unit(arm, fit) else 0.0
+    return replace(begun, caution=caution, hand_judged=caution > 0.0)
 
 
 def _is_another_unit(arm: RealArm, fit: Fit) -> bool:

@@ -11,7 +11,7 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, TorqueEffect
 from adapter.effects.catalogue import HELD
 from adapter.gap.candidates import PATTERN_SHARE, Pattern
-from adapter.gap.evidence import Carried, Noise
+from adapter.gap.evidence import ORDER, Carried, Noise, score
 from adapter.gap.fit import (
     Fit,
     Named,
@@ -37,6 +37,7 @@ from adapter.gap.scan import (
     honest_moves,
     least_chi2,
 )
+from adapter.model.spatial import Array
 
 TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
@@ -46,6 +47,8 @@ FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction 
 SAME_SHARE = 0.5  # of a signature that another name for it explains
 CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
+TRUSTED_ROUNDS = 3  # in which what was missed must show where inertias are trusted after all
+USUAL = float(np.exp(-0.5))  # weight of a row that does not count, its own squared distance beside
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
@@ -106,10 +109,11 @@ def search(
         rounds: that may be made, each with the best of what is worth naming.
         progress: hears what is being tried.
     """
-    budget = Budget(rounds)
+    nominal, budget = fit, Budget(rounds)
     progress("a load at the hand")
-    fit = start(fit, joints)
-    fit = settled(_extended(fit, joints, CATALOGUED, budget, progress), joints).fit
+    begun = start(fit, joints)
+    found = settled(_extended(begun, joints, CATALOGUED, budget, progress), joints)
+    fit = _unless_trusted(found, begun, nominal.prior, joints, progress).fit
     if fit.named:  # noise that was taken for the first effect's may have hidden another one
         fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
@@ -126,7 +130,7 @@ def _extended(
         table = SignatureTable(fit, joints, kind)
         fit, accepted = table.fit, False
         moves = honest_moves(table, refused | {e.candidate.key for e in fit.named})
-        if fit.caution:  # whether the hand held something from the start has been judged
+        if fit.hand_judged:
             moves = [x for x in moves if not any(map(from_the_start, x.leads))]
         for move in moves[:TRIED]:
             trial = _with(fit, move, table.fit.noise, progress)
@@ -138,6 +142,39 @@ def _extended(
         if not accepted and not (fit.caution and moves):  # else those that were refused hid others
             break
     return fit
+
+
+def _unless_trusted(
+    found: Found, begun: Fit, prior: Array, joints: Sequence[int], progress: Progress
+) -> Found:
+    """What was found with inertias of another unit, or with trusted ones where these say as much.
+
+    An effect that nobody thought of when the inertias were judged makes them look wrong. A load
+    at the hand was thought of.
+
+    Args:
+        begun: what the search began with; prior: (n, 10) of inertias that are trusted.
+    """
+    if not begun.caution or any(map(from_the_start, begun.named)):
+        return found
+    kept = [e for e in begun.named if e.assumed]
+    trusted = refitted(replace(begun, prior=prior, caution=0.0).with_named(kept).with_noise())[0]
+    trusted = _extended(trusted, joints, CATALOGUED, Budget(TRUSTED_ROUNDS), progress)
+    other = settled(trusted, joints)
+    if _total(other) < _total(found):
+        return found
+    named = [replace(e, assumed=False) for e in other.fit.named]
+    return replace(other, fit=other.fit.with_named(named))
+
+
+def _total(found: Found) -> float:
+    """ln of what the data are worth under what was found and its own noise, its names paid."""
+    fit, known, width = found.fit, found.carried, 0.0
+    for noise, weight in zip(fit.noise, fit.weights, strict=True):
+        rows = weight[ORDER:]  # around dates none counts: as if they were as usual
+        width += float(np.log(np.where(rows > 0.0, rows, USUAL) / noise.sigma).sum())
+    fits = score(known.G, known.g, known.prior_std).log_evidence - 0.5 * known.data @ known.data
+    return float(width + fits + sum(price(e) for e in fit.named if not e.assumed))
 
 
 def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
@@ -259,7 +296,7 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
 
 def _is_common(effect: Effect) -> bool:
     """Whether any joint may well have it: friction, an offset."""
-    return effect.bundled or bool(effect.form)
+    return effect.bundled or (bool(effect.form) and isinstance(effect, TorqueEffect))
 
 
 def from_the_start(e: Named | Lead) -> bool:
