@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from adapter.cli.results import disagreement_lines
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.gap.monitor import Blocks, Monitor
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
@@ -16,6 +17,7 @@ from adapter.runs.outcome import collect
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout
+from sim.hidden.bristles import draw_bristles
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
 
@@ -50,6 +52,8 @@ def disturbed(kind: str, seed: int) -> ArmData:
         add[:, 2] = np.sin(2 * np.pi * 3.0 * t) * on
     elif kind == "friction":
         add = FRICTION_NM * np.tanh(dq / 0.01)
+    elif kind == "bristles":
+        add = draw_bristles(np.random.default_rng(seed), dq.shape[1]).along(dq, 1e-3)
     return replace(data, tau=data.tau + add)
 
 
@@ -133,11 +137,20 @@ def test_nothing_new_nothing_said(seed: int) -> None:
     assert not watch("nothing", seed).reports
 
 
-@pytest.mark.parametrize("effects", [(), ("coulomb_friction", "viscous_friction")])
+@pytest.mark.parametrize(
+    ("kind", "effects"),
+    [
+        ("friction", ()),
+        ("friction", ("coulomb_friction", "viscous_friction")),
+        ("bristles", REAL_ARM_EFFECTS),
+    ],
+)
 @pytest.mark.parametrize("seed", QUIET[:2])
-def test_friction_that_was_always_there_is_not_new(seed: int, effects: tuple[str, ...]) -> None:
-    """Learned beside θ, or left out of the model for good."""
-    assert not watch("friction", seed, effects=effects).reports
+def test_friction_that_was_always_there_is_not_new(
+    kind: str, seed: int, effects: tuple[str, ...]
+) -> None:
+    """Learned beside θ, or left out of the model for good; with and without a memory."""
+    assert not watch(kind, seed, effects=effects).reports
 
 
 def test_rests_are_not_new() -> None:
