@@ -33,7 +33,8 @@ SIZE_STD = 0.4  # of the logarithm of all torques' size: no mass anywhere is no 
 LEAST_SIZE = 1e-3  # ... and negative mass everywhere is taken for so little of it
 GAIN_OF_EVIDENCE = 25.0  # cost (twice a log-likelihood) that another reading must save, and ...
 CLEAR_SHARE_OF_COST = 0.25  # so much less needs no other evidence
-SHARE_OF_COST = 0.75  # ... the share of the cost that it may leave, unless it lies much nearer
+# ... the share of the cost, and the cost, that it may leave, unless it lies much nearer.
+SHARE_OF_COST, MUCH = 0.75, 200.0  # an own arm with 40 % wrong inertias leaves less than 100
 # Of the misfit of the model as it is: a reading must lie nearer without any correction, too.
 SHARE_OF_MISFIT, FAR_SHARE_OF_MISFIT = 0.8, 0.5
 ALIKE = 0.7  # correlation of torques and model that makes them the same in another size
@@ -202,7 +203,7 @@ def convincing(comparison: TorqueComparison, best: TorqueReading, as_is: TorqueR
     if best.kind == "scale" or best.cost < CLEAR_SHARE_OF_COST * as_is.cost:
         return True
     before, after = (comparison.misfit(r.tau, best.joints) for r in (as_is, best))
-    if best.cost > SHARE_OF_COST * as_is.cost:  # much is left, which no reading explains
+    if best.cost > min(SHARE_OF_COST * as_is.cost, MUCH):  # much is left, which no reading explains
         return after < FAR_SHARE_OF_MISFIT * before
     return after < SHARE_OF_MISFIT * before
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
+from adapter.gap.at_rest import held_at_rest
 from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
 from adapter.gap.fit import Fit, theta_prior
 from adapter.gap.folds import holds_out
@@ -26,7 +27,7 @@ from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.result import Finding, GapResult
-from adapter.gap.screen import RecordingRefused, Screened, refuse
+from adapter.gap.screen import RecordingFault, RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import Recorded
@@ -38,14 +39,14 @@ from adapter.signals.matching import present
 from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
-ASSUMED = (
-    "the model has what any arm has (friction, motor inertia, offsets) where these data do not "
-    "single it out, too: it is not told by name"
-)
 NO_NAME = 0.5  # probability below which an effect is not told by name
 UNPLACED = (
     "the inertias were corrected by more than 4 prior standard deviations; which link it is, these "
     "data do not tell"
+)
+ASSUMED = (
+    "the model has what any arm has (friction, motor inertia, offsets) where these data do not "
+    "single it out, too: it is not told by name"
 )
 FIT_S, SCORE_S = 3.0, 2.0  # the least of a recording that is fitted; and scored
 
@@ -112,7 +113,10 @@ def find_gap(
         if not refusal.kind.is_an_answer:
             raise
         names = names_of([*logs, *settings.hold_out])
-        return GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
+        untold = GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
+        if refusal.kind is not RecordingFault.MOTION or len(logs) > 1:
+            return untold
+        return _with_what_is_held(untold, logs[0], nominal, settings.inertia_prior)
     progress("smoothing")
     prior = settings.inertia_prior
     fit = nominal_fit(task.fitted, task.model, prior, task.period_s, task.scored)
@@ -131,6 +135,18 @@ def find_gap(
         save_model(model_of(task.model, measured.found.fit), model_out)
         result = replace(result, model_out=str(model_out))
     return replace(result, wall_s=time.monotonic() - begun)
+
+
+def _with_what_is_held(
+    untold: GapResult, log: Path | str | Log, model: SelfModel, inertia_prior: float
+) -> GapResult:
+    """A load at the hand shows in an arm at rest as well."""
+    own = log if isinstance(log, Log) else read_log(Path(log))
+    load = held_at_rest(own, model, inertia_prior)
+    if load is None:
+        return untold
+    said = f"{untold.problem} The hand holds {load.parameters['m']:.2g} ± {load.std['m']:.2g} kg."
+    return replace(untold, problem=said, findings=(load,))
 
 
 def _task(

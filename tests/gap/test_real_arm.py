@@ -104,6 +104,22 @@ def test_friction_of_large_joints_is_told_once() -> None:
     assert max(f.parameters["Fc"] for f in dry) > 5.0
 
 
+def test_an_arm_at_rest_says_what_it_holds() -> None:
+    """And that nothing else can be told of it; a bare one says no more than that."""
+    for seed, kg in ((707, 3.0), (708, 0.0)):
+        twin = draw_twin(seed)
+        theta = twin.nominal.theta.copy()
+        theta[-1] += kg * np.array([1.0, 0.0, 0.0, 0.17, 0.03, 0.0, 0.0, 0.03, 0.0, 0.002])
+        still = np.repeat(twin.q[:1], 3000, axis=0)
+        log = by_pinocchio(replace(twin, arm=replace(twin.arm, theta=theta), q=still)).log()
+        found = find_gap([log], documented())
+        assert found.problem is not None and "too little motion" in found.problem
+        assert [f.effect for f in found.findings] == [HELD.name] * (kg > 0.0)
+        for load in found.findings:
+            assert abs(load.parameters["m"] - kg) < 4.0 * load.std["m"] < kg
+            assert "holds" in found.problem
+
+
 def test_where_a_load_is_likely_to_be() -> None:
     """Beyond the face that a tool is bolted to, as the last link's own centre points."""
     model = panda_model()
