@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.effects.base import ALL, JOINT, LINK
+from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
 from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern
@@ -22,6 +22,7 @@ from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
 
 OVERLAP = 0.9
+OFFSET = "torque_offset"
 MOST_RIVALS = 3
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
 SINGLED_OUT = 0.9  # probability of a link's correction
@@ -154,6 +155,11 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     """Every named effect of the catalogue. `ends`: recordings by name -> s, when each ends."""
     fit = found.fit
     covariance = honest_covariance(fit, found.known or found.carried)
+    shifted = {
+        e.candidate.joint
+        for k, e in enumerate(fit.named)
+        if e.candidate.effect.name == OFFSET and k not in found.weak
+    }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
         effect = named.candidate.effect
@@ -165,7 +171,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
         torque = fit.model.contribution(recording, k)
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
-        overlaps = _overlaps(standing, named)
+        overlaps = _overlaps(standing, named, named.candidate.joint in shifted)
         spread, evidence = parameter_std(fit, covariance, k), standing.probability
         if from_the_start(named):  # that it is there, whatever else could stand for it
             evidence = math.erf(named.values["m"] / spread["m"] / math.sqrt(2.0))
@@ -190,14 +196,17 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     return tuple(sorted(out, key=lambda f: -f.detectability))
 
 
-def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
-    """Other names that explain 0.9 and more of the signature, best first."""
+def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, float]:
+    """Other names that explain 0.9 and more of the signature, best first.
+
+    `shifted`: whether an offset of the same joint was named beside it.
+    """
     best: dict[str, float] = {}
     for rival in standing.rivals:
         effect = rival.candidate.effect
         if isinstance(effect, Pattern) or effect.name == named.candidate.effect.name:
             continue
-        if rival.overlap >= OVERLAP and _is_open(standing, rival, named):
+        if rival.overlap >= OVERLAP and _is_open(standing, rival, named, shifted):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
     # of rivals that explain all but the same, those that the data favour come first
     credible = {r.candidate.effect.name: -i for i, r in enumerate(standing.rivals[::-1])}
@@ -205,11 +214,16 @@ def _overlaps(standing: Standing, named: Named) -> dict[str, float]:
     return {name: best[name] for name in order[:MOST_RIVALS]}
 
 
-def _is_open(standing: Standing, rival: Rival, named: Named) -> bool:
-    """Whether the data leave a rival open that is a finer form of the named effect or a coarser."""
+def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> bool:
+    """Whether the data leave a rival open that is a finer form of the named effect or a coarser.
+
+    Friction and an offset of the same joint are asymmetric friction in other words.
+    """
     mine, other = named.candidate.effect, rival.candidate.effect
     nested = mine.form in dict(other.simpler) or other.form in dict(mine.simpler)
-    return not nested or standing.gain(rival) > -OPEN_NATS
+    if not nested or (shifted and other.form == TWO_LEVELS):
+        return True
+    return rival.log_evidence > standing.log_evidence - OPEN_NATS
 
 
 def noise_floor(fit: Fit) -> Array:
