@@ -17,7 +17,7 @@ from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.possible import possible
 from adapter.gap.refine import refined
-from adapter.gap.result import Curves, RolloutCurves, Shortfall
+from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
 from adapter.model.self_model import SelfModel
@@ -28,7 +28,6 @@ from adapter.simulate import DrivenMotion, Simulate
 
 SEGMENT_S = 0.5
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
-WORSE = 1.05  # times its error before: a joint that has become worse
 ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
 THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
@@ -288,7 +287,7 @@ class _Scored:
     @property
     def worse(self) -> NDArray[np.bool_]:
         """(n,) joints that the new model makes worse."""
-        return np.asarray(self.after > WORSE * self.before)
+        return np.asarray(self.after > (1.0 + WORSE) * self.before)
 
 
 def _paying(task: GapTask, found: Found) -> Found:

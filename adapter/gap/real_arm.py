@@ -178,7 +178,7 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
     if _is_another_unit(arm, fit):  # a real arm's: what its torques lack of the motion's band
         band = _named(SENSORS_BAND, SENSORS_BAND.templates()[0], -1)
         begun = begun.with_named([*begun.named, band])
-    begun = without_impossible(begun.with_noise())[0]
+    begun = _without_impossible(begun.with_noise())
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
     caution = CAUTION / seconds if _is_another_unit(arm, fit) else 0.0
     return replace(begun, caution=caution, hand_judged=caution > 0.0)
@@ -188,13 +188,13 @@ def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
     return bool(arm.fit.prior[0, 0] >= OTHER_UNIT * fit.prior[0, 0])
 
 
-def without_impossible(fit: Fit) -> tuple[Fit, Carried]:
+def _without_impossible(fit: Fit) -> Fit:
     """A fit without what was assumed and came out as no arm has it: friction that drives."""
     while True:
-        fit, known = refitted(fit)
+        fit, _ = refitted(fit)
         kept = [e for e in fit.named if not e.assumed or e.possible]
         if len(kept) == len(fit.named):
-            return fit, known
+            return fit
         fit = fit.with_named(kept)
 
 

@@ -92,10 +92,11 @@ def refined(found: Found) -> Found:
         return found
     while True:
         fit, carried = _refitted(fit, counted)
-        bad = worst(fit, carried)
+        values = weak(fit, carried)
+        bad = worst(fit, values)
         if bad is None:
-            named = frozenset(weak(fit, carried))
-            return replace(found, fit=fit, carried=carried, standings=tuple(standings), weak=named)
+            kept = replace(found, fit=fit, carried=carried, standings=tuple(standings))
+            return replace(kept, weak=frozenset(values))
         fit = fit.without(bad)
         del standings[bad]
 

@@ -11,6 +11,7 @@ import numpy as np
 from adapter.model.spatial import Array
 
 UNEXPLAINED = "unexplained"  # the name of what no effect of the catalogue explains
+WORSE = 0.05  # share by which an error of a joint may grow on data not seen, and unsaid
 
 # Of `GapResult`, as they are in the JSON file.
 IN_FILE = (

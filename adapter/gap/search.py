@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -240,7 +240,7 @@ def _with(
     trial = shaped(trial, last)
     while True:
         trial, carried = under_own_noise(trial)
-        bad = worst(trial, carried, before)
+        bad = worst(trial, weak(trial, carried, before))
         if bad is None:
             break
         trial = trial.without(bad)
@@ -254,7 +254,8 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
     swaps = 0
     while True:
         fit, carried = under_own_noise(fit)
-        bad = worst(fit, carried)
+        values = weak(fit, carried)
+        bad = worst(fit, values)
         if bad is not None:
             fit = fit.without(bad)
             continue
@@ -262,16 +263,15 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         ranked = standings(fit, carried, table)
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
-            return Found(fit, carried, ranked, weak=frozenset(weak(fit, carried)))
+            return Found(fit, carried, ranked, weak=frozenset(values))
         fit, swaps = dated_anew(swapped), swaps + 1
 
 
-def worst(fit: Fit, carried: Carried, first: int = 0) -> int | None:
-    """Of the named effects from `first` on the one that is least worth having, if one is not.
+def worst(fit: Fit, values: Mapping[int, float]) -> int | None:
+    """Of the effects that are `weak` the one that is least worth having.
 
     What any arm has stays, unless no arm has it so.
     """
-    values = weak(fit, carried, first)
     losing = [k for k in values if not (fit.named[k].assumed and fit.named[k].possible)]
     return min(losing, key=values.__getitem__, default=None)
 

@@ -20,12 +20,11 @@ from adapter.gap.phrases import (
     shown_unit,
     who,
 )
-from adapter.gap.result import Finding, GapResult, Leftover, LogLoad
+from adapter.gap.result import WORSE, Finding, GapResult, Leftover, LogLoad
 from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
-WORSE = 0.05  # share by which a joint's error may grow unsaid
 NOT_EXPLAINED = "are not explained by any effect of the catalogue"
 SIGNALS = {
     "dq": "velocity",

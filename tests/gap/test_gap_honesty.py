@@ -40,7 +40,7 @@ from adapter.gap.result import Leftover
 from adapter.gap.rivals import DATES, Standing, price
 from adapter.gap.scan import BELIEF
 from adapter.gap.screen import refuse
-from adapter.gap.search import Budget, Found, search, worst
+from adapter.gap.search import Budget, Found, search, weak, worst
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.words import as_json, console_summary, headline
 from adapter.model.robots import documented
@@ -156,7 +156,7 @@ def test_what_one_block_alone_shows_is_not_named(throughout: bool) -> None:
     fit, carried = refitted(fit)
     assert worth(fit, carried, 0).log_evidence > BELIEF + 20.0
     assert pays_held_out(fit, Folds.of(fit, carried), 0) is throughout
-    assert worst(fit, carried) == (None if throughout else 0)
+    assert worst(fit, weak(fit, carried)) == (None if throughout else 0)
 
 
 # ---------------------------------------------------------------- doubt
