@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,10 @@ Array = NDArray[np.float64]
 
 class DriverError(RuntimeError):
     """An arm, bus or recording cannot do what was asked; the message says what can be done."""
+
+
+class NotReady(DriverError):
+    """The arm is there and cannot move yet (reflex, user stop, brakes): no wrong use, no fault."""
 
 
 class EndOfStream(DriverError):
@@ -63,6 +67,37 @@ class JointSample:
 
 
 @dataclass
+class CommandCount:
+    """What became of the commands to an arm that sets the rhythm itself.
+
+    Attributes:
+        sent: commands that went out.
+        cut: of those asked for, the ones that a last limit changed or kept back.
+        holes: times that the arm had no command of ours for more than one period.
+        longest_hole_ms: the longest of them, from one command to the next.
+        success_min, success_mean: share of our commands that the arm says had arrived in time;
+            None where it says nothing.
+    """
+
+    sent: int = 0
+    cut: int = 0
+    holes: int = 0
+    longest_hole_ms: float = 0.0
+    success_min: float | None = None
+    success_mean: float | None = None
+
+    def line(self) -> str:
+        """In one sentence; shares in percent."""
+        said = f"{self.sent} commands, {self.cut} cut or kept back, {self.holes} holes"
+        if self.holes:
+            said += f" (the longest {self.longest_hole_ms:.0f} ms)"
+        if self.success_min is None or self.success_mean is None:
+            return said
+        low, mean = 100.0 * self.success_min, 100.0 * self.success_mean
+        return f"{said}; arrived in time: {mean:.1f} %, at worst {low:.0f} %"
+
+
+@dataclass
 class Intake:
     """What arrived from an arm and what became of it: received = used + refused.
 
@@ -72,6 +107,7 @@ class Intake:
         refused: the others, by reason.
         lost: messages that were sent (or due) and never arrived, as far as can be told.
         notes: one sentence for each kind of trouble, written at its first occurrence.
+        commands: what went the other way; None where the driver does not count it.
     """
 
     received: int = 0
@@ -79,6 +115,12 @@ class Intake:
     refused: Counter[str] = field(default_factory=Counter)
     lost: int = 0
     notes: list[str] = field(default_factory=list)
+    commands: CommandCount | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """As plain numbers and texts."""
+        commands = None if self.commands is None else dict(vars(self.commands))
+        return {**vars(self), "refused": dict(self.refused), "commands": commands}
 
 
 class Driver(Protocol):

@@ -138,6 +138,8 @@ def run(args: argparse.Namespace) -> int:
     result = _go(args, plan, driver, front_end, folder, truth)
     for line in result.timing.lines():
         console.print(line)
+    if result.intake.commands is not None:
+        console.print(result.intake.commands.line())
     if isinstance(driver, FaultyDriver):
         console.print(driver.account.line())
     warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes)
@@ -274,7 +276,7 @@ def _conclude(
         granted=[grant.line for grant in result.grants],
         ended=result.ended,
         fault=result.fault,
-        intake={**vars(result.intake), "refused": dict(result.intake.refused)},
+        intake=result.intake.as_dict(),
         set_aside=result.set_aside,
         skipped=result.skipped,
         restarts=result.restarts,

@@ -14,7 +14,7 @@ from drivers.fci.reader_client import QUICK_SWITCHING
 from drivers.fci.stream import STALE_NS, TICK_NS, Refusal, StateIntake, StateStream
 from drivers.fci.tables import told
 from drivers.fci.torque_control import TorqueControl
-from drivers.interface import Array, DriverError, Intake, JointSample
+from drivers.interface import Array, DriverError, Intake, JointSample, NotReady
 
 SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
 RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it
@@ -103,7 +103,8 @@ class FciArm:
     def connect(self) -> None:
         """Open the connection and wait for a state; an open one is closed before.
 
-        Raises DriverError, which says what to do.
+        Raises DriverError, which says what to do; NotReady where motion is allowed and the robot
+        is there but cannot move now.
         """
         self.close()
         self._account, self._state = StateIntake(), None
@@ -114,6 +115,7 @@ class FciArm:
             stream = self._stream = StateStream(connection, self._account)
             self._control = TorqueControl(connection.version, connection.channel, stream.send)
             self._first = self._make_ready(stream)
+            self.intake.commands = self._control.count if self.can_move else None
         except BaseException:
             self.close()
             raise
@@ -188,7 +190,7 @@ class FciArm:
         self._note_status(state.status)
         mode = state.status.robot_mode
         if self.can_move and mode != tables.ROBOT_IDLE:
-            raise DriverError(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
+            raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
         return state
 
     def _recovered(self, stream: StateStream, first: State) -> State:
@@ -199,7 +201,7 @@ class FciArm:
         deadline = time.monotonic() + RECOVERED_S
         while state is not None and state.status.robot_mode in _RECOVERING_MODES:
             if time.monotonic() > deadline:
-                raise DriverError(
+                raise NotReady(
                     f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
                     "that it recovered, but does not show it"
                 )

@@ -11,14 +11,15 @@ from typing import NamedTuple
 
 from drivers.address import Address
 from drivers.fci import codec, tables
-from drivers.fci.codec import StateDecoder, WireError
+from drivers.fci.codec import STATE_DTYPE, StateDecoder, WireError
 from drivers.fci.reader_client import ReaderClient, open_udp
-from drivers.interface import DriverError
+from drivers.interface import DriverError, NotReady
 
 CONNECT_LIMIT_S = 5.0
 _CHUNK = 1 << 16
 REPLY_LIMIT_S = 5.0
 RECOVERY_LIMIT_S = 10.0
+FIRST_STATE_S = 1.0  # for the length of the first state, which tells the version as well
 AUTO = "auto"
 OPTIONS = ("protocol", "recover")
 VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
@@ -172,10 +173,16 @@ class Connection:
 
 
 def open_connection(target: Target) -> Connection:
-    """Connect, in the version that the robot speaks. Raises DriverError."""
+    """Connect, in the version that the robot speaks. Raises DriverError.
+
+    Where the address leaves it open, version 5 is tried first. A robot of version 10 refuses
+    that and says its own, or it agrees and shows its version in the answer or by its states.
+    """
     version = target.version or tables.PANDA
     connection, server = _try(target, version)
-    if connection is None and target.version is None and server == tables.FR3:
+    if target.version is None and server == tables.FR3:
+        if connection is not None:
+            connection.close()
         version = tables.FR3
         connection, server = _try(target, version)
     if connection is None:
@@ -184,7 +191,7 @@ def open_connection(target: Target) -> Connection:
 
 
 def _try(target: Target, version: int) -> tuple[Connection | None, int]:
-    """(the connection, the robot's version), without a connection where versions differ."""
+    """(the connection, the robot's version), without a connection where the robot refuses ours."""
     channel = Channel(target.host, target.port)
     try:
         udp = open_udp(channel.local_host)
@@ -201,6 +208,8 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
                 f"the robot at {target.host} answers Connect with status {status}, which is not "
                 "defined: check its system version"
             )
+        if status == 0 and target.version is None and _sends(connection, tables.FR3):
+            server = tables.FR3
     except BaseException:
         connection.close()
         raise
@@ -208,6 +217,11 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
         connection.close()
         return None, server
     return connection, server
+
+
+def _sends(connection: Connection, version: int) -> bool:
+    """Whether the robot's first state has the length of this version."""
+    return connection.reader.next_length(FIRST_STATE_S) == STATE_DTYPE[version].itemsize
 
 
 def _ask(connection: Connection) -> tuple[int, int]:
@@ -252,4 +266,4 @@ def recover(connection: Connection) -> None:
         raise DriverError(f"the error recovery gives {error}: use Desk") from error
     name = tables.status_name(tables.RECOVER_STATUS[connection.version], status)
     if name != "success":
-        raise DriverError(f"the robot does not recover: {tables.meaning(name)}")
+        raise NotReady(f"the robot does not recover: {tables.meaning(name)}")

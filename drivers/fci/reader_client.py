@@ -144,6 +144,14 @@ class ReaderClient:
         self._taken += 1
         return Record(start + RECORD.size, *RECORD.unpack_from(self._map, start))
 
+    def next_length(self, wait_s: float) -> int | None:
+        """Length in bytes of the datagram that `next` will give; None where none comes in time."""
+        if self._taken == self._head and not self._more(wait_s):
+            return None
+        start = reader.FIRST_SLOT + self._taken % SLOTS * self._step
+        length: int = RECORD.unpack_from(self._map, start)[2]
+        return length
+
     def newest(self) -> int | None:
         """Start of the newest datagram that waits in `data`, of right length; None without."""
         self._head = WORD.unpack_from(self._map, HEAD)[0]

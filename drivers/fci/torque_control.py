@@ -17,10 +17,11 @@ from drivers.fci.connect import Channel
 from drivers.fci.limits import TORQUE_STEP, TorqueLimiter
 from drivers.fci.reader import SLOTS
 from drivers.fci.tables import raised, told
-from drivers.interface import Array, DriverError
+from drivers.interface import Array, CommandCount, DriverError, NotReady
 
 START_LIMIT_S = 2.0  # from Move to the running modes
 END_LIMIT_S = 0.1  # for the second answer once the modes are left; TCP may hold it back 40 ms
+RATE_WINDOW = 100  # commands that the robot's success rate is taken over
 LOOK_EVERY = 100  # states between two looks at the TCP channel
 ENDED_AFTER = 2  # states in a row that say so; a single one may be a damaged datagram
 BRAKE_S, EASE_S, FINISH_S, STOP_MOVE_S = 0.3, 0.2, 0.3, 0.5
@@ -45,8 +46,8 @@ class TorqueControl:
 
     Attributes:
         fault: why the last motion ended by itself; None where it did not. Kept until `stop`.
-        sent: commands sent.
-        guard: the limits on what is sent.
+        count: of the commands; holes in ticks of the robot.
+        limiter: the limits on what is sent.
     """
 
     def __init__(self, version: int, channel: Channel, send: Send) -> None:
@@ -54,10 +55,12 @@ class TorqueControl:
         self._encoder, self.limiter = CommandEncoder(version), TorqueLimiter()
         self._phase, self._move_id, self._deadline = _IDLE, -1, 0.0
         self._accepted, self._ticks, self._answered = False, 0, -SLOTS
+        self._sent_id = self._rates = self._rate_count = 0
+        self._rate_sum = 0.0
         self._status: Status | None = None
         self._odd = self._odd_tick = 0  # states in a row that say the motion is over; the last
         self.fault: str | None = None
-        self.sent = 0
+        self.count = CommandCount()
 
     @property
     def active(self) -> bool:
@@ -85,13 +88,13 @@ class TorqueControl:
 
     def _begin(self, robot_mode: int) -> None:
         if robot_mode != tables.ROBOT_IDLE:
-            raise DriverError(f"no motion: the robot {tables.ROBOT_MODE_MEANING[robot_mode]}")
+            raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[robot_mode]}")
         payload = codec.move_payload(self._version)
         self._move_id = self._channel.send(tables.MOVE[self._version], payload)
         self._phase, self._accepted = _STARTING, False
         self._deadline = time.monotonic() + START_LIMIT_S
         self.limiter.reset()
-        self._answered = -SLOTS
+        self._answered, self._sent_id, self._rates = -SLOTS, -1, -RATE_WINDOW
 
     def _drive(
         self, tau: list[float], accepted: Array, message_id: int, finished: bool = False
@@ -103,7 +106,28 @@ class TorqueControl:
         allowed = tau if finished else self.limiter.limit(tau, accepted.tolist())
         if allowed is not None:
             self._send(self._encoder.encode(message_id, allowed, finished))
-            self.sent += 1
+            self._note_sent(message_id)
+        self.count.cut = self.limiter.cut
+
+    def _note_sent(self, message_id: int) -> None:
+        """Count a command; it ends a hole where the last one answered no neighbouring tick."""
+        ticks, count = message_id - self._sent_id, self.count
+        if self._sent_id >= 0 and ticks > 1:
+            count.holes += 1
+            count.longest_hole_ms = max(count.longest_hole_ms, float(ticks))
+        self._sent_id = message_id
+        count.sent += 1
+
+    def _note_rate(self, rate: float) -> None:
+        """Count the robot's success rate, once it is about commands of this motion alone."""
+        count = self.count
+        self._rates += 1
+        if self._rates <= 0 or not 0.0 <= rate <= 1.0:
+            return
+        self._rate_sum += rate
+        self._rate_count += 1
+        count.success_mean = self._rate_sum / self._rate_count
+        count.success_min = rate if count.success_min is None else min(count.success_min, rate)
 
     def look(self, state: State) -> None:
         """See what a state means for the motion; trouble goes to `fault`."""
@@ -112,6 +136,7 @@ class TorqueControl:
             if self._phase == _STARTING:
                 self._look_at_start(state)
             elif self._phase == _RUNNING:
+                self._note_rate(state.success_rate)
                 if state.status is not self._status:
                     self._look_at_change(state)
                 elif self._ticks % LOOK_EVERY == 0:

@@ -16,7 +16,7 @@ import pytest
 from drivers.fci import FciArm, reader_client
 from drivers.fci.codec import id_at
 from drivers.fci.limits import TORQUE_STEP
-from drivers.interface import Driver, DriverError
+from drivers.interface import Driver, DriverError, NotReady
 from tests.helpers import fci_peer
 from tests.helpers.fci_peer import Peer
 
@@ -213,13 +213,19 @@ def test_no_state_after_the_handshake(peer5):
     assert sys.getswitchinterval() == before
 
 
-def test_states_of_the_other_version_only(peer5):
+@pytest.mark.parametrize("said", [5, 10])
+def test_a_server_that_agrees_to_5_and_is_10_is_taken_for_10(peer5, connected, said):
     peer5.connect_reply = lambda version, command_id: fci_peer.reply(
-        0, command_id, struct.pack("<BH", 0, 5)
+        0, command_id, struct.pack("<BH", 0, said)
     )
-    peer5.protocol = 10  # says 5 and sends states of 10
+    peer5.protocol = 10  # its answer, or its states alone, tell
     with pytest.raises(DriverError, match=r"nothing of use.*1377 bytes.*2373.*\?protocol"):
-        FciArm(peer5.address).connect()
+        FciArm(f"{peer5.address}?protocol=5").connect()
+    arm = connected(peer5, allow_motion=True)
+    assert arm.version == 10
+    assert arm.joint_names[0] == "fr3_joint1"
+    moving(arm, peer5)
+    assert exact(arm.intake)
 
 
 # The account
@@ -489,6 +495,29 @@ def test_a_motion_is_started_fed_and_finished(peer, connected):
     assert peer.modes[2] == 2
 
 
+def test_commands_are_accounted_for(peer, connected):
+    """A hole is a gap in the robot's ticks that we answered; shares are what the robot says."""
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    last = quiet(arm, peer)
+    arm.command(TAU)
+    count = arm.intake.commands
+    sent, holes = count.sent, count.holes
+    for step, rate in (*[(1, 1.0)] * 100, (1, 0.9), (7, 0.5), (1, 0.9), (1, np.nan), (1, 1.0)):
+        last += step
+        peer.send(peer.state(last, rate=rate))
+        arm.read()
+        arm.command(TAU)
+    assert count.sent - sent == 105
+    assert count.holes - holes == 1
+    assert count.longest_hole_ms >= 7
+    assert count.success_min == pytest.approx(0.5)
+    assert 0.9 < count.success_mean < 1.0
+    assert arm.intake.as_dict()["commands"]["holes"] == count.holes
+    assert "arrived in time" in count.line()
+    assert "at worst 50 %" in count.line()
+
+
 def test_commands_wait_until_the_modes_show_the_motion(peer5, connected):
     arm = connected(peer5, allow_motion=True)
     quiet(arm, peer5)
@@ -539,7 +568,7 @@ def test_a_command_answers_the_newest_state_with_what_was_accepted_there(
     """The robot is past a state behind which another waits: its id and its torque count."""
     arm = connected(peer5, allow_motion=True)
     moving(arm, peer5, np.full(7, sign * 3.0))  # in steps of 0.99 N m
-    base, sent = quiet(arm, peer5), arm._control.sent
+    base, sent = quiet(arm, peer5), arm.intake.commands.sent
     older, newer = sign * 2 * TORQUE_STEP, sign * 3.0
     peer5.send(peer5.state(base + 1, tau_d=(older,) * 7))
     if first:
@@ -730,7 +759,7 @@ def test_closing_stops_the_arm(peer5, connected):
 
 def test_motion_from_a_reflex_needs_a_recovery(peer, connected):
     peer.modes, peer.reflex = (0, 3, 4), (6,)
-    with pytest.raises(DriverError, match=r"is in reflex: .*\?recover=1"):
+    with pytest.raises(NotReady, match=r"is in reflex: .*\?recover=1"):
         connected(peer, allow_motion=True)
     arm = connected(peer, f"?recover=1&protocol={peer.protocol}", allow_motion=True)
     assert peer.requests[-1][0] == fci_peer.RECOVER[peer.protocol]
@@ -761,5 +790,5 @@ def test_motion_needs_an_idle_robot(peer5, connected, mode, why):
     listening = connected(peer5)
     assert listening.read().stamp_ns > 0
     listening.close()
-    with pytest.raises(DriverError, match=f"no motion: the robot .*{why}"):
+    with pytest.raises(NotReady, match=f"no motion: the robot .*{why}"):
         connected(peer5, allow_motion=True)

@@ -170,6 +170,7 @@ class Peer:
                 "reflex": self.reflex,
                 "dq": self.dq,
                 "tau_d": self._accepted,
+                "rate": 1.0,
             }
         return state(self.protocol, message_id, **{**known, **fields})
 
