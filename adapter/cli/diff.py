@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-from rich.markup import escape
 from rich.table import Table
 
 from adapter.cli.common import robot_of
@@ -16,7 +15,7 @@ from adapter.report.difference_words import (
     difference_summary,
 )
 from adapter.runs.compare import compare, documentation_of
-from adapter.runs.terminal import console, json_text, write_json
+from adapter.runs.terminal import console, output, write_json
 
 
 def run(args: argparse.Namespace) -> int:
@@ -27,16 +26,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         second = robot_of(args, args.second)
     found = compare(first, second)
-    if str(args.json) == "-":
-        print(json_text(difference_json(found)))
-    else:
-        write_json(args.json, difference_json(found))
+    write_json(args.json, difference_json(found))
+    shown = console if str(args.json) == "-" else output
     rows = difference_rows(found)
     if rows:
         table = Table(*HEADS, box=None, pad_edge=False, caption=LEGEND, caption_justify="left")
         for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)
+            table.add_row(*row)
+        shown.print(table)
     for line in difference_summary(found):
-        console.print(escape(line), soft_wrap=True)
+        shown.print(line, soft_wrap=True)
     return 0

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+from rich.text import Text
 from rich.tree import Tree as Shown
 
 from adapter.discovery import (
@@ -22,20 +23,20 @@ from adapter.discovery import (
 from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.runs.compiling import announce_compiling
-from adapter.runs.terminal import console, warn, write_json
+from adapter.runs.terminal import labelled, output, say, show, warn, write_json
 from drivers.files.mcap import read_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    announce_compiling(console.print)
+    announce_compiling(say)
     log = read_log(args.log, sensors=True)
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))
     _print_tree(found)
     for sentence in found.undecided:
-        console.print(f"[yellow]undecided:[/] {sentence}", soft_wrap=True)
+        labelled("undecided:", "yellow", sentence)
     figures = found.as_dict()
     try:
         learned = learn(found)
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_tree(found: Discovery) -> None:
     log = found.log
-    console.print(
+    show(
         f"{len(log.joint_names)} joints, {len(log.link_names)} links; "
         f"{log.duration_s:.1f} s of {', '.join(log.measured)} at {log.rate_hz:.0f} Hz"
     )
@@ -66,9 +67,9 @@ def _print_tree(found: Discovery) -> None:
         + [name for name in parents if name not in log.link_names]
     )
     for root in roots:
-        top = Shown(f"[bold]{root}[/]")
+        top = Shown(Text(root, "bold"))
         _hang(top, root, found.edges)
-        console.print(top)
+        output.print(top)
 
 
 def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
@@ -77,8 +78,9 @@ def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
             sure = edge.confidence if edge.directed else edge.connected
             style = "green" if sure >= DECIDED else "yellow"
             by = edge.joint if edge.joint is not None else "(no joint)"
-            way = "" if edge.directed else " [dim]this way or the other[/]"
-            label = f"{edge.link}  [dim]by[/] {by}  [{style}]{_shown(sure)}[/]{way}"
+            way = "" if edge.directed else " this way or the other"
+            label = Text.assemble(f"{edge.link}  ", ("by", "dim"), f" {by}  ")
+            label.append(_shown(sure), style).append(way, "dim")
             _hang(on.add(label), edge.link, edges)
 
 
@@ -96,9 +98,9 @@ def _print_lambda(learned: LearnedTree) -> None:
         turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in _halves(schema.lam[j]))
         spread = " ".join(_worst(part) for part in _halves(_known(learned)[j]))
         table.add_row(name, turn, place, f"{schema.ranks[j]}/6", spread)
-    console.print(table)
+    output.print(table)
     for sentence in schema.freedom.words(tree):
-        console.print(f"arbitrary, as no motion shows it: {sentence}", soft_wrap=True)
+        show(f"arbitrary, as no motion shows it: {sentence}")
 
 
 def _print_mountings(found: Discovery) -> None:
@@ -111,7 +113,7 @@ def _print_mountings(found: Discovery) -> None:
     for name, mounting in found.mountings.items():
         rows = (mounting.axis, mounting.as_dict()["position"])
         table.add_row(name, *(" ".join(f"{x:6.3f}" for x in row) for row in rows))
-    console.print(table)
+    output.print(table)
 
 
 def _halves(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,10 +150,10 @@ def _write_model(
     what = f"λ alone ({lacking if 'a' in found.bodies.motion else 'no accelerations'})"
     if left is not None:
         what = f"λ and θ; torque left unexplained {left.max():.2g} N m rms at the worst joint"
-    console.print(f"{args.model}: {what}")
+    show(f"{args.model}: {what}")
     arbitrary = model.provenance["discovered"]["theta_arbitrary"]
     if left is not None and arbitrary:
-        console.print(
+        show(
             f"θ of {len(arbitrary)} links is arbitrary where no torque shows it; the model file "
             "lists what"
         )

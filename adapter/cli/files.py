@@ -9,7 +9,7 @@ from typing import Any
 from adapter.effects.active import check_effects
 from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
-from adapter.runs.terminal import console, warn, write_json
+from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table
 from adapter.signals.recording import describe
 from drivers.files.mcap import recover
@@ -33,7 +33,7 @@ def run_import(args: argparse.Namespace) -> int:
     warn(list(report.warnings))
     facts = report.as_dict()
     write_json(args.json, facts)
-    console.print(f"{args.to}: {facts['samples']} samples")
+    show(f"{args.to}: {facts['samples']} samples")
     return 0
 
 
@@ -50,7 +50,7 @@ def run_recover(args: argparse.Namespace) -> int:
     }
     write_json(args.json, facts)
     total = sum(found.messages.values())
-    console.print(f"{found.out}: {total} messages, {found.lost_bytes} bytes could not be read")
+    show(f"{found.out}: {total} messages, {found.lost_bytes} bytes could not be read")
     return 0
 
 
@@ -59,7 +59,7 @@ def run_info(args: argparse.Namespace) -> int:
     facts = _model_facts(args.file) if args.file.suffix == ".json" else describe(args.file)
     write_json(args.json, facts)
     for key, value in facts.items():
-        console.print(f"{key}: {value}", soft_wrap=True)
+        show(f"{key}: {value}")
     return 0
 
 

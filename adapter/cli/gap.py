@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
+from rich.text import Text
 
 from adapter.cli.common import robot_of
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_robot
 from adapter.effects.export import robot_urdf
 from adapter.errors import ModelError, UsageError
@@ -24,10 +25,17 @@ from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
 from adapter.runs.compiling import announce_compiling
-from adapter.runs.terminal import console, results_folder, warn, write_json
+from adapter.runs.terminal import (
+    complain,
+    console,
+    output,
+    results_folder,
+    say,
+    show,
+    warn,
+    write_json,
+)
 from adapter.simulate import Rollouts
-
-EXIT_REFUSED = 2
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:
         settings = replace(settings, rounds=args.rounds)
-    announce_compiling(console.print)
+    announce_compiling(say)
     nominal = robot_of(args, args.model)
     folder = results_folder(args.out, "gap")
     model_out = _new_model(folder, args.model)
@@ -49,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
         names, logs = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
         nothing = GapResult.untold(names, nominal.name, logs, args.model, str(refusal))
         _write(args, folder, nothing, {"refused": refusal.kind})
-        console.print(f"[red]error:[/] {escape(str(refusal))}", soft_wrap=True)
-        return EXIT_REFUSED
+        complain(refusal)
+        return ExitCode.WRONG_USE
     result = replace(result, model_in=args.model)
     if rollouts is not None:
         notes = (*result.notes, *rollouts.troubles)
@@ -74,7 +82,7 @@ def _progress(quiet: bool) -> Iterator[Callable[[str], None]]:
         yield lambda text: None
         return
     with console.status("starting") as status:
-        yield status.update
+        yield lambda text: status.update(Text(text))
 
 
 def _without_empty_rollouts(result: GapResult) -> GapResult:
@@ -100,9 +108,9 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
         more["report"] = str(write_gap_page(result, folder / "report.html"))
     _write(args, folder, result, more)
     for line in console_summary(result):
-        console.print(line, soft_wrap=True)
+        output.print(Text.from_markup(line), soft_wrap=True)
     if "report" in more:
-        console.print(f"report {more['report']}", soft_wrap=True)
+        show(f"report {more['report']}")
 
 
 def _write_urdf(model: SelfModel, path: Path) -> str | None:

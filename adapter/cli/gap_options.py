@@ -15,9 +15,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "Find where a model and recordings disagree, name the effects that the model lacks, add "
         "them, and measure the gap again on data that the fit never saw. Several "
         "recordings are of one arm: friction, inertias and offsets are common, what the hand "
-        "carries and what pushes it is each one's own. Exit codes: 0 analysed, also where too "
-        "little moves to tell anything; 2 wrong use, or a recording that does not fit the model "
-        "(another robot, flipped signs, other units)."
+        "carries and what pushes it is each one's own. A recording in which too little moves to "
+        "tell anything is an answer too; one that does not fit the model (another robot, flipped "
+        "signs, other units) cannot be used."
     )
     add = parser.add_argument
     add("logs", nargs="+", type=Path, metavar="LOG", help="MCAP recording")

@@ -20,29 +20,34 @@ from adapter.cli import (
     run_options,
     sim,
 )
+from adapter.cli.exit_codes import ExitCode, listed
 from adapter.errors import MeansError, ModelWarning
 from adapter.experiments import arguments as experiments
-from adapter.runs.terminal import console, program_version
-from drivers.interface import DriverError
-
-EXIT_WRONG_USE, EXIT_NO_MEANS, EXIT_INTERRUPTED = 2, 5, 130
+from adapter.runs.terminal import complain, program_version, warn
+from drivers.interface import DriverError, NotReady
 
 
 class Command(NamedTuple):
     """What declares its options and may set `check`, one line of help, what carries it out.
 
-    The last is loaded by name, after the command line was found right: most bring libraries that
+    `run_by` is loaded by name, after the command line was found right: most bring libraries that
     take a second to load. `tests/house` reads this table, too.
     """
 
     declare: Callable[[argparse.ArgumentParser], None]
     words: str
     run_by: str
+    may_end: tuple[ExitCode, ...] = ()  # beside what every command may
 
 
 COMMANDS = {  # in the order of --help
-    "run": Command(run_options.declare, "learn live", "adapter.cli.run:run"),
-    "replay": Command(replay_options.declare, "learn from a recording", "adapter.cli.replay:run"),
+    "run": Command(run_options.declare, "learn live", "adapter.cli.run:run", tuple(ExitCode)),
+    "replay": Command(
+        replay_options.declare,
+        "learn from a recording",
+        "adapter.cli.replay:run",
+        (ExitCode.NOTHING_LEARNED,),
+    ),
     "gap": Command(gap_options.declare, "find what a model lacks", "adapter.cli.gap:run"),
     "load": Command(
         load_options.declare,
@@ -101,7 +106,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="adapter",
         description="Lets a torque-sensed arm learn its own body while it moves.",
-        epilog="adapter COMMAND --help tells more",
+        epilog=f"adapter COMMAND --help tells more. {listed(ExitCode)}",
     )
     parser.add_argument("--version", action="version", version=program_version())
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
@@ -109,6 +114,7 @@ def build_parser() -> argparse.ArgumentParser:
         part = commands.add_parser(name, help=command.words)
         part.set_defaults(check=lambda args: None)
         command.declare(part)
+        part.epilog = " ".join(filter(None, (part.epilog, listed(command.may_end))))
     return parser
 
 
@@ -121,22 +127,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module, _, function = COMMANDS[args.command].run_by.partition(":")
         return int(getattr(import_module(module), function)(args))
     except MeansError as error:
-        console.print(f"[red]error:[/] {error}", soft_wrap=True)
-        return EXIT_NO_MEANS
+        complain(error)
+        return ExitCode.NO_MEANS
+    except MemoryError:
+        complain("there is not enough memory for this")
+        return ExitCode.NO_MEANS
+    except NotReady as error:
+        complain(error)
+        return ExitCode.NOT_READY
     except OSError as error:
-        told = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        console.print(f"[red]error:[/] {told}", soft_wrap=True)
-        return EXIT_WRONG_USE
+        complain(f"{error.filename}: {error.strerror}" if error.filename else error)
+        return ExitCode.WRONG_USE
     except (DriverError, ValueError) as error:
-        console.print(f"[red]error:[/] {error}", soft_wrap=True)
-        return EXIT_WRONG_USE
+        complain(error)
+        return ExitCode.WRONG_USE
     except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+        return ExitCode.INTERRUPTED
 
 
 def _show_warning(message: Any, category: type[Warning], *where: Any) -> None:
     if issubclass(category, ModelWarning):
-        console.print(f"[yellow]warning:[/] {message}", soft_wrap=True)
+        warn([str(message)])
 
 
 if __name__ == "__main__":

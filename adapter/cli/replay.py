@@ -11,6 +11,7 @@ import numpy as np
 from rich.progress import Progress
 
 from adapter.cli.common import configure, robot_of_log
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
@@ -28,7 +29,7 @@ from adapter.runs.replay import (
 )
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
-from adapter.runs.terminal import console, results_folder, warn
+from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching, present
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     learner = replace(config.pipeline.learner, base_wrench=args.base_wrench == "zero")
     pipeline = replace(config.pipeline, filter=fitted, learner=learner)
     config = replace(config, pipeline=with_imus(pipeline, imus))
-    compile_first(robot, config.pipeline, args.every, console.print)
+    compile_first(robot, config.pipeline, args.every, say)
     result = _learn(args, log, robot, config)
     front_end, source = result.pipeline.front_end, ", ".join(map(str, args.logs))
     numbers = _figures(args, log, robot, reference, result)
@@ -74,8 +75,8 @@ def run(args: argparse.Namespace) -> int:
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, source)
-    console.print(f"{numbers['times_real_time']:.1f} times faster than real time")
-    return 0
+    show(f"{numbers['times_real_time']:.1f} times faster than real time")
+    return ExitCode.DONE if result.outcome.learned else ExitCode.NOTHING_LEARNED
 
 
 def _figures(
@@ -140,7 +141,7 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
 
 def tell(line: str) -> None:
     """A new disagreement, when it is found."""
-    console.print(f"[yellow]new disagreement:[/] {line}", soft_wrap=True)
+    labelled("new disagreement:", "yellow", line)
 
 
 def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:

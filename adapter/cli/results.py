@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from adapter.effects.active import check_effects
 from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
@@ -19,8 +19,8 @@ from adapter.model.self_model import SelfModel
 from adapter.report import write_report
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import load_run, run_data, save_run
-from adapter.runs.score import Reference
-from adapter.runs.terminal import console, json_ready, program_version, warn, write_json
+from adapter.runs.score import Reference, counted_from
+from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
 
 
@@ -67,14 +67,14 @@ def conclude(
 def print_figures(figures: dict[str, Any]) -> None:
     """The few figures that people want first."""
     lam, theta, tick = figures["lambda"], figures["theta"], figures["tick_us"]
-    table = Table(show_header=False, box=None, pad_edge=False)
+    table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
     refused = ", ".join(f"{count} {reason}" for reason, count in figures["refused"].items())
     table.add_row("samples", f"{figures['samples']}, learned {figures['learned']}")
     if refused:
         table.add_row("not learned", refused)
     table.add_row(
         f"λ ({lam['source']})",
-        f"{_seconds(lam['converged_s'])}; worst joint {max(lam['rotation_error_rad']):.2g} rad, "
+        f"{_reached(figures, 'lambda')}; worst joint {max(lam['rotation_error_rad']):.2g} rad, "
         f"{max(lam['position_error_m']):.2g} m against {lam['reference']}; "
         f"{lam['identifiable_rank']} directions shown",
     )
@@ -84,7 +84,7 @@ def print_figures(figures: dict[str, Any]) -> None:
         table.add_row("  from the documentation", words)
     rmse = theta["torque_rmse_nm"]
     fit = f"; fit {max(rmse):.3f} N m on the worst joint" if rmse else ""
-    table.add_row("θ", _seconds(theta["converged_s"]) + fit)
+    table.add_row("θ", _reached(figures, "theta") + fit)
     for change in theta["changes"]:
         load = change.get("payload")
         what = f"{load['m']:.3f} ± {load['m_std']:.3f} kg" if load else "superseded"
@@ -103,7 +103,7 @@ def print_figures(figures: dict[str, Any]) -> None:
     table.add_row("model", figures["model"])
     if "report" in figures:
         table.add_row("report", figures["report"])
-    console.print(table)
+    output.print(table)
 
 
 def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
@@ -113,8 +113,13 @@ def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
     return [sentence(report) for report in reports]
 
 
-def _seconds(value: float | None) -> str:
-    return "not converged" if value is None else f"converged {value:.2f} s after the first motion"
+def _reached(figures: dict[str, Any], which: str) -> str:
+    at = figures[which]["converged_s"]
+    if at is None:
+        return "not converged"
+    if not at and figures["slow_s"]:
+        return "converged in the slow phase"
+    return f"converged {at:.2f} s after {counted_from(figures)}"
 
 
 def write_robot(path: Path, written: RobotText) -> None:
@@ -146,13 +151,13 @@ def run_export(args: argparse.Namespace) -> int:
         facts["left_out"] = sorted({*facts.get("left_out", ()), *written.left_out})
         facts["notes"] = [*facts.get("notes", ()), *written.notes]
         onto = "" if written.onto is None else f" onto {written.onto}"
-        console.print(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
+        show(f"{path}: {model.name}{onto}, λ {model.lambda_source}")
     write_json(args.json, facts)
     for key, what in (("lambda_filled", "no motion"), ("theta_filled", "no torque")):
         if facts[key]:
-            console.print(f"from the documentation, as {what} shows it alone:")
+            show(f"from the documentation, as {what} shows it alone:")
         for words in facts[key]:
-            console.print(f"  {words}", soft_wrap=True)
+            show(f"  {words}")
     if "theta_note" in model.provenance:
         warn([f"θ: {model.provenance['theta_note']}"])
     return 0
@@ -162,5 +167,5 @@ def run_report(args: argparse.Namespace) -> int:
     """Carry `report` out."""
     page = write_report(args.html or args.folder / "report.html", load_run(args.folder))
     write_json(args.json, {"report": str(page)})
-    console.print(str(page))
+    show(str(page))
     return 0

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from adapter.cli.common import configure, recording_metadata, robot_of
 from adapter.cli.display import make_display
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.control.controller import ExcitationController
@@ -30,7 +31,7 @@ from adapter.runs.config import Config, with_imus
 from adapter.runs.live import describe_estimate, learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
-from adapter.runs.terminal import console, program_version, results_folder, warn
+from adapter.runs.terminal import complain, program_version, results_folder, say, show, warn
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.matching import counted, present
 from drivers.faults.driver import FaultyDriver, with_faults
@@ -38,7 +39,6 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import HARDWARE, joint_count, open_driver, split_address
 
-EXIT_ARM, EXIT_LEARNER = 3, 4
 # Of the documented speed, so that 20 ms of a torque that is held, the longest a Franka robot puts
 # up with, do not bring a joint to its limit.
 REAL_SHARE = 0.75
@@ -132,22 +132,31 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(truth, robot)
     driver = open_arm(args, plan)
     if maybe_real and not driver.can_move:
-        console.print("only listening; --allow-motion lets the arm move")
-    compile_first(robot, config.pipeline, 1, console.print)
+        say("only listening; --allow-motion lets the arm move")
+    compile_first(robot, config.pipeline, 1, say)
     front_end = make_front_end(robot, config.pipeline)
     result = _go(args, plan, driver, front_end, folder, truth)
     for line in result.timing.lines():
-        console.print(line)
+        show(line)
     if result.intake.commands is not None:
-        console.print(result.intake.commands.line())
+        show(result.intake.commands.line())
     if isinstance(driver, FaultyDriver):
-        console.print(driver.account.line())
+        show(driver.account.line())
     warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes)
     if result.collected is None:
-        console.print("[red]error:[/] the learner ended early; the recording is complete")
-        return EXIT_LEARNER
+        complain("the learner ended early")
+        return ExitCode.LEARNER_FAILED
     _conclude(args, folder, plan, reference, front_end, result)
-    return EXIT_ARM if result.fault else 0
+    return _ended(result)
+
+
+def _ended(result: LiveResult) -> ExitCode:
+    """How a run with results ended."""
+    if result.fault:
+        return ExitCode.ARM_FAILED
+    if not result.collected.learned:
+        return ExitCode.NOTHING_LEARNED
+    return ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
 
 
 def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
@@ -198,7 +207,7 @@ def _go(
         if maybe_real and controller is not None and controller.reference is not None:
             names = robot.tree.joint_names
             lines = plan_lines(controller.reference, controller.limits, names, duration_s)
-            console.print("\n".join(lines), soft_wrap=True)
+            say("\n".join(lines))
 
     learner = learner_job(
         robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
@@ -210,7 +219,7 @@ def _go(
         controller,
         Jobs(learner, recording, display),
         LiveOptions(duration_s, deadman=deadman, before_motion=show_plan),
-        say=lambda line: console.print(line, soft_wrap=True),
+        say=say,
     )
 
 
@@ -246,11 +255,8 @@ def _conclude(
     front_end: FrontEnd,
     result: LiveResult,
 ) -> None:
-    """Figures, files, headline; times of convergence count from the end of a slow start."""
-    robot, slow_s = plan.robot, plan.config.excitation.slow_s
-    outcome, first_ns = result.collected, front_end.first_moving_ns
-    if first_ns is not None and result.tracking is not None:
-        first_ns += round(1e9 * slow_s)
+    """Figures, files, headline."""
+    robot, outcome = plan.robot, result.collected
     refused = dict(front_end.refused)
     lost = result.unlearned + result.passed_on - outcome.learned
     if lost:
@@ -262,10 +268,11 @@ def _conclude(
         Course(
             result.samples,
             refused,
-            first_ns,
+            front_end.first_moving_ns,
             front_end.delay_s,
             result.timing.tick_us,
             result.timing.missed_deadlines,
+            0.0 if result.tracking is None else plan.config.excitation.slow_s,
         ),
         warnings=[*front_end.messages, *result.troubles, *outcome.lam_notes],
         robot=robot.name,

@@ -18,8 +18,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Move an arm on smooth random trajectories (or only listen) and learn λ and θ at its "
-        "rate, in real time. Exit codes: 0 done, 2 wrong use, 3 the arm failed, 4 the learner "
-        "failed."
+        "rate, in real time."
     )
     add = parser.add_argument
     add(

@@ -39,7 +39,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "Serve a simulated arm to drivers and to other people's clients, on this machine only, "
         f"until SIGTERM or Ctrl-C. {kinds}"
     )
-    parser.epilog = "adapter sim ARM --help tells more"
+    parser.epilog = "adapter sim ARM --help tells more."
     parser.add_argument("arm", choices=tuple(ARMS), metavar="ARM", help=", ".join(ARMS))
     parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="options of the arm")
 

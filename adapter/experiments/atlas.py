@@ -202,7 +202,7 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     """The whole experiment; says what it is at."""
 
     def say(line: str) -> None:
-        console.print(f"[dim]{line}[/]", soft_wrap=True)
+        console.print(line, style="dim", soft_wrap=True)
 
     began = time.perf_counter()
     say(f"simulating {args.trajectories} falls of {args.seconds:g} s, where none are kept")

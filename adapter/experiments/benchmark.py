@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.markup import escape
 from rich.table import Table
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
@@ -35,7 +34,7 @@ from adapter.physics.networks import (
 )
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
-from adapter.runs.terminal import console, write_json
+from adapter.runs.terminal import output, write_json
 from adapter.signals.filters import JointFilter
 from drivers.files.mcap import read_log
 from drivers.interface import JointSample
@@ -52,15 +51,13 @@ def run(args: argparse.Namespace) -> int:
     for row in rows:
         p50, p99 = row["p50_us"], row["p99_us"]
         shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
-        table.add_row(row["what"], *shown, escape(row["note"]))
-    console.print(table)
+        table.add_row(row["what"], *shown, row["note"])
+    output.print(table)
     unseen = _held_out(args)
     table = Table("unseen torque", "rmse by joint, N m", "note", box=None, pad_edge=False)
     for row in unseen:
-        table.add_row(
-            row["what"], " ".join(f"{x:.3f}" for x in row["rmse_nm"]), escape(row["note"])
-        )
-    console.print(table)
+        table.add_row(row["what"], " ".join(f"{x:.3f}" for x in row["rmse_nm"]), row["note"])
+    output.print(table)
     write_json(args.json, {"rows": rows, "held_out": unseen})
     return 0
 

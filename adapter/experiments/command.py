@@ -15,10 +15,11 @@ from adapter.experiments.page.page import write_experiment
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import AtlasResults, PandaResults, Stated
 from adapter.runs.terminal import (
-    console,
     json_ready,
+    output,
     program_version,
     results_folder,
+    show,
     write_json,
 )
 
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
             panda = run_panda(args.seed, PANDA_S, args.seeds)
             print_stated("Panda, section IV.B", panda.stated)
         _write(args, folder, atlas, panda)
-    console.print(f"report {folder / PAGE}", soft_wrap=True)
+    show(f"report {folder / PAGE}")
     return 0
 
 
@@ -63,7 +64,7 @@ def print_stated(title: str, stated: list[Stated]) -> None:
     for row in stated:
         unit = "" if row.ours is None else row.unit
         table.add_row(row.what, row.paper or "-", f"{shown(row.ours)} {unit}".strip())
-    console.print(table)
+    output.print(table)
 
 
 def shown(value: Any) -> str:

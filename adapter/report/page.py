@@ -24,7 +24,7 @@ from adapter.report.torque_panels import (
     theta_started,
 )
 from adapter.runs.run_folder import RunData
-from adapter.runs.score import TORQUE_GOAL
+from adapter.runs.score import TORQUE_GOAL, counted_from
 
 TEMPLATE = "report.html"
 MOST_TILES = 5  # side by side
@@ -133,7 +133,7 @@ def _schema_tiles(data: RunData) -> list[Tile]:
     schema = data.figures["lambda"]
     at = schema.get("converged_s")
     value = "not reached" if at is None else words.quantity(at, "s", 3)
-    note = f"after the first motion, to stay within {words.GOALS}"
+    note = f"after {counted_from(data.figures)}, to stay within {words.GOALS}"
     if schema.get("restarts"):
         note += f"; joints started anew {schema['restarts']} times, out of wrong valleys"
     found = [Tile("λ converged", value, note)]
@@ -152,7 +152,8 @@ def _theta_tiles(data: RunData) -> list[Tile]:
         return [Tile("θ", "not learned", "λ had not converged")]
     at = theta.get("converged_s")
     value = "not reached" if at is None else words.quantity(at, "s", 3)
-    note = f"after the first motion, to stay within {TORQUE_GOAL:g} × batch least squares"
+    goal = f"{TORQUE_GOAL:g} × batch least squares"
+    note = f"after {counted_from(data.figures)}, to stay within {goal}"
     found = [Tile("θ converged", value, note)]
     if theta.get("torque_rmse_nm"):
         text = words.spread(theta["torque_rmse_nm"], "N m")

@@ -33,7 +33,7 @@ def schema_panels(data: RunData) -> list[Panel]:
     lam = data.schema_trace[:, 1:].reshape(-1, data.n, 6)
     if len(t) < 2:
         return []
-    converged = data.figures["lambda"].get("converged_s")
+    converged = data.converged_s("lambda")
     # most happens at first: values are shown up to here, errors to the end
     until = t[-1] if converged is None else min(t[-1], max(SHOWN_S, SHOWN_FACTOR * converged))
     early, values = thin_rows(t[t <= until], lam[t <= until])

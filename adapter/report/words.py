@@ -9,7 +9,7 @@ from typing import Any
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL
+from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL, counted_from
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here
@@ -90,7 +90,10 @@ def is_live(figures: Mapping[str, Any]) -> bool:
 
 def headline(figures: Mapping[str, Any]) -> str:
     """What was learned, how fast and how well, in one sentence."""
-    parts = [schema_words(figures["lambda"]), *torque_words(figures["theta"])]
+    parts = [
+        schema_words(figures["lambda"], counted_from(figures)),
+        *torque_words(figures["theta"]),
+    ]
     samples = f"{count(figures['learned'])} of {count(figures['samples'])} samples learned"
     if is_live(figures):
         missed = figures.get("missed_deadlines") or 0
@@ -98,8 +101,8 @@ def headline(figures: Mapping[str, Any]) -> str:
     return "; ".join([*parts, samples]) + "."
 
 
-def schema_words(schema: Mapping[str, Any]) -> str:
-    """λ's part of the headline."""
+def schema_words(schema: Mapping[str, Any], start: str) -> str:
+    """λ's part of the headline; times count from `start`."""
     at, source = schema.get("converged_s"), schema.get("source", "")
     known = schema.get("reference") in (None, DOCUMENTATION)
     if source == LAMBDA_MEASURED:
@@ -107,11 +110,11 @@ def schema_words(schema: Mapping[str, Any]) -> str:
         if at is None:
             return f"λ, measured, did not stay within {GOALS} of {goal}"
         after = quantity(at, "s", 2)
-        return f"λ, measured, lies within {GOALS} of {goal} from {after} after the first motion on"
+        return f"λ, measured, lies within {GOALS} of {goal} from {after} after {start} on"
     goal = "" if known else " (judged against the given truth)"
     if at is None:
         return f"λ was to reproduce the documentation but did not stay within {GOALS}{goal}"
-    return f"λ reproduces the documentation {quantity(at, 's', 2)} after the first motion{goal}"
+    return f"λ reproduces the documentation {quantity(at, 's', 2)} after {start}{goal}"
 
 
 def torque_words(theta: Mapping[str, Any]) -> list[str]:

@@ -139,6 +139,11 @@ class RunData:
         """(k,) s after the first motion of the rows of a trace."""
         return stamps_s(trace) - self.start_s
 
+    def converged_s(self, which: str) -> float | None:
+        """When `lambda` or `theta` had converged, s after the first motion."""
+        at = self.figures[which].get("converged_s")
+        return None if at is None else float(at + self.figures.get("slow_s", 0.0))
+
     def score_signals(self) -> tuple[Array, Array, Array, Array, Array]:
         """q, dq, ddq, tau and prequential torque error, (k, n) each."""
         n = self.n

@@ -87,6 +87,16 @@ def settled_at(times: Array, good: Any) -> float | None:
     return float(times[bad[-1] + 1] if len(bad) else times[0])
 
 
+def _since(start_s: float | None, at_s: float | None) -> float | None:
+    """Seconds from the start; 0 for what was reached before it, in a slow phase, say."""
+    return None if start_s is None or at_s is None else max(at_s - start_s, 0.0)
+
+
+def counted_from(figures: Mapping[str, Any]) -> str:
+    """What times of convergence count from, in words."""
+    return "the slow phase" if figures.get("slow_s") else "the first motion"
+
+
 def course_errors(
     outcome: Outcome, documented: SelfModel, reference: Reference
 ) -> tuple[Array, Array]:
@@ -133,7 +143,7 @@ def schema_score(
     last_turn, last_shift = frame_errors(completed.lam, reference.lam, freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
-        "converged_s": None if at is None or start_s is None else at - start_s,
+        "converged_s": _since(start_s, at),
         "rotation_error_rad": last_turn.tolist(),
         "position_error_m": last_shift.tolist(),
         "identifiable_rank": outcome.lam_rank,
@@ -231,8 +241,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     }
     if outcome.theta_started_ns is None or not len(outcome.score_trace):
         return score
-    if start_s is not None:
-        score["started_s"] = 1e-9 * outcome.theta_started_ns - start_s
+    score["started_s"] = _since(start_s, 1e-9 * outcome.theta_started_ns)
     rows = ScoreRows(outcome, documented)
     late = rows.after_changes
     final = rows.tau - rows.torque(outcome.theta, outcome.effects)
@@ -243,8 +252,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     ours = trailing_rms(rows.time_s[early], rows.error[early] / noise, TORQUE_WINDOW_S)
     theirs = trailing_rms(rows.time_s[early], batch[early] / noise, TORQUE_WINDOW_S)
     at = settled_at(rows.time_s[early], ours <= TORQUE_GOAL * theirs)
-    if at is not None and start_s is not None:
-        score["converged_s"] = max(at - start_s, 0.0)
+    score["converged_s"] = _since(start_s, at)
     return score
 
 
@@ -258,6 +266,7 @@ class Course(NamedTuple):
         delay_s: from a filtered stamp to the sample that completed it.
         tick_us: percentiles of the tick, by name; None where there was no tick.
         missed_deadlines: ticks that came too late.
+        slow_s: how long the motion was slow at first.
     """
 
     samples: int
@@ -266,6 +275,7 @@ class Course(NamedTuple):
     delay_s: float
     tick_us: Mapping[str, float | None] = MappingProxyType({})
     missed_deadlines: int = 0
+    slow_s: float = 0.0
 
 
 def figures(
@@ -275,19 +285,23 @@ def figures(
     course: Course,
     **more: Any,
 ) -> dict[str, Any]:
-    """The figures of `run` and `replay`; times of convergence count from the first moving sample.
+    """The figures of `run` and `replay`.
+
+    Times of convergence count from the first moving sample, or the end of the slow phase, and are
+    0 where it was reached before.
 
     Filtered stamps lie `delay_s` before the sample that completed them; an estimate is there
     when its sample is, so the delay is added to every time of convergence.
     """
     first_ns = course.first_moving_ns
-    start_s = None if first_ns is None else 1e-9 * first_ns - course.delay_s
+    start_s = None if first_ns is None else 1e-9 * first_ns - course.delay_s + course.slow_s
     return {
         "samples": course.samples,
         "learned": outcome.learned,
         "refused": {reason: int(count) for reason, count in course.refused.items() if count},
         "missed_deadlines": course.missed_deadlines,
         "tick_us": dict(course.tick_us),
+        "slow_s": course.slow_s,
         "lambda": schema_score(outcome, documented, reference, start_s),
         "theta": theta_score(outcome, documented, start_s),
         "disagreements": None if outcome.disagreements is None else list(outcome.disagreements),

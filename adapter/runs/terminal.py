@@ -1,9 +1,14 @@
-"""What commands say on the terminal and write as figures; light, so a refusal comes at once."""
+"""What commands say on the terminal and write as figures; light, so a refusal comes at once.
+
+Results go to the standard output, all else (progress, warnings, errors) to the standard error.
+Names come from files and may hold anything: text is printed as it is, styles are given beside it.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime
@@ -12,10 +17,20 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.text import Text
 
 
 class PatientConsole(Console):
-    """Goes on where the terminal is gone: results are still written."""
+    """Reads no styles out of text; goes on where nobody listens: results are still written."""
+
+    def __init__(self, stderr: bool) -> None:
+        super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
+
+    def on_broken_pipe(self) -> None:
+        """Whoever read this has gone (`| head`); where rich would end the program, it goes on."""
+        self.quiet = True
+        with suppress(OSError, ValueError), open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), self.file.fileno())
 
     def print(self, *objects: Any, **options: Any) -> None:
         """As rich does, without an error."""
@@ -23,13 +38,34 @@ class PatientConsole(Console):
             super().print(*objects, **options)
 
 
-console = PatientConsole(stderr=True, highlight=False)
+console = PatientConsole(stderr=True)
+output = PatientConsole(stderr=False)
+
+
+def say(line: str) -> None:
+    """A line about how it goes."""
+    console.print(line, soft_wrap=True)
+
+
+def show(line: str) -> None:
+    """A line of the result."""
+    output.print(line, soft_wrap=True)
 
 
 def warn(lines: Iterable[str]) -> None:
     """Warnings, one line each."""
     for line in lines:
-        console.print(f"[yellow]warning:[/] {line}", soft_wrap=True)
+        labelled("warning:", "yellow", line)
+
+
+def complain(sentence: object) -> None:
+    """What ends the program."""
+    labelled("error:", "red", str(sentence))
+
+
+def labelled(label: str, style: str, line: str) -> None:
+    """A line about how it goes behind a label in a style of rich."""
+    console.print(Text.assemble((label, style), " ", line), soft_wrap=True)
 
 
 def program_version() -> str:
@@ -59,8 +95,10 @@ def json_text(figures: Any) -> str:
 
 
 def write_json(path: Path | None, figures: Any) -> None:
-    """Figures to a file, if one was asked for."""
-    if path is not None:
+    """Figures to a file, if one was asked for; `-` is the standard output."""
+    if str(path) == "-":
+        output.print(json_text(figures), end="", soft_wrap=True)
+    elif path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json_text(figures), encoding="utf-8")
 

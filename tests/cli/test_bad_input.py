@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import build_parser, main
 from adapter.cli.run import run_plan
 from adapter.effects.export import to_urdf
@@ -45,11 +46,14 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return " ".join(said.split())
 
 
-def replayed(tmp_path: Path, capsys: pytest.CaptureFixture[str], path: Path) -> str:
+def replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], path: Path, code: ExitCode = ExitCode.DONE
+) -> str:
     """Replay a recording that can be used; what was said about it."""
     out = tmp_path / "out"
-    assert main(["replay", str(path), "--quiet", "--no-report", "--out", str(out)]) == 0
-    return " ".join(capsys.readouterr().err.split())
+    assert main(["replay", str(path), "--quiet", "--no-report", "--out", str(out)]) == code
+    said = capsys.readouterr()
+    return " ".join(f"{said.err} {said.out}".split())
 
 
 def test_unknown_robot(tmp_path, capsys) -> None:
@@ -143,7 +147,8 @@ def test_joints_that_an_arm_without_names_lacks_are_locked(tmp_path, capsys, add
 def test_a_log_that_repeats_one_reading(tmp_path, capsys) -> None:
     still = motion(1)[0]
     samples = [JointSample(1_000_000 * k, still.q, still.dq, still.tau) for k in range(300)]
-    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
+    path = record(tmp_path / "log.mcap", samples)
+    said = replayed(tmp_path, capsys, path, ExitCode.NOTHING_LEARNED)
     assert "299 repeated" in said and "learned 0" in said
 
 
@@ -169,8 +174,8 @@ def test_models_of_different_joints_are_not_compared(tmp_path, capsys) -> None:
 
 def test_degrees(tmp_path, capsys) -> None:
     samples = [JointSample(s.stamp_ns, 57.3 * s.q, 57.3 * s.dq, s.tau) for s in motion()]
-    said = replayed(tmp_path, capsys, record(tmp_path / "log.mcap", samples))
-    assert "degrees" in said
+    path = record(tmp_path / "log.mcap", samples)
+    assert "degrees" in replayed(tmp_path, capsys, path, ExitCode.NOTHING_LEARNED)
 
 
 def test_a_reading_that_is_no_number(tmp_path, capsys) -> None:

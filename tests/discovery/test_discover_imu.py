@@ -92,7 +92,7 @@ def test_command_finds_the_tree_of_glued_sensors(tmp_path, capsys) -> None:
     assert figures["torque_rmse_nm"] is None
     found = load_model(model)
     assert found.provenance["discovered"]["theta"] == "not learned"
-    told = " ".join(capsys.readouterr().err.split())
+    told = " ".join("".join(capsys.readouterr()).split())
     for sentence in ("200 Hz, carried to the joint", "no efforts", "no velocities", "(no torques)"):
         assert sentence in told
     assert "sensor of" in told and "axis in its frame" in told
@@ -117,7 +117,7 @@ def test_floating_base_needs_a_word(tmp_path, capsys) -> None:
     case = _case(2, True, True)
     path = _write(tmp_path / "a.mcap", case, str, dq=True)
     assert any("--base" in line for line in _discovered(path)["undecided"])
-    assert "this way or the other" in capsys.readouterr().err
+    assert "this way or the other" in capsys.readouterr().out
     figures = _discovered(path, "--base", case.root)
     assert _edges(figures) == case.edges and figures["undecided"] == []
     assert main(["discover", str(path), "--base", "nobody"]) != 0

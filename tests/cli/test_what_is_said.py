@@ -1,0 +1,95 @@
+"""What commands print and how they end: names as they are, results apart, codes in one table."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from adapter.cli.exit_codes import ExitCode
+from adapter.cli.main import COMMANDS, build_parser, main
+from adapter.model.model_file import save_model
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
+from drivers.interface import DriverError, NotReady
+from tests.helpers.readme import README
+
+NAMES = ("[red]shoulder[/]", "[/]", "arm[1]", "[bold", ":smile:", "\\[x]", "[link=file:x]y")
+
+
+def awkward(name: str = "[red]arm[/bold]") -> SelfModel:
+    """The Panda with names that would be styles."""
+    robot = documented("panda")
+    return replace(robot, name=name, tree=replace(robot.tree, joint_names=NAMES), source=None)
+
+
+def test_names_are_printed_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In results, tables, warnings and errors."""
+    path = save_model(awkward(), tmp_path / "[bold]model[/x].json")
+    heavier = awkward("b")
+    heavier.theta[:, 0] *= 1.5
+    other = save_model(heavier, tmp_path / "[green].json")
+    assert main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "[red]arm[/bold]" in said and str(list(NAMES)) in said
+    assert main(["export", str(path), "--urdf", str(tmp_path / "[a].urdf")]) == 0
+    assert str(tmp_path / "[a].urdf") in capsys.readouterr().out
+    assert main(["diff", str(path), str(other)]) == 0
+    said = capsys.readouterr().out
+    assert any(name in said for name in NAMES)
+    assert main(["info", str(tmp_path / "[/gone].json")]) == ExitCode.WRONG_USE
+    assert "[/gone].json" in capsys.readouterr().err
+
+
+def test_results_go_to_the_standard_output(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = save_model(documented("panda"), tmp_path / "m.json")
+    for arguments in (["info", path], ["diff", path, path], ["export", path, "--urdf", "a.urdf"]):
+        arguments = [str(tmp_path / x) if x == "a.urdf" else str(x) for x in arguments]
+        assert main(arguments) == 0
+        said = capsys.readouterr()
+        assert said.out and not said.err
+    assert main(["info", "gone.json"]) == ExitCode.WRONG_USE
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ") and not said.out
+
+
+def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
+    """`adapter info FILE | head -0` ends as it would have, without a word on the pipe."""
+    path = save_model(documented("panda"), tmp_path / "m.json")
+    command = [sys.executable, "-m", "adapter", "info", str(path)]
+    piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **piped) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(60) == 0
+
+
+def test_exit_codes_stand_in_the_readme_and_in_the_help() -> None:
+    table = dict(re.findall(r"^\| (\d+) \| (.+?) \|$", README, re.MULTILINE))
+    assert table == {str(code.value): code.words for code in ExitCode}
+    parts = next(a for a in build_parser()._actions if a.dest == "command").choices
+    for name, command in COMMANDS.items():
+        said = " ".join(parts[name].format_help().split())
+        for code in command.may_end:
+            assert f"{code.value} {code.words}" in said
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (NotReady("joint 4 is in a reflex"), ExitCode.NOT_READY),
+        (DriverError("no [route]"), ExitCode.WRONG_USE),
+        (MemoryError(), ExitCode.NO_MEANS),
+    ],
+)
+def test_each_error_has_its_code(monkeypatch, capsys, error: Exception, code: ExitCode) -> None:
+    def fail(args: object) -> int:
+        raise error
+
+    monkeypatch.setattr("adapter.cli.files.run_info", fail)
+    assert main(["info", __file__]) == code
+    assert str(error) in capsys.readouterr().err
