@@ -143,6 +143,9 @@ def run(args: argparse.Namespace) -> int:
     if isinstance(driver, FaultyDriver):
         show(driver.account.line())
     warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes)
+    if result.unrecorded:
+        share = 100.0 * result.unrecorded / result.samples
+        warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
     if result.collected is None:
         complain("the learner ended early")
         return ExitCode.LEARNER_FAILED

@@ -61,6 +61,16 @@ class Clock:
         self.k, self.missed, self.missed_own = -1, 0, 0
         self._used_ns = self._used()
 
+    def follow(self, now_ns: int) -> None:
+        """Where the source keeps the rhythm: a tick begins; periods without one count as missed."""
+        if self._t0 is not None:
+            skipped = round((now_ns - self._t0) / self.period_ns) - 1
+            if skipped > 0:
+                self.missed += skipped
+                if self._used() - self._used_ns > self.period_ns:
+                    self.missed_own += skipped
+        self._t0, self._used_ns = now_ns, self._used()
+
     def wait(self) -> int:
         """Wait for the next deadline; returns by how much it is late, ns.
 

@@ -307,6 +307,8 @@ class _Loop:
         driver, session = self._driver, self._session
         plant_ns = 0 if first else getattr(driver, "plant_time_ns", 0)
         age_ns = session.had_ns - driver.arrived_ns if driver.arrived_ns else None
+        if driver.paced:
+            self._clock.follow(session.began_ns)
         ended_ns = time.monotonic_ns()
         self._timing.add(session.began_ns, session.stepped_ns, ended_ns, plant_ns, age_ns)
 

@@ -51,6 +51,16 @@ def test_deadlines_stay_on_the_grid_and_are_missed_only_by_more_than_a_period(wo
         fake.ns += busy
 
 
+def test_where_the_source_keeps_the_rhythm_periods_without_a_tick_are_missed():
+    """A loop held up for 30 periods by the machine, then for 5 by its own work."""
+    used = iter([0, 0, 0, 100, 100, 100, 2 * PERIOD, 2 * PERIOD])
+    clock, at = Clock(PERIOD, used=lambda: next(used)), 12_345
+    for step in (0, PERIOD, round(1.3 * PERIOD), 31 * PERIOD, 1000, 6 * PERIOD):
+        at += step
+        clock.follow(at)
+    assert (clock.missed, clock.missed_own) == (35, 5)
+
+
 def test_sleeps_on_the_real_clock_until_the_absolute_instant():
     at = time.monotonic_ns() + 5_000_000
     sleep_until(at)

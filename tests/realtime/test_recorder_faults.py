@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import signal
@@ -14,6 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapter.cli.exit_codes import ExitCode
+from adapter.cli.main import main
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
 from adapter.runs.live import describe_estimate
@@ -100,6 +103,18 @@ def _little_room(snapshot):
     return describe_estimate(snapshot)
 
 
+class _NoRoom:
+    """`describe_estimate`; a process that it is handed to may write files of `ROOM` bytes."""
+
+    def __reduce__(self):
+        return _without_room, ()
+
+
+def _without_room():
+    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, resource.RLIM_INFINITY))
+    return describe_estimate
+
+
 def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
     """Where there is no small disk to be had, a file that may not grow is as good."""
     path = (small_disk or tmp_path) / "a.mcap"
@@ -107,6 +122,17 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
     assert small_disk is None or "No space left on device" in result.troubles[0]
     _check_full(result, path)
     assert path.stat().st_size <= ROOM
+
+
+def test_a_run_whose_recording_is_incomplete_says_so(tmp_path, monkeypatch, capsys):
+    """By its exit code, in words, and in its figures."""
+    monkeypatch.setattr("adapter.cli.run.describe_estimate", _NoRoom())
+    run = ["run", "--duration", "1", "--quiet", "--no-report", "--out", str(tmp_path)]
+    assert main([*run, "--json", str(tmp_path / "o.json")]) == ExitCode.INCOMPLETE
+    figures = json.loads((tmp_path / "o.json").read_text())
+    assert figures["fault"] is None and figures["unrecorded"] > 0
+    said = capsys.readouterr().err
+    assert f"{figures['unrecorded']} samples (" in said and "not in the recording" in said
 
 
 def _stop_once(snapshot):
