@@ -25,13 +25,9 @@ from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
 from drivers.interface import Driver, JointSample
 
-# N m/rad and N m s/rad. Stiffness as of a Panda's joint impedance control; damping as high as
-# the arm's smallest inertias allow at 1 kHz (D T / I < 0.5), without the help of the motors'.
-PANDA_STIFFNESS = (600.0, 700.0, 400.0, 600.0, 40.0, 50.0, 10.0)
-PANDA_DAMPING = (15.0, 25.0, 8.0, 15.0, 1.2, 1.6, 0.3)
-GAINS_DELAY_NS = 1_000_000  # from a reading to its torque, for which that holds
-STIFFNESS_PER_EFFORT = 5.0  # 1/rad, of another arm
-DAMPING_TIME_S = 0.03  # damping over stiffness, of another arm
+GAINS_DELAY_NS = 1_000_000  # from a reading to its torque, for which the gains are made
+STIFFNESS_PER_EFFORT = 5.0  # 1/rad, of an arm that is not known by name
+DAMPING_TIME_S = 0.03  # damping over stiffness, of the same
 
 DEFAULT_PERIOD_NS = 1_000_000
 RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an arm that checks it
@@ -72,7 +68,8 @@ class Controller(Protocol):
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """Gains of the feedback; those of a Panda, or by a rule from the effort limits, where None.
+    """Gains of the feedback; where None, those of an arm that is known by name (`RobotFacts`), or
+    by a rule from the effort limits.
 
     Attributes:
         stiffness: K (n), N m/rad.
@@ -95,10 +92,10 @@ class ControlSettings:
     def gains(self, limits: MotionLimits) -> tuple[Array, Array]:
         """K and D (n,) of an arm. Raises SettingsError for a wrong number of gains."""
         n = len(limits.effort)
-        panda = limits.is_panda
+        known = limits.known
         effort = np.where(np.isfinite(limits.effort), limits.effort, 10.0)
-        rule = np.array(PANDA_STIFFNESS) if panda else STIFFNESS_PER_EFFORT * effort
-        damping_rule = np.array(PANDA_DAMPING) if panda else DAMPING_TIME_S * rule
+        rule = STIFFNESS_PER_EFFORT * effort if known is None else known.stiffness
+        damping_rule = DAMPING_TIME_S * rule if known is None else known.damping
         chosen = []
         for name, own in (("stiffness", rule), ("damping", damping_rule)):
             given = getattr(self, name)

@@ -16,7 +16,7 @@ it is r = slow_share r1 + (1 - slow_share) r2 of two such products.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -89,9 +89,18 @@ class RandomMotion:
         low, high = np.log(edges[:-1]), np.log(edges[1:])
         self.omega = 2.0 * np.pi * np.exp(low + (high - low) * rng.random(shape))
         relative = (0.5 + rng.random(shape)) / self.omega  # alike in speed, not in position
-        self.amplitude = relative * _scale(relative, self.omega, limits, lower, upper, s)[:, None]
-        reach = self.amplitude.sum(axis=1)
-        self.centre = np.minimum(np.maximum(q0, lower + reach), upper - reach)
+        factor = _scale(relative, self.omega, limits, lower, upper, s)
+        speed, reach = (relative * self.omega).sum(axis=1), relative.sum(axis=1)
+
+        def centre(factor: Array) -> Array:
+            return np.minimum(np.maximum(q0, lower + factor * reach), upper - factor * reach)
+
+        def slow_enough(factor: Array) -> Array:
+            middle, half = centre(factor), factor * reach
+            return factor * speed <= s.share * limits.speed_between(middle - half, middle + half)
+
+        factor = _largest(factor, slow_enough)
+        self.amplitude, self.centre = relative * factor[:, None], centre(factor)
         phase = rng.uniform(-np.pi, np.pi, shape)
         self.phase = _phases_through(phase, self.amplitude, q0 - self.centre)
         self._path = np.zeros((3, len(q0)))
@@ -212,6 +221,16 @@ def _scale(
     return factor
 
 
+def _largest(factor: Array, allowed: Callable[[Array], Array]) -> Array:
+    """The factors (n,), each shrunk as far as what is `allowed` (n,) of small ones demands."""
+    low, high = np.where(allowed(factor), factor, 0.0), factor
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        good = allowed(middle)
+        low, high = np.where(good, middle, low), np.where(good, high, middle)
+    return low
+
+
 def _phases_through(phase: Array, amplitude: Array, start: Array) -> Array:
     """Phases as near to the given ones as makes sum_i a_i sin(phi_i) = start (n,).
 
@@ -248,6 +267,7 @@ def plan_lines(
     """
     settings = motion.settings
     lower, upper, speed, acceleration, jerk = motion.bounds()
+    fastest = limits.speed_between(lower, upper)
     width = max(len(name) for name in joint_names)
     lines = [f"This moves {len(joint_names)} joints, {_until(duration_s, settings.stop_s)}."]
     if settings.slow_s:
@@ -261,7 +281,7 @@ def plan_lines(
             f"({math.degrees(lower[j]):+.1f} .. {math.degrees(upper[j]):+.1f} deg; "
             f"{_range_of(limits.lower[j], limits.upper[j], lower[j], upper[j])}), "
             f"{_speeds(speed[j], settings.slow_s, settings.slow_share)} rad/s "
-            f"({_share(speed[j], limits.velocity[j])} of {limits.velocity[j]:.4g})"
+            f"({_share(speed[j], fastest[j])} of {fastest[j]:.4g})"
         )
     lines.append(
         f"At most {_worst(acceleration, limits.acceleration)} of the documented acceleration and "

@@ -1,4 +1,4 @@
-"""What a motion of a documented arm has to keep."""
+"""What a motion of a documented arm has to keep, and whether its documentation says enough."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.model.self_model import SelfModel
+from adapter.errors import SettingsError
+from adapter.model.robots.known import RobotFacts, facts_of
+from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
 
-# Franka Emika Panda, vendor documentation (limits for planning motion): rad/s², rad/s³, N m/s.
-PANDA_ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
-PANDA_JERK = (7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0)
-PANDA_TORQUE_RATE = 1000.0
-# Of an arm whose documentation is silent; modest.
+# Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s.
 UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK = 1.0, 5.0, 1000.0
+UNKNOWN_TORQUE_RATE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,8 @@ class MotionLimits:
     """What a motion has to keep, (n,) each: rad, rad/s, rad/s², rad/s³, N m, N m/s.
 
     Attributes:
-        is_panda: whether the arm is known as one.
+        known: the arm, where it is known by name.
+        joint_names: () where nobody has named them.
     """
 
     lower: Array
@@ -32,21 +32,71 @@ class MotionLimits:
     jerk: Array
     effort: Array
     torque_rate: Array
-    is_panda: bool = False
+    known: RobotFacts | None = None
+    joint_names: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, model: SelfModel) -> MotionLimits:
-        """Limits of a documented arm; modest ones where its documentation is silent."""
-        n, known = model.tree.n, model.limits
-        panda = n == len(PANDA_JERK) and model.name.startswith(("panda", "fer"))
-        velocity = np.where(np.isfinite(known.velocity), known.velocity, UNKNOWN_VELOCITY)
+        """Limits of a documented arm; modest ones where its documentation is silent.
+
+        Of an arm that is known by name the vendor's limits hold, too.
+        """
+        n, known = model.tree.n, facts_of(model)
+        limits = model.limits if known is None else _tighter(model.limits, known.model.limits)
         return cls(
-            known.lower,
-            known.upper,
-            velocity,
-            np.array(PANDA_ACCELERATION) if panda else np.full(n, UNKNOWN_ACCELERATION),
-            np.array(PANDA_JERK) if panda else np.full(n, UNKNOWN_JERK),
-            np.where(np.isfinite(known.effort), known.effort, np.inf),
-            np.full(n, PANDA_TORQUE_RATE),
-            panda,
+            limits.lower,
+            limits.upper,
+            np.where(np.isfinite(limits.velocity), limits.velocity, UNKNOWN_VELOCITY),
+            np.full(n, UNKNOWN_ACCELERATION) if known is None else known.acceleration,
+            np.full(n, UNKNOWN_JERK) if known is None else known.jerk,
+            np.where(np.isfinite(limits.effort), limits.effort, np.inf),
+            np.full(n, UNKNOWN_TORQUE_RATE) if known is None else known.torque_rate,
+            known,
+            model.tree.joint_names,
+        )
+
+    @property
+    def robot(self) -> str:
+        """Name of the arm where it is known; empty elsewhere."""
+        return "" if self.known is None else self.known.name
+
+    def speed_between(self, low: Array, high: Array) -> Array:
+        """Speed (n,) rad/s allowed everywhere between the positions low and high (n,)."""
+        by_position = None if self.known is None else self.known.speed_by_position
+        if by_position is None:
+            return self.velocity
+        speed: Array = np.minimum(self.velocity, by_position.between(low, high))
+        return speed
+
+
+def _tighter(one: Limits, other: Limits) -> Limits:
+    """What keeps both; one's number where the other has none."""
+    return Limits(
+        np.fmax(one.lower, other.lower),
+        np.fmin(one.upper, other.upper),
+        np.fmin(one.velocity, other.velocity),
+        np.fmin(one.effort, other.effort),
+    )
+
+
+def need_complete(model: SelfModel) -> None:
+    """Refuse to move an arm whose limits are not all documented.
+
+    Raises:
+        SettingsError: naming each joint and what it lacks.
+    """
+    limits, lacks = model.limits, []
+    for j, name in enumerate(model.tree.joint_names):
+        wrong = [key for key in ("lower", "upper") if not np.isfinite(getattr(limits, key)[j])]
+        if not wrong and limits.lower[j] >= limits.upper[j]:
+            wrong = ["lower below upper"]
+        wrong += [key for key in ("velocity", "effort") if not getattr(limits, key)[j] > 0.0]
+        if wrong:
+            lacks.append(f"{name} ({', '.join(wrong)})")
+    if lacks:
+        raise SettingsError(
+            f"{model.name}: an arm that may be real moves only within documented limits, and "
+            f"these joints lack some: {'; '.join(lacks)}. Write them into the robot's file: "
+            '<limit lower="" upper="" velocity="" effort=""/> in rad, rad/s, N m, above zero; a '
+            "joint that turns without end needs a range for this, too (type revolute)"
         )
