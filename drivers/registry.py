@@ -15,6 +15,7 @@ LOG = "drivers.files.log:LogArm"  # takes (file, joint names)
 # Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
 HARDWARE = {"fci": "drivers.fci.arm:FciArm", "can": "drivers.damiao.arm:DamiaoArm"}
 COUNT = {"fci": "drivers.fci.arm:joint_count", "can": "drivers.damiao.settings:joint_count"}
+NAMELESS = ("can",)  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
 

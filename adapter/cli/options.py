@@ -22,7 +22,7 @@ MODEL_FILES = (".urdf", ".xml", ".json")
 def add_learning(parser: argparse.ArgumentParser) -> None:
     """Options of everything that learns."""
     add = parser.add_argument
-    add("--robot", metavar="NAME|FILE", help="panda (default), .urdf, .xml (MJCF) or .json")
+    add("--robot", metavar="NAME|FILE", help="panda (default), fr3, .urdf, .xml (MJCF) or .json")
     add_joints(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--mode", choices=MODES, help="moments (default) or the paper's sample")

@@ -19,7 +19,9 @@ from adapter.cli.run_options import simulated
 from adapter.control.controller import ExcitationController
 from adapter.control.excitation import plan_lines
 from adapter.control.feedforward import Feedforward, ModelFeedforward
-from adapter.control.limits import MotionLimits
+from adapter.control.limits import MotionLimits, another_robot, need_complete
+from adapter.control.resting import check_resting_torque
+from adapter.control.settings import gentle
 from adapter.effects.active import lasting_effects, with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
@@ -39,11 +41,7 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import HARDWARE, joint_count, open_driver, split_address
 
-# Of the documented speed, so that 20 ms of a torque that is held, the longest a Franka robot puts
-# up with, do not bring a joint to its limit.
-REAL_SHARE = 0.75
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
-SLOW_S = 10.0  # an arm that may be real moves at a tenth of the speed for so long
 
 
 class SimulationLike(Protocol):
@@ -96,10 +94,9 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
         pipeline = with_imus(config.pipeline, world.scenario.imus)
         config = dataclasses.replace(config, pipeline=pipeline)
     maybe_real = world is None and scheme in HARDWARE
-    if maybe_real and _may_move(args) and not config.excitation.slow_s:
-        share = min(config.excitation.share, REAL_SHARE)
-        gentle = dataclasses.replace(config.excitation, slow_s=SLOW_S, share=share)
-        config = dataclasses.replace(config, excitation=gentle)
+    if maybe_real and _may_move(args):
+        need_complete(robot)
+        config = dataclasses.replace(config, excitation=gentle(config.excitation))
     return RunPlan(config.apply(robot), config, world, maybe_real)
 
 
@@ -207,7 +204,11 @@ def _go(
 
     def show_plan() -> None:
         warn(driver.intake.notes)  # who holds the arm, say; again with what came later at the end
-        if maybe_real and controller is not None and controller.reference is not None:
+        if controller is None:
+            warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
+        elif maybe_real and controller.reference is not None and controller.start is not None:
+            if not args.trust_model:
+                check_resting_torque(robot, controller.start.q, controller.start.tau)
             names = robot.tree.joint_names
             lines = plan_lines(controller.reference, controller.limits, names, duration_s)
             say("\n".join(lines))

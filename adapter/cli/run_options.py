@@ -8,7 +8,8 @@ from pathlib import Path
 
 from adapter.cli.options import NAMES, add_learning, check_learning
 from adapter.errors import UsageError
-from drivers.registry import SCHEMES, split_address
+from adapter.model.robots import names as robot_names
+from drivers.registry import NAMELESS, SCHEMES, split_address
 
 FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
@@ -32,6 +33,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="leave to move an arm that may be real (fci, can): prints the plan, goes at a tenth "
         "of the speed for 10 s, stops when this terminal closes. Without it, only listen",
+    )
+    add(
+        "--trust-model",
+        action="store_true",
+        help="move an arm that may be real although what it holds at rest is not the weight that "
+        "the model says",
     )
     add("--duration", type=float, default=30.0, metavar="S", help="default 30")
     add(
@@ -78,6 +85,11 @@ def _check(args: argparse.Namespace) -> None:
     for option in args.set:
         if "=" not in option:
             raise UsageError(f"'{option}' is not KEY=VALUE")
+    if args.allow_motion and scheme in NAMELESS and args.robot is None and not simulated(args.driver):
+        raise UsageError(
+            f"an arm behind {scheme}:// does not say which robot it is; --robot must, before it "
+            f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
+        )
     check_learning(args)
     if args.fault is not None or simulated(args.driver):
         import_module(NAMES).check_run(args)

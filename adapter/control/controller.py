@@ -10,7 +10,7 @@ no b, and the model's torque less the gravity in it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from adapter.control.excitation import RandomMotion, smooth_step
 from adapter.control.feedforward import Feedforward
-from adapter.control.limits import MotionLimits
+from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
 from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError, SettingsError
@@ -140,9 +140,11 @@ class ExcitationController:
         motion: settings of the reference.
         control: gains.
         feedforward: a model to help, used as soon as it is ready; feedback alone where None.
+        draw: makes the motion from limits, the arm's position and settings.
 
     Attributes:
         reference: the motion; None before the first sample.
+        start: the sample that it was drawn from.
         saturated: commands that were cut at the effort limit.
         rate_limited: commands that were cut at the torque rate limit.
     """
@@ -153,15 +155,17 @@ class ExcitationController:
         motion: ExcitationSettings | None = None,
         control: ControlSettings | None = None,
         feedforward: Feedforward | None = None,
+        draw: Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion] = RandomMotion,
     ) -> None:
         control = control or ControlSettings()
         n = len(limits.effort)
         self.limits, self.motion = limits, motion or ExcitationSettings()
-        self.feedforward = feedforward
+        self.feedforward, self._draw = feedforward, draw
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
         self._effort = limits.effort * control.effort_share
         self.reference: RandomMotion | None = None
+        self.start: JointSample | None = None
         self.saturated = self.rate_limited = 0
         self._tau, self._bias, self._still = np.zeros(n), np.zeros(n), np.zeros(n)
         self._fade_s, self._ticks = 0.0, 0
@@ -172,7 +176,10 @@ class ExcitationController:
         """Learn the arm's period, whether it carries its own weight, and how late it acts.
 
         Where it acts later than the gains are made for, damping shrinks in that proportion.
+
+        Raises SettingsError for an arm that says it is another than the limits are of.
         """
+        need_same_robot(driver, self.limits)
         self._D = self._full_D * min(1.0, GAINS_DELAY_NS / max(driver.delay_ns, 1))
         self._take_on(driver.period_ns, driver.adds_gravity)
 
@@ -207,7 +214,8 @@ class ExcitationController:
                     f"joint {int(np.argmin(np.isfinite(values))) + 1} gives no {name}; a motion "
                     "can only start where every joint is measured"
                 )
-        self.reference = ref = RandomMotion(self.limits, sample.q, self.motion)
+        self.reference = ref = self._draw(self.limits, sample.q, self.motion)
+        self.start = sample
         self._tau = self._bias = np.array(held, dtype=np.float64)
         self._gate = ReadingGate(self._new_judge(), self._period_ns)
         self._started = False

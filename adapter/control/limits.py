@@ -10,6 +10,7 @@ from adapter.errors import SettingsError
 from adapter.model.robots.known import RobotFacts, facts_of
 from adapter.model.self_model import Limits, SelfModel
 from adapter.model.spatial import Array
+from drivers.interface import Driver
 
 # Of an arm whose documentation is silent; modest: rad/s, rad/s², rad/s³, N m/s.
 UNKNOWN_VELOCITY, UNKNOWN_ACCELERATION, UNKNOWN_JERK = 1.0, 5.0, 1000.0
@@ -100,3 +101,19 @@ def need_complete(model: SelfModel) -> None:
             '<limit lower="" upper="" velocity="" effort=""/> in rad, rad/s, N m, above zero; a '
             "joint that turns without end needs a range for this, too (type revolute)"
         )
+
+
+def another_robot(driver: Driver, limits: MotionLimits) -> str:
+    """What is wrong where an arm says it is another than the model's; empty elsewhere."""
+    robot = getattr(driver, "robot", "")
+    if not robot or robot == limits.robot:
+        return ""
+    model = f"of the robot {limits.robot}" if limits.robot else "of no robot that is known by name"
+    return f"the arm says that it is the robot {robot}, the model is {model}; give --robot {robot}"
+
+
+def need_same_robot(driver: Driver, limits: MotionLimits) -> None:
+    """Refuse to move an arm by another's limits. Raises SettingsError naming both."""
+    wrong = another_robot(driver, limits)
+    if wrong:
+        raise SettingsError(wrong)

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from adapter.errors import SettingsError
+
+# Of the documented speed, so that 20 ms of a torque that is held, the longest a Franka robot puts
+# up with, do not bring a joint to its limit.
+REAL_SHARE = 0.75
+SLOW_S, SLOW_SHARE = 10.0, 0.1  # an arm that may be real starts so slowly for so long
 
 
 @dataclass(frozen=True)
@@ -77,3 +82,16 @@ class ExcitationSettings:
                         f"excitation.rests: {begin} to {end} s begins or ends while the motion "
                         f"becomes quicker, {quicker[0]} to {quicker[1]} s"
                     )
+
+
+def gentle(settings: ExcitationSettings) -> ExcitationSettings:
+    """The same for an arm that may be real: no settings are quicker or start less slowly.
+
+    Raises SettingsError where rests fall into the end of the slow start.
+    """
+    return replace(
+        settings,
+        share=min(settings.share, REAL_SHARE),
+        slow_s=max(settings.slow_s, SLOW_S, settings.start_s),
+        slow_share=min(settings.slow_share, SLOW_SHARE),
+    )

@@ -76,6 +76,7 @@ class FaultyDriver:
     period_ns, delay_ns = _of_driver("period_ns"), _of_driver("delay_ns")
     paced, can_move = _of_driver("paced"), _of_driver("can_move")
     adds_gravity, intake = _of_driver("adds_gravity"), _of_driver("intake")
+    robot = property(lambda self: getattr(self.driver, "robot", ""))  # that it says it is
     arrived_ns = _of_driver("arrived_ns")  # when the newest sample taken had arrived
 
     def __init__(self, driver: Driver, faults: Faults, seed: int = 0) -> None:

@@ -18,9 +18,10 @@ from drivers.interface import Array, DriverError, Intake, JointSample, NotReady
 
 SILENCE_S = 1.0  # without a state; the time after which Franka's own client gives up
 RECOVERED_S = 3.0  # from the answer to a recovery until the modes show it
+_ROBOTS = {tables.PANDA: "panda", tables.FR3: "fr3"}
 _NAMES = {
-    tables.PANDA: tuple(f"panda_joint{i}" for i in range(1, JOINTS + 1)),
-    tables.FR3: tuple(f"fr3_joint{i}" for i in range(1, JOINTS + 1)),
+    version: tuple(f"{robot}_joint{i}" for i in range(1, JOINTS + 1))
+    for version, robot in _ROBOTS.items()
 }
 _LIMP_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_USER_STOP)
 _RECOVERING_MODES = (tables.ROBOT_REFLEX, tables.ROBOT_RECOVERY)
@@ -89,6 +90,11 @@ class FciArm:
         self._control: TorqueControl | None = None
         self._first: State | None = None  # read by connect, not handed out yet
         self._state: State | None = None
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot that this is; empty before it is connected."""
+        return "" if self.version is None else _ROBOTS[self.version]
 
     @property
     def kernel_drops(self) -> int:

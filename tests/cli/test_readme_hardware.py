@@ -45,11 +45,10 @@ def test_simulated_hardware(kind: str, tmp_path: Path) -> None:
     serve = next(line for line in commands(shell) if line.strip() == f"adapter sim {kind}")
     run = next(line for line in commands(shell) if f"{kind}://" in line)
     run = run.replace("127.0.0.1", f"127.0.0.1:{PORT}").replace("163.2?", f"163.2:{PORT}?")
-    (tmp_path / "soon.toml").write_text("[excitation]\nslow_s = 2.0\n")
     arm = served(serve, tmp_path)
     with Stalls() as stalls:
         try:
-            options = "--duration 2 --config soon.toml --out run --json run.json"
+            options = "--duration 2 --out run --json run.json"
             code, said = give(f"{run} {options}", tmp_path, codes=(0, 2, 3))
         finally:
             arm.terminate()
