@@ -85,7 +85,8 @@ def _check(args: argparse.Namespace) -> None:
     for option in args.set:
         if "=" not in option:
             raise UsageError(f"'{option}' is not KEY=VALUE")
-    if args.allow_motion and scheme in NAMELESS and args.robot is None and not simulated(args.driver):
+    unnamed = scheme in NAMELESS and args.robot is None and not simulated(args.driver)
+    if args.allow_motion and unnamed:
         raise UsageError(
             f"an arm behind {scheme}:// does not say which robot it is; --robot must, before it "
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"

@@ -78,5 +78,5 @@ def _best_load(wanted: Array, loads: Array, band: Array, heaviest: float) -> Arr
     goal = np.r_[np.zeros(count), 1.0]
     bounds = [(0.0, heaviest) if k % 4 == 0 else (None, None) for k in range(count)]
     found = linprog(goal, np.vstack(rows), np.concatenate(ends), bounds=[*bounds, (0.0, None)])
-    load: Array = found.x[:count] if found.success else np.zeros(count)
+    load: Array = np.zeros(count) if found.x is None else found.x[:count]
     return load

@@ -49,7 +49,7 @@ class RobotFacts:
         names: how files call it, at the beginning of the name.
         acceleration, jerk, torque_rate: limits, rad/s², rad/s³, N m/s.
         stiffness, damping: of the feedback, N m/rad, N m s/rad.
-        capsules: by number of the link (0 the base) rows [from (3), to (3), radius] in its frame, m.
+        capsules: by number of the link (0 the base) rows [from, to, radius] (7,) in its frame, m.
         speed_by_position: None where the velocity limit holds everywhere.
         model: its documented model.
     """
