@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from drivers.files.bounded import parse_json
 from sim.noise_levels import NOISES, check_levels
 
 DEFAULT_SCENARIO = "nominal"
@@ -65,8 +65,8 @@ def options_of(texts: Sequence[str]) -> dict[str, Any]:
         if not equals:
             raise ValueError(f"--set takes KEY=VALUE, got '{text}'")
         try:
-            found[key] = json.loads(value)
-        except json.JSONDecodeError:
+            found[key] = parse_json(value)
+        except ValueError:
             found[key] = value
     return found
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
@@ -19,6 +18,7 @@ from adapter.learning.schema_kernels import MotionMoments
 from adapter.learning.theta_kernels import Moments
 from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
+from drivers.files.bounded import read_arrays
 
 VERSION = 7
 MORE = "schema.more."  # before the names of what some kinds of schema hold
@@ -98,9 +98,8 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
         SettingsError: not a checkpoint, or one of another tree or other settings.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise SettingsError(f"{path}: cannot be read as a checkpoint: {error}") from error
     if int(arrays.get("version", -1)) != VERSION:
         raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")

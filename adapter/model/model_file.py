@@ -20,6 +20,7 @@ import numpy as np
 from adapter.errors import ModelError
 from adapter.model.self_model import LIMITS, MJCF, URDF, FixedFrame, Limits, SelfModel, Source, Tool
 from adapter.model.tree import Tree
+from drivers.files.bounded import parse_json, read_text
 
 FORMAT = "panda-adapter/self-model"
 VERSION = 1
@@ -54,8 +55,8 @@ def load_model(path: str | Path) -> SelfModel:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        text = read_text(path)
+    except (OSError, ValueError) as error:
         raise ModelError(f"{path}: cannot be read as a model file ({error})") from None
     try:
         return loads(text)
@@ -71,7 +72,7 @@ def dumps(model: SelfModel) -> str:
 def loads(text: str) -> SelfModel:
     """The model in a model file's text. Raises ModelError."""
     try:
-        data = json.loads(text, parse_constant=_refuse_constant)
+        data = parse_json(text)
     except ValueError as error:
         raise ModelError(f"not a JSON model file ({error})") from None
     if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -83,10 +84,6 @@ def loads(text: str) -> SelfModel:
     if missing:
         raise ModelError(f"'{missing[0]}' is missing; needed are {', '.join(_REQUIRED)}")
     return _from_json(data)
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"'{name}' is not a number; what is unknown is null")
 
 
 def _to_json(model: SelfModel) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
 from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
 from adapter.model.self_model import URDF, SelfModel, Source, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, vector3
+from drivers.files.bounded import read_text
 
 JOINT_TYPES = (*TURNING, "fixed", "prismatic", "planar", "floating")
 _SIX = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -63,11 +64,11 @@ def model_from_urdf(
 def file_text(path: str | Path) -> str:
     """A file's text, its line ends as they are. Raises ModelError."""
     try:
-        return Path(path).read_bytes().decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise ModelError(f"{path}: not text in UTF-8 ({error}); save it as UTF-8") from None
+        return read_text(path)
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError as error:
+        raise ModelError(f"{path}: {error}") from None
 
 
 def parse_urdf(text: str, file: str) -> FileRobot:

@@ -21,6 +21,7 @@ from adapter.model.self_model import LAMBDA_SOURCES
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.realtime.shared import SharedBlock, SharedMemoryError, fence
+from drivers.files.bounded import parse_json
 
 MAGIC = 0x5041534E41503032  # "PASNAP02"
 VERSION, KIND, N, BODIES, EFFECTS, PID, TEXT = 0, 8, 9, 10, 11, 12, 13  # words of the header
@@ -79,7 +80,7 @@ class Board:
         head, h = 8 * HEADER_WORDS, self._header
         n, bodies, effects = int(h[N]), int(h[BODIES]), int(h[EFFECTS])
         text = self._block.array((int(h[TEXT]),), np.uint8, head).tobytes()
-        names = json.loads(text)
+        names = parse_json(text)
         self.joint_names: tuple[str, ...] = tuple(names["joints"])
         self.effect_names: tuple[str, ...] = tuple(names["effects"])
         self.shapes = {

@@ -16,6 +16,7 @@ from adapter.errors import SettingsError
 from adapter.learning.settings import LearnerSettings
 from adapter.model.self_model import SelfModel, Tool
 from adapter.signals.settings import FilterSettings, FrontEndSettings
+from drivers.files.bounded import read_text
 
 
 @dataclass(frozen=True)
@@ -92,10 +93,10 @@ def read_config(path: str | Path | None) -> Config:
     if path is None:
         return Config()
     try:
-        table = tomllib.loads(Path(path).read_text())
+        table = tomllib.loads(read_text(path))
     except OSError as error:
         raise SettingsError(f"{path}: cannot be read: {error.strerror}") from error
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: not TOML: {error}") from error
     return config_from(table, str(path))
 

@@ -6,8 +6,6 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +20,7 @@ from adapter.model.spatial import Array
 from adapter.runs.outcome import Outcome, learned_model, shown_parameters
 from adapter.runs.score import Reference, ScoreRows, course_errors, stamps_s
 from adapter.runs.terminal import json_text
+from drivers.files.bounded import parse_json, read_arrays, read_text
 
 VERSION = 2
 MODEL, DOCUMENTED = "model.json", "documented.json"
@@ -262,7 +261,7 @@ def load_run(folder: str | Path) -> RunData:
 
 def _read_figures(path: Path) -> dict[str, Any]:
     try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
+        figures = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise RunFolderError(f"{path}: cannot be read as figures ({error})") from None
     if not isinstance(figures, dict):
@@ -272,9 +271,8 @@ def _read_figures(path: Path) -> dict[str, Any]:
 
 def _read_traces(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise RunFolderError(f"{path}: cannot be read as traces ({error})") from None
     version = arrays.get("version")
     if version is None or version.shape != () or int(version) != VERSION:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +27,7 @@ from adapter.runs.outcome import (
     frame_errors,
     shown_parameters,
 )
+from drivers.files.bounded import parse_json, read_text
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_GOAL = 1.1  # times the final batch least squares
@@ -58,7 +58,7 @@ def reference_from(path: str | Path | None, documented: SelfModel) -> Reference:
     if path is None:
         return Reference(documented.lam, documented.theta[-n:], "documentation")
     try:
-        content = json.loads(Path(path).read_text())
+        content = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise ModelError(f"{path}: cannot be read as a truth or model file: {error}") from error
     if not isinstance(content, dict) or "lambda" not in content:

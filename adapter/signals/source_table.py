@@ -8,10 +8,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from drivers.files.bounded import read_arrays
 from drivers.interface import Array, DriverError
 
 _INDEX = re.compile(r"\d+")
@@ -117,12 +117,10 @@ def read_table(path: Path) -> SourceTable:
 def read_npz(path: Path) -> dict[str, Array]:
     """The number arrays of an npz file by key. Raises DriverError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {
-                key: file[key].astype(np.float64) for key in file if file[key].dtype.kind in "fiu"
-            }
-    except (OSError, ValueError, BadZipFile) as error:
+        arrays = read_arrays(path)
+    except (OSError, ValueError) as error:
         raise DriverError(f"{path}: cannot be read as .npz: {error}") from error
+    return {key: x.astype(np.float64) for key, x in arrays.items() if x.dtype.kind in "fiu"}
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

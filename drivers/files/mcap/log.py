@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.files.bounded import parse_json
 from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
 from drivers.files.mcap.joints import Commands, Joints, assemble_joints, read_commands
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
@@ -231,7 +231,7 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
         channels = region.channel.tolist()
         wanted = {c.id for c in scan.channels.values() if c.topic == topic}
         for i in (i for i, number in enumerate(channels) if number in wanted):
-            yield json.loads(region.data[region.start[i] : region.stop[i]].tobytes())
+            yield parse_json(region.data[region.start[i] : region.stop[i]].tobytes())
 
 
 def _wanted(series: Series, topic: str, sensors: bool, tell: Sequence[str]) -> bool:
@@ -290,6 +290,6 @@ def _metadata(scan: McapScan) -> dict[str, Any]:
 
 def _decoded(text: str) -> Any:
     try:
-        return json.loads(text)
-    except json.JSONDecodeError:
+        return parse_json(text)
+    except ValueError:
         return text

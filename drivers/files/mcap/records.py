@@ -26,10 +26,12 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Header, Metadata, Schema
 from numpy.typing import NDArray
 
+from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT
 from drivers.interface import DriverError
 
 _COMPRESSIONS = ("", "zstd", "lz4")
-_CHUNK_LIMIT = 2**32  # bytes; a larger claim comes from a damaged chunk
+_MOST_OTHERS = 2**18  # records of a stretch that are no messages; channel numbers have 16 bits
+_MOST_WARNINGS = 50
 HEAD = 9  # opcode and length
 RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
@@ -43,6 +45,9 @@ _OTHER_FORMATS = {
     b"SQLite format 3": "it is a rosbag2 of storage sqlite3: turn it into mcap (ros2 bag convert)",
     b"#ROSBAG": "it is a ROS 1 bag: turn it into a rosbag2 of storage mcap",
 }
+_NOTED = frozenset(
+    map(int, (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT))
+) | {int(Opcode.CHUNK_INDEX)}
 _INVALID = 0  # what a file system leaves behind a cut: zeros
 _IN_CHUNK = frozenset({_INVALID})
 _IN_FILE = frozenset({_INVALID, int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)})
@@ -66,30 +71,28 @@ def decompress(name: str, data: memoryview, size: int, cut: bool = False) -> mem
     """
     if name not in _COMPRESSIONS:
         raise DamagedChunk(f"it is compressed by {name!r} (known: none, zstd, lz4)")
-    if size > _CHUNK_LIMIT:
-        raise DamagedChunk(f"it claims {size} bytes")
     try:
-        content = _DECOMPRESSORS[name](data, size, cut)
-    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        content = _DECOMPRESSORS[name](data, size)
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
         raise DamagedChunk(f"{name} cannot read it ({error})") from error
     if not cut and len(content) != size:
-        raise DamagedChunk(f"it makes {len(content)} bytes instead of {size}")
+        raise DamagedChunk(f"it does not make the {size} bytes that it claims")
     return content
 
 
-def _stored(data: memoryview, size: int, cut: bool) -> memoryview:
+def _stored(data: memoryview, size: int) -> memoryview:
     return data
 
 
-def _zstd(data: memoryview, size: int, cut: bool) -> memoryview:
-    if cut:
-        return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(data))
-    return memoryview(zstandard.ZstdDecompressor().decompress(data, max_output_size=size))
+def _zstd(data: memoryview, size: int) -> memoryview:
+    """At most `size` bytes and one more, whatever the frame's own head claims."""
+    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+        return memoryview(reader.read(size + 1))
 
 
-def _lz4(data: memoryview, size: int, cut: bool) -> memoryview:
+def _lz4(data: memoryview, size: int) -> memoryview:
     frame = importlib.import_module("lz4.frame")  # comes with mcap; imported only where needed
-    return memoryview(frame.LZ4FrameDecompressor().decompress(data))
+    return memoryview(frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
 
 
 _DECOMPRESSORS = {"": _stored, "zstd": _zstd, "lz4": _lz4}
@@ -153,7 +156,10 @@ def walk(data: memoryview, at: int, until: frozenset[int]) -> Walk:
         if stop > size or opcode in until:
             break
         if opcode != message:
-            found.others.append((opcode, at + HEAD, stop))
+            if opcode in _NOTED:
+                found.others.append((opcode, at + HEAD, stop))
+                if len(found.others) > _MOST_OTHERS:
+                    break
         elif length < _MESSAGE_HEAD:
             break
         else:
@@ -199,7 +205,7 @@ class McapScan:
         self.attachments: list[Attachment] = []
         self.truncated = False
         self.lost_bytes = 0
-        self._rescued = 0
+        self._rescued = self._made = 0
         self.warnings: list[str] = []
         self._chunks: list[int] = []
         self._read_index()
@@ -284,6 +290,7 @@ class McapScan:
     def _chunk(self, at: int, stop: int) -> Iterator[Region]:
         try:
             head = self._chunk_head(at)
+            self._spend(head.size)
             content = decompress(head.name, self._data[head.first : head.last], head.size)
             if head.crc and zlib.crc32(content) != head.crc:
                 raise DamagedChunk("its checksum is wrong")
@@ -300,12 +307,21 @@ class McapScan:
         """What can be decompressed of the last chunk; no checksum holds it to anything."""
         try:
             head = self._chunk_head(at)
+            self._spend(head.size)
             content = decompress(head.name, self._data[head.first :], head.size, cut=True)
         except (DamagedChunk, struct.error, UnicodeDecodeError):
             return
         found = walk(content, 0, _IN_CHUNK)
         self._rescued = len(found.start)
         yield from self._use(found, content)
+
+    def _spend(self, size: int) -> None:
+        """Count what chunks make. Raises DamagedChunk where no recording makes so much."""
+        if size > CHUNK_LIMIT:
+            raise DamagedChunk(f"it claims {size} bytes, at most {CHUNK_LIMIT} are read")
+        if self._made + size > GROWTH_LIMIT * self.size + CHUNK_LIMIT:
+            raise DamagedChunk(f"the file would grow more than {GROWTH_LIMIT} times")
+        self._made += size
 
     def _chunk_head(self, at: int) -> _ChunkHead:
         _, _, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
@@ -332,7 +348,10 @@ class McapScan:
         )
 
     def _warn(self, sentence: str) -> None:
-        self.warnings.append(f"{self.path}: {sentence}")
+        if len(self.warnings) < _MOST_WARNINGS:
+            self.warnings.append(f"{self.path}: {sentence}")
+        elif len(self.warnings) == _MOST_WARNINGS:
+            self.warnings.append(f"{self.path}: has more damage, which is not listed")
 
 
 def _open(path: Path) -> memoryview:
