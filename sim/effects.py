@@ -17,6 +17,8 @@ b = d^2 - c, of first order where b is zero.
 | x_torque_crosstalk | joints [i, j]: sensor j reads share tau_i on top | share (1) |
 | x_torque_deadband | the sensor reads tau - clip(tau, -w, w) | w (N m) |
 | x_torque_saturation | the sensor's curve bends: s tanh(tau/s) | s (N m) |
+| x_held_joint | a stiff spring holds it where it is when this begins | none |
+| x_wall | a stiff plane across the hand's way when this begins, `gap` ahead | gap (m) |
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ Number = float | list[float]
 # Where an effect acts: on the motion of a joint, on the rigid bodies, at the flange, on what an
 # encoder or a torque sensor says. Name -> (place, needed keys, keys with a default).
 MOTION, BODY, WRENCH, ENCODER, TORQUE = "motion", "body", "wrench", "encoder", "torque"
+OBSTACLE = "obstacle"  # `sim.obstacles`
 SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "viscous_friction": (MOTION, ("Fv",), ()),
     "coulomb_friction": (MOTION, ("Fc",), ()),
@@ -66,6 +69,8 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "x_torque_crosstalk": (TORQUE, ("share",), ()),
     "x_torque_deadband": (TORQUE, ("w",), ()),
     "x_torque_saturation": (TORQUE, ("s",), ()),
+    "x_held_joint": (OBSTACLE, (), ()),
+    "x_wall": (OBSTACLE, (), ("gap",)),
 }
 PAIRS = ("x_cross_viscous", "x_torque_crosstalk")  # joints [from, to]
 LENGTHS = {"inertia": 6, "dtheta": 10}
@@ -107,7 +112,7 @@ class Effect:
 
     @property
     def place(self) -> str:
-        """Where it acts: motion, body, wrench, encoder or torque."""
+        """Where it acts: motion, body, wrench, encoder, torque or obstacle."""
         return SPECS[self.name][0]
 
     @property
@@ -219,7 +224,8 @@ def _check_keys(effect: Effect) -> None:
 
 def _check_joints(effect: Effect) -> None:
     """Raises ValueError for a wrong number of joints or joints that do not count from 1."""
-    joints, whole = effect.joints, effect.place in (BODY, WRENCH) or effect.name == "signal_delay"
+    joints = effect.joints
+    whole = effect.place in (BODY, WRENCH) or effect.name in ("signal_delay", "x_wall")
     if any(j < 1 for j in joints):
         raise ValueError(f"{effect.name} is on joints {list(joints)}; they count from 1")
     if effect.name == "link_inertia" and len(joints) != 1:

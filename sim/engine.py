@@ -23,6 +23,7 @@ import pybullet as bullet
 from sim.dynamics import end_effector
 from sim.effects import WRENCH
 from sim.joint_effects import Losses, add_up, bend, losses_at, rows_of, step
+from sim.obstacles import Obstacles
 from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
 
@@ -62,6 +63,7 @@ class Engine:
 
     Attributes:
         stopped: a joint touched an end stop during the last tick.
+        obstacles: what is in the arm's way.
     """
 
     def __init__(
@@ -96,6 +98,7 @@ class Engine:
             for effect in truth.effects
             if effect.place == WRENCH
         ]
+        self.obstacles = Obstacles(truth.effects, truth.n)
         self._stages: list[ArmClient] = []
         clients: list[int] = []
         self._close = weakref.finalize(self, disconnect, clients)
@@ -146,7 +149,7 @@ class Engine:
         stage, ahead = self._stage, self._coriolis_ahead(self._ddq)
         self.stopped, self._mass = False, None
         # Where nothing depends on the motion the state is only asked for at the tick's end.
-        acting = len(self._rows) or self._wrenches or self._end_stops
+        acting = len(self._rows) or self._wrenches or self._end_stops or len(self.obstacles)
         free = not acting and not law.kp.any() and not law.kd.any()
         for i in range(self._substeps):
             part = (i + 0.5) / self._substeps
@@ -237,7 +240,7 @@ class Engine:
         touching = beyond != 0.0
         self.stopped |= bool(touching.any())
         push = law.kp * (law.q_des - q) + law.kd * law.dq_des + ff
-        if not len(self._rows) and not law.kd.any() and not touching.any():
+        if not len(self._rows) and not law.kd.any() and not touching.any() and not self.obstacles:
             got = np.minimum(np.maximum(push, -law.most), law.most)
             return np.asarray(got + self._contact(t, q))
         stage = self._stage
@@ -250,5 +253,9 @@ class Engine:
         parts = add_up(self._rows, t, q, middle, rigid, self._bent)
         parts[0] += STOP_STIFFNESS * beyond - self._contact(t, q)
         parts[1] += STOP_DAMPING * touching
+        if self.obstacles:
+            against, damping = self.obstacles.act(t, q, middle, stage.truth.frames)
+            parts[0] += against
+            parts[1] += damping
         drive = np.array([push, law.kd, law.most])
         return np.asarray(step(M, bias, dq, self._h, parts, drive))

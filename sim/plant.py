@@ -22,6 +22,7 @@ REFRESH_TICKS = 20  # a command counts for 20 ms of plant time, then the brakes 
 BRAKE_TIME_S = 0.02  # below the full deceleration, speed dies away with this time constant
 LOCK_BELOW = 0.01  # rad/s, a slower joint is held where it is
 LOCK_RATE = 60.0  # 1/s, the critically damped hold
+RELEASE_TICKS = 100  # for which the arm only damps: what it leans on pushes it back meanwhile
 
 
 class Plant:
@@ -80,7 +81,7 @@ class Plant:
         self._engine.place(self._q, self._dq)
         self._drive = self._engine.drive_for(self._q, self._dq, np.zeros(truth.n))
         self._wanted = self._drive
-        self._age = 0
+        self._age = self._braked_ticks = 0
         self._lock, self._moving = self._q.copy(), np.zeros(truth.n, dtype=bool)
         self._k = -1
         self._clean: JointSample | None = None
@@ -127,6 +128,10 @@ class Plant:
         """True q, dq of the links and true driving torque at the last sample, (n,) each."""
         return self._q, self._dq, self._drive
 
+    def pushed(self) -> Array:
+        """Torque (n,) N m that what is in the way puts on the joints."""
+        return self._engine.obstacles.torque
+
     def ddq(self) -> Array:
         """True joint acceleration (n,) at the last sample, rad/s²."""
         return self._engine.acceleration(self._q, self._dq, self._drive)
@@ -151,6 +156,7 @@ class Plant:
         """Close the brakes."""
         if not self.braked:
             self.braked, self._moving = True, np.ones(self.truth.n, dtype=bool)
+            self._braked_ticks = 0
 
     def close(self) -> None:
         """Free the simulator; may be called more than once."""
@@ -178,7 +184,9 @@ class Plant:
 
     def _brake(self) -> Array:
         """Driving torque (n,) at the end of the next tick that slows down and then holds."""
-        stopped = self._moving & (np.abs(self._dq) < LOCK_BELOW)
+        self._braked_ticks += 1
+        still = np.abs(self._dq) < LOCK_BELOW
+        stopped = self._moving & still & (self._braked_ticks > RELEASE_TICKS)
         self._lock[stopped] = self._q[stopped]
         self._moving &= ~stopped
         most = self.truth.limits.acceleration

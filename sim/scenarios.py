@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.effects import payload, per_joint
+from sim.effects import Effect, payload, per_joint
 from sim.engine import PERIOD_S
 from sim.imus import Imus
 from sim.noise import levels_of
@@ -124,21 +124,42 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         seed: decides truth and noise.
         options: `noise` ("real" or "none"), `links` (bool: measure link motion or not), `levels`
             (a mapping of single noise levels to change, see `NoiseLevels`), `imus` (names of links
-            with a sensor glued on), and those of the scenario: `angle_deg`, `offset_m` of
-            bent_link, `mass` (kg), `t_s` of payload_at_20s.
+            with a sensor glued on), `trouble` (see `in_trouble`), and those of the scenario:
+            `angle_deg`, `offset_m` of bent_link, `mass` (kg), `t_s` of payload_at_20s.
 
     Raises:
         ValueError: unknown name, option or level, or a value out of range; with the choices.
     """
     numbers = check(name, options)
+    truth = DRAWN_BY[name](np.random.default_rng([seed, TRUTH_STREAM]), **numbers)
     return Scenario(
         name,
         seed,
-        DRAWN_BY[name](np.random.default_rng([seed, TRUTH_STREAM]), **numbers),
+        in_trouble(truth, options.get("trouble", {})),
         levels_of(options.get("noise", "real"), **options.get("levels", {})),
         options.get("links", SCENARIOS[name].links),
         tuple(options.get("imus", ())),
     )
+
+
+def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
+    """The same arm with something in its way.
+
+    Args:
+        truth: the arm.
+        trouble: `held` (numbers of joints) held from `t_s` on, `wall` (m ahead of the hand)
+            standing there from `t_s` on, `load` (kg at the flange) carried up to `t_s`.
+    """
+    effects, since = list(truth.effects), (float(trouble.get("t_s", 0.0)), None)
+    if "held" in trouble:
+        effects.append(Effect("x_held_joint", tuple(trouble["held"]), {}, since))
+    if "wall" in trouble:
+        effects.append(Effect("x_wall", (), {"gap": float(trouble["wall"])}, since))
+    if "load" in trouble:
+        com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
+        load = payload(float(trouble["load"]), com)
+        effects.append(Effect(load.name, (), load.parameters, (-1.0, since[0])))
+    return truth.with_changes(effects=tuple(effects))
 
 
 def _direction(rng: np.random.Generator) -> Array:

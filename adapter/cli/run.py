@@ -16,7 +16,7 @@ from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
-from adapter.control.controller import ExcitationController
+from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.excitation import plan_lines
 from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.control.limits import MotionLimits, another_robot, need_complete
@@ -184,7 +184,9 @@ def controller_of(
         lasting = lasting_effects(whole.effects, robot.tree.n)
         known = [active for active in lasting if active.effect.name not in effects]
         forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known)
-    return ExcitationController(MotionLimits.of(robot), config.excitation, feedforward=forward)
+    control = ControlSettings(safety=config.safety)
+    limits, expected = MotionLimits.of(robot), ModelFeedforward.of(robot)
+    return ExcitationController(limits, config.excitation, control, forward, expected=expected)
 
 
 def _go(

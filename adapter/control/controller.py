@@ -11,7 +11,7 @@ no b, and the model's torque less the gravity in it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +20,8 @@ from adapter.control.excitation import RandomMotion, smooth_step
 from adapter.control.feedforward import Feedforward
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
-from adapter.control.settings import ExcitationSettings
+from adapter.control.safety import ArmWatch, Now
+from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.spatial import Array
 from drivers.interface import Driver, JointSample
@@ -34,6 +35,7 @@ RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an 
 START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
 FADE_S = 1.0  # from feedback alone to feed-forward
 REFRESH_TICKS = 50
+CARRY_TICKS = 20  # between two times that an arm is told what carries it
 
 
 class Controller(Protocol):
@@ -75,11 +77,13 @@ class ControlSettings:
         stiffness: K (n), N m/rad.
         damping: D (n), N m s/rad.
         effort_share: of the effort limits that a command uses at most.
+        safety: when the arm is stopped because it does not move as it should.
     """
 
     stiffness: Sequence[float] | None = None
     damping: Sequence[float] | None = None
     effort_share: float = 0.95
+    safety: SafetySettings = field(default_factory=SafetySettings)
 
     def __post_init__(self) -> None:
         for name in ("stiffness", "damping"):
@@ -141,12 +145,11 @@ class ExcitationController:
         control: gains.
         feedforward: a model to help, used as soon as it is ready; feedback alone where None.
         draw: makes the motion from limits, the arm's position and settings.
+        expected: a model of the arm, to tell what pushes it; nothing tells that where None.
 
     Attributes:
         reference: the motion; None before the first sample.
         start: the sample that it was drawn from.
-        saturated: commands that were cut at the effort limit.
-        rate_limited: commands that were cut at the torque rate limit.
     """
 
     def __init__(
@@ -156,19 +159,21 @@ class ExcitationController:
         control: ControlSettings | None = None,
         feedforward: Feedforward | None = None,
         draw: Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion] = RandomMotion,
+        expected: Feedforward | None = None,
     ) -> None:
         control = control or ControlSettings()
         n = len(limits.effort)
         self.limits, self.motion = limits, motion or ExcitationSettings()
         self.feedforward, self._draw = feedforward, draw
+        self._expected, self._safety = expected, control.safety
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
         self._effort = limits.effort * control.effort_share
         self.reference: RandomMotion | None = None
         self.start: JointSample | None = None
-        self.saturated = self.rate_limited = 0
         self._tau, self._bias, self._still = np.zeros(n), np.zeros(n), np.zeros(n)
         self._fade_s, self._ticks = 0.0, 0
+        self._carry: Callable[[Array], None] | None = None
         self._feedback_only, self._with_model = ErrorTally(n), ErrorTally(n)
         self._take_on(DEFAULT_PERIOD_NS, False)
 
@@ -182,6 +187,7 @@ class ExcitationController:
         need_same_robot(driver, self.limits)
         self._D = self._full_D * min(1.0, GAINS_DELAY_NS / max(driver.delay_ns, 1))
         self._take_on(driver.period_ns, driver.adds_gravity)
+        self._carry = getattr(driver, "carry", None)  # of arms without brakes
 
     def _take_on(self, period_ns: int, adds_gravity: bool) -> None:
         self._period_ns, self._adds_gravity = period_ns, adds_gravity
@@ -218,11 +224,14 @@ class ExcitationController:
         self.start = sample
         self._tau = self._bias = np.array(held, dtype=np.float64)
         self._gate = ReadingGate(self._new_judge(), self._period_ns)
+        self._watch = ArmWatch(self.limits, self._safety, self._K, self._effort)
         self._started = False
         ref.advance(0.0)  # compiles, as do the next lines, before the clock runs
         self._new_judge().judge(ref.q, ref.dq, ref.q, (0.0, 0.0))
         if self.feedforward is not None:
             self.feedforward(ref.q, ref.dq, ref.ddq)
+        if self._expected is not None:
+            self._expected(ref.q, ref.dq, ref.ddq)
 
     def _new_judge(self) -> ReadingJudge:
         return ReadingJudge(self.limits.velocity, self.limits.effort, self._K)
@@ -258,7 +267,22 @@ class ExcitationController:
         tau = self._wanted(sample, 1e-9 * step_ns)
         if not np.isfinite(tau).all():
             raise ControlError("the model's torque is not a finite number; the arm is stopped")
-        return self._limited(tau, (RATE_SHARE if now_ns else 1.0) * self._most)
+        return self._watched(tau, sample, (RATE_SHARE if now_ns else 1.0) * self._most, step_ns)
+
+    def _watched(self, tau: Array, sample: JointSample, most: Array, step_ns: int) -> Array:
+        """The command (n,) N m for a wanted torque, not further than `most` from the last one."""
+        ref, model, watch = self.reference, self._expected, self._watch
+        assert ref is not None
+        now = watch.now
+        now[0], now[1], now[2], now[3] = tau, self._tau, ref.q - sample.q, sample.dq
+        if model is not None:
+            now[4], now[5] = sample.tau, model(ref.q, ref.dq, ref.ddq)
+            if self._adds_gravity:
+                now[6] = model.unbent(sample.q)
+            elif self._carry is not None and self._ticks % CARRY_TICKS == 0:
+                self._carry(model.unbent(sample.q) + watch.now[Now.OFFSET])
+        self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
+        return self._tau.copy()
 
     def _start(self, sample: JointSample) -> None:
         """The first reading has to be where the motion was drawn from; it may be long ago."""
@@ -297,21 +321,12 @@ class ExcitationController:
             tau = tau - model.unbent(ref.q)
         return tau
 
-    def _limited(self, tau: Array, most: Array) -> Array:
-        """Within the effort limits and not further than `most` (n,) from the last command."""
-        cut = np.minimum(np.maximum(tau, -self._effort), self._effort)
-        self.saturated += bool((cut != tau).any())
-        step = np.minimum(np.maximum(cut - self._tau, -most), most)
-        self.rate_limited += bool((np.abs(cut - self._tau) > most).any())
-        self._tau = self._tau + step
-        return self._tau.copy()
-
     def tracking(self) -> dict[str, Any]:
         """Tracking error from the end of the soft start on, without and with feed-forward."""
         return {
             "feedback": self._feedback_only.as_dict(),
             "feedforward": self._with_model.as_dict(),
-            "saturated": self.saturated,
-            "rate_limited": self.rate_limited,
+            "saturated": 0 if self.reference is None else self._watch.saturated,
+            "rate_limited": 0 if self.reference is None else self._watch.rate_limited,
             "unusable": 0 if self.reference is None else self._gate.unusable,
         }

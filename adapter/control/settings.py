@@ -95,3 +95,40 @@ def gentle(settings: ExcitationSettings) -> ExcitationSettings:
         slow_s=max(settings.slow_s, SLOW_S, settings.start_s),
         slow_share=min(settings.slow_share, SLOW_SHARE),
     )
+
+
+@dataclass(frozen=True)
+class SafetySettings:
+    """When the arm is stopped because it does not move as it should; shares are of each joint's
+    effort limit (torques), and of effort times speed limit (power).
+
+    Attributes:
+        tracking_share: torque that the feedback's spring alone may hold.
+        tracking_rad: distance from the reference that stops a joint however soft its spring is.
+        external_share: torque beyond what the model expects and what it was off by before.
+        power_share: of torque times velocity, along the motion and against it.
+        hold_s: for which one of these must be exceeded.
+        saturated_s: for which a command may be cut at the effort limit, or at its present share.
+        start_share: of the effort limit, beyond the expected torque, that a command has at the
+            start of a motion.
+        rise_s: of motion as expected until it has all of `ControlSettings.effort_share`.
+    """
+
+    tracking_share: float = 0.8
+    tracking_rad: float = 0.5
+    external_share: float = 0.7
+    power_share: float = 0.7
+    hold_s: float = 0.01
+    saturated_s: float = 0.1
+    start_share: float = 0.5
+    rise_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        for name in ("tracking_share", "external_share", "power_share", "start_share"):
+            if not 0.0 < getattr(self, name) <= 1.0:
+                raise SettingsError(f"safety.{name} must be above 0 and at most 1")
+        if not 0.0 < self.tracking_rad <= math.pi:
+            raise SettingsError("safety.tracking_rad must be above 0 and at most pi")
+        for name, most in (("hold_s", 0.05), ("saturated_s", 1.0), ("rise_s", 600.0)):
+            if not 0.0 <= getattr(self, name) <= most:
+                raise SettingsError(f"safety.{name} must be from 0 to {most:g}")

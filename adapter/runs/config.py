@@ -11,7 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from adapter.control.settings import ExcitationSettings
+from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import SettingsError
 from adapter.learning.settings import LearnerSettings
 from adapter.model.self_model import SelfModel, Tool
@@ -60,12 +60,14 @@ class Config:
         tool: a known tool, kept out of θ.
         pipeline: filter, front end, learner.
         excitation: of the controller in `run`.
+        safety: when it stops the arm because that does not move as it should.
     """
 
     gravity: tuple[float, ...] | None = None
     tool: ToolSettings | None = None
     pipeline: PipelineSettings = field(default_factory=PipelineSettings)
     excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
+    safety: SafetySettings = field(default_factory=SafetySettings)
 
     def __post_init__(self) -> None:
         if self.gravity is not None and len(self.gravity) != 3:

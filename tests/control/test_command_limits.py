@@ -36,6 +36,7 @@ class Arm:
 
     paced, adds_gravity, period_ns, arrived_ns = True, False, PERIOD_NS, 1
     delay_ns = PERIOD_NS
+    joint_names = PANDA.tree.joint_names
 
     def __init__(self) -> None:
         self.q, self.dq = READY.copy(), np.zeros(7)

@@ -13,7 +13,7 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.sample_clock import SampleClock
-from adapter.control.settings import ExcitationSettings
+from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
 from adapter.model.urdf import read_urdf
 from drivers.interface import JointSample
@@ -30,6 +30,7 @@ class Floating:
     """What a controller has to know of an arm that carries its own weight."""
 
     paced, adds_gravity, period_ns, arrived_ns, delay_ns = True, True, MS, 1, MS
+    joint_names = PANDA.tree.joint_names
 
 
 class Weightless:
@@ -114,7 +115,8 @@ def test_commands_end_at_the_effort_and_step_no_further_than_the_rate(sign: floa
         __call__ = staticmethod(pull)
 
     for instants, most in ((True, 0.9), (False, 1.0)):
-        controller = ExcitationController(LIMITS, feedforward=Model())
+        patient = ControlSettings(safety=SafetySettings(saturated_s=1.0))
+        controller = ExcitationController(LIMITS, None, patient, feedforward=Model())
         controller.attend(Late(MS))
         controller._adds_gravity = False  # the model's torque as it is
         controller.prepare(_sample(0, tau=np.zeros(7)))

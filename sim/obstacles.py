@@ -1,0 +1,76 @@
+"""What is in an arm's way: something that holds joints, or a wall before the hand.
+
+Both are stiff springs with dampers that appear at an instant, wherever the arm is then: joints
+are held at the angles they have, a wall stands across the way that the hand goes, so far ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from sim.dynamics import Frames, end_effector
+from sim.effects import OBSTACLE, Effect
+from sim.truth import Array
+
+# Our choice: a joint gives 0.02 rad to 100 N m, a wall 5 mm to 100 N.
+HOLD_STIFFNESS, HOLD_DAMPING = 5000.0, 50.0  # N m/rad, N m s/rad
+WALL_STIFFNESS, WALL_DAMPING = 20000.0, 200.0  # N/m, N s/m
+HAND = np.eye(4)  # in the last link's frame
+HAND[2, 3] = 0.107  # m, the flange
+
+
+class Obstacles:
+    """All that is in the way of one arm.
+
+    Attributes:
+        torque: (n,) N m that they put on the joints at present.
+        force: N, of walls on the hand.
+    """
+
+    def __init__(self, effects: Iterable[Effect], n: int) -> None:
+        self._effects = [effect for effect in effects if effect.place == OBSTACLE]
+        self._n = n
+        self._places: dict[int, tuple[Array, float]] = {}
+        self.torque, self.force = np.zeros(n), 0.0
+
+    def __len__(self) -> int:
+        return len(self._effects)
+
+    def act(self, t: float, q: Array, dq: Array, frames: Frames) -> tuple[Array, Array]:
+        """What they add to the motion at t (s): torque (n,) N m against the drives, and damping
+        (n,) N m s/rad, at q, dq (n,) rad, rad/s.
+        """
+        against, damping = np.zeros(self._n), np.zeros(self._n)
+        self.force = 0.0
+        for k, effect in enumerate(self._effects):
+            if not effect.acts(t):
+                self._places.pop(k, None)
+            elif effect.name == "x_wall":
+                against -= self._wall(k, effect, q, dq, frames)
+            else:
+                joints = effect.columns(self._n)
+                at, _ = self._places.setdefault(k, (q.copy(), 0.0))
+                against[joints] += HOLD_STIFFNESS * (q - at)[joints]
+                damping[joints] += HOLD_DAMPING
+        self.torque = -against - damping * dq
+        return against, damping
+
+    def _wall(self, k: int, effect: Effect, q: Array, dq: Array, frames: Frames) -> Array:
+        """Torque (n,) N m of a wall upon the hand."""
+        pose, J = end_effector(frames, q, HAND)
+        hand, speed = pose[:3, 3], J[:3] @ dq
+        if k not in self._places:
+            fast = float(np.linalg.norm(speed))
+            if fast < 1e-3:
+                return np.zeros(self._n)  # there is no way to stand across yet
+            way = speed / fast
+            self._places[k] = way, float(way @ hand) + effect.number("gap")
+        way, at = self._places[k]
+        depth = float(way @ hand) - at
+        if depth <= 0.0:
+            return np.zeros(self._n)
+        push = max(WALL_STIFFNESS * depth + WALL_DAMPING * float(way @ speed), 0.0)
+        self.force += push
+        return np.asarray(-push * (J[:3].T @ way))

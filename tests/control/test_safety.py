@@ -1,0 +1,134 @@
+"""A blocked arm, a wall, a load that drops: stopped in time, by name, and without a push left."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from adapter.control.controller import ControlSettings, ExcitationController
+from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
+from adapter.control.safety import CALM, ArmWatch, Now
+from adapter.control.settings import ExcitationSettings, SafetySettings
+from adapter.errors import ControlError, SettingsError
+from adapter.model.robots import documented
+from adapter.realtime.session import run_lockstep
+from adapter.signals.front_end import FrontEnd
+from drivers.interface import JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+
+PANDA = documented("panda")
+LIMITS = MotionLimits.of(PANDA)
+N, T_S = PANDA.tree.n, 1.0
+# Limits so far away that one of them is left to be seen.
+FAR = {"tracking_share": 1.0, "tracking_rad": 3.0, "external_share": 1.0, "power_share": 1.0}
+
+
+def moved(trouble: dict, seconds: float = 3.0, seed: int = 1, told=PANDA, **safety):
+    """(result, plant, last torque of what is in the way, the same a quarter of a second later)."""
+    plant = build("nominal", seed, trouble=trouble).plant()
+    arm = PyBulletArm(plant)
+    controller = ExcitationController(
+        LIMITS,
+        ExcitationSettings(seed=seed),
+        ControlSettings(safety=SafetySettings(**safety)),
+        expected=ModelFeedforward.of(told),
+    )
+    pushes = []
+
+    def note(sample: JointSample, tau) -> None:
+        pushes.append(np.abs(plant.pushed()).max())
+
+    result = run_lockstep(arm, FrontEnd(PANDA), None, controller, seconds, each=note)
+    for _ in range(250):
+        arm.read()
+    left = float(np.abs(plant.pushed()).max())
+    speed = float(np.abs(plant.link_state()[1]).max())
+    arm.close()
+    assert speed < 0.01  # it stands, and was not dropped
+    return result, pushes, left
+
+
+@pytest.mark.parametrize(
+    ("trouble", "safety", "said"),
+    [
+        ({"held": [2], "t_s": T_S}, {}, "joint 2 (panda_joint2) is pushed"),
+        ({"held": [2], "t_s": T_S}, {**FAR, "tracking_share": 0.3}, "from where it should be"),
+        ({"held": [2], "t_s": T_S}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
+        ({"held": [1, 2, 3, 4, 5, 6, 7], "t_s": T_S}, {}, "is pushed"),
+        ({"wall": 0.01, "t_s": 1.5}, {}, "is pushed"),
+        ({"load": 4.0, "t_s": T_S}, {**FAR, "power_share": 0.1}, "would move with"),
+        ({"load": 4.0, "t_s": T_S}, {**FAR, "external_share": 0.3}, "is pushed"),
+    ],
+    ids=["held", "tracking", "saturated", "all-held", "wall", "load-power", "load"],
+)
+def test_it_stops_by_joint_and_cause_and_lets_go(trouble, safety, said) -> None:
+    result, pushes, left = moved(trouble, **safety)
+    assert result.ended == "driver_error" and result.fault is not None
+    assert result.fault.startswith("joint ") and said in result.fault and "\n" not in result.fault
+    assert len(pushes) > 1000 * T_S
+    assert left <= 0.2 * max(pushes)
+    assert max(pushes) <= 1.2 * LIMITS.effort.max()
+
+
+STEP = np.full(N, 1.0)
+
+
+def watch_at_rest(**safety) -> ArmWatch:
+    watch = ArmWatch(LIMITS, SafetySettings(**safety), np.ones(N), LIMITS.effort)
+    watch.now[Now.MEASURED] = watch.now[Now.EXPECTED] = 0.0
+    watch.step(STEP, 1e-3)
+    return watch
+
+
+@pytest.mark.parametrize(
+    ("row", "size"),
+    [
+        (Now.ERROR, np.full(N, 0.5)),
+        (Now.WANTED, 0.5 * LIMITS.effort),
+        (Now.MEASURED, -0.7 * LIMITS.effort),
+        (Now.SPEED, 0.7 * LIMITS.velocity),
+    ],
+    ids=["tracking", "saturated", "external", "power"],
+)
+@pytest.mark.parametrize("j", range(N))
+def test_a_limit_that_is_exceeded_stops_within_50_ms(row: Now, size, j: int) -> None:
+    watch = watch_at_rest(saturated_s=0.04)
+
+    def run(share: float, ticks: int = 50) -> None:
+        for _ in range(ticks):
+            watch.now[Now.WANTED] = watch.now[Now.COMMAND] = 0.0
+            if row == Now.SPEED:  # a command at the effort limit, which the model expects
+                for k in (Now.WANTED, Now.COMMAND, Now.MEASURED, Now.EXPECTED):
+                    watch.now[k, j] = LIMITS.effort[j]
+            watch.now[row, j] = share * size[j]
+            watch.step(STEP, 1e-3)
+
+    run(0.98, 200)
+    with pytest.raises(ControlError, match=f"^joint {j + 1} .*the arm is stopped$"):
+        run(1.05)
+
+
+def test_a_constant_difference_is_no_push_and_effort_rises_with_agreement() -> None:
+    watch = watch_at_rest()
+    off = CALM * 0.6 * LIMITS.effort  # a load that comes slowly
+    watch.now[Now.SPEED] = 0.1
+    rooms = []
+    for k in range(8000):
+        watch.now[Now.MEASURED] = min(k / 4000, 1.0) * off
+        watch.now[Now.WANTED] = 0.0
+        rooms.append(float(watch.room[0]))
+        watch.step(STEP, 1e-3)
+    np.testing.assert_allclose(watch.now[Now.OFFSET], off, rtol=0.03)
+    assert rooms[0] == 0.5 * LIMITS.effort[0] and np.all(np.diff(rooms) >= -1e-9)
+    assert rooms[-1] == pytest.approx(2.0 * LIMITS.effort[0])  # all that the joint may
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("tracking_share", 0.0), ("hold_s", 0.06), ("power_share", 1.1), ("tracking_rad", 4.0)],
+)
+def test_settings_that_cannot_be_are_refused(name: str, value: float) -> None:
+    with pytest.raises(SettingsError, match=name):
+        SafetySettings(**{name: value})
