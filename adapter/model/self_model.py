@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -97,6 +98,20 @@ class Limits:
     def unknown(cls, n: int) -> Limits:
         """Limits of n joints of which nothing is known."""
         return cls(*(np.full(n, np.nan) for _ in LIMITS))
+
+
+def check_limits(limits: Sequence[float], where: str) -> None:
+    """Refuse a joint's [lower upper velocity effort] that no joint has; NaN is unknown.
+
+    Raises:
+        ModelError: beginning with `where`.
+    """
+    lower, upper, *most = limits
+    if lower > upper:
+        raise ModelError(f"{where}: its lower limit {lower:g} lies above its upper one {upper:g}")
+    for key, value in zip(LIMITS[2:], most, strict=True):
+        if value <= 0.0 or math.isinf(value):
+            raise ModelError(f"{where}: its {key} limit must be above zero, got {value:g}")
 
 
 @dataclass(frozen=True)
@@ -202,6 +217,11 @@ class SelfModel:
         for key in LIMITS:
             if np.shape(getattr(self.limits, key)) != (n,):
                 raise ModelError(f"limits.{key} must hold {n} values, one for each joint")
+        for name, *row in zip(self.tree.joint_names, *map(self._limit, LIMITS), strict=True):
+            check_limits(row, f"joint '{name}'")
+
+    def _limit(self, key: str) -> list[float]:
+        return [float(x) for x in getattr(self.limits, key)]
 
     def _check_names(self) -> None:
         links = (self.tree.base_name, *self.tree.link_names)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from adapter.errors import ModelError
+from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import move_theta, tensor_from_six, theta_from_body
 from adapter.model.robot_file import SLIDING, TURNING, FileJoint, FileRobot, Merged
-from adapter.model.self_model import URDF, SelfModel, Source, gravity_down
+from adapter.model.self_model import URDF, SelfModel, Source, check_limits, gravity_down
 from adapter.model.spatial import Array, matrix_from_rpy, vector3
 from drivers.files.bounded import read_text
 
@@ -98,6 +99,7 @@ def parse_urdf(text: str, file: str) -> FileRobot:
         if joint.name in joints:
             raise ModelError(f"{file}: joint '{joint.name}' appears twice")
         joints[joint.name] = joint
+    _stated(joints.values(), file)
     if not joints and any("xacro}" in element.tag for element in root):
         raise ModelError(f"{file}: is xacro yet; make a URDF of it first: xacro FILE > arm.urdf")
     if not links:
@@ -219,3 +221,17 @@ def _limits(element: ET.Element, kind: str, where: str) -> Array:
             place = ("lower", "upper", "velocity", "effort").index(key)
             out[place] = _number(found, key, where)
     return out
+
+
+def _stated(joints: Iterable[FileJoint], file: str) -> None:
+    """Check limits; a speed or effort of 0 is what many files write for one that nobody knows."""
+    silent = []
+    for joint in joints:
+        if joint.kind in (*TURNING, *SLIDING):
+            zero = joint.limits[2:] == 0.0
+            silent += [joint.name] * bool(zero.any())
+            joint.limits[2:][zero] = math.nan
+            check_limits(joint.limits.tolist(), f"{file}: joint '{joint.name}'")
+    if silent:
+        said = f"{file}: a limit of 0 for the speed or effort of {', '.join(silent)} says nothing"
+        warnings.warn(f"{said}; it is taken as not known", ModelWarning, stacklevel=4)

@@ -101,6 +101,11 @@ class SharedBlock:
             finally:
                 resource_tracker.register = register
 
+    @property
+    def size(self) -> int:
+        """Bytes of the block."""
+        return 0 if self._memory is None else self._memory.size
+
     def array(self, shape: tuple[int, ...], dtype: Any, offset: int) -> NDArray[Any]:
         """A view of the block; must be dropped before `close`."""
         assert self._memory is not None

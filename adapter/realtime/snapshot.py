@@ -74,15 +74,27 @@ class Board:
     def __init__(self, block: SharedBlock) -> None:
         self._block = block
         self.name = block.name
+        if block.size < 8 * HEADER_WORDS:
+            block.close()
+            raise foreign(block.name)
         self._header: NDArray[np.int64] = block.array((HEADER_WORDS,), np.int64, 0)
 
     def _map(self) -> None:
-        head, h = 8 * HEADER_WORDS, self._header
-        n, bodies, effects = int(h[N]), int(h[BODIES]), int(h[EFFECTS])
-        text = self._block.array((int(h[TEXT]),), np.uint8, head).tobytes()
-        names = parse_json(text)
-        self.joint_names: tuple[str, ...] = tuple(names["joints"])
-        self.effect_names: tuple[str, ...] = tuple(names["effects"])
+        """Lay the arrays over the block. Raises SnapshotError where it is not what it says."""
+        head = 8 * HEADER_WORDS
+        n, bodies, effects, text = (int(self._header[k]) for k in (N, BODIES, EFFECTS, TEXT))
+        least, size = min(n, bodies, effects, text), value_count(n, bodies, effects)
+        if least < 0 or text > TEXT_BYTES or block_size(size) > self._block.size:
+            raise foreign(self.name)
+        try:
+            names = parse_json(self._block.array((text,), np.uint8, head).tobytes())
+            joints, known = names["joints"], names["effects"]
+        except (ValueError, KeyError, TypeError):
+            raise foreign(self.name) from None
+        self.joint_names: tuple[str, ...] = tuple(joints)
+        self.effect_names: tuple[str, ...] = tuple(known)
+        if (len(self.joint_names), len(self.effect_names)) != (n, effects):
+            raise foreign(self.name)
         self.shapes = {
             "lam": (n, 6),
             "lam_std": (n, 6),
@@ -92,7 +104,6 @@ class Board:
             "effects_std": (effects, n),
             "effect_shapes": (effects, n),
         }
-        size = value_count(n, bodies, effects)
         start = head + TEXT_BYTES
         self._words = self._block.array((2, SLOT_WORDS), np.int64, start)
         self._values = self._block.array((2, size), np.float64, start + 16 * SLOT_WORDS)
@@ -109,30 +120,61 @@ def value_count(n: int, bodies: int, effects: int) -> int:
     return 12 * n + 20 * bodies + 3 * effects * n
 
 
+def block_size(values: int) -> int:
+    """Bytes of a block for so many values."""
+    return 8 * (HEADER_WORDS + 2 * SLOT_WORDS + 2 * values) + TEXT_BYTES
+
+
+def foreign(name: str) -> SnapshotError:
+    """What is said of shared memory that is not ours; it is left alone."""
+    return SnapshotError(
+        f"'{name}' is in use by another program: shared memory '{name}' is no estimate of this "
+        "version"
+    )
+
+
+def attached(name: str) -> SharedBlock:
+    """An existing block. Raises FileNotFoundError; SnapshotError for what cannot be ours."""
+    try:
+        return SharedBlock.attach(name)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError):  # of another user, a folder, of no bytes; a name that is none
+        raise foreign(name) from None
+
+
 def allocate(size: int, name: str | None) -> SharedBlock:
     """A block; one that a dead process left under this name is replaced."""
     try:
-        return SharedBlock.create(size, name)
-    except FileExistsError:
-        assert name is not None
+        try:
+            return SharedBlock.create(size, name)
+        except FileExistsError:
+            assert name is not None
+            _remove_leftover(name)
+            return SharedBlock.create(size, name)
     except (SharedMemoryError, OSError) as error:
         raise SnapshotError(f"no shared memory for the estimate: {error}") from error
-    old = SharedBlock.attach(name)
-    header = old.array((HEADER_WORDS,), np.int64, 0)
-    kind, owner = int(header[KIND]), int(header[PID])
-    del header
-    old.close()
-    if kind != MAGIC or _alive(owner):
-        who = f"process {owner}" if kind == MAGIC else "another program"
-        raise SnapshotError(f"'{name}' is in use by {who}")
-    old.unlink()
-    return SharedBlock.create(size, name)
+
+
+def _remove_leftover(name: str) -> None:
+    """Remove what a dead process left. Raises SnapshotError where it is not, or not ours."""
+    try:
+        board = Board(attached(name))
+    except FileNotFoundError:  # gone meanwhile
+        return
+    kind, owner = int(board._header[KIND]), int(board._header[PID])
+    board.close()
+    if kind != MAGIC:
+        raise foreign(name)
+    if _alive(owner):
+        raise SnapshotError(f"'{name}' is in use by process {owner}")
+    board._block.unlink()
 
 
 def _alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         return True
@@ -209,8 +251,7 @@ class SnapshotWriter(Board):
         text = json.dumps({"joints": list(joint_names), "effects": list(effect_names)}).encode()
         if len(text) > TEXT_BYTES:
             raise SnapshotError(f"the joint names take {len(text)} bytes; at most {TEXT_BYTES}")
-        size = 8 * (HEADER_WORDS + 2 * SLOT_WORDS + 2 * value_count(n, b, e)) + TEXT_BYTES
-        board = cls(allocate(size, name))
+        board = cls(allocate(block_size(value_count(n, b, e)), name))
         h = board._header
         h[[N, BODIES, EFFECTS, PID, TEXT]] = n, b, e, os.getpid(), len(text)
         board._block.array((len(text),), np.uint8, 8 * HEADER_WORDS)[:] = list(text)
@@ -283,7 +324,7 @@ class SnapshotReader(Board):
 
     def __init__(self, name: str = DEFAULT_NAME) -> None:
         try:
-            block = SharedBlock.attach(name)
+            block = attached(name)
         except FileNotFoundError:
             raise SnapshotError(
                 f"no estimate is published as '{name}'; is `adapter run` running, with this "
@@ -291,10 +332,13 @@ class SnapshotReader(Board):
             ) from None
         super().__init__(block)
         if int(self._header[KIND]) != MAGIC:
-            self._words, self._values = np.zeros((0, 0), np.int64), np.zeros((0, 0))
             self.close()
-            raise SnapshotError(f"shared memory '{name}' is no estimate of this version")
-        self._map()
+            raise foreign(name)
+        try:
+            self._map()
+        except SnapshotError:
+            self.close()
+            raise
 
     def read(self, timeout_s: float = READ_TIMEOUT_S) -> Snapshot:
         """The newest estimate; of `version` 0 and NaN where nothing was published yet.
@@ -315,14 +359,16 @@ class SnapshotReader(Board):
             size = shape[0] * shape[1]
             parts[key] = values[start : start + size].reshape(shape).copy()
             start += size
-        flags = int(words[FLAGS])
+        flags, source = int(words[FLAGS]), int(words[SOURCE])
+        if not 0 <= source < len(LAMBDA_SOURCES):
+            raise foreign(self.name)
         return Snapshot(
             **parts,
             lam_converged=bool(flags & LAM_CONVERGED),
             theta_converged=bool(flags & THETA_CONVERGED),
             stamp_ns=int(words[STAMP]),
             learned=int(words[LEARNED]),
-            lambda_source=LAMBDA_SOURCES[int(words[SOURCE])],
+            lambda_source=LAMBDA_SOURCES[source],
             version=int(words[SEQUENCE]),
             published_ns=int(words[PUBLISHED]),
         )

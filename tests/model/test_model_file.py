@@ -60,12 +60,13 @@ def models(draw: st.DrawFn) -> SelfModel:
     tree = Tree(parent, draw(st.booleans()), tuple(names), tuple(f"l{x}" for x in names), "base")
     tool = Tool(draw(st.floats(0.01, 9)), draw(arrays(finite, 3)), draw(arrays(finite, 3, 3)))
     frame = FixedFrame("flange", "j", "base", draw(arrays(finite, 3, 3)), draw(arrays(finite, 3)))
+    sizes = [np.abs(draw(arrays(any_number, n))) for _ in range(4)]
     return SelfModel(
         name=draw(st.text()),
         tree=tree,
         lam=draw(arrays(finite, n, 6)),
         theta=draw(arrays(finite, tree.bodies, 10)),
-        limits=Limits(*(draw(arrays(any_number, n)) for _ in range(4))),
+        limits=Limits(-sizes[0], sizes[1], sizes[2] + 1e-3, sizes[3] + 1e-3),
         axis=draw(arrays(finite, n, 3)),
         frames=(frame,),
         gravity=draw(arrays(finite, 3)),

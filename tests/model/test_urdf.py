@@ -258,3 +258,39 @@ def test_robots_by_name_and_by_file(tmp_path: Path) -> None:
     assert older.source is not None and older.source.text == PANDA.read_text()
     other = replace(model, source=None, lam=model.lam + 0.01)
     assert documented(save_model(other, path)).source is None
+
+
+LIMIT = 'lower="-2.8973" upper="2.8973" velocity="2.175" effort="87"'
+
+
+@pytest.mark.parametrize(
+    ("limit", "told"),
+    [
+        (
+            'lower="-1" upper="1" effort="87" velocity="-1"',
+            "velocity limit must be above .* -1",
+        ),
+        ('lower="-1" upper="1" effort="-87" velocity="2"', "effort limit must be above zero.* -87"),
+        (
+            'lower="1" upper="-1" effort="87" velocity="2"',
+            "limit 1 lies above its upper one -1",
+        ),
+        ('lower="-1" upper="1" effort="nan" velocity="2"', "finite number.*'nan'"),
+        ('lower="-1" upper="1" effort="87" velocity="inf"', "finite number.*'inf'"),
+    ],
+)
+def test_limits_that_no_joint_has_are_refused(limit: str, told: str) -> None:
+    text = PANDA.read_text()
+    assert LIMIT in text
+    with pytest.raises(ModelError, match=rf"arm.urdf: joint 'panda_joint\d'.*{told}"):
+        model_from_urdf(text.replace(LIMIT, limit), "arm.urdf")
+
+
+def test_a_limit_of_zero_is_not_known() -> None:
+    text = PANDA.read_text().replace(LIMIT, 'lower="-1" upper="1" effort="0" velocity="0"')
+    with pytest.warns(ModelWarning, match="0 for the speed or effort of panda_joint1, .*not known"):
+        limits = model_from_urdf(text).limits
+    assert np.isnan(limits.velocity[0]) and np.isnan(limits.effort[0])
+    known = documented("panda")
+    with pytest.raises(ModelError, match="joint 'panda_joint1': its effort limit must be above"):
+        replace(known, limits=replace(known.limits, effort=-known.limits.effort))

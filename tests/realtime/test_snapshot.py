@@ -7,13 +7,14 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from multiprocessing.shared_memory import SharedMemory
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.realtime import SnapshotError, SnapshotReader, SnapshotWriter
+from adapter.realtime import SnapshotError, SnapshotReader, SnapshotWriter, snapshot
 from adapter.realtime.snapshot import PID, nothing_known
 
 JOINTS = ("a", "b", "c")
@@ -76,6 +77,44 @@ def test_a_name_in_use_is_refused_and_a_leftover_replaced(board):
     fresh = SnapshotWriter.create(JOINTS, name=board.name)
     assert fresh.effect_names == ()
     fresh.close()
+
+
+def header(**words: int) -> bytes:
+    """The head of a block that says it is ours, and room behind it."""
+    head = np.zeros(snapshot.HEADER_WORDS, np.int64)
+    head[snapshot.KIND] = snapshot.MAGIC
+    for word, value in words.items():
+        head[getattr(snapshot, word)] = value
+    return head.tobytes() + bytes(2**16)
+
+
+FOREIGN = {
+    "small": b"somebody's",
+    "page": b"\0" * 4096,
+    "large counts": header(N=2**40, BODIES=2**40, TEXT=2),
+    "negative counts": header(N=-1, BODIES=-1),
+    "long text": header(TEXT=2**62),
+    "no names": header(N=3, BODIES=3, TEXT=9),
+    "owner of no process": header(PID=2**62),
+}
+
+
+@pytest.mark.parametrize("content", FOREIGN.values(), ids=FOREIGN)
+def test_what_somebody_else_has_under_this_name_survives(content: bytes) -> None:
+    """It is neither read as an estimate nor written over; a run publishes under another name."""
+    name = f"adapter-test-foreign-{os.getpid()}"
+    theirs = SharedMemory(name, create=True, size=len(content))
+    try:
+        theirs.buf[: len(content)] = content
+        with pytest.raises(SnapshotError, match=r"another program|no whole estimate"):
+            SnapshotReader(name).read(timeout_s=0.01)
+        if len(content) < 2**16:  # else it is taken for what a dead process left
+            with pytest.raises(SnapshotError, match="in use by another program"):
+                SnapshotWriter.create(JOINTS, name=name)
+            assert bytes(theirs.buf[: len(content)]) == content
+    finally:
+        theirs.close()
+        theirs.unlink()
 
 
 def _hammer(name: str, stop) -> None:
