@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -110,7 +109,7 @@ def check_limits(limits: Sequence[float], where: str) -> None:
     if lower > upper:
         raise ModelError(f"{where}: its lower limit {lower:g} lies above its upper one {upper:g}")
     for key, value in zip(LIMITS[2:], most, strict=True):
-        if value <= 0.0 or math.isinf(value):
+        if value <= 0.0:
             raise ModelError(f"{where}: its {key} limit must be above zero, got {value:g}")
 
 
