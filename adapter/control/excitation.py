@@ -69,6 +69,8 @@ class RandomMotion:
         limits: to keep.
         q0: (n,) where the arm is, rad.
         settings: of the motion.
+        attempt: another one gives another motion of the same seed.
+        size: share of the amplitudes that the limits and the settings allow.
 
     Attributes:
         q, dq, ddq: (n,) reference of the last `advance`.
@@ -78,18 +80,23 @@ class RandomMotion:
     """
 
     def __init__(
-        self, limits: MotionLimits, q0: Array, settings: ExcitationSettings | None = None
+        self,
+        limits: MotionLimits,
+        q0: Array,
+        settings: ExcitationSettings | None = None,
+        attempt: int = 0,
+        size: float = 1.0,
     ) -> None:
         self.settings = s = settings or ExcitationSettings()
         q0 = np.array(q0, dtype=np.float64)
-        rng = np.random.default_rng(s.seed)
+        rng = np.random.default_rng([s.seed, attempt] if attempt else s.seed)
         lower, upper = _usable_range(limits, q0, s)
         edges = np.geomspace(s.low_hz, s.high_hz, s.sines + 1)
         shape = (len(q0), s.sines)
         low, high = np.log(edges[:-1]), np.log(edges[1:])
         self.omega = 2.0 * np.pi * np.exp(low + (high - low) * rng.random(shape))
         relative = (0.5 + rng.random(shape)) / self.omega  # alike in speed, not in position
-        factor = _scale(relative, self.omega, limits, lower, upper, s)
+        factor = size * _scale(relative, self.omega, limits, lower, upper, s)
         speed, reach = (relative * self.omega).sum(axis=1), relative.sum(axis=1)
 
         def centre(factor: Array) -> Array:

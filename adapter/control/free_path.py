@@ -1,0 +1,313 @@
+"""Whether a motion keeps clear of the cell and of the arm itself, all the way along its path.
+
+Distances are coal's. Along the path a pair of bodies comes nearer at most as fast as the joints
+between them turn, times how far away they turn it; from a distance d the next look is therefore
+due only when d could have become the least one found, and nothing lies between two looks:
+
+    |d(s) - d(s')| <= v_pair |s - s'|,   v_pair = sum_j max|q_j'| r_j
+
+The path of a random motion depends on its path time alone, so stops and slow starts change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.control.cell import Cell
+from adapter.control.excitation import RandomMotion, sums_of_sines
+from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
+from adapter.control.shapes import Capsule, capsules_of
+from adapter.errors import MeansError, SettingsError
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array, matrix_from_rpy, z_to_axis
+from adapter.model.tree import BASE
+from adapter.physics.kernels import frames_of, place_frames
+
+FINEST_M = 0.005  # distances between two looks are known to so much
+TABLE, REACH = "table", "reach"
+ATTEMPTS, SAME_SIZE, SHRINK = 60, 3, 0.8  # motions drawn, of one size, and the next size
+POSES, ALWAYS = 100, 0.95  # two bodies that are near in so many of so many random poses are joined
+BEYOND_S = 5.0  # of path, after the last stop should have ended
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """The least distance of a motion: m, between what, at which path time; inf where none is."""
+
+    distance: float
+    names: tuple[str, str]
+    path_s: float
+
+    def __str__(self) -> str:
+        return f"{self.distance:.3f} m between {self.names[0]} and {self.names[1]}"
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two bodies: a capsule, and another or a thing in the cell (None: the limit of reach).
+
+    Attributes:
+        arms: (n,) m: how far away from both each joint may turn one against the other.
+    """
+
+    names: tuple[str, str]
+    one: int
+    other: int | None
+    thing: tuple[Any, Any] | None
+    arms: Array
+
+
+def _coal() -> Any:
+    try:
+        import coal
+    except ImportError:
+        raise MeansError(
+            "whether a path is free is computed by coal, which is not installed; "
+            "pip install 'panda-adapter[motion]'"
+        ) from None
+    return coal
+
+
+class ArmInCell:
+    """An arm's capsules and what they must not touch.
+
+    Args:
+        model: of the arm, its base fixed.
+        cell: around it.
+
+    Attributes:
+        capsules: on the links.
+        ignored: pairs that are near in nearly every pose, so that they count as joined.
+
+    Raises:
+        SettingsError: `cell.allowed` has a name that does not exist; with the choices.
+        MeansError: coal is not installed.
+    """
+
+    def __init__(self, model: SelfModel, cell: Cell) -> None:
+        self._coal = _coal()
+        self.model, self.cell = model, cell
+        self.capsules = capsules_of(model, cell.hand)
+        self._frames = frames_of(model.tree.parent, model.lam)
+        n = model.tree.n
+        self._R, self._o = np.zeros((n, 3, 3)), np.zeros((n, 3))
+        self._bodies = [self._body(capsule) for capsule in self.capsules]
+        self._request = self._coal.DistanceRequest()
+        self._pairs = [*self._own_pairs(), *self._cell_pairs()]
+        self._check_allowed()
+        self.ignored = self._joined()
+        allowed = {frozenset(pair) for pair in (*cell.allowed, *self.ignored)}
+        self._pairs = [pair for pair in self._pairs if frozenset(pair.names) not in allowed]
+
+    def clearance(
+        self, motion: RandomMotion, path_s: float, at_least: float = -np.inf
+    ) -> Clearance:
+        """The least distance from path time 0 to `path_s`, to 5 mm.
+
+        Args:
+            motion: drawn; path_s: up to where it is looked at.
+            at_least: the search ends at the first distance that is less, m.
+        """
+        speed = motion.bounds()[2]
+        least = Clearance(np.inf, ("nothing", "nothing"), 0.0)
+        path = np.zeros((3, len(speed)))
+        for pair in self._pairs:
+            nearing, s = float(pair.arms @ speed), 0.0
+            while nearing > 0.0 and s <= path_s:
+                sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, path)
+                place_frames(self._frames, path[0], self._R, self._o)
+                distance = self._distance(pair)
+                if distance < least.distance:
+                    least = Clearance(distance, pair.names, s)
+                    if distance < at_least:
+                        return least
+                s += max(distance - least.distance, FINEST_M) / nearing
+        return least
+
+    def at(self, q: Array) -> Clearance:
+        """The least distance of one pose (n,)."""
+        place_frames(self._frames, q, self._R, self._o)
+        found = [Clearance(self._distance(pair), pair.names, 0.0) for pair in self._pairs]
+        nothing = Clearance(np.inf, ("nothing", "nothing"), 0.0)
+        return min(found, key=lambda each: each.distance, default=nothing)
+
+    def placed(self, q: Array) -> list[tuple[Array, float]]:
+        """Ends (2, 3) in base axes and radius of every capsule in one pose (n,)."""
+        place_frames(self._frames, q, self._R, self._o)
+        return [
+            (c.ends if c.link == BASE else self._o[c.link] + c.ends @ self._R[c.link].T, c.radius)
+            for c in self.capsules
+        ]
+
+    def _body(self, capsule: Capsule) -> tuple[Any, Array, Array]:
+        """Shape, and its turn and place in the link's frame."""
+        line = capsule.ends[1] - capsule.ends[0]
+        length = float(np.linalg.norm(line))
+        turn = z_to_axis(line / length) if length > 0.0 else np.eye(3)
+        return self._coal.Capsule(capsule.radius, length), turn, capsule.ends.mean(axis=0)
+
+    def _placed(self, k: int) -> Any:
+        _, turn, place = self._bodies[k]
+        link = self.capsules[k].link
+        if link == BASE:
+            return self._coal.Transform3s(turn, place)
+        R = self._R[link]
+        return self._coal.Transform3s(R @ turn, self._o[link] + R @ place)
+
+    def _distance(self, pair: Pair) -> float:
+        if pair.other is None and pair.thing is None:
+            capsule = self.capsules[pair.one]
+            ends = self._o[capsule.link] + capsule.ends @ self._R[capsule.link].T
+            furthest = np.linalg.norm(ends, axis=1).max() + capsule.radius
+            return float((self.cell.reach or np.inf) - furthest)
+        if pair.other is None:
+            assert pair.thing is not None
+            shape, place = pair.thing
+        else:
+            shape, place = self._bodies[pair.other][0], self._placed(pair.other)
+        own, result = self._bodies[pair.one][0], self._coal.DistanceResult()
+        return float(
+            self._coal.distance(own, self._placed(pair.one), shape, place, self._request, result)
+        )
+
+    def _own_pairs(self) -> list[Pair]:
+        """Every two capsules whose links are not joined to each other."""
+        parent, found = self.model.tree.parent, []
+        for k, one in enumerate(self.capsules):
+            for m, other in enumerate(self.capsules[:k]):
+                joined = one.link == other.link or other.link in (
+                    parent[one.link] if one.link != BASE else None,
+                )
+                joined |= other.link != BASE and parent[other.link] == one.link
+                if not joined:
+                    arms = np.where(
+                        self._turned_by(one.link) != self._turned_by(other.link),
+                        np.maximum(self._lever(one), self._lever(other)),
+                        0.0,
+                    )
+                    names = self._name(one), self._name(other)
+                    found.append(Pair(names, k, m, None, arms))
+        return found
+
+    def _cell_pairs(self) -> list[Pair]:
+        """Every capsule that moves against every thing. What the base carries first stands on the
+        table, by its mounting."""
+        found = []
+        for k, capsule in enumerate(self.capsules):
+            if capsule.link == BASE:
+                continue
+            name, arms = self._name(capsule), self._lever(capsule)
+            first = self.model.tree.parent[capsule.link] == BASE
+            for thing, shape, place in self._things():
+                if not (first and thing == TABLE):
+                    found.append(Pair((name, thing), k, None, (shape, place), arms))
+            if self.cell.reach is not None:
+                found.append(Pair((name, REACH), k, None, None, arms))
+        return found
+
+    def _things(self) -> list[tuple[str, Any, Any]]:
+        """Name, shape and place of what stands in the cell."""
+        coal, cell, things = self._coal, self.cell, []
+        if cell.table:
+            plane = coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
+            things.append((TABLE, plane, coal.Transform3s()))
+        for box in cell.box:
+            place = coal.Transform3s(matrix_from_rpy(box.rpy), np.array(box.xyz))
+            things.append((box.name, coal.Box(*box.size), place))
+        for pillar in cell.cylinder:
+            place = coal.Transform3s(matrix_from_rpy(pillar.rpy), np.array(pillar.xyz))
+            things.append((pillar.name, coal.Cylinder(pillar.radius, pillar.length), place))
+        for wall in cell.plane:
+            length = float(np.linalg.norm(wall.normal))
+            normal = np.array(wall.normal) / length
+            things.append((wall.name, coal.Halfspace(normal, wall.offset), coal.Transform3s()))
+        return things
+
+    def _name(self, capsule: Capsule) -> str:
+        tree = self.model.tree
+        return tree.base_name if capsule.link == BASE else tree.link_names[capsule.link]
+
+    def _turned_by(self, link: int) -> Array:
+        """Whether each joint (n,) turns a link."""
+        turns = np.zeros(self.model.tree.n, dtype=bool)
+        while link != BASE:
+            turns[link] = True
+            link = self.model.tree.parent[link]
+        return turns
+
+    def _lever(self, capsule: Capsule) -> Array:
+        """How far from each joint's axis (n,) the capsule's line may be, 0 where it is not turned.
+
+        From its own joint's, exactly; from those before it at most the lengths between.
+        """
+        levers, link = np.zeros(self.model.tree.n), capsule.link
+        if link == BASE:
+            return levers
+        levers[link] = np.linalg.norm(capsule.ends[:, :2], axis=1).max()
+        far = np.linalg.norm(capsule.ends, axis=1).max()
+        while self.model.tree.parent[link] != BASE:
+            far += np.linalg.norm(self.model.lam[link, 3:])
+            link = self.model.tree.parent[link]
+            levers[link] = far
+        return levers
+
+    def _check_allowed(self) -> None:
+        names = {name for pair in self._pairs for name in pair.names}
+        for name in (name for pair in self.cell.allowed for name in pair):
+            if name not in names:
+                raise SettingsError(f"cell.allowed: no '{name}'; have: {', '.join(sorted(names))}")
+
+    def _joined(self) -> list[tuple[str, str]]:
+        """Pairs of links that are near in nearly every pose, whatever the joints do."""
+        rng, limits = np.random.default_rng(0), self.model.limits
+        low = np.where(np.isfinite(limits.lower), limits.lower, -np.pi)
+        high = np.where(np.isfinite(limits.upper), limits.upper, np.pi)
+        own = [pair for pair in self._pairs if pair.other is not None]
+        near = np.zeros(len(own))
+        for _ in range(POSES):
+            place_frames(self._frames, rng.uniform(low, high), self._R, self._o)
+            near += [self._distance(pair) < self.cell.margin for pair in own]
+        return [p.names for p, count in zip(own, near, strict=True) if count > ALWAYS * POSES]
+
+
+def free_motion(
+    arm: ArmInCell, duration_s: float, told: Callable[[Clearance], None] | None = None
+) -> Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion]:
+    """What draws a motion whose path is free: other phases, then smaller ones, until one is.
+
+    Args:
+        arm: in its cell.
+        duration_s: until the safe stop begins.
+        told: takes the least distance of the motion that is returned.
+
+    Raises (what is returned does):
+        SettingsError: the arm does not stand free, or no motion is; names the nearest pair.
+    """
+    margin = arm.cell.margin
+
+    def draw(limits: MotionLimits, q0: Array, settings: ExcitationSettings) -> RandomMotion:
+        nearest = arm.at(q0)
+        if nearest.distance < margin:
+            raise SettingsError(
+                f"the arm stands too near to start: {nearest}, where {margin:g} m are kept; move "
+                "it by hand, or describe the cell in --config ([cell])"
+            )
+        path_s = duration_s + settings.stop_s + BEYOND_S
+        for k in range(ATTEMPTS):
+            motion = RandomMotion(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
+            nearest = arm.clearance(motion, path_s, margin)
+            if nearest.distance >= margin:
+                if told is not None:
+                    told(nearest)
+                return motion
+        raise SettingsError(
+            f"no free motion was found from here; the nearest of the last one: {nearest}, where "
+            f"{margin:g} m are kept. Move the arm to where it has more room, or limit --range"
+        )
+
+    return draw

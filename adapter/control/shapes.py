@@ -1,0 +1,147 @@
+"""The room that an arm takes: capsules on its links, as small as what is known of them allows.
+
+In this order: those of an arm that is known by name; the boxes, cylinders and spheres of a URDF's
+collision elements; from a joint to the next with a radius that the inertia says. Meshes are not
+read: their files are rarely where a URDF is.
+"""
+
+from __future__ import annotations
+
+import warnings
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from adapter.control.cell import Hand
+from adapter.errors import ModelWarning
+from adapter.model.inertia import body_from_theta
+from adapter.model.locking import LOCKED
+from adapter.model.robot_file import Merged
+from adapter.model.robots.known import facts_of
+from adapter.model.self_model import URDF, SelfModel
+from adapter.model.spatial import Array, matrix_from_rpy
+from adapter.model.tree import BASE
+from adapter.model.urdf import parse_urdf
+
+THINNEST_M, THICKEST_M = 0.03, 0.15  # radius that an inertia may say
+HAND_RADIUS_M = 0.1  # of a hand on an arm that is known by name: Franka's is 0.2 m wide
+ENOUGH_M = 0.02  # beyond the known shapes, a frame on the hand says that something is there
+
+
+@dataclass(frozen=True)
+class Capsule:
+    """All within `radius` of a line between two points.
+
+    Attributes:
+        link: number of the link that it is on, -1 for the base.
+        ends: (2, 3) in that link's frame, m.
+    """
+
+    link: int
+    ends: Array
+    radius: float
+
+
+def capsules_of(model: SelfModel, hand: Hand | None = None) -> list[Capsule]:
+    """Capsules on the links of an arm with a fixed base."""
+    known = facts_of(model)
+    if known is not None:
+        found = [
+            Capsule(number - 1, row[:6].reshape(2, 3), float(row[6]))
+            for number, rows in known.capsules.items()
+            for row in rows
+        ]
+        found += _on_the_hand(model, found)
+    else:
+        found = list(_of_collisions(model))
+        bare = set(range(BASE, model.tree.n)) - {capsule.link for capsule in found}
+        found += [capsule for link in sorted(bare) for capsule in _of_inertia(model, link)]
+    if hand is not None:
+        ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, hand.length]])
+        found += [Capsule(link, ends, hand.radius) for link in leaves(model)]
+    return found
+
+
+def leaves(model: SelfModel) -> list[int]:
+    """Links that carry no other."""
+    return [link for link in range(model.tree.n) if link not in model.tree.parent]
+
+
+def _on_the_hand(model: SelfModel, known: list[Capsule]) -> Iterator[Capsule]:
+    """Room for what a file hangs on the flange of an arm whose own shapes are known."""
+    for link in leaves(model):
+        reach = max(np.abs(c.ends).max() + c.radius for c in known if c.link == link)
+        for frame in model.frames:
+            far = np.linalg.norm(frame.position) > reach + ENOUGH_M
+            if frame.parent == model.tree.link_names[link] and far:
+                yield Capsule(link, np.array([np.zeros(3), frame.position]), HAND_RADIUS_M)
+
+
+def _of_collisions(model: SelfModel) -> Iterator[Capsule]:
+    """Capsules around the simple shapes of a URDF's collision elements."""
+    source = model.source
+    if source is None or source.format != URDF or source.text is None:
+        return
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)  # they were said when the model was read
+        locked = model.provenance.get(LOCKED) or {}
+        merged = Merged(parse_urdf(source.text, source.file), model.tree.joint_names, locked)
+    root = ET.fromstring(source.text)
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    for link in root.findall("link"):
+        body, R_link, p_link = merged.place[link.get("name", "")]
+        for collision in link.findall("collision"):
+            shape = collision.find("geometry/*")
+            origin = collision.find("origin")
+            line = None if shape is None else _line_of(shape)
+            if line is None:
+                continue
+            place = np.zeros(6) if origin is None else _six(origin)
+            half, radius = line
+            centre, along = p_link + R_link @ place[:3], R_link @ matrix_from_rpy(place[3:]) @ half
+            yield Capsule(body, np.array([centre - along, centre + along]), radius)
+
+
+def _six(origin: ET.Element) -> Array:
+    texts = origin.get("xyz", "0 0 0"), origin.get("rpy", "0 0 0")
+    return np.array([float(part) for text in texts for part in text.split()])
+
+
+def _line_of(shape: ET.Element) -> tuple[Array, float] | None:
+    """Half of the line (3,) and the radius of the capsule around a shape; None for a mesh."""
+    if shape.tag == "sphere":
+        return np.zeros(3), float(shape.get("radius", "0"))
+    if shape.tag == "cylinder":
+        return np.array([0.0, 0.0, 0.5 * float(shape.get("length", "0"))]), float(
+            shape.get("radius", "0")
+        )
+    if shape.tag == "box":
+        half = 0.5 * np.array([float(part) for part in shape.get("size", "0 0 0").split()])
+        longest = np.where(np.arange(3) == np.argmax(half), half, 0.0)
+        return longest, float(np.linalg.norm(half - longest))
+    return None
+
+
+def _of_inertia(model: SelfModel, link: int) -> Iterator[Capsule]:
+    """Capsules from a link's joint to the joints that it carries, or through its centre of mass.
+
+    The radius is that of a solid cylinder with the link's inertia about the line.
+    """
+    theta = model.base_theta if link == BASE else model.theta[link]
+    mass, com, inertia = body_from_theta(theta) if theta[0] > 0.0 else (0.0, np.zeros(3), None)
+    children = [k for k, parent in enumerate(model.tree.parent) if parent == link]
+    ends = [model.lam[k, 3:] for k in children]
+    if not children:
+        name = model.tree.link_names[link]
+        ends = [frame.position for frame in model.frames if frame.parent == name] or [2.0 * com]
+        ends = [max(ends, key=lambda end: float(np.linalg.norm(end)))]
+    for end in ends:
+        length = float(np.linalg.norm(end))
+        radius = THINNEST_M
+        if inertia is not None and length > 0.0:
+            about = float(end @ inertia @ end) / length**2
+            radius = float(np.clip(np.sqrt(2.0 * about / mass), THINNEST_M, THICKEST_M))
+        yield Capsule(link, np.array([np.zeros(3), end]), radius)
