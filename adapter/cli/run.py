@@ -17,8 +17,9 @@ from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.control.controller import ControlSettings, ExcitationController
-from adapter.control.excitation import plan_lines
+from adapter.control.excitation import RandomMotion, plan_lines
 from adapter.control.feedforward import Feedforward, ModelFeedforward
+from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.resting import check_resting_torque
 from adapter.control.settings import gentle
@@ -71,6 +72,11 @@ class RunPlan:
     world: SimulationLike | None
     maybe_real: bool
 
+    def free_motion(self, duration_s: float) -> FreeMotion:
+        """What draws a motion that is free in the cell. Raises SettingsError, MeansError."""
+        arm = ArmInCell(self.robot, self.config.cell)
+        return FreeMotion(arm, duration_s + self.config.excitation.slow_s)
+
 
 def run_plan(args: argparse.Namespace) -> RunPlan:
     """Model, settings and simulated arm of a command line.
@@ -89,7 +95,7 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     )
     robot, locked = present(robot, names, args.driver)
     warn(locked)
-    config = configure(args, None, robot)
+    config = _limited(args, configure(args, None, robot))
     if world is not None and world.scenario.imus:
         pipeline = with_imus(config.pipeline, world.scenario.imus)
         config = dataclasses.replace(config, pipeline=pipeline)
@@ -98,6 +104,15 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
         need_complete(robot)
         config = dataclasses.replace(config, excitation=gentle(config.excitation))
     return RunPlan(config.apply(robot), config, world, maybe_real)
+
+
+def _limited(args: argparse.Namespace, config: Config) -> Config:
+    """The same with the motion that the command line asks for. Raises SettingsError."""
+    asked = {"share": args.speed, "range_share": args.range}
+    if args.move is not None:
+        asked["move"] = tuple(name.strip() for name in args.move.split(",") if name.strip())
+    said = {key: value for key, value in asked.items() if value is not None}
+    return dataclasses.replace(config, excitation=dataclasses.replace(config.excitation, **said))
 
 
 def _joints_of_arm(address: str, world: SimulationLike | None) -> tuple[str, ...]:
@@ -169,11 +184,12 @@ def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
 
 
 def controller_of(
-    args: argparse.Namespace, config: Config, robot: SelfModel, driver: Driver
+    args: argparse.Namespace, plan: RunPlan, driver: Driver
 ) -> ExcitationController | None:
-    """What moves the arm; None where it is only listened to."""
+    """What moves the arm; None where it is only listened to. Raises SettingsError, MeansError."""
     if args.passive or not driver.can_move:
         return None
+    config, robot = plan.config, plan.robot
     forward: Feedforward | None = None
     tool = None if robot.tool is None else robot.tool.theta()
     if args.feedforward == "documented":
@@ -186,7 +202,8 @@ def controller_of(
         forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known)
     control = ControlSettings(safety=config.safety)
     limits, expected = MotionLimits.of(robot), ModelFeedforward.of(robot)
-    return ExcitationController(limits, config.excitation, control, forward, expected=expected)
+    draw = plan.free_motion(args.duration) if plan.maybe_real else RandomMotion
+    return ExcitationController(limits, config.excitation, control, forward, draw, expected)
 
 
 def _go(
@@ -199,7 +216,7 @@ def _go(
 ) -> LiveResult:
     """The live run itself; an arm that may be real shows its plan and has a dead man's switch."""
     config, robot, maybe_real = plan.config, plan.robot, plan.maybe_real
-    controller = controller_of(args, config, robot, driver)
+    controller = controller_of(args, plan, driver)
     duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     display = None if args.quiet else DisplayJob(partial(make_display, duration_s))
@@ -213,6 +230,9 @@ def _go(
                 check_resting_torque(robot, controller.start.q, controller.start.tau)
             names = robot.tree.joint_names
             lines = plan_lines(controller.reference, controller.limits, names, duration_s)
+            least = getattr(controller.draw, "least", None)
+            if least is not None:
+                lines.insert(-1, f"Nearest on the way: {least} (margin {config.cell.margin:g} m).")
             say("\n".join(lines))
 
     learner = learner_job(

@@ -40,6 +40,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="move an arm that may be real although what it holds at rest is not the weight that "
         "the model says",
     )
+    add("--speed", type=float, metavar="SHARE", help="of the joints' speed limits, at most")
+    add("--range", type=float, metavar="SHARE", help="of the joints' ranges, at most")
+    add("--move", metavar="A,B,C", help="joints that move; the others stand still")
     add("--duration", type=float, default=30.0, metavar="S", help="default 30")
     add(
         "--scenario",

@@ -1,11 +1,11 @@
 """The cell that an arm stands in, as settings: what it must not touch. In base axes, m and rad.
 
-    [cell]
-    margin = 0.05
-    [[cell.box]]
-    name = "shelf"
-    size = [0.4, 1.0, 0.05]
-    xyz = [0.6, 0.0, 0.4]
+[cell]
+margin = 0.05
+[[cell.box]]
+name = "shelf"
+size = [0.4, 1.0, 0.05]
+xyz = [0.6, 0.0, 0.4]
 """
 
 from __future__ import annotations
@@ -112,6 +112,7 @@ class Cell:
             raise SettingsError("cell.reach must be above zero")
         if any(len(pair) != 2 for pair in self.allowed):
             raise SettingsError("cell.allowed needs pairs of names")
-        names = [thing.name for thing in (*self.box, *self.cylinder, *self.plane)]
+        names = [each.name for each in self.box] + [each.name for each in self.cylinder]
+        names += [each.name for each in self.plane]
         if len({*names, "table"}) <= len(names):
             raise SettingsError("cell: every box, cylinder and plane needs a name of its own")

@@ -164,7 +164,7 @@ class ExcitationController:
         control = control or ControlSettings()
         n = len(limits.effort)
         self.limits, self.motion = limits, motion or ExcitationSettings()
-        self.feedforward, self._draw = feedforward, draw
+        self.feedforward, self.draw = feedforward, draw
         self._expected, self._safety = expected, control.safety
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
@@ -220,7 +220,7 @@ class ExcitationController:
                     f"joint {int(np.argmin(np.isfinite(values))) + 1} gives no {name}; a motion "
                     "can only start where every joint is measured"
                 )
-        self.reference = ref = self._draw(self.limits, sample.q, self.motion)
+        self.reference = ref = self.draw(self.limits, sample.q, self.motion)
         self.start = sample
         self._tau = self._bias = np.array(held, dtype=np.float64)
         self._gate = ReadingGate(self._new_judge(), self._period_ns)

@@ -76,7 +76,8 @@ class RandomMotion:
         q, dq, ddq: (n,) reference of the last `advance`.
 
     Raises:
-        SettingsError: the arm stands outside its position limits.
+        SettingsError: the arm stands outside its position limits, or a joint asked for is not
+            there.
     """
 
     def __init__(
@@ -97,6 +98,7 @@ class RandomMotion:
         self.omega = 2.0 * np.pi * np.exp(low + (high - low) * rng.random(shape))
         relative = (0.5 + rng.random(shape)) / self.omega  # alike in speed, not in position
         factor = size * _scale(relative, self.omega, limits, lower, upper, s)
+        factor = factor * _moving(limits, s)
         speed, reach = (relative * self.omega).sum(axis=1), relative.sum(axis=1)
 
         def centre(factor: Array) -> Array:
@@ -193,6 +195,16 @@ def _usable_range(
             f"{upper[j]:.3f}]; move it by hand before the start"
         )
     return np.minimum(lower + settings.margin, q0), np.maximum(upper - settings.margin, q0)
+
+
+def _moving(limits: MotionLimits, settings: ExcitationSettings) -> Array:
+    """1 for each joint (n,) that is to move, 0 for the others."""
+    names = limits.joint_names
+    for name in settings.move:
+        if name not in names:
+            raise SettingsError(f"no joint '{name}' to move; have: {', '.join(names)}")
+    wanted = settings.move or names
+    return np.array([name in wanted for name in names]) if names else np.ones(len(limits.effort))
 
 
 def _ramp_factors(settings: ExcitationSettings) -> tuple[float, float]:

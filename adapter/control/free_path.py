@@ -11,7 +11,6 @@ The path of a random motion depends on its path time alone, so stops and slow st
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +29,9 @@ from adapter.physics.kernels import frames_of, place_frames
 
 FINEST_M = 0.005  # distances between two looks are known to so much
 TABLE, REACH = "table", "reach"
-ATTEMPTS, SAME_SIZE, SHRINK = 60, 3, 0.8  # motions drawn, of one size, and the next size
+ATTEMPTS, SAME_SIZE, SHRINK = 48, 3, 0.8  # motions drawn, of one size, and the next size
 POSES, ALWAYS = 100, 0.95  # two bodies that are near in so many of so many random poses are joined
+SAME_START = 1e-3  # rad: from so near the same motion is free, too, to a millimetre or so
 BEYOND_S = 5.0  # of path, after the last stop should have ended
 
 
@@ -105,18 +105,19 @@ class ArmInCell:
         self._pairs = [pair for pair in self._pairs if frozenset(pair.names) not in allowed]
 
     def clearance(
-        self, motion: RandomMotion, path_s: float, at_least: float = -np.inf
+        self, motion: RandomMotion, path_s: float, at_least: float | None = None
     ) -> Clearance:
         """The least distance from path time 0 to `path_s`, to 5 mm.
 
         Args:
             motion: drawn; path_s: up to where it is looked at.
-            at_least: the search ends at the first distance that is less, m.
+            at_least: ask only whether all distances are as large, m: quicker, and the first one
+                found that is not comes back.
         """
         speed = motion.bounds()[2]
         least = Clearance(np.inf, ("nothing", "nothing"), 0.0)
         path = np.zeros((3, len(speed)))
-        for pair in self._pairs:
+        for pair in tuple(self._pairs):
             nearing, s = float(pair.arms @ speed), 0.0
             while nearing > 0.0 and s <= path_s:
                 sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, path)
@@ -124,9 +125,12 @@ class ArmInCell:
                 distance = self._distance(pair)
                 if distance < least.distance:
                     least = Clearance(distance, pair.names, s)
-                    if distance < at_least:
+                    if at_least is not None and distance < at_least:
+                        self._pairs.remove(pair)
+                        self._pairs.insert(0, pair)  # the next motion is likely to touch there, too
                         return least
-                s += max(distance - least.distance, FINEST_M) / nearing
+                goal = least.distance if at_least is None else at_least
+                s += max(distance - goal, FINEST_M) / nearing
         return least
 
     def at(self, q: Array) -> Clearance:
@@ -275,39 +279,49 @@ class ArmInCell:
         return [p.names for p, count in zip(own, near, strict=True) if count > ALWAYS * POSES]
 
 
-def free_motion(
-    arm: ArmInCell, duration_s: float, told: Callable[[Clearance], None] | None = None
-) -> Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion]:
-    """What draws a motion whose path is free: other phases, then smaller ones, until one is.
+class FreeMotion:
+    """Draws a motion whose path is free: other phases, then smaller ones, until one is.
 
     Args:
         arm: in its cell.
         duration_s: until the safe stop begins.
-        told: takes the least distance of the motion that is returned.
 
-    Raises (what is returned does):
-        SettingsError: the arm does not stand free, or no motion is; names the nearest pair.
+    Attributes:
+        least: the least distance of the motion drawn last; None before.
     """
-    margin = arm.cell.margin
 
-    def draw(limits: MotionLimits, q0: Array, settings: ExcitationSettings) -> RandomMotion:
-        nearest = arm.at(q0)
+    def __init__(self, arm: ArmInCell, duration_s: float) -> None:
+        self.arm, self._duration_s = arm, duration_s
+        self.least: Clearance | None = None
+        self._checked: tuple[Array, ExcitationSettings, int] | None = None
+
+    def __call__(
+        self, limits: MotionLimits, q0: Array, settings: ExcitationSettings
+    ) -> RandomMotion:
+        """A motion from q0 (n,), the same for the same seed.
+
+        Raises:
+            SettingsError: the arm does not stand free, or no motion is; names the nearest pair.
+        """
+        if self._checked is not None:
+            before, same, k = self._checked
+            if settings == same and np.abs(q0 - before).max() < SAME_START:
+                return RandomMotion(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
+        margin, nearest = self.arm.cell.margin, self.arm.at(q0)
         if nearest.distance < margin:
             raise SettingsError(
                 f"the arm stands too near to start: {nearest}, where {margin:g} m are kept; move "
                 "it by hand, or describe the cell in --config ([cell])"
             )
-        path_s = duration_s + settings.stop_s + BEYOND_S
+        path_s = self._duration_s + settings.stop_s + BEYOND_S
         for k in range(ATTEMPTS):
             motion = RandomMotion(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
-            nearest = arm.clearance(motion, path_s, margin)
+            nearest = self.arm.clearance(motion, path_s, margin)
             if nearest.distance >= margin:
-                if told is not None:
-                    told(nearest)
+                self.least = self.arm.clearance(motion, path_s)
+                self._checked = q0, settings, k
                 return motion
         raise SettingsError(
             f"no free motion was found from here; the nearest of the last one: {nearest}, where "
-            f"{margin:g} m are kept. Move the arm to where it has more room, or limit --range"
+            f"{margin:g} m are kept. Move the arm to where it has more room"
         )
-
-    return draw

@@ -23,6 +23,7 @@ class ExcitationSettings:
         low_hz, high_hz: between these frequencies.
         share: of the velocity, acceleration and jerk limits that is never exceeded.
         range_share: of a joint's range that is used at most.
+        move: names of the joints that move, the others stand; all of them where empty.
         margin: kept from the position limits, rad.
         start_s, stop_s: length of the soft start and of the safe stop.
         rests: (from, to) seconds of motion time in which the arm rests; the stop before and the
@@ -38,6 +39,7 @@ class ExcitationSettings:
     high_hz: float = 1.0
     share: float = 0.9
     range_share: float = 0.8
+    move: tuple[str, ...] = ()
     margin: float = 0.15
     start_s: float = 1.0
     stop_s: float = 1.0

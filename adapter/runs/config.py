@@ -11,6 +11,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from adapter.control.cell import Cell
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import SettingsError
 from adapter.learning.settings import LearnerSettings
@@ -61,6 +62,7 @@ class Config:
         pipeline: filter, front end, learner.
         excitation: of the controller in `run`.
         safety: when it stops the arm because that does not move as it should.
+        cell: what an arm that may be real must not touch in `run`.
     """
 
     gravity: tuple[float, ...] | None = None
@@ -68,6 +70,7 @@ class Config:
     pipeline: PipelineSettings = field(default_factory=PipelineSettings)
     excitation: ExcitationSettings = field(default_factory=ExcitationSettings)
     safety: SafetySettings = field(default_factory=SafetySettings)
+    cell: Cell = field(default_factory=Cell)
 
     def __post_init__(self) -> None:
         if self.gravity is not None and len(self.gravity) != 3:

@@ -91,10 +91,11 @@ def learn(
     assert world is not None
     if task.rests:
         config = replace(config, excitation=replace(config.excitation, rests=task.rests))
+        plan = replace(plan, config=config)
     front_end = make_front_end(robot, config.pipeline)
     learner = make_learner(robot, config.pipeline)
     arm = task.arm_of(world.scenario, task.seed) if task.arm_of else open_arm(args, plan)
-    controller = controller_of(args, config, robot, arm)
+    controller = controller_of(args, plan, arm)
     watched = Watched(learner, look)
     result = run_lockstep(arm, front_end, watched, controller, args.duration)
     arm.close()

@@ -1,0 +1,162 @@
+"""A free path: what a motion may touch, found against a dense look with formulas of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib import resources
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from adapter.control.cell import Box, Cell, Cylinder, Hand, Plane
+from adapter.control.excitation import RandomMotion, sums_of_sines
+from adapter.control.free_path import ArmInCell, FreeMotion
+from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings, gentle
+from adapter.control.shapes import capsules_of
+from adapter.errors import SettingsError
+from adapter.model.robots import documented
+from adapter.model.urdf import model_from_urdf
+from adapter.runs.config import config_from, config_table
+from sim.scenarios import build
+
+pytest.importorskip("coal")
+PANDA = documented("panda")
+LIMITS = MotionLimits.of(PANDA)
+READY = build("nominal").truth.ready
+SPAN_S = 8.0
+
+
+def _poses(motion, every_s):
+    out = np.zeros((3, 7))
+    for s in np.arange(0.0, SPAN_S, every_s):
+        sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, out)
+        yield out[0].copy()
+
+
+def _along(ends, count=25):
+    return ends[0] + np.linspace(0.0, 1.0, count)[:, None] * (ends[1] - ends[0])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_lies_between_two_looks(seed):
+    """A dense look at box, wall and table finds what was found, to its own step."""
+    centre, half, wall = np.array([0.5, 0.45, 0.75]), np.array([0.1, 0.05, 0.2]), 0.9
+    things = Cell(
+        margin=0.01,
+        box=(Box("box", tuple(2.0 * half), tuple(centre)),),
+        plane=(Plane("wall", (-1.0, 0.0, 0.0), -wall),),
+        allowed=tuple(combinations((f"panda_link{k}" for k in range(8)), 2)),
+    )
+    arm = ArmInCell(PANDA, things)
+    motion = RandomMotion(LIMITS, READY, ExcitationSettings(seed=seed))
+    dense = np.inf
+    for q in _poses(motion, 0.01):
+        for capsule, (ends, radius) in zip(arm.capsules, arm.placed(q), strict=True):
+            if capsule.link > 0:
+                points = _along(ends)
+                beside = np.linalg.norm(np.maximum(np.abs(points - centre) - half, 0.0), axis=1)
+                gaps = beside, wall - points[:, 0], points[:, 2]
+                dense = min(dense, *(gap.min() - radius for gap in gaps))
+    assert arm.clearance(motion, SPAN_S).distance == pytest.approx(dense, abs=0.02)
+
+
+CELLS = {
+    "low shelf": Cell(box=(Box("shelf", (0.6, 1.0, 0.02), (0.6, 0.0, 0.95)),)),
+    "pillar": Cell(cylinder=(Cylinder("pillar", 0.05, 1.5, (0.35, 0.35, 0.75)),)),
+    "wall": Cell(plane=(Plane("wall", (0.0, -2.0, 0.0), -0.3),)),
+    "reach": Cell(reach=0.98),
+    "long hand": Cell(hand=Hand(0.5, 0.08)),
+}
+
+
+@pytest.mark.parametrize("cell", CELLS.values(), ids=list(CELLS))
+def test_a_motion_that_would_touch_is_drawn_again(cell):
+    """The first motion of these seeds would not keep the margin; the one that is drawn does."""
+    arm, settings = ArmInCell(PANDA, cell), gentle(ExcitationSettings(seed=3))
+    first = arm.clearance(RandomMotion(LIMITS, READY, settings), SPAN_S)
+    assert first.distance < cell.margin
+    draw = FreeMotion(arm, SPAN_S)
+    motion = draw(LIMITS, READY, settings)
+    assert draw.least.distance >= cell.margin
+    assert min(arm.at(q).distance for q in _poses(motion, 0.05)) >= cell.margin - 0.005
+    np.testing.assert_array_equal(draw(LIMITS, READY, settings).phase, motion.phase)
+
+
+def test_an_arm_that_stands_too_near_or_has_no_room_is_not_moved():
+    """The hand is at x = 0.31, z = 0.59; what it touches is named."""
+    crate = Cell(box=(Box("crate", (0.2, 0.2, 0.2), (0.35, 0.0, 0.5)),))
+    with pytest.raises(SettingsError, match=r"too near to start: -?0\.\d+ m between .* and crate"):
+        FreeMotion(ArmInCell(PANDA, crate), SPAN_S)(LIMITS, READY, ExcitationSettings())
+
+
+def test_only_the_joints_asked_for_move():
+    settings = ExcitationSettings(move=("panda_joint2", "panda_joint7"))
+    motion = RandomMotion(LIMITS, READY, settings)
+    lower, upper = motion.bounds()[:2]
+    np.testing.assert_array_equal(upper - lower > 0.0, [0, 1, 0, 0, 0, 0, 1])
+    motion.advance(3.0)
+    np.testing.assert_array_equal(motion.q[[0, 2, 3, 4, 5]], READY[[0, 2, 3, 4, 5]])
+    with pytest.raises(SettingsError, match=r"no joint 'elbow' to move; have: panda_joint1"):
+        RandomMotion(LIMITS, READY, replace(settings, move=("elbow",)))
+
+
+def test_a_cell_is_read_from_toml_and_kept_in_a_recording():
+    table = {
+        "cell": {
+            "margin": 0.04,
+            "box": [{"name": "a", "size": [1, 1, 1], "xyz": [2, 0, 0]}],
+            "plane": [{"name": "b", "normal": [1, 0, 0], "offset": -2}],
+            "cylinder": [{"name": "c", "radius": 0.1, "length": 1, "xyz": [0, 2, 0]}],
+            "allowed": [["panda_link5", "a"]],
+        }
+    }
+    config = config_from(table)
+    assert config.cell.box[0].size == (1.0, 1.0, 1.0) and config.cell.plane[0].offset == -2.0
+    assert config_from(config_table(config)) == config
+    for wrong, said in (
+        ({"bax": []}, "no setting 'bax'; have: margin"),
+        ({"box": [{"name": "a", "size": [1, 1], "xyz": [0, 0, 0]}]}, "'a': size needs 3 lengths"),
+        ({"plane": [{"name": "a", "normal": [0, 0, 0], "offset": 0}]}, "must not be zero"),
+        ({"margin": 0.0}, "margin must be at least"),
+        ({"box": [{"name": "table", "size": [1, 1, 1], "xyz": [0, 0, 9]}]}, "name of its own"),
+    ):
+        with pytest.raises(SettingsError, match=said):
+            config_from({"cell": wrong})
+    with pytest.raises(SettingsError, match=r"no 'moon'; have: .*panda_link7.*table"):
+        ArmInCell(PANDA, Cell(allowed=(("moon", "table"),)))
+
+
+ARM = """<robot name="two"><link name="base"/>
+<link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/>
+<inertia ixx="0.03" iyy="0.03" izz="0.0025" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="fore"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
+<inertia ixx="0.01" iyy="0.01" izz="0.0002" ixy="0" ixz="0" iyz="0"/></inertial>SHAPE</link>
+<joint name="a" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="10"/></joint>
+<joint name="b" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/>
+<axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="10"/></joint></robot>"""
+SHAPE = """<collision><origin xyz="0 0 0.15" rpy="0 0 0"/><geometry><box size="0.06 0.08 0.3"/>
+</geometry></collision><collision><geometry><mesh filename="x.stl"/></geometry></collision>"""
+
+
+def test_an_arm_of_ones_own_gets_its_shapes_from_its_file():
+    bare = {c.link: c for c in capsules_of(model_from_urdf(ARM.replace("SHAPE", "")))}
+    assert np.linalg.norm(bare[0].ends[1] - bare[0].ends[0]) == pytest.approx(0.4)
+    assert bare[0].radius == pytest.approx(0.05)  # of a cylinder of 2 kg with 0.0025 kg m²
+    assert np.linalg.norm(bare[1].ends[1]) == pytest.approx(0.2)  # twice to its centre
+    shaped = {c.link: c for c in capsules_of(model_from_urdf(ARM.replace("SHAPE", SHAPE)))}
+    assert shaped[1].radius == pytest.approx(0.05)  # half the diagonal of 0.06 by 0.08
+    model = model_from_urdf(ARM.replace("SHAPE", SHAPE))
+    straight = ArmInCell(model, Cell()).placed(np.zeros(2))
+    high = max(ends[:, 2].max() for ends, _ in straight)
+    assert high == pytest.approx(0.8)  # 0.1 + 0.4 + 0.3, whatever axes the joints turn about
+
+
+def test_a_panda_with_a_hand_in_its_file_needs_room_for_it():
+    folder = resources.files("adapter") / "model" / "robots"
+    hand = '<link name="hand"/><joint name="h" type="fixed"><parent link="panda_link8"/>'
+    hand += '<child link="hand"/><origin xyz="0 0 0.1"/></joint></robot>'
+    model = model_from_urdf((folder / "panda.urdf").read_text().replace("</robot>", hand))
+    assert len(capsules_of(model)) == len(capsules_of(PANDA)) + 1
