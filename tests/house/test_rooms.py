@@ -25,7 +25,7 @@ LOOSE = {"__init__.py", "__main__.py", "errors.py", "py.typed"}
 # What takes long to load, or is not there everywhere: the only thing a function may import.
 HEAVY = {
     *("torch", "numba", "pybullet", "matplotlib", "scipy", "filterpy", "clarabel", "sklearn"),
-    *("pinocchio", "mujoco", "can", "differentiable_robot_model", "figaroh"),
+    *("pinocchio", "coal", "mujoco", "can", "differentiable_robot_model", "figaroh"),
 }
 FACES = {
     "adapter",
