@@ -27,7 +27,7 @@ from adapter.effects.active import lasting_effects, with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
-from adapter.realtime.learned_feedforward import LearnedFeedforward
+from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
@@ -154,7 +154,8 @@ def run(args: argparse.Namespace) -> int:
         show(result.intake.commands.line())
     if isinstance(driver, FaultyDriver):
         show(driver.account.line())
-    warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes)
+    notes = [] if result.tracking is None else result.tracking["notes"]
+    warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes + notes)
     if result.unrecorded:
         share = 100.0 * result.unrecorded / result.samples
         warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
@@ -191,17 +192,19 @@ def controller_of(
         return None
     config, robot = plan.config, plan.robot
     forward: Feedforward | None = None
+    expected = ModelFeedforward.of(robot)
     tool = None if robot.tool is None else robot.tool.theta()
     if args.feedforward == "documented":
-        forward = ModelFeedforward.of(robot)
+        forward = expected
     elif args.feedforward == "learned":
         effects = config.pipeline.learner.effects
         whole = with_bodies(robot)
         lasting = lasting_effects(whole.effects, robot.tree.n)
         known = [active for active in lasting if active.effect.name not in effects]
-        forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known)
+        bound = FeedforwardBound(robot, expected)
+        forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
-    limits, expected = MotionLimits.of(robot), ModelFeedforward.of(robot)
+    limits = MotionLimits.of(robot)
     draw = plan.free_motion(args.duration) if plan.maybe_real else RandomMotion
     return ExcitationController(limits, config.excitation, control, forward, draw, expected)
 

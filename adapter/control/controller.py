@@ -35,7 +35,7 @@ RATE_SHARE = 0.9  # of the step that the torque rate allows in a period, for an 
 START_REACH = 0.02  # rad, further from where the motion was drawn from it does not start
 FADE_S = 1.0  # from feedback alone to feed-forward
 REFRESH_TICKS = 50
-CARRY_TICKS = 20  # between two times that an arm is told what carries it
+CARRY_TICKS = 20  # between two looks at what carries the arm
 
 
 class Controller(Protocol):
@@ -232,6 +232,8 @@ class ExcitationController:
             self.feedforward(ref.q, ref.dq, ref.ddq)
         if self._expected is not None:
             self._expected(ref.q, ref.dq, ref.ddq)
+            if self._adds_gravity:
+                self._watch.now[Now.CARRIED] = self._expected.unbent(ref.q)
 
     def _new_judge(self) -> ReadingJudge:
         return ReadingJudge(self.limits.velocity, self.limits.effort, self._K)
@@ -277,12 +279,17 @@ class ExcitationController:
         now[0], now[1], now[2], now[3] = tau, self._tau, ref.q - sample.q, sample.dq
         if model is not None:
             now[4], now[5] = sample.tau, model(ref.q, ref.dq, ref.ddq)
-            if self._adds_gravity:
-                now[6] = model.unbent(sample.q)
-            elif self._carry is not None and self._ticks % CARRY_TICKS == 0:
-                self._carry(model.unbent(sample.q) + watch.now[Now.OFFSET])
+            if self._ticks % CARRY_TICKS == 0:
+                self._tell_weight(model.unbent(ref.q))
         self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
         return self._tau.copy()
+
+    def _tell_weight(self, gravity: Array) -> None:
+        """What carries the arm (n,) N m: kept where the arm adds it, else told where asked for."""
+        if self._adds_gravity:
+            self._watch.now[Now.CARRIED] = gravity
+        elif self._carry is not None:
+            self._carry(gravity + self._watch.now[Now.OFFSET])
 
     def _start(self, sample: JointSample) -> None:
         """The first reading has to be where the motion was drawn from; it may be long ago."""
@@ -329,4 +336,5 @@ class ExcitationController:
             "saturated": 0 if self.reference is None else self._watch.saturated,
             "rate_limited": 0 if self.reference is None else self._watch.rate_limited,
             "unusable": 0 if self.reference is None else self._gate.unusable,
+            "notes": [] if self.feedforward is None else list(self.feedforward.notes),
         }

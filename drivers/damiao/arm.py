@@ -104,6 +104,7 @@ class DamiaoArm:
     def _get_ready(self) -> None:
         self._last_ns = 0
         self._commanded = self._driving = False
+        self._told: list[float] | None = None
         self._wire.waiting()  # what others sent before
         talk = Dialogue(self._wire, self.settings)
         self.limits = talk.limits()
@@ -245,6 +246,7 @@ class DamiaoArm:
         self._need_open()
         if not self.can_move:
             raise DriverError("this CAN arm may not be moved; allow motion first")
+        self._need_leave()
         frames, cut = torque_frames(tau, self._tau_max)
         if cut:
             self._replies.note("cut", "a torque beyond a motor's TMAX was cut")
@@ -253,6 +255,23 @@ class DamiaoArm:
         self._beat()
         self._commanded = True
         self._stream.command(frames)
+
+    def carry(self, tau: Array) -> None:
+        """What carries the arm here, (n,) N m; a braked arm is carried so, by the guardian too.
+
+        Without it that is the torque measured in the last 50 ms, in which a push is as well.
+        """
+        if np.isfinite(tau).all():
+            self._told = np.asarray(tau, dtype=np.float64).tolist()
+
+    def _need_leave(self) -> None:
+        """Raises DriverError where the guardian has forbidden to drive on."""
+        joint = None if self._guardian is None else self._guardian.memory.forbidden
+        if joint is not None:
+            raise DriverError(
+                f"joint {joint + 1} ({self.joint_names[joint]}) is pushed although it stands "
+                "still: something holds the arm; the guardian process has stopped it"
+            )
 
     def stop(self) -> None:
         """Brake a driven arm and hold it where it comes to rest; it goes on being held.
@@ -312,9 +331,10 @@ class DamiaoArm:
     def _report(self, values: list[float]) -> None:
         """Keep what the arm must be carried with, here and with the guardian."""
         n = self._joints
-        self._carried = [
+        self._carried = self._told or [
             old + CARRIED_SHARE * (new - old)
             for old, new in zip(self._carried, values[2 * n :], strict=True)
         ]
         if self._guardian is not None:
-            self._guardian.memory.put(values[:n], values[n : 2 * n], self._carried)
+            parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
+            self._guardian.memory.put(*parts)

@@ -8,6 +8,9 @@ driven and then fall. So this process, with its own handle on the bus, takes ove
 - when no command has come for `SILENCE_NS` although the arm is being driven;
 - when the loop asks for it: before its first command, and after its stop.
 
+It also looks whether the loop pushes an arm that stands still (`PushWatch`), and then forbids its
+commands: the loop's driver refuses them, naming the joint, and brakes.
+
 It sends the commands of `drivers.damiao.holding` at 200 Hz, until
 
 - the next driver connects with leave to move and sends SIGUSR1 once it holds the arm itself;
@@ -38,13 +41,13 @@ import can
 from drivers.damiao import codec
 from drivers.damiao.bus import message_for, open_bus, wire_of
 from drivers.damiao.codec import Scales, WireError
-from drivers.damiao.holding import SINK_S, Braker
+from drivers.damiao.holding import SINK_S, Braker, PushWatch
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
 
 MOST_JOINTS = 15
 HEAD_BYTES = 64
-ROWS = 4  # held angle, angle, speed, torque
+ROWS = 5  # held angle, angle, speed, torque that carries the arm, torque measured
 BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
@@ -64,8 +67,8 @@ class GuardianMode(IntEnum):
 class GuardianMemory:
     """The shared block.
 
-    The loop writes, the guardian reads, except for `taken`. Each number is written as a whole;
-    numbers of one tick may be mixed with the next one's, which is 1 ms later.
+    The loop writes, the guardian reads, except for `taken` and `forbidden`. Each number is written
+    as a whole; numbers of one tick may be mixed with the next one's, which is 1 ms later.
 
     Args:
         file: of `BLOCK_BYTES`, open for reading and writing.
@@ -78,7 +81,7 @@ class GuardianMemory:
         self._head = memoryview(self._map)[:HEAD_BYTES].cast("q")
         self._joints = joints
         self._row = struct.Struct(f"{joints}d")
-        self._rows = struct.Struct(f"{3 * joints}d")
+        self._rows = struct.Struct(f"{4 * joints}d")
 
     @property
     def mode(self) -> GuardianMode:
@@ -107,15 +110,31 @@ class GuardianMemory:
         """The guardian takes over."""
         self._head[2] += 1
 
-    def put(self, q: Sequence[float], dq: Sequence[float], tau: Sequence[float]) -> None:
-        """Where the arm is, rad, how fast, rad/s, and what carries it, N m."""
-        self._rows.pack_into(self._map, HEAD_BYTES + self._row.size, *q, *dq, *tau)
+    @property
+    def forbidden(self) -> int | None:
+        """Joint (from 0) because of which the arm may not be driven on; None for none."""
+        return self._head[3] - 1 if self._head[3] else None
 
-    def motion(self) -> tuple[list[float], list[float], list[float]]:
-        """(q, dq, tau) as `put` wrote them."""
-        values = self._rows.unpack_from(self._map, HEAD_BYTES + self._row.size)
+    @forbidden.setter
+    def forbidden(self, joint: int | None) -> None:
+        self._head[3] = 0 if joint is None else joint + 1
+
+    def put(
+        self,
+        q: Sequence[float],
+        dq: Sequence[float],
+        carried: Sequence[float],
+        tau: Sequence[float] | None = None,
+    ) -> None:
+        """Where the arm is, rad, how fast, rad/s, what carries it and what was measured, N m."""
+        values = *q, *dq, *carried, *(carried if tau is None else tau)
+        self._rows.pack_into(self._map, HEAD_BYTES + self._row.size, *values)
+
+    def motion(self) -> tuple[list[float], list[float], list[float], list[float]]:
+        """(q, dq, carried, tau) as `put` wrote them."""
+        values = list(self._rows.unpack_from(self._map, HEAD_BYTES + self._row.size))
         n = self._joints
-        return list(values[:n]), list(values[n : 2 * n]), list(values[2 * n :])
+        return values[:n], values[n : 2 * n], values[2 * n : 3 * n], values[3 * n :]
 
     def hold(self, q: Sequence[float]) -> None:
         """Hold these angles from now on, rad."""
@@ -151,6 +170,7 @@ class Guardian:
         self._messages = [message_for(settings, can_id, codec.ENABLE) for can_id in settings.ids]
         self._index = {can_id: j for j, can_id in enumerate(settings.reply_ids)}
         self._braker: Braker | None = None
+        self._pushes, self._looked_s = PushWatch(limits), 0.0
         self._mode = GuardianMode.IDLE
         self._q: list[float] = []
         self._dq: list[float] = []
@@ -171,6 +191,7 @@ class Guardian:
                 driven and time.monotonic_ns() - memory.beat_ns < SILENCE_NS
             ):
                 self._braker = None
+                self._look(driven)
                 time.sleep(WATCH_S)
                 continue
             if self._braker is None or mode != self._mode:
@@ -191,9 +212,22 @@ class Guardian:
         self._wire.close()
         self._bus.shutdown()
 
+    def _look(self, driven: bool) -> None:
+        """Forbid to drive an arm on that is pushed although it stands still."""
+        now_s = time.monotonic()
+        dt_s, self._looked_s = min(now_s - self._looked_s, HOLD_S), now_s
+        if not driven:
+            self._pushes.reset()
+            return
+        _, dq, carried, tau = self._memory.motion()
+        joint = self._pushes.step(dt_s, dq, carried, tau)
+        if joint is not None and self._memory.forbidden is None:
+            self._memory.forbidden = joint
+            self._say(f"joint {joint + 1} is pushed although it stands still; the arm is stopped")
+
     def _begin(self, mode: GuardianMode, alive: bool) -> None:
         self._wire.waiting()  # old replies
-        self._q, self._dq, tau = self._memory.motion()
+        self._q, self._dq, tau, _ = self._memory.motion()
         self._mode, self._heard_s = mode, time.monotonic()
         self._braker = Braker(
             self._limits, tau, self._memory.held() if mode == GuardianMode.HOLD else None

@@ -27,6 +27,14 @@ STEP_S = 0.002
 SETTLE_AT_MOST_S, REST_S, RESTING = 5.0, 0.15, 0.05  # s, s, rad/s
 SETTLE_SHARE, ADOPTIONS = 0.03, 2  # of each step's torque in the mean; times it is carried anew
 STOP_AT_MOST_S, HELD_S = 1.5, 0.5
+# An arm that something keeps from where it is held is not pushed for good: beyond this share of
+# TMAX in the spring the held angle comes after it, slowly enough for a load that was put on.
+YIELD_SHARE, YIELD_SPEED = 0.15, 0.2  # , rad/s
+# A driven arm that stands still and is pushed nevertheless: shares of TMAX, s, rad/s. Further away
+# than the limits of the loop itself, for which this is the second look.
+PUSH_SHARE, PUSH_S = 0.75, 0.1
+FULL_SHARE, FULL_S = 0.8, 0.3
+STANDING = 0.05
 
 
 def gains(limits: Scales) -> tuple[float, float]:
@@ -46,6 +54,7 @@ class Braker:
     Attributes:
         hold: angles held, rad; None while braking.
         holding_s: for how long.
+        yields: the held angles come after an arm that is kept away from them.
     """
 
     def __init__(
@@ -56,6 +65,7 @@ class Braker:
         self._tau = [value if math.isfinite(value) else 0.0 for value in tau]
         self.hold = None if hold is None else list(hold)
         self.holding_s = math.inf if hold is not None else 0.0
+        self.yields = True
         self._braking_s = 0.0
 
     def commands(self, dt_s: float, q: Sequence[float], dq: Sequence[float]) -> list[bytes]:
@@ -67,6 +77,8 @@ class Braker:
         """
         if self.hold is not None:
             self.holding_s += dt_s
+            if self.yields:
+                self._yield(self.hold, q, YIELD_SPEED * dt_s)
         else:
             self._braking_s += dt_s
             slow = all(abs(speed) < SLOW for speed in dq if speed == speed)
@@ -74,6 +86,14 @@ class Braker:
                 self.hold, self.holding_s = list(q), 0.0
         share = min(self.holding_s / FADE_S, 1.0) if self.hold is not None else 0.0
         return [self._command(j, share, q[j]) for j in range(len(self._limits))]
+
+    def _yield(self, hold: list[float], q: Sequence[float], step: float) -> None:
+        """Let held angles come after joints that are kept away from them, by `step` rad at most."""
+        for j, limit in enumerate(self._limits):
+            most = YIELD_SHARE * limit.tau_max / self._gains[j][0]
+            away = hold[j] - q[j]
+            if abs(away) > most:
+                hold[j] -= math.copysign(min(abs(away) - most, step), away)
 
     def _command(self, j: int, share: float, q_now: float) -> bytes:
         kp, kd = self._gains[j]
@@ -98,6 +118,42 @@ class Braker:
         ]
 
 
+class PushWatch:
+    """Finds a driven arm that is pushed although it stands still.
+
+    Args:
+        limits: of each motor.
+    """
+
+    def __init__(self, limits: Sequence[Scales]) -> None:
+        self._most = [limit.tau_max for limit in limits]
+        self.reset()
+
+    def reset(self) -> None:
+        """The arm is driven anew."""
+        self._pushed_s = [0.0] * len(self._most)
+        self._full_s = [0.0] * len(self._most)
+
+    def step(
+        self, dt_s: float, dq: Sequence[float], carried: Sequence[float], tau: Sequence[float]
+    ) -> int | None:
+        """The joint (from 0) that is pushed for too long; None for none.
+
+        Args:
+            dt_s: since the last call.
+            dq: (n) rad/s; carried, tau: (n) N m that carry the arm, and that were measured.
+        """
+        for j, most in enumerate(self._most):
+            stands = abs(dq[j]) < STANDING
+            pushed = stands and abs(tau[j] - carried[j]) > PUSH_SHARE * most
+            full = stands and abs(tau[j]) > FULL_SHARE * most
+            self._pushed_s[j] = self._pushed_s[j] + dt_s if pushed else 0.0
+            self._full_s[j] = self._full_s[j] + dt_s if full else 0.0
+            if self._pushed_s[j] > PUSH_S or self._full_s[j] > FULL_S:
+                return j
+        return None
+
+
 def settle(
     stream: MotorStream,
     limits: Sequence[Scales],
@@ -119,7 +175,8 @@ def settle(
         (n) angles held, rad; (n) torques that carry the arm, N m.
     """
     hold = stream.motion()[0]
-    braker = Braker(limits, carried, hold)
+    braker = Braker(limits, carried, list(hold))
+    braker.yields = False  # what carries it is not known yet
     mean, now, wanted = list(carried), list(carried), list(carried)
     adopted, rest_s = 0, 0.0
     for _ in range(round(SETTLE_AT_MOST_S / STEP_S)):

@@ -109,6 +109,11 @@ class FaultyDriver:
             raise DriverError(self._dead)
         self.driver.command(tau)
 
+    @property
+    def carry(self) -> Any:
+        """The driver's, where it is told what carries the arm; None where it is not."""
+        return getattr(self.driver, "carry", None)
+
     def stop(self) -> None:
         """Stop the driver."""
         self.driver.stop()

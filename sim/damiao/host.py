@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import can
 
@@ -87,6 +87,11 @@ class WrappedDriver:
     def command(self, tau: Array) -> None:
         """Pass on (n,) N m. Raises DriverError."""
         self._driver.command(tau)
+
+    @property
+    def carry(self) -> Any:
+        """The driver's, where it is told what carries the arm; None where it is not."""
+        return getattr(self._driver, "carry", None)
 
 
 class InProcess(WrappedDriver):

@@ -111,7 +111,7 @@ def test_commands_end_at_the_effort_and_step_no_further_than_the_rate(sign: floa
         return np.full(7, sign * 1e4)
 
     class Model:
-        ready, attach, detach, refresh = True, None, None, staticmethod(lambda: None)
+        ready, notes, attach, detach, refresh = True, (), None, None, staticmethod(lambda: None)
         __call__ = staticmethod(pull)
 
     for instants, most in ((True, 0.9), (False, 1.0)):

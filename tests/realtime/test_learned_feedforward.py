@@ -7,7 +7,7 @@ import pytest
 
 from adapter.control.feedforward import ModelFeedforward
 from adapter.model.robots import documented
-from adapter.realtime.learned_feedforward import LearnedFeedforward
+from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.snapshot import SnapshotError, SnapshotWriter, nothing_known
 
 PANDA = documented("panda")
@@ -91,3 +91,70 @@ def test_an_estimate_that_is_no_number_leaves_the_last(board):
 def test_nobody_publishes():
     with pytest.raises(SnapshotError, match="no estimate is published"):
         LearnedFeedforward(PANDA.tree, PANDA.gravity).attach("nobody_at_all")
+
+
+def bounded() -> LearnedFeedforward:
+    bound = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA))
+    return LearnedFeedforward(PANDA.tree, PANDA.gravity, bound=bound)
+
+
+def follow(forward: LearnedFeedforward, calls: int) -> np.ndarray:
+    """What it says of one motion in so many ticks (calls, n), refreshed as the controller does."""
+    said = []
+    for k in range(calls):
+        if k % 50 == 0:
+            forward.refresh()
+        said.append(forward(Q.copy(), DQ, DDQ))
+    return np.array(said)
+
+
+def loaded(mass: float, std: float = 0.0):
+    theta = PANDA.theta.copy()
+    theta[-1, 0] += mass
+    return replace(estimate(theta, **DONE), theta_std=np.full((N, 10), std))
+
+
+def test_every_update_fades_in(board):
+    forward = bounded()
+    forward.attach(board.name)
+    board.publish(loaded(0.0))
+    before = follow(forward, 100)[-1]
+    board.publish(loaded(2.0))
+    said = follow(forward, 700)
+    steps = np.abs(np.diff(np.vstack([before, said]), axis=0))
+    whole = np.abs(said[-1] - before)
+    assert (steps.max(axis=0) <= whole / 400 + 1e-9).all() and whole.max() > 5.0
+    heavy = PANDA.theta.copy()
+    heavy[-1, 0] += 2.0
+    expected = ModelFeedforward.of(replace(PANDA, theta=heavy))(Q, DQ, DDQ)
+    np.testing.assert_allclose(said[-1], expected, atol=1e-9)
+    assert not forward.notes
+    forward.detach()
+
+
+@pytest.mark.parametrize("std", [0.0, 1e3], ids=["sure of itself", "without any idea"])
+def test_a_false_load_falls_back_to_the_documented_model_and_says_so(board, std):
+    forward = bounded()
+    forward.attach(board.name)
+    board.publish(loaded(0.0))
+    follow(forward, 100)
+    board.publish(loaded(20.0, std))
+    documented = ModelFeedforward.of(PANDA)(Q, DQ, DDQ)
+    most = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA)).at(Q, DQ, DDQ, np.full((N, 10), std))
+    said = follow(forward, 1200)
+    assert (np.abs(said - documented) <= most + 1e-9).all()
+    assert np.abs(np.diff(said, axis=0)).max() < 0.6  # below the torque rate
+    np.testing.assert_allclose(said[-1], documented, atol=1e-9)
+    assert len(forward.notes) == 1 and "fell back to the documented model" in forward.notes[0]
+    board.publish(loaded(1.0))  # believed again
+    assert np.abs(follow(forward, 1200)[-1] - documented).max() > 1.0
+    assert len(forward.notes) == 1
+    forward.detach()
+
+
+def test_the_bound_is_set_by_a_load_friction_and_the_standard_deviation():
+    bound = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA))
+    sure, unsure, lost = (bound.at(Q, DQ, DDQ, np.full((N, 10), x)) for x in (0.0, 0.1, 1e3))
+    assert (sure > 0.1 * PANDA.limits.effort).all()
+    assert (unsure >= sure).all() and unsure.max() > sure.max()
+    np.testing.assert_allclose(lost, 2.0 * sure)

@@ -1,0 +1,221 @@
+"""Random faults, blockages and false estimates in lockstep, on each driver: is every stop in order?
+
+    PYTHONPATH=. python tests/benchmarks/fault_trials.py --driver sim --trials 100
+
+Each trial is a short motion; counted is what must never be: a command beyond torque or torque rate,
+a reference beyond position, speed, acceleration or jerk, contact torque that is still above the
+bound 0.15 s after the stop, a stop by a blockage that names no joint. Ends with 1 if any was.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from adapter.control.controller import ControlSettings, ExcitationController
+from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
+from adapter.errors import SettingsError
+from adapter.model.robots import documented
+from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
+from adapter.realtime.session import run_lockstep
+from adapter.realtime.snapshot import SnapshotWriter, nothing_known
+from adapter.signals.front_end import FrontEnd
+from drivers.faults.driver import with_faults
+from drivers.interface import Driver, JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.obstacles import Obstacles
+from sim.scenarios import Scenario, build
+from tests.helpers.fci_lockstep import FciLockstep
+
+PANDA = documented("panda")
+N, LIMITS = PANDA.tree.n, MotionLimits.of(PANDA)
+SECONDS = 1.6
+FAULTS = ("lost=0.02", "late=0.02", "repeated=0.05", "reordered=0.02", "corrupt=0.01", "nan=0.02",
+          "spike=0.01", "stuck:{j}@{t}+0.1", "jump:{j}@{t}+0.05", "silence@{t}+0.05",
+          "clock@{t}+100")  # fmt: skip
+BOUND = 0.15  # of the effort limit: contact torque that may be left; also what a brake may hold
+NAMED = r"joint ?\d|usable joint reading|newer joint reading|reflex|without"
+KINDS = ("position", "speed", "acceleration", "jerk", "torque", "rate", "contact", "unnamed")
+
+
+def world_of(rng: np.random.Generator, seed: int) -> tuple[Scenario, str]:
+    """A scenario with at most one blockage, and what it is."""
+    t_s = float(rng.uniform(0.0, 1.0))
+    kind = str(rng.choice(["none", "held", "wall", "load"]))
+    trouble: dict = {"t_s": t_s}
+    if kind == "held":
+        count = int(rng.integers(1, N + 1))
+        trouble["held"] = sorted(int(j) + 1 for j in rng.choice(N, count, replace=False))
+    elif kind == "wall":
+        trouble["wall"] = float(rng.uniform(0.0, 0.05))
+    elif kind == "load":
+        trouble["load"] = float(rng.uniform(0.5, 8.0))
+    noise = str(rng.choice(["real", "none"]))
+    return build("nominal", seed, noise=noise, trouble=trouble if kind != "none" else {}), kind
+
+
+def opened(name: str, world: Scenario) -> tuple[Driver, Obstacles]:
+    """The driver, and what is in the way of its arm."""
+    if name == "sim":
+        plant = world.plant()
+        return PyBulletArm(plant), plant._engine.obstacles
+    if name == "fci":
+        robot = FciLockstep(world)
+        return robot, robot.served.arm._plant._engine.obstacles
+    from drivers.damiao import holding
+    from drivers.damiao.arm import DamiaoArm
+    from sim.damiao.host import Lockstep
+    from sim.damiao.line import Line
+    from sim.damiao.server import Boards
+
+    class Clock:  # whoever waits lets the line's time pass
+        @staticmethod
+        def sleep(seconds: float) -> None:
+            line.advance_to(line.now_ns() + int(1e9 * seconds))
+
+    line = Line()
+    boards = Boards(line.boards, world, now_ns=line.now_ns)
+    line.attach(boards)
+    vars(holding)["time"] = Clock
+    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+    address, names = "can://line?interface=virtual", world.truth.joint_names
+    arm = Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
+    return arm, boards.world._engine.obstacles
+
+
+class Account:
+    """What a trial did that it must not do."""
+
+    def __init__(self, controller: ExcitationController, obstacles: Obstacles) -> None:
+        self._controller, self._obstacles = controller, obstacles
+        self.broken: Counter[str] = Counter()
+        self.peak = 0.0
+        self._tau: np.ndarray | None = None
+        self._most = LIMITS.torque_rate * 1e-3 + 1e-9
+        self._last: tuple[float, np.ndarray] | None = None
+
+    def note(self, sample: JointSample, tau: np.ndarray | None) -> None:
+        self.peak = max(self.peak, float(np.abs(self._obstacles.torque).max()))
+        ref = self._controller.reference
+        if tau is None or ref is None:
+            return
+        self._count("torque", np.abs(tau) > LIMITS.effort)
+        if self._tau is not None:
+            self._count("rate", np.abs(tau - self._tau) > self._most)
+        self._tau = tau
+        self._count("position", (ref.q < LIMITS.lower) | (ref.q > LIMITS.upper))
+        self._count("speed", np.abs(ref.dq) > LIMITS.velocity)
+        self._count("acceleration", np.abs(ref.ddq) > LIMITS.acceleration)
+        if self._last is not None and ref.time_s > self._last[0]:
+            jerk = (ref.ddq - self._last[1]) / (ref.time_s - self._last[0])
+            self._count("jerk", np.abs(jerk) > LIMITS.jerk)
+        self._last = ref.time_s, ref.ddq.copy()
+
+    def _count(self, kind: str, wrong: np.ndarray) -> None:
+        self.broken[kind] += bool(wrong.any())
+
+
+def forward_of(
+    rng: np.random.Generator,
+) -> tuple[LearnedFeedforward | ModelFeedforward | None, SnapshotWriter | None]:
+    """No feed-forward, the documented one, or one that a false estimate is published to."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return None, None
+    if kind == 1:
+        return ModelFeedforward.of(PANDA), None
+    board = SnapshotWriter.create(PANDA.tree.joint_names, name=None)
+    theta = PANDA.theta.copy()
+    theta[int(rng.integers(N))] += rng.normal(0.0, 1.0, 10) * [10.0, 3, 3, 3, 1, 1, 1, 1, 1, 1]
+    known = replace(nothing_known(N, N, 0), lam=PANDA.lam, lam_converged=True, theta_converged=True)
+    std = np.full((N, 10), float(rng.choice([0.0, 0.01, 10.0])))
+    board.publish(replace(known, theta=theta, theta_std=std))
+    bound = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA))
+    forward = LearnedFeedforward(PANDA.tree, PANDA.gravity, bound=bound)
+    forward.attach(board.name)
+    return forward, board
+
+
+def trial(name: str, seed: int) -> tuple[Counter[str], str]:
+    """What one trial broke, and how it ended."""
+    rng = np.random.default_rng([seed, 14])
+    world, trouble = world_of(rng, seed)
+    driver, obstacles = opened(name, world)
+    fault = str(rng.choice(("", *FAULTS))) if trouble == "none" else ""
+    fault = fault.format(j=int(rng.integers(1, N + 1)), t=round(float(rng.uniform(0.2, 1.2)), 3))
+    forward, board = forward_of(rng)
+    motion = ExcitationSettings(
+        seed=seed, share=float(rng.uniform(0.2, 0.9)), start_s=0.4, stop_s=0.3
+    )
+    expected = ModelFeedforward.of(PANDA)
+    controller = ExcitationController(LIMITS, motion, ControlSettings(), forward, expected=expected)
+    account = Account(controller, obstacles)
+    arm = with_faults(driver, fault, seed) if fault else driver
+    said = ""
+    try:
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, SECONDS, each=account.note)
+        said = result.fault or ""
+        for _ in range(0 if name == "can" else 150):  # there braking takes longer by itself
+            driver.read()
+        left = np.abs(obstacles.torque)
+        if said and trouble in ("held", "wall"):
+            account._count("contact", left > np.maximum(BOUND * LIMITS.effort, 1.0))
+    except SettingsError as error:  # before any motion
+        said = f"not started: {error}"
+    finally:
+        driver.close()
+        controller.detach()
+        if board is not None:
+            board.close()
+            board.unlink()
+    if said and not re.search(
+        r"joint ?\d|usable joint reading|newer joint reading|reflex|without", said
+    ):
+        account.broken["unnamed"] += 1
+    cause = re.sub(r"-?\d+(\.\d+)?", "#", said)[:70] if said else "to its end"
+    return (
+        account.broken,
+        f"{trouble or fault}{' ' + fault.split('=')[0].split(':')[0] if fault else ''}: {cause}",
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--driver", choices=["sim", "can", "fci"], default="sim")
+    parser.add_argument("--trials", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first trial")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    broken: Counter[str] = Counter()
+    ends: Counter[str] = Counter()
+    begun, bad = time.perf_counter(), []
+    for seed in range(args.first, args.first + args.trials):
+        found, end = trial(args.driver, seed)
+        ends[end] += 1
+        wrong = {kind: count for kind, count in found.items() if count}
+        broken.update(wrong.keys())
+        if wrong:
+            bad.append((seed, wrong, end))
+            print(f"seed {seed}: {wrong} {end}", flush=True)
+    each_s = (time.perf_counter() - begun) / max(args.trials, 1)
+    print(f"{args.driver}: {args.trials} trials, {each_s:.2f} s each; trials that broke a limit:")
+    print("  " + ", ".join(f"{kind} {broken[kind]}" for kind in KINDS))
+    for end, count in ends.most_common():
+        print(f"  {count:5d}  {end}")
+    if args.json:
+        numbers = {"trials": args.trials, "broken": {k: broken[k] for k in KINDS}, "ends": ends}
+        args.json.write_text(json.dumps({args.driver: numbers}, indent=1) + "\n", "utf-8")
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

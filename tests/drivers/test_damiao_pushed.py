@@ -1,0 +1,109 @@
+"""A CAN arm that something holds: stopped, braked without a push, held without one."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+
+import numpy as np
+import pytest
+
+from adapter.control.controller import ExcitationController
+from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
+from adapter.model.robots import documented
+from adapter.realtime.session import run_lockstep
+from adapter.signals.front_end import FrontEnd
+from drivers.damiao import holding
+from drivers.damiao.arm import DamiaoArm
+from drivers.damiao.codec import Scales
+from drivers.damiao.guardian import BLOCK_BYTES, GuardianMemory
+from drivers.damiao.holding import Braker, PushWatch
+from sim.damiao.host import Lockstep
+from sim.damiao.line import Line
+from sim.damiao.server import Boards
+from sim.scenarios import build
+
+PANDA = documented("panda")
+LIMITS = [Scales(12.5, 25.0, 100.0)] * 2
+
+
+def test_a_held_can_arm_is_stopped_and_the_push_goes(monkeypatch) -> None:
+    scenario = build("nominal", trouble={"held": [2], "t_s": 2.5})
+    line = Line()
+    boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+    line.attach(boards)
+    monkeypatch.setattr(
+        holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
+    )
+    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+    names = scenario.truth.joint_names
+    arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
+    driver = Lockstep(arm, line)
+    controller = ExcitationController(
+        MotionLimits.of(PANDA), ExcitationSettings(seed=1), expected=ModelFeedforward.of(PANDA)
+    )
+    obstacles, pushes = boards.world._engine.obstacles, []
+    result = run_lockstep(
+        driver,
+        FrontEnd(PANDA),
+        None,
+        controller,
+        4.0,
+        each=lambda sample, tau: pushes.append(np.abs(obstacles.torque).max()),
+    )
+    assert result.fault is not None and result.fault.startswith("joint 2 (panda_joint2) is ")
+    assert max(pushes) > 20.0
+    left = np.abs(obstacles.torque).max()
+    assert left < 0.3 * max(pushes), (left, max(pushes))
+    assert np.abs(boards.world.state()[2]).max() < 0.2
+    driver.close()
+    boards.close()
+
+
+def test_held_angles_come_after_an_arm_that_is_kept_away_but_slowly() -> None:
+    braker = Braker(LIMITS, [0.0, 0.0], [0.5, 0.0])
+    kp = holding.gains(LIMITS[0])[0]
+    away = [0.2, 0.0]  # a wall keeps joint 1 there
+    before = braker.hold[0]
+    for _ in range(400):
+        braker.commands(0.005, away, [0.0, 0.0])
+        assert 0.0 <= before - braker.hold[0] <= 0.2 * 0.005 + 1e-12
+        before = braker.hold[0]
+    assert kp * (braker.hold[0] - 0.2) == pytest.approx(0.15 * 100.0)
+    assert braker.hold[1] == 0.0
+    nothing_known = Braker(LIMITS, [0.0, 0.0], [0.5, 0.0])
+    nothing_known.commands(0.005, [math.nan, 0.0], [0.0, 0.0])
+    assert nothing_known.hold == [0.5, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("dq", "carried", "tau", "joint"),
+    [
+        (0.0, 30.0, -50.0, 0),  # pushed against what carries it
+        (0.0, 60.0, 85.0, 0),  # all that the motor can for too long
+        (0.5, 30.0, -50.0, None),  # it moves: that is an acceleration
+        (0.0, 60.0, 70.0, None),
+    ],
+)
+def test_the_guardian_finds_an_arm_that_is_pushed_although_it_stands(
+    dq, carried, tau, joint
+) -> None:
+    watch = PushWatch(LIMITS)
+    said = [watch.step(0.002, [dq, 0.0], [carried, 0.0], [tau, 0.0]) for _ in range(200)]
+    assert next((j for j in said if j is not None), None) == joint
+    assert said[0] is None
+
+
+def test_a_forbidden_joint_is_read_by_the_loop() -> None:
+    with tempfile.TemporaryFile() as block:
+        block.truncate(BLOCK_BYTES)
+        guardian, loop = GuardianMemory(block, 2), GuardianMemory(block, 2)
+        assert loop.forbidden is None
+        loop.put([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
+        assert guardian.motion() == ([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
+        guardian.forbidden = 1
+        assert loop.forbidden == 1
+        guardian.close()
+        loop.close()
