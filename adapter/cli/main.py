@@ -42,6 +42,12 @@ class Command(NamedTuple):
 
 COMMANDS = {  # in the order of --help
     "run": Command(run_options.declare, "learn live", "adapter.cli.run:run", tuple(ExitCode)),
+    "plan": Command(
+        run_options.declare_plan,
+        "where run would move the arm",
+        "adapter.cli.plan:run",
+        (ExitCode.NOT_READY,),
+    ),
     "replay": Command(
         replay_options.declare,
         "learn from a recording",

@@ -6,22 +6,23 @@ import argparse
 import dataclasses
 import shlex
 import sys
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
+from adapter.cli.agreement import agree, need_somebody
 from adapter.cli.common import configure, recording_metadata, robot_of
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.control.controller import ControlSettings, ExcitationController
-from adapter.control.excitation import RandomMotion, plan_lines
+from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
-from adapter.control.resting import check_resting_torque
 from adapter.control.settings import gentle
 from adapter.effects.active import lasting_effects, with_bodies
 from adapter.model.model_file import dumps
@@ -139,6 +140,8 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     plan = run_plan(args)
     config, robot, maybe_real = plan.config, plan.robot, plan.maybe_real
+    if maybe_real and _may_move(args):
+        need_somebody(args.yes)
     folder = results_folder(args.out, "run")
     truth = args.truth or _write_truth(plan.world, folder)
     reference = reference_from(truth, robot)
@@ -224,19 +227,12 @@ def _go(
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     display = None if args.quiet else DisplayJob(partial(make_display, duration_s))
 
-    def show_plan() -> None:
+    def before_motion(stopped: Callable[[], bool]) -> None:
         warn(driver.intake.notes)  # who holds the arm, say; again with what came later at the end
         if controller is None:
             warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
-        elif maybe_real and controller.reference is not None and controller.start is not None:
-            if not args.trust_model:
-                check_resting_torque(robot, controller.start.q, controller.start.tau)
-            names = robot.tree.joint_names
-            lines = plan_lines(controller.reference, controller.limits, names, duration_s)
-            least = getattr(controller.draw, "least", None)
-            if least is not None:
-                lines.insert(-1, f"Nearest on the way: {least} (margin {config.cell.margin:g} m).")
-            say("\n".join(lines))
+        elif maybe_real:
+            agree(args, driver, controller, duration_s, folder, stopped)
 
     learner = learner_job(
         robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
@@ -247,7 +243,7 @@ def _go(
         front_end,
         controller,
         Jobs(learner, recording, display),
-        LiveOptions(duration_s, deadman=deadman, before_motion=show_plan),
+        LiveOptions(duration_s, deadman=deadman, before_motion=before_motion),
         say=say,
     )
 

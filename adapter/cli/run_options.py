@@ -34,6 +34,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="leave to move an arm that may be real (fci, can): prints the plan, goes at a tenth "
         "of the speed for 10 s, stops when this terminal closes. Without it, only listen",
     )
+    add("--yes", action="store_true", help="move without being asked after the plan")
     add(
         "--trust-model",
         action="store_true",
@@ -70,6 +71,16 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
     add_learning(parser)
     parser.set_defaults(check=_check)
+
+
+def declare_plan(parser: argparse.ArgumentParser) -> None:
+    """Those of `adapter plan`: the same command line shows what it would do."""
+    declare(parser)
+    parser.description = (
+        "Where `adapter run` with these options would move the arm from where it stands, as lines "
+        "and as a page; nothing moves."
+    )
+    parser.set_defaults(allow_motion=True)
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -43,7 +43,8 @@ class LiveOptions:
         deadman: stop safely as well when the operator's terminal or the parent process is gone.
         shared_memory: sizes and names.
         before_motion: called once the motion is drawn (the controller knows it) and before the
-            first command; what it raises ends the run with the arm at rest.
+            first command, with what says whether somebody asked to stop; what it raises ends the
+            run with the arm at rest.
     """
 
     duration_s: float | None = None
@@ -51,7 +52,7 @@ class LiveOptions:
     lock_memory: bool = True
     deadman: bool = False
     shared_memory: SharedMemoryOptions = field(default_factory=SharedMemoryOptions)
-    before_motion: Callable[[], None] | None = None
+    before_motion: Callable[[Callable[[], bool]], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ def run_live(
             loop = _Loop(driver, session, supervisor, stop, deadman)
             _prepare(driver, front_end, controller, supervisor, session)
             if options.before_motion is not None:
-                options.before_motion()
+                options.before_motion(lambda: stop.count > 0)
             with real_time:
                 for grant in real_time.grants:
                     tell(grant.line)

@@ -112,7 +112,7 @@ def one_run(address: str, minutes: float, folder: Path) -> tuple[int, dict[str, 
     """One run until its end; the exit code and what it came to."""
     path = folder / "figures.json"
     command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
-    command += ["--robot", "panda"]
+    command += ["--robot", "panda", "--yes"]
     command += ["--duration", str(60 * minutes), "--seed", "5", "--quiet"]
     command += ["--out", str(folder), "--no-report", "--json", str(path)]
     code, memory, ended_s = watch(command)

@@ -40,7 +40,16 @@ def _killed_in_motion(folder: Path) -> str:
     with rigs.process("-m", "sim.fci", "--port", "0") as line:
         address = f"fci://{line.split()[2]}"
         command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
-        command += ["--duration", "60", "--quiet", "--out", str(folder), "--json", str(figures)]
+        command += [
+            "--yes",
+            "--duration",
+            "60",
+            "--quiet",
+            "--out",
+            str(folder),
+            "--json",
+            str(figures),
+        ]
         recording = folder / "recording.mcap"
         loop = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:

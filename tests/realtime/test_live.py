@@ -49,7 +49,7 @@ def no_leftovers(monkeypatch):
     assert tools.wait_for(lambda: not tools.left_behind(blocks))
 
 
-def _wait_for_display(diary: Path) -> None:
+def _wait_for_display(diary: Path, stopped=None) -> None:
     """Nobody else does, and it yields to whatever runs."""
     assert tools.wait_for(lambda: diary.exists() and diary.stat().st_size > 0, 120.0)
 

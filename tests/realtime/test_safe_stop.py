@@ -302,7 +302,7 @@ def test_what_is_raised_before_the_motion_leaves_the_arm_alone():
     arm, (front_end, controller) = tools.Swinging(), tools.parts()
     seen = []
 
-    def refuse() -> None:
+    def refuse(stopped) -> None:
         seen.append(controller.reference.q.copy())
         raise DriverError("the operator said no")
 

@@ -1,0 +1,58 @@
+"""`adapter plan`: the plan of a run as lines and as a page; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from adapter.cli.agreement import PLAN_PAGE
+from adapter.cli.exit_codes import ExitCode
+from adapter.cli.run import run_plan
+from adapter.control.excitation import plan_lines
+from adapter.control.limits import MotionLimits, need_same_robot
+from adapter.control.resting import check_resting_torque
+from adapter.report.plan_page import write_plan
+from adapter.runs.terminal import results_folder, say, show
+from drivers.interface import Driver, JointSample
+from drivers.registry import open_driver, split_address
+
+READS = 200  # among which every joint has to be measured
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    plan = run_plan(args)
+    robot, limits = plan.robot, MotionLimits.of(plan.robot)
+    draw = plan.free_motion(args.duration)
+    scheme, _ = split_address(args.driver)
+    builders = {} if plan.world is None else {scheme: plan.world.driver}
+    driver = open_driver(args.driver, builders, robot.tree.joint_names, False)
+    driver.connect()
+    try:
+        sample = _measured(driver)
+        need_same_robot(driver, limits)
+    finally:
+        driver.close()
+    motion = draw(limits, sample.q, plan.config.excitation)
+    assert draw.least is not None
+    duration_s = args.duration + plan.config.excitation.slow_s
+    lines = plan_lines(motion, limits, robot.tree.joint_names, duration_s)
+    lines.insert(-1, f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).")
+    page = results_folder(args.out, "plan") / PLAN_PAGE
+    write_plan(page, draw.arm, motion, limits, draw.least, lines)
+    for line in lines:
+        show(line)
+    say(f"As a page: {page}")
+    if not args.trust_model:
+        check_resting_torque(robot, sample.q, sample.tau)
+    return ExitCode.DONE
+
+
+def _measured(driver: Driver) -> JointSample:
+    """The first sample with the position of every joint, else the last one read."""
+    for _ in range(READS):
+        sample = driver.read()
+        if np.isfinite(sample.q).all() and np.isfinite(sample.tau).all():
+            break
+    return sample

@@ -1,0 +1,139 @@
+"""The page of a plan: where a motion goes, before it is one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adapter.control.cell import Cell
+from adapter.control.excitation import RandomMotion, sums_of_sines
+from adapter.control.free_path import ArmInCell, Clearance
+from adapter.control.limits import MotionLimits
+from adapter.model.spatial import Array, matrix_from_rpy
+from adapter.report.html import fill, write_whole
+from adapter.report.skeleton import from_a_corner
+from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+TEMPLATE = "plan.html"
+POSES = 80  # drawn along the path
+RIM = 24  # corners of a circle
+VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
+    ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; red: nearest"),
+    ("Seen from the side", lambda points: points[..., [0, 2]], "x to the right, z up"),
+    ("Seen from above", lambda points: points[..., [0, 1]], "x to the right, y up"),
+)
+
+
+def write_plan(
+    path: str | Path,
+    arm: ArmInCell,
+    motion: RandomMotion,
+    limits: MotionLimits,
+    nearest: Clearance,
+    lines: Sequence[str],
+) -> Path:
+    """Write the page of a motion in its cell. Raises RunFolderError."""
+    poses = [_pose(motion, s) for s in np.linspace(0.0, max(nearest.path_s, 30.0), POSES)]
+    context: dict[str, Any] = {
+        "robot": arm.model.name,
+        "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {arm.cell.margin:g} m",
+        "ignored": [" and ".join(pair) for pair in arm.ignored],
+        "views": [
+            _view(arm, poses, _pose(motion, nearest.path_s), motion.q, view) for view in VIEWS
+        ],
+        "joints": _joint_panels(motion, limits, arm.model.tree.joint_names),
+        "lines": lines,
+    }
+    return write_whole(path, fill(TEMPLATE, context))
+
+
+def _pose(motion: RandomMotion, s: float) -> Array:
+    out = np.zeros((3, len(motion.q)))
+    sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, out)
+    return out[0].copy()
+
+
+def _view(
+    arm: ArmInCell,
+    poses: Sequence[Array],
+    nearest: Array,
+    start: Array,
+    view: tuple[str, Callable[[Array], Array], str],
+) -> Panel:
+    title, project, note = view
+    drawing = Drawing("third", bare=True, stretch=1.3)
+    ax = drawing.axes[0]
+    for outline in _outlines(arm.cell):
+        ax.plot(*project(outline).T, color=GOAL, linewidth=0.8)
+    for q, color, width, alpha in (
+        *((q, MUTED, 2.5, 0.08) for q in poses),
+        (start, ACCENT, 2.2, 1.0),
+        (nearest, GOAL, 1.4, 1.0),
+    ):
+        for ends, _ in arm.placed(q):
+            ax.plot(
+                *project(ends).T, color=color, linewidth=width, alpha=alpha, solid_capstyle="round"
+            )
+    _scale(ax, arm.cell.table, project)
+    return drawing.panel(title, "", note)
+
+
+def _scale(ax: Axes, table: bool, project: Callable[[Array], Array]) -> None:
+    if table:
+        square = 0.6 * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+        ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
+    left, foot = ax.get_xlim()[0], ax.get_ylim()[0]
+    ax.plot([left, left + 0.2], [foot, foot], color=INK, linewidth=1.2)
+    ax.text(left + 0.23, foot, "0.2 m", color=MUTED, va="center", fontsize=7.6)
+
+
+def _outlines(cell: Cell) -> list[Array]:
+    """Lines (k, 3) that show the boxes and cylinders of a cell, and a piece of each plane."""
+    loop = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]], dtype=float)
+    found = []
+    for box in cell.box:
+        R, half = matrix_from_rpy(box.rpy), 0.5 * np.array(box.size)
+        corners = np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
+        found.append(np.array(box.xyz) + (corners * half) @ R.T)
+    angle = np.linspace(0.0, 2.0 * np.pi, RIM)
+    for each in cell.cylinder:
+        ring = each.radius * np.c_[np.cos(angle), np.sin(angle)]
+        ends = [np.c_[ring, np.full(RIM, z)] for z in (-0.5 * each.length, 0.5 * each.length)]
+        found.append(np.array(each.xyz) + np.vstack(ends) @ matrix_from_rpy(each.rpy).T)
+    for plane in cell.plane:
+        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+        across = np.linalg.svd(normal[None])[2][1:]
+        found.append(plane.offset * normal + 0.8 * loop @ across)
+    return found
+
+
+def _joint_panels(motion: RandomMotion, limits: MotionLimits, names: Sequence[str]) -> list[Panel]:
+    """Ranges against limits, and speeds as shares of theirs."""
+    lower, upper, speed, acceleration, jerk = motion.bounds()
+    ranges, shares = Drawing("half"), Drawing("half")
+    fastest = limits.speed_between(lower, upper)
+    at = np.arange(len(names))
+    for j in range(len(names)):
+        ends = [limits.lower[j], limits.upper[j]]
+        ranges.axes[0].plot(ends, [j, j], color=GRID, linewidth=7.0, solid_capstyle="butt")
+        moved = [lower[j], upper[j]]
+        ranges.axes[0].plot(
+            moved, [j, j], color=joint_color(j), linewidth=4.0, solid_capstyle="butt"
+        )
+    parts = speed / fastest, acceleration / limits.acceleration, jerk / limits.jerk
+    for k, (part, color) in enumerate(zip(parts, (ACCENT, MUTED, INK), strict=True)):
+        shares.axes[0].barh(at + 0.25 * (k - 1), 100.0 * part, 0.22, color=color)
+    for drawing in (ranges, shares):
+        drawing.axes[0].set_yticks(at, list(names), parse_math=False)
+        drawing.axes[0].invert_yaxis()
+        drawing.figure.subplots_adjust(left=0.24)
+    return [
+        ranges.panel("Ranges", "rad", "grey: the limits"),
+        shares.panel("Shares of the limits", "%", "blue speed, grey acceleration, black jerk"),
+    ]
