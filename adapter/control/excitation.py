@@ -288,7 +288,8 @@ def plan_lines(
     lower, upper, speed, acceleration, jerk = motion.bounds()
     fastest = limits.speed_between(lower, upper)
     width = max(len(name) for name in joint_names)
-    lines = [f"This moves {len(joint_names)} joints, {_until(duration_s, settings.stop_s)}."]
+    moving = int(np.count_nonzero(speed))
+    lines = [f"This moves {moving} joints, {_until(duration_s, settings.stop_s)}."]
     if settings.slow_s:
         lines.append(
             f"The first {settings.slow_s:g} s go at {settings.slow_share:.0%} of the speed, "
