@@ -6,11 +6,15 @@ import contextlib
 import time
 from collections.abc import Sequence
 
+import numpy as np
+
 from drivers.fci import tables
 from drivers.fci.codec import JOINTS, State, Status
 from drivers.fci.connect import Connection, open_connection, parse, recover
 from drivers.fci.limits import checked
 from drivers.fci.reader_client import QUICK_SWITCHING
+from drivers.fci.safeguards import Load, RobotSettings
+from drivers.fci.safeguards import parse as parse_safeguards
 from drivers.fci.stream import STALE_NS, TICK_NS, Refusal, StateIntake, StateStream
 from drivers.fci.tables import told
 from drivers.fci.torque_control import TorqueControl
@@ -46,8 +50,12 @@ class FciArm:
     `command` say why until `stop` is called. If this process dies, the robot stops by itself
     after 20 missing commands.
 
+    With `allow_motion`, `connect` sets collision thresholds and the load at the hand
+    (`drivers.fci.safeguards`), and `close` puts back the load that was there and Franka's default
+    thresholds; the robot does not tell those it had.
+
     Args:
-        address: `fci://HOST[:PORT][?protocol=5|10|auto&recover=1]`.
+        address: `fci://HOST[:PORT][?protocol=5|10|auto&recover=1&collision=1&load=KG,X,Y,Z]`.
         joint_names: 7 names; by default panda_joint1 to 7, or fr3_joint1 to 7 where the address
             or, at `connect`, the robot says protocol 10.
         allow_motion: whether commands may be sent.
@@ -72,6 +80,7 @@ class FciArm:
         allow_motion: bool = False,
     ) -> None:
         self._target = parse(address)
+        self._safeguards = parse_safeguards(address, self._target.options)
         self._named = joint_names is not None
         names = _NAMES[self._target.version or tables.PANDA] if joint_names is None else joint_names
         self.joint_names: tuple[str, ...] = tuple(names)
@@ -88,6 +97,7 @@ class FciArm:
         self._connection: Connection | None = None
         self._stream: StateStream | None = None
         self._control: TorqueControl | None = None
+        self._settings: RobotSettings | None = None
         self._first: State | None = None  # read by connect, not handed out yet
         self._state: State | None = None
 
@@ -121,7 +131,9 @@ class FciArm:
             stream = self._stream = StateStream(connection, self._account)
             self._control = TorqueControl(connection.version, connection.channel, stream.send)
             self._first = self._make_ready(stream)
-            self.intake.commands = self._control.count if self.can_move else None
+            if self.can_move:
+                self._set_up(stream, connection)
+                self.intake.commands = self._control.count
         except BaseException:
             self.close()
             raise
@@ -174,10 +186,12 @@ class FciArm:
         try:
             if motion is not None and motion.active:
                 self.stop()
+            if self._settings is not None:
+                self._settings.restore()
         except DriverError as error:
             self._account.note("close", str(error))
         finally:
-            self._connection = self._stream = self._control = self._first = None
+            self._connection = self._stream = self._control = self._first = self._settings = None
             connection.close()
             QUICK_SWITCHING.end()
 
@@ -198,6 +212,14 @@ class FciArm:
         if self.can_move and mode != tables.ROBOT_IDLE:
             raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
         return state
+
+    def _set_up(self, stream: StateStream, connection: Connection) -> None:
+        """Thresholds and load of this run; says them. Raises DriverError."""
+        mass, *inertia_and_com = stream.load().tolist()
+        former = Load(mass, np.array(inertia_and_com[9:]), np.array(inertia_and_com[:9]))
+        version, channel = connection.version, connection.channel
+        self._settings = RobotSettings(version, channel, self._safeguards)
+        self._account.note("settings", self._settings.apply(former))
 
     def _recovered(self, stream: StateStream, first: State) -> State:
         """The first state that shows no reflex any more. Raises DriverError."""

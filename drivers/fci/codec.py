@@ -170,7 +170,7 @@ class StateDecoder:
         self.version, self.size = version, dtype.itemsize
         single = version == tables.FR3
         self._wire = np.dtype("<f4" if single else "<f8")
-        self._numbers = _offset(dtype, "tau_J")
+        self._numbers, self._load = _offset(dtype, "tau_J"), _offset(dtype, "m_load")
         self._count = (_offset(dtype, "dq_d") - self._numbers) // self._wire.itemsize
         self._status_from = _offset(dtype, "motion_generator_mode")
         self._status_to = _offset(dtype, "control_command_success_rate")
@@ -212,6 +212,10 @@ class StateDecoder:
         """(7,) the torque command that the robot accepted last, N m, of the state at `start`."""
         at = start + self._numbers + JOINTS * self._wire.itemsize
         return np.frombuffer(data, self._wire, JOINTS, at).astype(np.float64)
+
+    def load(self, data: memoryview, start: int) -> Array:
+        """(13,) of the state at `start`: mass (kg), inertia (9,) and centre (3,) of the load."""
+        return np.frombuffer(data, self._wire, 13, start + self._load).astype(np.float64)
 
 
 def _status(data: bytes, version: int) -> Status:

@@ -6,6 +6,7 @@ import select
 import socket
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ REPLY_LIMIT_S = 5.0
 RECOVERY_LIMIT_S = 10.0
 FIRST_STATE_S = 1.0  # for the length of the first state, which tells the version as well
 AUTO = "auto"
-OPTIONS = ("protocol", "recover")
+OPTIONS = ("protocol", "recover", "collision", "load")
 VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
 
 
@@ -127,16 +128,18 @@ class Target(NamedTuple):
         host, port: of the robot.
         version: 5, 10 or None to find out.
         recover: whether to end a reflex at connect.
+        options: the others, as texts.
     """
 
     host: str
     port: int
     version: int | None
     recover: bool
+    options: Mapping[str, str]
 
 
 def parse(address: str) -> Target:
-    """What `fci://HOST[:PORT][?protocol=5|10|auto&recover=0|1]` asks for. Raises DriverError."""
+    """What `fci://HOST[:PORT][?protocol=5|10|auto&recover=0|1&...]` asks for. Raises DriverError."""
     parts = Address.of(address, OPTIONS)
     protocol = parts.options.get("protocol", AUTO)
     if protocol not in VERSIONS:
@@ -144,7 +147,8 @@ def parse(address: str) -> Target:
     recovering = parts.options.get("recover", "0")
     if recovering not in ("0", "1"):
         raise DriverError(f"'{address}': recover={recovering}; write recover=1 or recover=0")
-    return Target(parts.host, parts.port or tables.PORT, VERSIONS[protocol], recovering == "1")
+    port = parts.port or tables.PORT
+    return Target(parts.host, port, VERSIONS[protocol], recovering == "1", parts.options)
 
 
 @dataclass

@@ -158,6 +158,7 @@ class StateStream:
         self._last_refused = ""
         self.arrived_ns = 0
         self.unsent = 0
+        self._start = 0
 
     @property
     def behind(self) -> bool:
@@ -186,6 +187,7 @@ class StateStream:
                     self._last_refused, reason = f" ({error})", Refusal.MALFORMED
             if reason is None:
                 self._port, self.arrived_ns = record.port, record.arrived_ns
+                self._start = record.start
                 return state
             account.refuse(reason, record)
             if account.useless(record):
@@ -193,6 +195,10 @@ class StateStream:
                     f"for 1 s the robot has sent nothing of use, the last was {reason}"
                     f"{self._last_refused}: check ?protocol and the network, connect again"
                 )
+
+    def load(self) -> Array:
+        """(13,) load in the state that `next` gave last: mass, inertia (9,), centre (3,)."""
+        return self._connection.decoder.load(self._connection.reader.data, self._start)
 
     def answered(self, state: State) -> tuple[int, Array]:
         """What a command computed from this state answers: an id, and the torque accepted there.

@@ -14,6 +14,10 @@ CONNECT = {PANDA: 0, FR3: 0}
 MOVE = {PANDA: 1, FR3: 1}
 STOP_MOVE = {PANDA: 2, FR3: 2}
 RECOVER = {PANDA: 12, FR3: 10}  # AutomaticErrorRecovery
+SETTINGS = {
+    "SetCollisionBehavior": {PANDA: 4, FR3: 3},
+    "SetLoad": {PANDA: 10, FR3: 9},
+}
 
 # Modes in a state.
 CONTROLLER_TORQUE, CONTROLLER_NONE = 2, 3
@@ -78,6 +82,7 @@ RECOVER_STATUS = {
         "aborted",
     ),
 }
+SET_STATUS = ("success", "not_possible", "invalid_argument", "rejected_by_safety")  # FR3: the last
 
 MEANING = {
     "success": "it says that all is done",

@@ -138,7 +138,7 @@ def test_names_and_addresses_are_checked():
     for address, why in (
         ("fci://robot?protocol=7", "have: auto, 5, 10"),
         ("fci://robot?recover=yes", "write recover=1"),
-        ("fci://robot?speed=1", "have: protocol, recover"),
+        ("fci://robot?speed=1", "have: protocol, recover, collision, load"),
         ("fci://", "names nobody"),
     ):
         with pytest.raises(DriverError, match=why):
@@ -754,6 +754,62 @@ def test_closing_stops_the_arm(peer5, connected):
     assert peer5.modes == (0, 3, 1)
 
 
+# Thresholds and load
+
+
+def settings_of(peer):
+    """(name, numbers) of the settings that arrived, in order."""
+    names = {fci_peer.SET_COLLISION[peer.protocol]: "collision"}
+    names[fci_peer.SET_LOAD[peer.protocol]] = "load"
+    return [
+        (names[command], struct.unpack(f"<{len(payload) // 8}d", payload))
+        for command, payload in peer.requests
+        if command in names
+    ]
+
+
+def test_thresholds_and_load_are_set_before_motion_and_put_back(peer, connected):
+    peer.load = (1.5, *np.eye(3).ravel(), 0.25, 0.0, 0.125)
+    connected(peer).close()
+    assert settings_of(peer) == []  # who only listens changes nothing
+    arm = connected(peer, "?collision=2&load=0.5,0,0,0.1", allow_motion=True)
+    (_, thresholds), (_, load) = settings_of(peer)
+    torques, forces = np.reshape(thresholds[:28], (4, 7)), np.reshape(thresholds[28:], (4, 6))
+    assert np.array_equal(torques, [[40, 40, 36, 36, 32, 28, 24]] * 4)
+    assert np.array_equal(forces, [[40, 40, 40, 50, 50, 50]] * 4)
+    assert load[:4] == (0.5, 0.0, 0.0, 0.1)
+    assert len(load) == 13
+    said = " ".join(arm.intake.notes)
+    for part in ("40 40 36 36 32 28 24 N m", "load at its hand is 0.5 kg", "1.5 kg before"):
+        assert part in said
+    moving(arm, peer)
+    arm.close()
+    (_, load), (_, thresholds) = settings_of(peer)[2:]
+    assert load == (1.5, 0.25, 0.0, 0.125, *np.eye(3).ravel())
+    torques, forces = np.reshape(thresholds[:28], (4, 7)), np.reshape(thresholds[28:], (4, 6))
+    assert np.array_equal(torques[:, 0], [20, 20, 10, 10])
+    assert np.array_equal(forces[:, 5], [20, 20, 10, 10])
+
+
+def test_settings_can_be_left_alone_and_refused(peer5, connected):
+    arm = connected(peer5, "?collision=keep&load=keep", allow_motion=True)
+    arm.close()
+    assert settings_of(peer5) == []
+    assert "as the last client left them" in " ".join(arm.intake.notes)
+    peer5.set_status = 1
+    with pytest.raises(NotReady, match=r"does not take SetCollisionBehavior.*collision=keep"):
+        connected(peer5, allow_motion=True)
+    for option, why in (
+        ("collision=0", "factor from 0.1 to 5, or keep"),
+        ("collision=nan", "factor from 0.1 to 5"),
+        ("load=-1", "KG,X,Y,Z"),
+        ("load=1,2", "KG,X,Y,Z"),
+        ("load=nan,0,0,0", "KG,X,Y,Z"),
+    ):
+        with pytest.raises(DriverError, match=why):
+            FciArm(f"fci://robot?{option}")
+
+
 # Recovery
 
 
@@ -762,7 +818,8 @@ def test_motion_from_a_reflex_needs_a_recovery(peer, connected):
     with pytest.raises(NotReady, match=r"is in reflex: .*\?recover=1"):
         connected(peer, allow_motion=True)
     arm = connected(peer, f"?recover=1&protocol={peer.protocol}", allow_motion=True)
-    assert peer.requests[-1][0] == fci_peer.RECOVER[peer.protocol]
+    asked = [command for command, _ in peer.requests]
+    assert fci_peer.RECOVER[peer.protocol] in asked
     moving(arm, peer)
     assert exact(arm.intake)
 

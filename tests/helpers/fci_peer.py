@@ -23,6 +23,8 @@ PLACES = {
     5: ("d", 1016, 1072, 1184, 1296, 2280, 2365),
     10: ("f", 512, 540, 596, 652, 1288, 1373),
 }
+SET_COLLISION, SET_LOAD = {5: 4, 10: 3}, {5: 10, 10: 9}
+LOAD_AT = {5: 880, 10: 444}
 MOVE, STOP_MOVE, RECOVER = 1, 2, {5: 12, 10: 10}
 RUNNING = {5: 2, 10: 5}  # generator mode of a torque motion
 STARTED, NOT_POSSIBLE = 1, {5: 3, 10: 5}
@@ -41,6 +43,7 @@ def state(
     errors: Iterable[int] = (),
     reflex: Iterable[int] = (),
     rate: float = 0.0,
+    load: Iterable[float] = (0.0,) * 13,
 ) -> bytes:
     """A state; modes are (generator, controller, robot), errors and reflex indices of flags."""
     number, at_tau, at_tau_d, at_q, at_dq, at_modes, at_rate = PLACES[protocol]
@@ -48,6 +51,7 @@ def state(
     struct.pack_into("<Q", data, 0, message_id)
     for at, values in ((at_tau, tau), (at_tau_d, tau_d), (at_q, q), (at_dq, dq)):
         struct.pack_into(f"<7{number}", data, at, *values)
+    struct.pack_into(f"<13{number}", data, LOAD_AT[protocol], *load)
     data[at_modes], data[at_modes + 1], data[at_modes + 84] = modes
     for index in errors:
         data[at_modes + 2 + index] = 1
@@ -82,7 +86,9 @@ class Peer:
 
     Attributes:
         first_status: of Move; started by default, any other number refuses.
-        stop_status, recover_status: of StopMove and AutomaticErrorRecovery; None never answers.
+        stop_status, recover_status, set_status: of StopMove, AutomaticErrorRecovery and settings;
+            None never answers.
+        load: mass, inertia and centre in every state.
         obeys_finish: whether the finish flag ends the motion.
         modes, errors, reflex: put into every state.
         commands: (message id, torques, finish flag) received.
@@ -94,6 +100,8 @@ class Peer:
         self.first_status = STARTED
         self.stop_status: int | None = 0
         self.recover_status: int | None = 0
+        self.set_status: int | None = 0
+        self.load: tuple[float, ...] = (0.0,) * 13
         self.obeys_finish = True
         self.modes, self.errors, self.reflex = (0, 3, 1), (), ()
         self.dq: tuple[float, ...] = ZERO
@@ -171,6 +179,7 @@ class Peer:
                 "dq": self.dq,
                 "tau_d": self._accepted,
                 "rate": 1.0,
+                "load": self.load,
             }
         return state(self.protocol, message_id, **{**known, **fields})
 
@@ -221,6 +230,10 @@ class Peer:
                 if self._move_id is not None and self.stop_status == 0:
                     self._say(MOVE, self._move_id, bytes([2]))
                     self._move_id = None
+        elif command in (SET_COLLISION[self.protocol], SET_LOAD[self.protocol]):
+            if self.set_status is not None:
+                with self._lock:
+                    self._say(command, command_id, bytes([self.set_status]))
         elif command == RECOVER[self.protocol] and self.recover_status is not None:
             with self._lock:
                 if self.recover_status == 0:
