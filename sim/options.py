@@ -27,6 +27,7 @@ SCENARIOS = {
     "bent_link": ScenarioKind(("angle_deg", "offset_m"), links=True),
     "payload_at_20s": ScenarioKind(("mass", "t_s")),
     "friction": ScenarioKind(),
+    "real_drives": ScenarioKind(),
     "wall_mounted": ScenarioKind(),
 }
 
@@ -84,10 +85,15 @@ def options_of(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def add_scenario(parser: argparse.ArgumentParser, of_set: str = "as in noise=none") -> None:
+def add_scenario(
+    parser: argparse.ArgumentParser,
+    of_set: str = "as in noise=none",
+    default: str = DEFAULT_SCENARIO,
+) -> None:
     """Declare which arm is simulated: `--scenario`, `--set` (told more of), `--seed`."""
     add = parser.add_argument
-    add("--scenario", default=DEFAULT_SCENARIO, metavar="NAME", help=", ".join(SCENARIOS))
+    words = f"{', '.join(SCENARIOS)}; {default} by default"
+    add("--scenario", default=default, metavar="NAME", help=words)
     words = f"option of the scenario, {of_set}"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=words)
     add("--seed", type=int, default=0, help="of the arm, noise and faults")

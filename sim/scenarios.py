@@ -101,6 +101,13 @@ def friction(rng: np.random.Generator) -> Truth:
     return panda().with_changes(effects=viscous + per_joint("coulomb_friction", "Fc", losses["Fc"]))
 
 
+def real_drives(rng: np.random.Generator) -> Truth:
+    """The same with the inertia of its motors, which a light wrist cannot be controlled without."""
+    arm = friction(rng)
+    motors = per_joint("motor_inertia", "B", facts_of("panda")["motors"]["B"])
+    return arm.with_changes(effects=arm.effects + motors)
+
+
 def wall_mounted(rng: np.random.Generator) -> Truth:
     """The documented arm on a wall: the base's z axis is level, its x axis points down."""
     arm = panda()
@@ -112,6 +119,7 @@ DRAWN_BY: dict[str, Callable[..., Truth]] = {
     "bent_link": bent_link,
     "payload_at_20s": payload_at_20s,
     "friction": friction,
+    "real_drives": real_drives,
     "wall_mounted": wall_mounted,
 }
 

@@ -8,6 +8,7 @@ from numba import njit
 from drivers.interface import DriverError, JointSample
 from sim.dynamics import cross, end_effector, mass_matrix, torques
 from sim.effects import payload
+from sim.fci.cartesian import difference, impedance, posture
 from sim.fci.codec import TICK_S
 from sim.fci.settings import Settings
 from sim.plant import Plant
@@ -26,7 +27,8 @@ SINGULAR = 0.01  # manipulability (m³, Yoshikawa) below which no wrench is told
 
 
 class Arm:
-    """Plant and internal model. The model is the true arm without later payloads and losses.
+    """Plant and internal model: the true arm and its motors' inertia, without later payloads and
+    without friction.
 
     Attributes:
         truth: what the internal model knows.
@@ -41,6 +43,7 @@ class Arm:
 
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = known_arm(scenario.truth)
+        self._motors = motor_inertias(scenario.truth)
         self._plant: Plant = scenario.plant()
         self._n = self.truth.n
         self._still = np.zeros(self._n)
@@ -52,6 +55,8 @@ class Arm:
         self._look()
         self.step()  # whatever is compiled on first use is compiled before the clock runs
         self.mass(self.q)
+        self.reach(self.q, self.pose, np.nan)
+        self._spring(self.pose, np.zeros(6), np.ones(6))
 
     @property
     def saturated(self) -> bool:
@@ -87,6 +92,28 @@ class Arm:
         push = ddq + rate * rate * (q - self.q) + 2 * rate * (dq - self.dq)
         self.drive(self.model(self.q, self.dq, push) - self.model(self.q, self._still, self._still))
 
+    def comply(
+        self, pose: Array, twist: Array, path: tuple[Array, Array, Array], stiffness: Array
+    ) -> None:
+        """Hold the end effector to a pose (4, 4) and twist (6,) by a Cartesian spring.
+
+        Args:
+            pose, twist: wanted, base axes.
+            path: q, dq, ddq (7,) each, of which the posture counts where it leaves the end alone.
+            stiffness: (6,) N/m and N m/rad.
+        """
+        q, dq, ddq = path
+        tau, rest = self._spring(pose, twist, stiffness)
+        inner = FASTEST_RATE**2 / 16 * (q - self.q) + FASTEST_RATE / 2 * (dq - self.dq)
+        tau = tau + rest @ (self.mass(self.q) @ inner) + self.model(self.q, self.dq, ddq)
+        self.drive(tau - self.model(self.q, self._still, self._still))
+
+    def _spring(self, pose: Array, twist: Array, stiffness: Array) -> tuple[Array, Array]:
+        error, rate = difference(self.pose, pose), twist - self.jacobian @ self.dq
+        M = self.mass(self.q)
+        tau, rest = impedance(M, self.jacobian, error, rate, stiffness, FASTEST_RATE)
+        return tau, rest
+
     def brake(self) -> None:
         """Slow down and hold."""
         self._plant.stop()
@@ -112,16 +139,27 @@ class Arm:
     def model(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (7,) of the internal model for a motion, N m."""
         truth = self.truth
-        return np.asarray(torques(truth.frames, self._theta, truth.base, q, dq, ddq))
+        rigid = torques(truth.frames, self._theta, truth.base, q, dq, ddq)
+        return np.asarray(rigid + self._motors * ddq)
 
     def mass(self, q: Array) -> Array:
         """(7, 7) mass matrix of the internal model, kg m²."""
-        return np.asarray(mass_matrix(self.truth.frames, self._theta, q))
+        M = np.asarray(mass_matrix(self.truth.frames, self._theta, q))
+        M.flat[:: self._n + 1] += self._motors
+        return M
 
     def frame(self, q: Array) -> tuple[Array, Array]:
         """Pose (4, 4) of the end effector and Jacobian (6, 7) at a posture."""
         pose, J = end_effector(self.truth.frames, q, self._tool)
         return pose, J
+
+    def reach(self, q: Array, pose: Array, elbow: float) -> tuple[Array, float]:
+        """The joints (7,) nearest to q that bring the end effector to a pose, and what they miss.
+
+        `elbow`, rad, is what joint 3 shall be; NaN for anything.
+        """
+        found, missed = posture(self.truth.frames, self._tool, q, np.ascontiguousarray(pose), elbow)
+        return found, missed
 
     def close(self) -> None:
         """Free the simulator."""
@@ -141,6 +179,15 @@ class Arm:
 def known_arm(truth: Truth) -> Truth:
     """What the robot knows of itself: the rigid arm as it starts, without effects."""
     return truth.with_changes(effects=())
+
+
+def motor_inertias(truth: Truth) -> Array:
+    """(n,) kg m² that the motors add to the joints at all times."""
+    found = np.zeros(truth.n)
+    for effect in truth.effects:
+        if effect.name == "motor_inertia" and effect.interval_s is None:
+            found[effect.columns(truth.n)] += effect.number("B")
+    return found
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ of floats (f64 in version 5, f32 in version 10), so that the order of the fields
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
 
 import numpy as np
@@ -68,7 +68,8 @@ ERRORS = (
     "base_acceleration_initialization_timeout", "base_acceleration_invalid_reading",
 )  # fmt: skip
 COMMAND_BYTES = {5: 370, 10: 371}
-_Q_AT, _DQ_AT, _GENERATOR_END, _TAU_AT, _TORQUE_END = 8, 64, 313, 314, 370
+_Q_AT, _DQ_AT, _POSE_AT, _TWIST_AT, _ELBOW_AT, _ELBOW_VALID = 8, 64, 120, 248, 296, 312
+_GENERATOR_END, _TAU_AT, _TORQUE_END = 313, 314, 370
 HEADER = struct.Struct("<III")  # command, command id, size with this header
 LONGEST = 428  # bytes, SetCollisionBehavior
 _CONNECT = struct.Struct("<HH")  # version, UDP port of the client
@@ -179,6 +180,9 @@ class RobotCommand:
         tau: (7,) torques without gravity, N m.
         generator_finished: the finish flag of motions with a generator (all in version 5).
         torque_finished: the finish flag of torques alone (version 10).
+        pose: (16,) of the end effector, column by column.
+        twist: (6,) of the end effector, base axes.
+        elbow: (2,) joint 3 (rad) and the side of joint 4; None where the client leaves it open.
     """
 
     message_id: int
@@ -187,6 +191,9 @@ class RobotCommand:
     tau: Array
     generator_finished: bool
     torque_finished: bool
+    pose: Array = field(default_factory=lambda: np.zeros(16))
+    twist: Array = field(default_factory=lambda: np.zeros(6))
+    elbow: Array | None = None
 
 
 def read_command(data: bytes | bytearray | memoryview, version: int) -> RobotCommand | None:
@@ -200,6 +207,9 @@ def read_command(data: bytes | bytearray | memoryview, version: int) -> RobotCom
         np.frombuffer(data, "<f8", JOINTS, _TAU_AT),
         data[_GENERATOR_END] != 0,
         version == 10 and data[_TORQUE_END] != 0,
+        np.frombuffer(data, "<f8", 16, _POSE_AT),
+        np.frombuffer(data, "<f8", 6, _TWIST_AT),
+        np.frombuffer(data, "<f8", 2, _ELBOW_AT) if data[_ELBOW_VALID] else None,
     )
 
 

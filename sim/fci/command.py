@@ -7,7 +7,9 @@ import json
 import sys
 
 from sim.ending import Ending
-from sim.fci.codec import HOST
+from sim.fci.codec import HOST, PORT
+from sim.fci.gripper import PORT as GRIPPER_PORT
+from sim.fci.gripper import GripperServer
 from sim.fci.server import FciServer
 from sim.options import options_of
 from sim.scenarios import build
@@ -19,13 +21,21 @@ def run(args: argparse.Namespace) -> int:
     """Serve until SIGTERM, SIGINT or the end of the duration; the process's exit code."""
     try:
         scenario = build(args.scenario, args.seed, **options_of(args.set))
-        server = FciServer(scenario, args.port, args.protocol, args.fault, args.core, args.patience)
-    except (ValueError, OSError) as error:
-        print(f"error: {_sentence(error, args.port)}", file=sys.stderr)
+        hand = _hand(args)
+        try:
+            server = FciServer(
+                scenario, args.port, args.protocol, args.fault, args.core, args.patience, hand
+            )
+        except OSError as error:
+            raise ValueError(_taken(args.port, error)) from error
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
         return EXIT_USAGE
     try:
         with Ending(args.duration) as ending:
             print(f"listening on {HOST}:{server.port} protocol {server.protocol}", flush=True)
+            if hand is not None:
+                print(f"the gripper on {HOST}:{hand.port}", flush=True)
             server.serve(ending.is_set)
     finally:
         server.close()
@@ -37,7 +47,18 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _sentence(error: Exception, port: int) -> str:
-    if isinstance(error, OSError):
-        return f"port {port} of {HOST} cannot be used ({error.strerror}); stop what uses it"
-    return str(error)
+def _hand(args: argparse.Namespace) -> GripperServer | None:
+    """The gripper: on its port where the robot is on its own, or where one is named."""
+    port = args.gripper_port
+    if port is None:
+        if args.port != PORT:
+            return None
+        port = GRIPPER_PORT
+    try:
+        return GripperServer(port, args.object)
+    except OSError as error:
+        raise ValueError(_taken(port, error)) from error
+
+
+def _taken(port: int, error: OSError) -> str:
+    return f"port {port} of {HOST} cannot be used ({error.strerror}); stop what uses it"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from sim.fci.arm import Arm
+from sim.fci.cartesian import HAND_LIMITS, CartesianMotion
 from sim.fci.codec import JOINTS, TICK_S, ControllerMode, Generator, Request, RobotCommand
 from sim.truth import Array, Limits
 
@@ -27,14 +29,8 @@ FIRST_COMMAND_TICKS = 200
 TORQUE_STEP, ROUNDING = 1.0, 1e-5
 COMMUNICATION = "communication_constraints_violation"
 TORQUE_JUMP = "controller_torque_discontinuity"
-POSSIBLE = {
-    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_POSITION),
-    (ControllerMode.JOINT_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_POSITION),
-    (ControllerMode.CARTESIAN_IMPEDANCE, Generator.JOINT_VELOCITY),
-    (ControllerMode.EXTERNAL, Generator.JOINT_POSITION),
-    (ControllerMode.EXTERNAL, Generator.JOINT_VELOCITY),
-}
+JOINT_GENERATORS = (Generator.JOINT_POSITION, Generator.JOINT_VELOCITY)
+CARTESIAN_GENERATORS = (Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY)
 
 
 class DesiredMotion:
@@ -48,8 +44,9 @@ class DesiredMotion:
         self._kind, self._limits, self._fresh = kind, limits, True
         self.q, self.dq, self.ddq = q.copy(), np.zeros(len(q)), np.zeros(len(q))
 
-    def follow(self, q: Array, dq: Array) -> str | None:
+    def follow(self, command: RobotCommand) -> str | None:
         """Take a command, of which the kind's part counts; the error that it commits, if any."""
+        q, dq = command.q, command.dq
         if self._kind == Generator.JOINT_POSITION:
             if self._fresh and not (np.abs(q - self.q) <= START_TOLERANCE).all():
                 return START_POSE
@@ -89,10 +86,11 @@ class DesiredMotion:
 
 
 def allowed(controller: int, generator: int, version: int) -> bool:
-    """Whether this robot makes such a motion; Cartesian generators it does not."""
+    """Whether this robot makes such a motion."""
     if (controller, generator) == (ControllerMode.EXTERNAL, Generator.NONE):
         return version == 10
-    return (controller, generator) in POSSIBLE
+    possible = JOINT_GENERATORS + CARTESIAN_GENERATORS
+    return controller in tuple(ControllerMode)[: ControllerMode.OTHER] and generator in possible
 
 
 class CommandedMotion:
@@ -103,16 +101,21 @@ class CommandedMotion:
         controller: the mode asked for.
         generator: the mode asked for.
         tau: (7,) last accepted torque, N m, held where a command is missing.
-        path: the desired joint motion; at rest with torques alone.
+        path: the desired motion; at rest with torques alone.
         finished: the client has raised the finish flag.
     """
 
-    def __init__(self, request: Request, q: Array, limits: Limits) -> None:
+    def __init__(self, request: Request, arm: Arm, version: int) -> None:
         controller, generator = request.move_modes()
         self.request = request
         self.controller, self.generator = ControllerMode(controller), Generator(generator)
         self.tau: Array = np.zeros(JOINTS)
-        self.path = DesiredMotion(self.generator, q, limits)
+        self.path: DesiredMotion | CartesianMotion
+        if self.generator in CARTESIAN_GENERATORS:
+            limits, hand, pose = arm.truth.limits, HAND_LIMITS[version], arm.frame(arm.q)[0]
+            self.path = CartesianMotion(self.generator, arm.q, limits, hand, arm.reach, pose)
+        else:
+            self.path = DesiredMotion(self.generator, arm.q, arm.truth.limits)
         self.finished = False
         self._arrived = np.zeros(WINDOW, dtype=bool)
         self._ticks = self._missed = self._before = 0
@@ -148,7 +151,7 @@ class CommandedMotion:
             self.finished = command.torque_finished
             return None
         self.finished = command.generator_finished
-        found = self.path.follow(command.q, command.dq)
+        found = self.path.follow(command)
         if found is None and self.finished:
             found = self.path.ends()
         return found

@@ -8,6 +8,7 @@ from pathlib import Path
 from sim.faults import describe, read_fault
 from sim.fci.codec import HOST, PORT, VERSIONS
 from sim.fci.faults import KINDS
+from sim.fci.gripper import WIDEST
 from sim.options import add_scenario, options_of
 from sim.options import check as check_scenario
 
@@ -18,8 +19,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe(KINDS)
     add = parser.add_argument
     add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
+    words = "TCP port of the gripper; 1338, which clients know, where --port is 1337, else none"
+    add("--gripper-port", type=int, default=None, metavar="PORT", help=words)
+    words = "width of what lies between the gripper's fingers; 0 is nothing"
+    add("--object", type=float, default=0.0, metavar="M", help=words)
     add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
-    add_scenario(parser)
+    add_scenario(parser, default="real_drives")
     add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
     add("--core", type=int, default=None, help="processor to stay on")
     words = "wait so long for a late command while the world stands still; no robot does"
@@ -32,6 +37,8 @@ def check(args: argparse.Namespace) -> None:
     """Raises ValueError for an arm, a fault or a patience that does not exist."""
     if not 0.0 <= args.patience < float("inf"):
         raise ValueError(f"--patience takes seconds from 0 up, got {args.patience}")
+    if not 0.0 <= args.object <= WIDEST:
+        raise ValueError(f"--object takes 0 to {WIDEST} m, got {args.object}")
     check_scenario(args.scenario, options_of(args.set))
     for text in args.fault:
         read_fault(text, KINDS)

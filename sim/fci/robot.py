@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from sim.fci.arm import Arm
+from sim.fci.cartesian import ELBOW_FLIP, CartesianMotion
 from sim.fci.codec import (
     ERRORS,
     TICK_S,
@@ -20,7 +21,7 @@ from sim.fci.codec import (
     Status,
     reply,
 )
-from sim.fci.motion import CommandedMotion, allowed
+from sim.fci.motion import CommandedMotion, DesiredMotion, allowed
 from sim.fci.settings import Settings
 from sim.scenarios import Scenario
 from sim.truth import Array
@@ -34,7 +35,6 @@ TORQUE_RANGE, COLLISION, CARTESIAN_COLLISION = (
     "joint_reflex",
     "cartesian_reflex",
 )
-ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
 
 
 class Robot:
@@ -133,7 +133,7 @@ class Robot:
             return Status.NOT_POSSIBLE
         if not allowed(*request.move_modes(), self.version):
             return Status.INVALID
-        self.motion = CommandedMotion(request, self.arm.q, self.arm.truth.limits)
+        self.motion = CommandedMotion(request, self.arm, self.version)
         self.mode = RobotMode.MOVE
         self.reflex_reason[:] = 0
         return Status.STARTED
@@ -196,11 +196,22 @@ class Robot:
             self._end(Status.OK)
             return
         self.tau_desired = motion.tau
+        path = motion.path
         if motion.by_torque:
             self.arm.drive(motion.tau)
-        else:
-            path = motion.path
+        elif motion.controller == ControllerMode.JOINT_IMPEDANCE:
             self.arm.track(path.q, path.dq, path.ddq, self.settings.stiffness)
+        else:
+            pose, twist, _ = self.hand_path(path)
+            joints = path.q, path.dq, path.ddq
+            self.arm.comply(pose, twist, joints, self.settings.cartesian_stiffness)
+
+    def hand_path(self, path: DesiredMotion | CartesianMotion) -> tuple[Array, Array, Array]:
+        """Pose (4, 4), twist and acceleration (6,) that a motion wants of the end effector."""
+        if isinstance(path, CartesianMotion):
+            return path.pose, path.twist, path.acceleration
+        pose, J = self.arm.frame(path.q)
+        return pose, J @ path.dq, np.zeros(6)
 
     def _watch(self) -> None:
         """Limits of the arm itself and collisions, from what its sensors say."""
@@ -297,13 +308,14 @@ class Reporter:
         fields["joint_collision"][:] = robot.joint_collision
         fields["cartesian_collision"][:] = robot.cartesian_collision
         if motion is None:
-            for name in ("dq_d", "ddq_d", "O_dP_EE_d", "O_dP_EE_c"):
+            for name in ("dq_d", "ddq_d", "O_dP_EE_d", "O_dP_EE_c", "O_ddP_EE_c"):
                 fields[name][:] = 0.0
             pose = robot.arm.pose
         else:
-            pose, J = robot.arm.frame(robot.q_desired)
+            pose, twist, acceleration = robot.hand_path(motion.path)
             fields["dq_d"][:], fields["ddq_d"][:] = motion.path.dq, motion.path.ddq
-            fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = J @ motion.path.dq
+            fields["O_dP_EE_d"][:] = fields["O_dP_EE_c"][:] = twist
+            fields["O_ddP_EE_c"][:] = acceleration
         fields["O_T_EE_d"][:] = fields["O_T_EE_c"][:] = pose.ravel("F")
         _elbow(fields["elbow_d"], robot.q_desired)
         _elbow(fields["elbow_c"], robot.q_desired)

@@ -27,6 +27,7 @@ from sim.fci.codec import (
     reply,
 )
 from sim.fci.faults import KINDS, Spoiler
+from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library
 from sim.fci.robot import Reporter, Robot
 from sim.fci.urdf import robot_urdf
@@ -36,6 +37,8 @@ CHUNK = 4096  # bytes at a time; the longest request has 428
 MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
 QUEUE = 64  # datagrams looked at per tick: more would be a flood, not a robot's client
 IDLE_S = 0.05  # how often a server without a client looks whether it is to stop
+IDLE_WITH_HAND_S = 0.01
+HAND_TICKS = 10  # between two looks at the gripper's client
 
 
 class ClientSession:
@@ -173,6 +176,7 @@ class FciServer:
         core: processor to stay on; None leaves it to the system.
         patience_s: so long the world stands still for a command that a client owes, once until
             the next one comes. No robot does: for clients on a busy machine.
+        hand: a gripper to serve beside it; this class's to close.
 
     Attributes:
         port: the TCP port.
@@ -192,11 +196,13 @@ class FciServer:
         faults: Sequence[str] = (),
         core: int | None = None,
         patience_s: float = 0.0,
+        hand: GripperServer | None = None,
     ) -> None:
         if protocol not in VERSIONS:
             raise ValueError(f"no protocol {protocol}; have: 5, 10")
         asked = [read_fault(text, KINDS) for text in faults]
         self.protocol = self._version = protocol
+        self._hand = hand
         self._core, self._patience_s, self._patient = core, patience_s, patience_s > 0.0
         self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)
         self._spoiler = Spoiler(asked, scenario.seed)
@@ -218,7 +224,7 @@ class FciServer:
         self._session: ClientSession | None = None
         self._ticks = Ticks()
         self._tick = self._id = self._silent_until = 0
-        self._owed = False
+        self._owed = self._answering = False  # a command for the last state; any in this motion
         self._sent = self._clients = self._refused = 0
         self._foreign = self._stale = 0
 
@@ -228,13 +234,18 @@ class FciServer:
             self._ticks.restart()
             while not stop():
                 if self._session is None and not self.robot.moving:
-                    select.select([self._listener], [], [], IDLE_S)
+                    wait_s = IDLE_S if self._hand is None else IDLE_WITH_HAND_S
+                    select.select([self._listener], [], [], wait_s)
                     self._ticks.restart()
+                    if self._hand is not None:
+                        self._hand.poll()
                     self._accept()
                     continue
                 self._ticks.wait()
                 self._one_tick()
                 self._talk()
+                if self._hand is not None and self._tick % HAND_TICKS == 0:
+                    self._hand.poll()
 
     def summary(self) -> dict[str, Any]:
         """What happened so far."""
@@ -258,6 +269,8 @@ class FciServer:
         """Close the connections and free the simulator."""
         self._drop()
         self._listener.close()
+        if self._hand is not None:
+            self._hand.close()
         self.robot.arm.close()
 
     def _answer_to_state(self, session: ClientSession) -> RobotCommand | None:
@@ -276,7 +289,12 @@ class FciServer:
         self._strike()
         session, robot, command = self._session, self.robot, None
         if session is not None:
+            before = session.stale
             command = self._answer_to_state(session)
+            # It may be late from its very first command on, which then answers no tick.
+            self._answering = robot.motion is not None and (
+                self._answering or robot.motion.begun or session.stale > before
+            )
             if command is not None and self._spoiler.loses_command(self._tick):
                 command = None
         if command is not None or robot.motion is None:
@@ -291,7 +309,7 @@ class FciServer:
             self._spoiler.spoil_values(self._reporter.frame, self._tick)
             for data in self._spoiler.deliver(self._reporter.frame.data, self._tick):
                 session.send(data)
-                self._owed = robot.motion is not None and robot.motion.begun
+                self._owed = robot.motion is not None and (self._answering or robot.motion.begun)
             self._sent += 1
         for data in robot.take_replies():
             session.reply(data)

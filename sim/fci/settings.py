@@ -13,6 +13,7 @@ from sim.truth import Array
 STIFFEST = 14250.0  # N m/rad
 CARTESIAN_STIFFNESS = ((10.0, 3000.0), (1.0, 300.0))  # N/m, N m/rad
 FILTER_HZ = (1.0, 1000.0)
+CARTESIAN_DEFAULT = (3000.0, 3000.0, 3000.0, 300.0, 300.0, 300.0)  # N/m, N m/rad, as the next
 STIFFNESS = (3000.0, 3000.0, 3000.0, 2500.0, 2500.0, 2000.0, 2000.0)  # N m/rad, libfranka examples
 # Thresholds before a client sets any: chosen here, above what excitation with a hand needs.
 TORQUE_THRESHOLD = (40.0, 40.0, 36.0, 36.0, 10.0, 10.0, 10.0)  # N m
@@ -34,6 +35,7 @@ class Settings:
         EE_T_K: stiffness frame in the end effector.
         load: mass (kg), centre (3,) in the flange (m), inertia (3, 3) about it (kg m²).
         stiffness: (7,) of the joint impedance controller, N m/rad.
+        cartesian_stiffness: (6,) of the Cartesian one, base axes, N/m and N m/rad.
         lower_torque, upper_torque: (7,) contact and collision, N m.
         lower_force, upper_force: (6,) contact and collision, N and N m.
     """
@@ -45,6 +47,7 @@ class Settings:
         default_factory=lambda: (0.0, np.zeros(3), np.zeros((3, 3)))
     )
     stiffness: Array = field(default_factory=lambda: np.array(STIFFNESS))
+    cartesian_stiffness: Array = field(default_factory=lambda: np.array(CARTESIAN_DEFAULT))
     lower_torque: Array = field(default_factory=lambda: np.array(TORQUE_THRESHOLD))
     upper_torque: Array = field(default_factory=lambda: np.array(TORQUE_THRESHOLD))
     lower_force: Array = field(default_factory=lambda: np.array(FORCE_THRESHOLD))
@@ -82,7 +85,10 @@ class Settings:
 
     def _SetCartesianImpedance(self, x: Array) -> bool:
         lowest, highest = np.repeat(np.array(CARTESIAN_STIFFNESS), 3, axis=0).T
-        return bool((x >= lowest).all() and (x <= highest).all())
+        if (x < lowest).any() or (x > highest).any():
+            return False
+        self.cartesian_stiffness = x
+        return True
 
     def _SetFilters(self, x: Array) -> bool:
         return bool((x >= FILTER_HZ[0]).all() and (x <= FILTER_HZ[1]).all())

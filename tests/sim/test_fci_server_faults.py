@@ -181,7 +181,7 @@ def test_settings_are_not_possible_in_a_motion(robot):
     assert robot.request(move())[12] == 3
 
 
-@pytest.mark.parametrize(("pair", "code"), [((0, 2), 5), ((1, 3), 5), ((2, 4), 5), ((7, 9), 5)])
+@pytest.mark.parametrize(("pair", "code"), [((3, 2), 5), ((2, 4), 5), ((0, 5), 5), ((7, 9), 5)])
 def test_motions_that_this_robot_does_not_make(robot, pair, code):
     assert robot.request(move(*pair))[12] == code
     assert robot.mode == RobotMode.IDLE
@@ -228,7 +228,7 @@ def test_joint_velocities_that_lead_too_far(speed, start, error):
     truth = build("nominal").truth
     path = DesiredMotion(Generator.JOINT_VELOCITY, truth.ready + start * np.eye(7)[1], truth.limits)
     for k in range(5000):
-        found = path.follow(ZERO, speed(k) * np.eye(7)[1])
+        found = path.follow(RobotCommand(k, ZERO, speed(k) * np.eye(7)[1], ZERO, False, False))
         if found is not None:
             break
     assert found == error

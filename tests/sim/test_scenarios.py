@@ -142,7 +142,7 @@ def test_truth_file_says_what_the_arm_is(name, tmp_path):
         (load,) = told["effects"]
         assert (load["effect"], load["interval_s"]) == ("payload", [20.0, None])
         assert load["parameters"]["m"] == 1.0
-    elif name == "friction":
+    elif name in ("friction", "real_drives"):
         coulomb = [e for e in told["effects"] if e["effect"] == "coulomb_friction"]
         assert [e["parameters"]["Fc"] for e in coulomb] == facts_of("panda")["friction"]["Fc"]
         assert [e["joints"] for e in coulomb] == [[j] for j in range(1, 8)]
