@@ -23,6 +23,7 @@ BAND_HZ = (10.0, 40.0)
 BLOCK = 16  # samples drawn at once: dear enough one by one, a hitch in the loop if many
 TAPS = 256  # samples after which the band filter has forgotten an input but for 2e-4
 POINTS = 1 << 14  # of the band filter's response, over the frequencies up to half the rate
+MOVING = 0.1  # rad/s, from here on a joint's torque noise is that of motion
 MAX_JITTER = 0.45  # of a period: stamps stay in order
 
 Draw = Callable[[np.random.Generator], Array]
@@ -72,6 +73,9 @@ class SensorNoise:
 
     def _noisy(self, k: int, clean: JointSample) -> JointSample:
         tau, dq, q = self._joints.at(k)
+        least = self._levels.tau_at_rest
+        if least != 1.0:
+            tau = tau * (least + (1.0 - least) * np.minimum(np.abs(clean.dq) / MOVING, 1.0))
         tau = clean.tau + tau
         on = self._quantised
         tau[on] = np.round(tau[on] / self._step[on]) * self._step[on]

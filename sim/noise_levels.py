@@ -20,6 +20,8 @@ class NoiseLevels:
     Attributes:
         tau_above_50hz: torque noise above 50 Hz, N m rms; white over all frequencies.
         tau_10_to_40hz: torque noise between 10 and 40 Hz, share of the white noise included.
+        tau_at_rest: share of the torque noise that is left in a joint at rest; all of it from
+            0.1 rad/s on.
         tau_step: quantisation of the torque, N m; 0 for none.
         dq_above_50hz: velocity noise above 50 Hz, rad/s rms; white.
         q_above_50hz: position noise above 50 Hz, rad rms; white.
@@ -32,6 +34,7 @@ class NoiseLevels:
 
     tau_above_50hz: float | list[float] = 0.0
     tau_10_to_40hz: float | list[float] = 0.0
+    tau_at_rest: float = 1.0
     tau_step: float | list[float] = 0.0
     dq_above_50hz: float | list[float] = 0.0
     q_above_50hz: float | list[float] = 0.0

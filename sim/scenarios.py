@@ -114,6 +114,9 @@ def wall_mounted(rng: np.random.Generator) -> Truth:
     return arm.with_changes(gravity=turn(1, np.pi / 2).T @ arm.gravity)
 
 
+# The levels are those of a log in motion, where gears add to the noise. Chosen: with all of it at
+# rest a force controller, which takes its zero there, drifts away against friction.
+LEVELS = {"real_drives": {"tau_at_rest": 0.2}}
 DRAWN_BY: dict[str, Callable[..., Truth]] = {
     "nominal": nominal,
     "bent_link": bent_link,
@@ -144,7 +147,9 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
         name,
         seed,
         in_trouble(truth, options.get("trouble", {})),
-        levels_of(options.get("noise", "real"), **options.get("levels", {})),
+        levels_of(
+            options.get("noise", "real"), **{**LEVELS.get(name, {}), **options.get("levels", {})}
+        ),
         options.get("links", SCENARIOS[name].links),
         tuple(options.get("imus", ())),
     )

@@ -139,7 +139,7 @@ class Target(NamedTuple):
 
 
 def parse(address: str) -> Target:
-    """What `fci://HOST[:PORT][?protocol=5|10|auto&recover=0|1&...]` asks for. Raises DriverError."""
+    """What `fci://HOST[:PORT][?protocol=5|10|auto&...]` asks for. Raises DriverError."""
     parts = Address.of(address, OPTIONS)
     protocol = parts.options.get("protocol", AUTO)
     if protocol not in VERSIONS:

@@ -18,7 +18,8 @@ ELBOW_TOLERANCE = 1e-2  # rad, chosen
 REACHED = 1e-3  # m and rad, so far the joints may be from a pose; else it is out of reach
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
 ELBOW_SPEED = 2.175  # rad/s (Franka FCI documentation)
-ROOM = 1.1  # poses start from f32 states, and differences over 1 ms enlarge that
+# Poses start from f32 states, and differences over 1 ms enlarge that.
+ROOM, SPEED_ROOM = 1.1, 1.001
 
 START = "cartesian_position_motion_generator_start_pose_invalid"
 FRAME = "cartesian_position_motion_generator_invalid_frame_flag"
@@ -128,7 +129,7 @@ class CartesianMotion:
         q, missed = self._reach(self.q, pose, elbow)
         if not missed <= REACHED or not self._in_range(q):
             return JOINT_POSITION
-        if not (np.abs(q - self.q) <= self._limits.velocity * ROOM * TICK_S).all():
+        if not (np.abs(q - self.q) <= self._limits.velocity * SPEED_ROOM * TICK_S).all():
             return JOINT_VELOCITY
         self._take_joints(q)
         self.pose, self.twist, self.acceleration, self._fresh = pose, twist, acceleration, False

@@ -19,7 +19,7 @@ from sim.scenarios import build
 
 ZERO = np.zeros(7)
 PREFIX = "cartesian_motion_generator_"
-TICKS = 1000
+TICKS = 600  # of an eased motion
 
 
 def move(controller, generator):
@@ -47,7 +47,7 @@ def answer(pose=None, twist=None, elbow=None, end=False):
 
 
 def eased(k):
-    """From 0 to 1 in a second, with its rate at rest at both ends."""
+    """From 0 to 1, with its rate at rest at both ends."""
     s = min(k / TICKS, 1.0)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
@@ -63,7 +63,7 @@ def shifted(start, s):
 def test_poses_are_followed(robot, controller):
     start = robot.arm.pose.copy()
     assert robot.request(move(controller, 2))[12] == 1
-    for k in range(TICKS + 400):
+    for k in range(TICKS + 300):
         robot.tick(None if 300 <= k % 500 < 303 else answer(shifted(start, eased(k))))
         assert robot.motion is not None, [ERRORS[i] for i in np.flatnonzero(robot.errors)]
     wanted = shifted(start, 1.0)
@@ -106,7 +106,7 @@ def bent(start, what):
         (lambda late: np.nan, "cartesian_position_motion_generator_invalid_frame_flag"),
         (lambda late: 1e-3 * late, PREFIX + "velocity_discontinuity"),
         (lambda late: 7.5e-6 * late**2, PREFIX + "acceleration_discontinuity"),
-        (lambda late: 2e-4 * (late - 100 * np.tanh(late / 100)), PREFIX + "joint_"),  # too far
+        (lambda late: 5e-4 * (late - 100 * np.tanh(late / 100)), "joint_"),  # too far
     ],
 )
 def test_poses_that_break_a_limit(still, what, error):
@@ -116,7 +116,7 @@ def test_poses_that_break_a_limit(still, what, error):
         still.tick(answer(at(k)))
         if still.motion is None:
             break
-    assert len(still.violations) == 1 and still.violations[0].startswith(error)
+    assert len(still.violations) == 1 and error in still.violations[0]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ class Hand:
     """A gripper and a client of it, both here."""
 
     def __init__(self, thing=0.0):
-        self.server = GripperServer(0, thing)
+        self.server, self.held = GripperServer(0, thing), b""
         self.tcp = socket.create_connection(("127.0.0.1", self.server.port))
         self.tcp.settimeout(0.0)
         self.udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -195,14 +195,13 @@ class Hand:
         end = time.monotonic() + limit_s
         while time.monotonic() < end:
             self.server.poll()
-            try:
-                data = self.tcp.recv(100)
-            except BlockingIOError:
-                time.sleep(1e-3)
-                continue
-            command, ident, size = struct.unpack_from("<HII", data)
-            assert size == len(data)
-            return command, ident, struct.unpack_from("<H", data, 10)[0], data[12:]
+            with contextlib.suppress(BlockingIOError):
+                self.held += self.tcp.recv(100)
+            if self.held:
+                command, ident, size = struct.unpack_from("<HII", self.held)
+                data, self.held = self.held[:size], self.held[size:]
+                return command, ident, struct.unpack_from("<H", data, 10)[0], data[12:]
+            time.sleep(1e-3)
         raise AssertionError("no reply")
 
     def state(self):
