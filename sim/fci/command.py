@@ -24,8 +24,9 @@ def run(args: argparse.Namespace) -> int:
         hand = _hand(args)
         try:
             server = FciServer(
-                scenario, args.port, args.protocol, args.fault, args.core, args.patience, hand
+                scenario, args.port, args.protocol, args.fault, args.core, args.patience
             )
+            server.hand = hand
         except OSError as error:
             raise ValueError(_taken(args.port, error)) from error
     except ValueError as error:

@@ -176,12 +176,12 @@ class FciServer:
         core: processor to stay on; None leaves it to the system.
         patience_s: so long the world stands still for a command that a client owes, once until
             the next one comes. No robot does: for clients on a busy machine.
-        hand: a gripper to serve beside it; this class's to close.
 
     Attributes:
         port: the TCP port.
         protocol: the version it speaks.
         robot: the robot.
+        hand: a gripper to serve beside it, where there is one; this class's to close.
 
     Raises:
         ValueError: no such protocol or fault; names the choices.
@@ -196,13 +196,12 @@ class FciServer:
         faults: Sequence[str] = (),
         core: int | None = None,
         patience_s: float = 0.0,
-        hand: GripperServer | None = None,
     ) -> None:
         if protocol not in VERSIONS:
             raise ValueError(f"no protocol {protocol}; have: 5, 10")
         asked = [read_fault(text, KINDS) for text in faults]
         self.protocol = self._version = protocol
-        self._hand = hand
+        self.hand: GripperServer | None = None
         self._core, self._patience_s, self._patient = core, patience_s, patience_s > 0.0
         self._says = next((int(f.value) for f in asked if f.name == "version"), protocol)
         self._spoiler = Spoiler(asked, scenario.seed)
@@ -234,18 +233,18 @@ class FciServer:
             self._ticks.restart()
             while not stop():
                 if self._session is None and not self.robot.moving:
-                    wait_s = IDLE_S if self._hand is None else IDLE_WITH_HAND_S
+                    wait_s = IDLE_S if self.hand is None else IDLE_WITH_HAND_S
                     select.select([self._listener], [], [], wait_s)
                     self._ticks.restart()
-                    if self._hand is not None:
-                        self._hand.poll()
+                    if self.hand is not None:
+                        self.hand.poll()
                     self._accept()
                     continue
                 self._ticks.wait()
                 self._one_tick()
                 self._talk()
-                if self._hand is not None and self._tick % HAND_TICKS == 0:
-                    self._hand.poll()
+                if self.hand is not None and self._tick % HAND_TICKS == 0:
+                    self.hand.poll()
 
     def summary(self) -> dict[str, Any]:
         """What happened so far."""
@@ -269,8 +268,8 @@ class FciServer:
         """Close the connections and free the simulator."""
         self._drop()
         self._listener.close()
-        if self._hand is not None:
-            self._hand.close()
+        if self.hand is not None:
+            self.hand.close()
         self.robot.arm.close()
 
     def _answer_to_state(self, session: ClientSession) -> RobotCommand | None:
