@@ -1,14 +1,16 @@
 """A process that does nothing but take datagrams from a socket and put them into a ring.
 
-Run by its path, as `python -I -S reader.py UDP EVENT ALIVE MEMORY STATE_SIZE PARENT CORES` (four
-descriptors it inherits, and numbers), and with the standard library only, so that it is ready
-within a few hundredths of a second. Its interpreter serves no other thread: a busy one in the
-driver's process costs no datagram.
+Run by its path, as `python -I -S reader.py UDP EVENT ALIVE MEMORY BEFORE STATE_SIZE PARENT CORES`
+(five descriptors it inherits, the fifth -1 for none, and numbers), and with the standard library
+only, so that it is ready within a few hundredths of a second. Its interpreter serves no other
+thread: a busy one in the driver's process costs no datagram.
 
-The ring lies in shared memory. The kernel writes a datagram straight into a slot; then the head
-is moved on and the driver is woken. The reader moves the head only, the driver the tail only, and
-both are aligned words. Where the ring is full, datagrams are dropped and the next record tells how
-many were. A reader that is killed leaves a sound ring behind for the next one.
+The ring lies in shared memory. The kernel writes a datagram straight into a slot; then the head is
+moved on and the driver is woken. The reader moves the head only, the driver the tail only, and both
+are aligned words. Where the ring is full, datagrams are dropped and the next record tells how many
+were. A reader that is killed leaves a sound ring behind for the next one, a spare: it has started
+long before and waits until BEFORE, the pipe that the other holds, hangs up. No robot waits as long
+as a process needs to start.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import contextlib
 import gc
 import mmap
 import os
+import select
 import socket
 import struct
 import sys
@@ -141,15 +144,27 @@ def serve(udp: socket.socket, ring: StateRing, event: int, parent: int, state_si
             return
 
 
+def gone(before: int, parent: int) -> bool:
+    """Wait until the reader before is gone; False where the parent went first."""
+    poll = select.poll()
+    poll.register(before, 0)  # hanging up is always told
+    while not poll.poll(1e3 * TIME_OUT_S):
+        if os.getppid() != parent:
+            return False
+    return True
+
+
 def main(arguments: list[str]) -> None:
     """Serve the descriptors named on the command line."""
-    udp, event, _alive, memory, state_size, parent = map(int, arguments[:6])
+    udp, event, _alive, memory, before, state_size, parent = map(int, arguments[:7])
     gc.disable()  # nothing here makes cycles
     with contextlib.suppress(OSError):  # a core taken away meanwhile: any other will do
-        os.sched_setaffinity(0, map(int, arguments[6].split(",")))
+        os.sched_setaffinity(0, map(int, arguments[7].split(",")))
     with contextlib.suppress(OSError):  # not permitted: an ordinary priority has to do
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     shared = mmap.mmap(memory, ring_size(state_size))
+    if before >= 0 and not gone(before, parent):
+        return
     ring = StateRing(shared, state_size)
     WORD.pack_into(shared, READY, 1)
     os.eventfd_write(event, 1)

@@ -22,6 +22,7 @@ from drivers.interface import DriverError
 SWITCH_INTERVAL_S = 50e-6
 RECEIVE_BUFFER = 4 << 20  # bytes; half a second of states with the kernel's overhead
 _SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; beyond net.core.rmem_max, where permitted
+SPARE_AFTER = 100  # records after a takeover; to start a process takes some of the robot's ticks
 START_LIMIT_S = 10.0  # a reader needs about 0.05 s
 RESTARTS, RESTARTS_WITHIN_S = 5, 10.0
 
@@ -50,6 +51,24 @@ class QuickSwitching:
 
 
 QUICK_SWITCHING = QuickSwitching()
+
+
+class Reader(NamedTuple):
+    """A reader process, at work or spare.
+
+    Attributes:
+        process: itself.
+        alive: a pipe without data, which hangs up when the process dies.
+    """
+
+    process: subprocess.Popen[bytes]
+    alive: int
+
+    def end(self) -> None:
+        """Kill the process and let go of its pipe."""
+        self.process.kill()
+        self.process.wait()
+        os.close(self.alive)
 
 
 class Record(NamedTuple):
@@ -90,7 +109,7 @@ def open_udp(host: str) -> socket.socket:
 
 
 class ReaderClient:
-    """Records of a reader process, which is started again when it dies.
+    """Records of a reader process; when it dies, a spare that waits beside it takes over.
 
     Args:
         udp: from `open_udp`; stays the caller's.
@@ -113,23 +132,30 @@ class ReaderClient:
         self._poll = select.epoll()
         # Edge-triggered: each write of the reader wakes us once, and nothing has to be read.
         self._poll.register(self._event, select.EPOLLIN | select.EPOLLET)
-        self._alive = -1  # a pipe without data; hangs up when the reader dies
-        self._process: subprocess.Popen[bytes] | None = None
+        self._reader: Reader | None = None
+        self._spare: Reader | None = None
         self._deaths: deque[float] = deque(maxlen=RESTARTS)
         self._cores = ",".join(map(str, sorted(os.sched_getaffinity(0))))
-        self._taken = self._head = 0
+        self._taken = self._head = self._spare_at = 0
         self._closed = False
         self.restarts = 0
 
     @property
     def pid(self) -> int:
         """Process id of the reader."""
-        assert self._process is not None
-        return self._process.pid
+        assert self._reader is not None
+        return self._reader.process.pid
+
+    @property
+    def spare_pid(self) -> int | None:
+        """Process id of the spare; None for a moment after it took over."""
+        return None if self._spare is None else self._spare.process.pid
 
     def start(self) -> None:
         """Start the reader and wait until it listens. Raises DriverError."""
-        self._spawn()
+        first = self._spawn(-1)
+        self._work_with(first)
+        self._spare = self._spawn(first.alive)
         deadline = time.monotonic() + START_LIMIT_S
         while not WORD.unpack_from(self._map, READY)[0]:
             if self._wait(deadline - time.monotonic()) is not True:
@@ -142,6 +168,8 @@ class ReaderClient:
             return None
         start = reader.FIRST_SLOT + self._taken % SLOTS * self._step
         self._taken += 1
+        if self._taken == self._spare_at and self._reader and self._spare is None:
+            self._spare = self._spawn(self._reader.alive)
         return Record(start + RECORD.size, *RECORD.unpack_from(self._map, start))
 
     def next_length(self, wait_s: float) -> int | None:
@@ -166,7 +194,9 @@ class ReaderClient:
         if self._closed:
             return
         self._closed = True
-        self._end_reader()
+        for reader_ in (self._spare, self._reader):  # the spare first: it would take over
+            if reader_ is not None:
+                reader_.end()
         self._poll.close()
         self.data.release()
         self._map.close()
@@ -198,33 +228,33 @@ class ReaderClient:
             return None
         return all(descriptor == self._event for descriptor, _ in events)
 
-    def _spawn(self) -> None:
-        self._alive, theirs = os.pipe2(os.O_CLOEXEC)
+    def _spawn(self, before: int) -> Reader:
+        """A new reader; it waits until the pipe `before` hangs up, -1 for no waiting."""
+        alive, theirs = os.pipe2(os.O_CLOEXEC)
         descriptors = (self._udp.fileno(), self._event, theirs, self._memory)
-        arguments = [*descriptors, self._state_size, os.getpid()]
+        arguments = [*descriptors, before, self._state_size, os.getpid()]
+        inherited = descriptors if before < 0 else (*descriptors, before)
         command = [sys.executable, "-I", "-S", reader.__file__, *map(str, arguments), self._cores]
         try:
             # A session of its own: a terminal's Ctrl-C must not take the eyes of a safe stop.
-            self._process = subprocess.Popen(
-                command, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+            process = subprocess.Popen(
+                command, pass_fds=inherited, stdin=subprocess.DEVNULL, start_new_session=True
             )
         except OSError as error:
+            os.close(alive)
             raise DriverError(f"cannot start the reader of the robot's states: {error}") from error
         finally:
             os.close(theirs)
-        self._poll.register(self._alive, 0)  # hanging up is always told
+        return Reader(process, alive)
 
-    def _end_reader(self) -> None:
-        if self._alive >= 0:
-            os.close(self._alive)
-            self._alive = -1
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
+    def _work_with(self, reader_: Reader) -> None:
+        """Take records from this one from now on, and a little later have a spare for it."""
+        self._reader, self._spare = reader_, None
+        self._poll.register(reader_.alive, 0)  # hanging up is always told
+        self._spare_at = self._taken + SPARE_AFTER
 
     def _restart(self) -> None:
-        """A new reader on the same socket, which kept the datagrams meanwhile."""
+        """The spare reads from the same socket, which kept the datagrams meanwhile."""
         now = time.monotonic()
         if len(self._deaths) == RESTARTS and now - self._deaths[0] < RESTARTS_WITHIN_S:
             raise DriverError(
@@ -232,8 +262,15 @@ class ReaderClient:
                 f"{RESTARTS_WITHIN_S:.0f} s: look at this computer's log for what kills it"
             )
         self._deaths.append(now)
-        self._end_reader()
-        self._spawn()
+        old, spare = self._reader, self._spare
+        if old is not None:
+            self._poll.unregister(old.alive)  # the spare holds this pipe as well
+            old.end()
+        self._reader = self._spare = None
+        if spare is not None and spare.process.poll() is not None:  # that died as well
+            spare.end()
+            spare = None
+        self._work_with(self._spawn(-1) if spare is None else spare)
         self.restarts += 1
 
     def _stuck(self) -> bool:

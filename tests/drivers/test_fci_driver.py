@@ -342,6 +342,25 @@ def test_a_killed_reader_is_replaced(peer5, connected):
     assert sum("was replaced" in note for note in arm.intake.notes) == 1
 
 
+@pytest.mark.parametrize("ready", [True, False])
+def test_a_spare_reader_takes_over_in_motion(peer, connected, ready):
+    """The motion goes on where the spare had started; where it dies as well, a new one is made."""
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    pid, spare = arm.reader_pid, arm.spare_pid
+    if not ready:
+        os.kill(spare, signal.SIGKILL)
+    os.kill(pid, signal.SIGKILL)
+    drive(arm, lambda: arm.reader_pid != pid)
+    assert (arm.reader_pid == spare) == ready
+    drive(arm, lambda: arm.spare_pid not in (pid, spare, None))
+    sent = arm.intake.commands.sent
+    drive(arm, lambda: arm.intake.commands.sent > sent + 50)
+    assert peer.modes[2] == 2
+    assert exact(arm.intake)
+    arm.stop()
+
+
 def test_a_reader_that_stands_still_is_replaced(peer5, connected):
     arm = connected(peer5)
     pid = arm.reader_pid
@@ -381,7 +400,7 @@ def test_the_reader_goes_when_its_driver_is_killed(peer5):
         "from drivers.fci import FciArm",
         f"arm = FciArm('{peer5.address}')",
         "arm.connect()",
-        "print(arm.reader_pid, flush=True)",
+        "print(arm.reader_pid, arm.spare_pid, flush=True)",
         "time.sleep(100)",
     )
     driver = subprocess.Popen(
@@ -390,12 +409,12 @@ def test_the_reader_goes_when_its_driver_is_killed(peer5):
         text=True,
         cwd=Path(__file__).parents[2],
     )
-    pid = int(driver.stdout.readline())
+    pids = [int(word) for word in driver.stdout.readline().split()]
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
     driver.stdout.close()
     deadline = time.monotonic() + LIMIT_S
-    while _alive(pid):
+    while any(map(_alive, pids)):
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
