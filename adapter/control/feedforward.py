@@ -131,9 +131,9 @@ class ModelFeedforward:
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion, which goes on from the one asked for before."""
-        asked = q, dq, ddq
-        if not all(new is old for new, old in zip(asked, self._asked, strict=True)):
-            self._asked, self._said = asked, self._moved(*asked)
+        asked = self._asked
+        if q is not asked[0] or dq is not asked[1] or ddq is not asked[2]:
+            self._asked, self._said = (q, dq, ddq), self._moved(q, dq, ddq)
         return self._said.copy()
 
     def _moved(self, q: Array, dq: Array, ddq: Array) -> Array:
