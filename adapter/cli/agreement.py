@@ -20,6 +20,7 @@ from adapter.runs.terminal import say
 from drivers.interface import Driver
 
 PLAN_PAGE = "plan.html"
+MOST_READS = 200  # at once
 
 
 def need_somebody(agreed: bool) -> None:
@@ -31,6 +32,20 @@ def need_somebody(agreed: bool) -> None:
         )
 
 
+def reading(driver: Driver) -> Callable[[], None]:
+    """What takes the samples that came in since it was called last: none may wait for long."""
+    taken_ns = [0]
+
+    def read() -> None:
+        now_ns = time.monotonic_ns()
+        count = (now_ns - taken_ns[0]) // driver.period_ns if taken_ns[0] and driver.paced else 1
+        taken_ns[0] = now_ns
+        for _ in range(min(count, MOST_READS)):
+            driver.read()
+
+    return read
+
+
 def agree(
     args: argparse.Namespace,
     driver: Driver,
@@ -38,8 +53,11 @@ def agree(
     duration_s: float,
     folder: Path,
     stopped: Callable[[], bool],
-) -> None:
+) -> Callable[[], Path] | None:
     """Check what the arm holds, show the plan and ask; the driver's samples are read meanwhile.
+
+    Returns:
+        What writes the page after the run, where nobody was asked; None where it is written.
 
     Raises:
         SettingsError: the arm does not hold what its model says, or nobody agreed.
@@ -49,19 +67,24 @@ def agree(
     draw, motion, start = controller.draw, controller.reference, controller.start
     assert isinstance(draw, FreeMotion) and draw.least is not None
     assert motion is not None and start is not None
-    model, limits = draw.arm.model, controller.limits
+    model, limits, least = draw.arm.model, controller.limits, draw.least
     if not args.trust_model:
         check_resting_torque(model, start.q, start.tau)
     lines = plan_lines(motion, limits, model.tree.joint_names, duration_s)
     lines.insert(-1, f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).")
+    say("\n".join(lines))
+
+    def write() -> Path:
+        return write_plan(folder / PLAN_PAGE, draw.arm, motion, limits, least, lines)
+
+    if args.yes:  # nobody looks at it now, and the arm's samples do not wait
+        return write
     with ThreadPoolExecutor(1) as pool:
-        page = pool.submit(
-            write_plan, folder / PLAN_PAGE, draw.arm, motion, limits, draw.least, lines
-        )
+        page = pool.submit(write)
         _read_until(page.done, driver)
-        say("\n".join([*lines, f"As a page: {page.result()}"]))
-    if not args.yes:
-        _ask(driver, stopped)
+        say(f"As a page: {page.result()}")
+    _ask(driver, stopped)
+    return None
 
 
 def _ask(driver: Driver, stopped: Callable[[], bool]) -> None:

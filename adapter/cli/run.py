@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from adapter.cli.agreement import agree, need_somebody
+from adapter.cli.agreement import agree, need_somebody, reading
 from adapter.cli.common import configure, recording_metadata, robot_of
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
@@ -23,10 +23,11 @@ from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
-from adapter.control.settings import gentle
+from adapter.control.settings import ExcitationSettings, gentle
 from adapter.effects.active import lasting_effects, with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
 from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
@@ -43,6 +44,7 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import HARDWARE, joint_count, open_driver, split_address
 
+DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
 
 
@@ -208,7 +210,10 @@ def controller_of(
         forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
     limits = MotionLimits.of(robot)
-    draw = plan.free_motion(args.duration) if plan.maybe_real else RandomMotion
+    draw: DrawMotion = RandomMotion
+    if plan.maybe_real:
+        draw = free = plan.free_motion(args.duration)
+        free.arm.meanwhile = reading(driver)
     return ExcitationController(limits, config.excitation, control, forward, draw, expected)
 
 
@@ -227,18 +232,20 @@ def _go(
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     display = None if args.quiet else DisplayJob(partial(make_display, duration_s))
 
+    later: list[Callable[[], Path] | None] = []
+
     def before_motion(stopped: Callable[[], bool]) -> None:
         warn(driver.intake.notes)  # who holds the arm, say; again with what came later at the end
         if controller is None:
             warn(filter(None, [another_robot(driver, MotionLimits.of(robot))]))
         elif maybe_real:
-            agree(args, driver, controller, duration_s, folder, stopped)
+            later.append(agree(args, driver, controller, duration_s, folder, stopped))
 
     learner = learner_job(
         robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
     )
     deadman = maybe_real and controller is not None
-    return run_live(
+    result = run_live(
         driver,
         front_end,
         controller,
@@ -246,6 +253,9 @@ def _go(
         LiveOptions(duration_s, deadman=deadman, before_motion=before_motion),
         say=say,
     )
+    for write in filter(None, later):
+        write()
+    return result
 
 
 def _recording(

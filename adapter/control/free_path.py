@@ -11,6 +11,7 @@ The path of a random motion depends on its path time alone, so stops and slow st
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,7 @@ TABLE, REACH = "table", "reach"
 ATTEMPTS, SAME_SIZE, SHRINK = 48, 3, 0.8  # motions drawn, of one size, and the next size
 POSES, ALWAYS = 100, 0.95  # two bodies that are near in so many of so many random poses are joined
 SAME_START = 1e-3  # rad: from so near the same motion is free, too, to a millimetre or so
+LOOKS = 100  # between two calls of `meanwhile`
 BEYOND_S = 5.0  # of path, after the last stop should have ended
 
 
@@ -82,6 +84,7 @@ class ArmInCell:
 
     Attributes:
         capsules: on the links.
+        meanwhile: called every few milliseconds of a search, so that an arm's samples can be read.
         ignored: pairs that are near in nearly every pose, so that they count as joined.
 
     Raises:
@@ -92,6 +95,7 @@ class ArmInCell:
     def __init__(self, model: SelfModel, cell: Cell) -> None:
         self._coal = _coal()
         self.model, self.cell = model, cell
+        self.meanwhile: Callable[[], None] = lambda: None
         self.capsules = capsules_of(model, cell.hand)
         self._frames = frames_of(model.tree.parent, model.lam)
         n = model.tree.n
@@ -117,12 +121,16 @@ class ArmInCell:
         speed = motion.bounds()[2]
         least = Clearance(np.inf, ("nothing", "nothing"), 0.0)
         path = np.zeros((3, len(speed)))
+        looks = 0
         for pair in tuple(self._pairs):
             nearing, s = float(pair.arms @ speed), 0.0
             while nearing > 0.0 and s <= path_s:
                 sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, path)
                 place_frames(self._frames, path[0], self._R, self._o)
                 distance = self._distance(pair)
+                looks += 1
+                if looks % LOOKS == 0:
+                    self.meanwhile()
                 if distance < least.distance:
                     least = Clearance(distance, pair.names, s)
                     if at_least is not None and distance < at_least:
