@@ -6,6 +6,7 @@ import math
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.control.sample_clock import SampleClock
 from adapter.errors import ControlError
@@ -34,7 +35,7 @@ class ReadingVerdict(IntEnum):
     JUMPED = 2  # moved as no joint moves
     STUCK = 3  # stands still while the arm should move
     REPEATED = 4  # not newer than those before it
-    BROKEN_OFF = 5  # a jump behind a leap of the stamps
+    BROKEN_OFF = 5  # a jump behind a hole: of all samples, or of this joint's
 
 
 VERDICTS = tuple(ReadingVerdict)
@@ -154,6 +155,7 @@ class ReadingGate:
         self._started = self._leapt = False
         self.unusable = 0
         self._blind_ns = self._handled_ns = self._stamped_ns = 0
+        self._unmeasured: NDArray[np.bool_] | None = None  # since its last measured, good reading
 
     def look(self, sample: JointSample, now_ns: int) -> int:
         """Time since the last sample, ns; see `SampleClock.step`.
@@ -180,13 +182,17 @@ class ReadingGate:
             times = 1e-9 * self._handled_ns, 1e-9 * self._stamped_ns
             between_s = min(times), max(times)
             verdict = self._judge.judge(sample.q, sample.dq, q_ref, between_s)
-        if verdict == ReadingVerdict.JUMPED and self._leapt:
-            verdict = ReadingVerdict.BROKEN_OFF
+        unmeasured = np.isnan(sample.tau)  # what a driver predicts has no torque
+        if self._unmeasured is not None:
+            self._unmeasured |= unmeasured
+            hole = self._leapt or bool(self._unmeasured[self._judge.joint])
+            if verdict == ReadingVerdict.JUMPED and hole:
+                verdict = ReadingVerdict.BROKEN_OFF
         if self._blind_ns > BLIND_NS or verdict == ReadingVerdict.STUCK:
             raise ControlError(_WHY[verdict].format(self._judge.joint + 1))
         if verdict != ReadingVerdict.GOOD:
             self.unusable += 1
             return False
         self._blind_ns = self._handled_ns = self._stamped_ns = 0
-        self._leapt = False
+        self._leapt, self._unmeasured = False, unmeasured
         return True

@@ -64,6 +64,9 @@ _STATE = {
     "score_trace": ("_rows", "_used", "_offers", "stride"),
 }
 
+_NEEDED = (".held", ".changes", "adam.steps")
+_FINITE = ("schema.R0", "schema.p", "theta.x", "theta.th", "adam.first", "adam.second")
+
 
 def save_checkpoint(learner: OnlineLearner, path: str | Path, *, sync: bool = True) -> None:
     """Write a learner's state; an existing file is replaced in one go, or not at all.
@@ -103,11 +106,12 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
         raise SettingsError(f"{path}: cannot be read as a checkpoint: {error}") from error
     if int(arrays.get("version", -1)) != VERSION:
         raise SettingsError(f"{path}: not a checkpoint of version {VERSION}")
-    if str(arrays["about"]) != _about(learner):
+    if str(arrays.get("about")) != _about(learner):
         raise SettingsError(
-            f"{path}: is of another robot or other learner settings: {arrays['about']}; "
+            f"{path}: is of another robot or other learner settings: {arrays.get('about')}; "
             f"here: {_about(learner)}"
         )
+    _check_sound(arrays, path)
     learner._shadow = learner.theta.empty_moments() if "_shadow.A" in arrays else None
     for part, names in _STATE.items():
         owner = attrgetter(part)(learner) if part else learner
@@ -120,6 +124,16 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
     learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
     learner.adam.steps = int(arrays["adam.steps"])
+
+
+def _check_sound(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
+    """Refuse a checkpoint that lacks parts, or whose estimate holds what is no number."""
+    lacking = [key for key in (*_NEEDED, *_FINITE) if key not in arrays]
+    if lacking:
+        raise SettingsError(f"{path}: the checkpoint lacks '{lacking[0]}'")
+    for key in _FINITE:
+        if arrays[key].dtype.kind not in "fiub" or not np.isfinite(arrays[key]).all():
+            raise SettingsError(f"{path}: '{key}' of the checkpoint holds what is no finite number")
 
 
 def _put(owner: object, name: str, value: np.ndarray | None) -> None:

@@ -14,11 +14,14 @@ import zstandard
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import main
+from adapter.errors import SettingsError
+from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.model.model_file import dumps
 from adapter.model.robots import documented
 from drivers.files.bounded import DEPTH_LIMIT, parse_json, read_arrays
 from drivers.files.mcap import read_log, survey
 from drivers.files.mcap.records import MAGIC
+from tests.helpers.arm_data import learner_for
 from tests.helpers.mcap_tools import record, samples
 
 ZEROS = 2**28  # bytes, in a few kB of a chunk
@@ -78,6 +81,19 @@ def test_damage_is_not_listed_without_end(tmp_path: Path) -> None:
 def test_what_is_honest_is_read(tmp_path: Path) -> None:
     log = read_log(record(tmp_path / "a.mcap", samples(500)))
     assert len(log) == 500 and not log.warnings
+
+
+@pytest.mark.parametrize("key", ["theta.x", "schema.R0", "adam.second"])
+def test_checkpoints_are_whole_and_finite(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "c.npz"
+    save_checkpoint(learner_for(), path)
+    load_checkpoint(learner_for(), path)
+    arrays = read_arrays(path)
+    for wrong in (np.full_like(arrays[key], np.nan), None):
+        content = {**arrays, key: wrong}
+        np.savez(path, **{name: x for name, x in content.items() if x is not None})
+        with pytest.raises(SettingsError, match=f"'{key}'"):
+            load_checkpoint(learner_for(), path)
 
 
 DEEP = "[" * 100_000 + "]" * 100_000
