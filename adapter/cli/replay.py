@@ -17,6 +17,7 @@ from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
+from adapter.runs.contacts import contact_lines
 from adapter.runs.outcome import learned_model
 from adapter.runs.replay import (
     Replay,
@@ -95,7 +96,13 @@ def _figures(
         robot,
         reference,
         course,
-        warnings=[*log.warnings, *front_end.messages, *result.outcome.lam_notes],
+        warnings=[
+            *log.warnings,
+            *front_end.messages,
+            *result.outcome.lam_notes,
+            *contact_lines(result.contacts, robot.tree.joint_names),
+        ],
+        contacts=result.contacts,
         recording=", ".join(map(str, args.logs)),
         robot=robot.name,
         every=args.every,

@@ -23,16 +23,19 @@ from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward, ModelFeedforward
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
+from adapter.control.observer import ContactObserver
 from adapter.control.settings import ExcitationSettings, gentle
 from adapter.effects.active import lasting_effects, with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
+from adapter.runs.contacts import contact_lines, contacts_of
 from adapter.runs.live import describe_estimate, learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
@@ -245,17 +248,21 @@ def _go(
         robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
     )
     deadman = maybe_real and controller is not None
+    effects, names = config.pipeline.learner.effects, robot.tree.joint_names
+    watching = FollowingObserver(
+        ContactObserver(robot, effects), config.safety.stop_at_contact, names
+    )
     result = run_live(
         driver,
         front_end,
         controller,
         Jobs(learner, recording, display),
-        LiveOptions(duration_s, deadman=deadman, before_motion=before_motion),
+        LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
         say=say,
     )
     for write in filter(None, later):
         write()
-    return result
+    return dataclasses.replace(result, contacts=contacts_of(watching.observer, robot))
 
 
 def _recording(
@@ -309,7 +316,13 @@ def _conclude(
             result.timing.missed_deadlines,
             0.0 if result.tracking is None else plan.config.excitation.slow_s,
         ),
-        warnings=[*front_end.messages, *result.troubles, *outcome.lam_notes],
+        warnings=[
+            *front_end.messages,
+            *result.troubles,
+            *outcome.lam_notes,
+            *contact_lines(result.contacts, robot.tree.joint_names),
+        ],
+        contacts=result.contacts,
         robot=robot.name,
         driver=args.driver,
         scenario=args.scenario,

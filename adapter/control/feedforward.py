@@ -65,6 +65,10 @@ class ModelFeedforward:
 
     Until `set` has given it parameters its torques are zero. Asked again for the very same arrays,
     it says what it said.
+
+    Attributes:
+        frames, theta: of the rigid bodies in use; θ (n, 10) with the tool.
+        gravity: (3,) m/s².
     """
 
     notes: Sequence[str] = ()
@@ -79,6 +83,7 @@ class ModelFeedforward:
         if tree.floating:
             raise SettingsError("feed-forward needs a fixed base; this model's base floats")
         n = tree.n
+        self.gravity = np.asarray(gravity, dtype=np.float64)
         self._parent, self._base = tree.parent, base_at_rest(gravity)[None]
         self._effects = effects_by_name(effect_names)
         self._known = by_joint(known, n) if known else None
@@ -124,10 +129,13 @@ class ModelFeedforward:
         `shapes` (e, n) of effects that have several, as `Theta.shapes`.
         """
         self._asked = (None, None, None)
-        self._frames = frames_of(self._parent, lam)
-        self._theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
-        self._values = np.array(effect_values, dtype=np.float64)
-        self._shapes = np.full(self._values.shape, np.nan) if shapes is None else shapes.copy()
+        self.frames = frames_of(self._parent, lam)
+        self.theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
+        if shapes is None:
+            shapes = np.full(np.shape(effect_values), np.nan)
+        taken = zip(self._effects, effect_values, shapes, strict=True)
+        parts = [(effect, value * effect.shares(shape)) for effect, value, shape in taken]
+        self._parts = [part for part in parts if part[1].any()]
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion, which goes on from the one asked for before."""
@@ -144,28 +152,66 @@ class ModelFeedforward:
         """Torques (n,) N m of holding still with nothing bent."""
         return self._torque(q, self._still, self._still, self._straight)
 
+    def beside_bodies(self, q: Array, dq: Array, dt_s: float) -> Array:
+        """Torques (n,) N m beside those of the rigid bodies, but for what ddq asks for.
+
+        Args:
+            q, dq: (n,) as measured, dt_s after those of the call before: bristles follow them.
+        """
+        wind(dt_s, q, dq, self._bristles, self._bent)
+        return self._beside(q, dq, self._still, self._bent.reshape(-1, len(q)))
+
+    def friction(self, dq: float) -> Array:
+        """(n,) N m: half of what turning from -dq to dq (rad/s) changes, far from the turn."""
+        still, speed = self._still, np.full(len(self._still), dq)
+        ahead = self._beside(still, speed, still, self._straight + 1.0)
+        return 0.5 * (ahead - self._beside(still, -speed, still, self._straight - 1.0))
+
+    def motor_inertia(self) -> Array:
+        """(n,) kg m²: what is beside the bodies and follows the joint's own acceleration."""
+        still, one = self._still, np.ones(len(self._still))
+        return self._beside(still, still, one, self._straight) - self._beside(
+            still, still, still, self._straight
+        )
+
     def _torque(self, q: Array, dq: Array, ddq: Array, bent: Array) -> Array:
+        self._set_motion(q, dq, ddq)
+        tau = self._rigid()
+        return tau + self._beside(q, dq, ddq, bent, tau)
+
+    def _set_motion(self, q: Array, dq: Array, ddq: Array) -> None:
+        """Where the links move otherwise than the joints say, theirs."""
         signals, known = self._signals, self._known
         signals[0, 0], signals[1, 0], signals[2, 0] = q, dq, ddq
         if known is not None and known.moves:
             self._to_links(known)
-        tau = self._rigid()
+
+    def _beside(
+        self, q: Array, dq: Array, ddq: Array, bent: Array, rigid: Array | None = None
+    ) -> Array:
+        """What comes on top of the rigid bodies' torques (n,), computed here where it is needed."""
+        signals, known = self._signals, self._known
+        more: Array = np.zeros(len(q))
         if known is not None:
+            if rigid is None:
+                self._set_motion(q, dq, ddq)
+                rigid = self._rigid()
             link, speed, pull = signals[0, 0], signals[1, 0], signals[2, 0]
-            total = tau + known.torque(JointSignals(link, speed, pull, tau, bent=bent))
+            more = more + known.torque(JointSignals(link, speed, pull, rigid, bent=bent))
             if known.pushed:
-                push = np.empty((1, len(tau), 1))
-                wrench_torques(self._frames, signals[0], known.wrench[:, None], push)
-                total = total - push[0, :, 0]
-            tau = total + known.gain * total
+                push = np.empty((1, len(rigid), 1))
+                wrench_torques(self.frames, signals[0], known.wrench[:, None], push)
+                more = more - push[0, :, 0]
+            more = more + known.gain * (rigid + more)
         at = JointSignals(q, dq, ddq, bent=bent)
-        for effect, value, shape in zip(self._effects, self._values, self._shapes, strict=True):
-            tau = tau + value * effect.torque_per_unit(at, shape)
-        return tau
+        for effect, parts in self._parts:
+            for part, column in zip(parts, effect.basis(at), strict=True):
+                more += part * column
+        return more
 
     def _rigid(self) -> Array:
         tau = self._signals[3]
-        torques(self._frames, self._theta, self._motion, self._base, tau)
+        torques(self.frames, self.theta, self._motion, self._base, tau)
         return tau[0].copy()
 
     def _to_links(self, known: ByJoint) -> None:

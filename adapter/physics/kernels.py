@@ -319,6 +319,81 @@ def regressor(frames, q, motion, base, Y):
             j = frames.parent[j]
 
 
+@jit
+def momenta(frames, theta, q, dq, gravity, out):
+    """Momentum of a fixed-base arm and what changes it beside the motors, at one instant.
+
+    With p = M(q) dq and the kinetic energy T, Lagrange's equations say dp/dt = tau + dT/dq - g.
+    The momentum of a sub-tree H = [l; a] about the base's origin gives both: p_j = S_j . H_j with
+    the joint's line S_j, and dT/dq_j = H_j . (V_j x S_j) with the link's twist V_j.
+
+    Args:
+        frames: `Frames`; theta: (n, 10).
+        q, dq: (n,) rad, rad/s; gravity: (3,) m/s² in base axes.
+        out: (3, n), filled: p N m s, dT/dq N m, g N m.
+    """
+    n = q.shape[0]
+    R, o = np.empty((n, 3, 3)), np.empty((n, 3))
+    motion, own, up = np.empty((n, 12)), np.empty(6), np.empty(3)
+    momentum, weight = np.zeros((n + 1, 6)), np.zeros((n + 1, 6))
+    place_frames(frames, q, R, o)
+    link_motion(frames, JointMotion(q, dq, np.zeros(n)), np.zeros(12), motion)
+    for j in range(n):
+        body_momentum(motion[j], theta[j], own)
+        transfer_one(R[j], o[j], own, momentum[j + 1])
+        for r in range(3):
+            up[r] = -R[j, 0, r] * gravity[0] - R[j, 1, r] * gravity[1] - R[j, 2, r] * gravity[2]
+            own[r] = theta[j, 0] * up[r]
+        own[3] = theta[j, 2] * up[2] - theta[j, 3] * up[1]
+        own[4] = theta[j, 3] * up[0] - theta[j, 1] * up[2]
+        own[5] = theta[j, 1] * up[1] - theta[j, 2] * up[0]
+        transfer_one(R[j], o[j], own, weight[j + 1])
+    for j in range(n - 1, -1, -1):
+        line, H = axis_line(R[j], o[j]), momentum[j + 1]
+        out[0, j] = moment_about(line, H)
+        out[1, j] = energy_slope(R[j], o[j], motion[j], line, H)
+        out[2, j] = moment_about(line, weight[j + 1])
+        below = frames.parent[j] + 1
+        for r in range(6):
+            momentum[below, r] += momentum[j + 1, r]
+            weight[below, r] += weight[j + 1, r]
+
+
+@jit
+def body_momentum(m, theta, out):
+    """Momentum out (6,) [l; a] of one body about its frame's origin; arguments as `body_wrench`."""
+    vx, vy, vz, wx, wy, wz = m[0], m[1], m[2], m[3], m[4], m[5]
+    mass, hx, hy, hz = theta[0], theta[1], theta[2], theta[3]
+    out[0] = mass * vx + wy * hz - wz * hy
+    out[1] = mass * vy + wz * hx - wx * hz
+    out[2] = mass * vz + wx * hy - wy * hx
+    out[3] = theta[4] * wx + theta[5] * wy + theta[6] * wz + hy * vz - hz * vy
+    out[4] = theta[5] * wx + theta[7] * wy + theta[8] * wz + hz * vx - hx * vz
+    out[5] = theta[6] * wx + theta[8] * wy + theta[9] * wz + hx * vy - hy * vx
+
+
+@jit
+def energy_slope(R, o, m, line, H):
+    """H . (V x S): how the kinetic energy of a sub-tree changes with its joint's angle, N m.
+
+    Args:
+        R, o: (3, 3) and (3,), the joint's frame in the base; m: (12,) motion row of its link.
+        line: S of `axis_line`; H: (6,) momentum of the sub-tree about the base's origin.
+    """
+    w, v = R @ m[3:6], R @ m[:3]
+    vx = v[0] + o[1] * w[2] - o[2] * w[1]  # of the link's point at the base's origin
+    vy = v[1] + o[2] * w[0] - o[0] * w[2]
+    vz = v[2] + o[0] * w[1] - o[1] * w[0]
+    a, b, c, x, y, z = line
+    linear = (
+        H[0] * (w[1] * c - w[2] * b + vy * z - vz * y)
+        + H[1] * (w[2] * a - w[0] * c + vz * x - vx * z)
+        + H[2] * (w[0] * b - w[1] * a + vx * y - vy * x)
+    )
+    angular = H[3] * (w[1] * z - w[2] * y) + H[4] * (w[2] * x - w[0] * z)
+    return linear + angular + H[5] * (w[0] * y - w[1] * x)
+
+
 # Tables of m samples. `base` is (m, 12), or (1, 12) where it is the same for all.
 
 

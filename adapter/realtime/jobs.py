@@ -290,6 +290,9 @@ class RecorderTask:
                 writer.write(sample)
                 if command is not None:
                     writer.write_command(sample.stamp_ns, command)
+                external = layout.external_torque(own)
+                if external is not None:
+                    writer.write_external(sample.stamp_ns, external)
             count = len(rows)
             del rows
             ring.take(count)

@@ -18,6 +18,7 @@ import numpy as np
 
 from adapter.control.controller import Controller
 from adapter.realtime.clock import Clock
+from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.real_time import DEFAULT_PRIORITY, Grant, RealTime, split_cores
 from adapter.realtime.session import Ended, FrontEndLike, Session, stop_arm
@@ -45,6 +46,7 @@ class LiveOptions:
         before_motion: called once the motion is drawn (the controller knows it) and before the
             first command, with what says whether somebody asked to stop; what it raises ends the
             run with the arm at rest.
+        observer: says what pushes the arm; None where nobody wants to know.
     """
 
     duration_s: float | None = None
@@ -53,6 +55,7 @@ class LiveOptions:
     deadman: bool = False
     shared_memory: SharedMemoryOptions = field(default_factory=SharedMemoryOptions)
     before_motion: Callable[[Callable[[], bool]], None] | None = None
+    observer: FollowingObserver | None = None
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ class LiveResult:
         troubles: workers that died or failed, one sentence each.
         tracking: of the controller, see `Controller.tracking`; None in passive mode.
         intake: the driver's account.
+        contacts: what pushed the arm, filled in by whoever knows the arm.
     """
 
     samples: int
@@ -95,6 +99,7 @@ class LiveResult:
     troubles: list[str]
     tracking: dict[str, Any] | None
     intake: Intake
+    contacts: list[dict[str, Any]] = field(default_factory=list)
 
 
 class StopSignals:
@@ -202,6 +207,9 @@ def run_live(
                 supervisor.keep,
                 options.duration_s,
             )
+            session.observer = observer = options.observer
+            if observer is not None and supervisor.board is not None:
+                observer.attach(supervisor.board.name)
             loop = _Loop(driver, session, supervisor, stop, deadman)
             _prepare(driver, front_end, controller, supervisor, session)
             if options.before_motion is not None:
@@ -218,6 +226,8 @@ def run_live(
             stop_arm(driver, session)
             if controller is not None:
                 controller.detach()
+            if options.observer is not None:
+                options.observer.detach()
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
         tracking = None if controller is None else controller.tracking()
         return loop.result(real_time.grants, collected, tracking)

@@ -44,6 +44,17 @@ class FrontEndLike(Protocol):
         """The filtered state that this sample completes, or None."""
 
 
+class ObserverLike(Protocol):
+    """Who says what pushes the arm; `adapter.realtime.following.FollowingObserver` for one."""
+
+    @property
+    def alarm(self) -> str | None:
+        """Why a motion has to end; None while all is well."""
+
+    def step(self, sample: JointSample) -> Array:
+        """External torque (n,) N m with this sample."""
+
+
 class Session:
     """Ticks of one run.
 
@@ -52,10 +63,11 @@ class Session:
         front_end: takes the samples.
         controller: moves the arm; None listens.
         pass_on: takes each filtered state; it must copy what it keeps.
-        keep: takes each sample and the command given upon it, if any.
+        keep: takes each sample, the command given upon it and the external torque, if any.
         duration_s: of the arm's own stamps, until the safe stop begins; None for no end.
 
     Attributes:
+        observer: takes each sample; None where nobody wants to know what pushes the arm.
         samples: read so far.
         set_aside: read to get ready, before the first tick; nobody else saw them.
         elapsed_s: on the arm's own stamps; one that leaps by more than a second counts a period.
@@ -72,9 +84,10 @@ class Session:
         front_end: FrontEndLike,
         controller: Controller | None,
         pass_on: Callable[[Array], None],
-        keep: Callable[[JointSample, Array | None], None],
+        keep: Callable[[JointSample, Array | None, Array | None], None],
         duration_s: float | None,
     ) -> None:
+        self.observer: ObserverLike | None = None
         self._driver, self._front_end, self._controller = driver, front_end, controller
         self._pass_on, self._keep, self._duration_s = pass_on, keep, duration_s
         self.samples, self.set_aside, self.elapsed_s = 0, 0, 0.0
@@ -157,8 +170,9 @@ class Session:
         self.samples += 1
         if record is not None:
             self._pass_on(record)
+        external = None if self.observer is None else self.observer.step(sample)
         command, trouble = self._move(sample)
-        self._keep(sample, command)
+        self._keep(sample, command, external)
         if trouble is not None:
             return self._end(Ended.DRIVER_ERROR, trouble)
         return self._goes_on(sample.stamp_ns)
@@ -166,6 +180,8 @@ class Session:
     def _move(self, sample: JointSample) -> tuple[Array | None, str | None]:
         if self._controller is None:
             return None, None
+        if self.observer is not None and self.observer.alarm is not None:
+            return None, self.observer.alarm
         try:
             # Where time goes on between two reads, the instant of this one says how far.
             tau = self._controller.step(sample, self.had_ns if self._driver.arrived_ns else 0)
@@ -253,7 +269,7 @@ def run_lockstep(
         if learner is not None:
             learner.step(record)
 
-    def keep(sample: JointSample, command: Array | None) -> None:
+    def keep(sample: JointSample, command: Array | None, external: Array | None) -> None:
         if each is not None:
             each(sample, command)
 

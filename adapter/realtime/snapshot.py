@@ -8,6 +8,7 @@ writer that dies half-way leaves the other slot whole.
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -23,7 +24,7 @@ from adapter.physics.kernels import jit
 from adapter.realtime.shared import SharedBlock, SharedMemoryError, fence
 from drivers.files.bounded import parse_json
 
-MAGIC = 0x5041534E41503032  # "PASNAP02"
+MAGIC = 0x5041534E41503033  # "PASNAP03"
 VERSION, KIND, N, BODIES, EFFECTS, PID, TEXT = 0, 8, 9, 10, 11, 12, 13  # words of the header
 HEADER_WORDS, TEXT_BYTES = 16, 8192
 SEQUENCE, STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(6)  # words of a slot
@@ -103,6 +104,7 @@ class Board:
             "effects": (effects, n),
             "effects_std": (effects, n),
             "effect_shapes": (effects, n),
+            "torque_std": (n,),
         }
         start = head + TEXT_BYTES
         self._words = self._block.array((2, SLOT_WORDS), np.int64, start)
@@ -117,7 +119,7 @@ class Board:
 
 
 def value_count(n: int, bodies: int, effects: int) -> int:
-    return 12 * n + 20 * bodies + 3 * effects * n
+    return 13 * n + 20 * bodies + 3 * effects * n
 
 
 def block_size(values: int) -> int:
@@ -194,6 +196,7 @@ class Snapshot:
         effects_std: (e, n) their standard deviations.
         effect_shapes: (e, n) the parameter beside it that was chosen (s0 of bristle friction); NaN
             for effects without one.
+        torque_std: (n,) N m, what the estimate leaves unexplained of the torques learned from.
         lam_converged: λ is valid to work with.
         theta_converged: θ and the effects are valid to work with.
         stamp_ns: of the newest filtered state learned from, on the arm's clock.
@@ -210,6 +213,7 @@ class Snapshot:
     effects: Array
     effects_std: Array
     effect_shapes: Array
+    torque_std: Array
     lam_converged: bool = False
     theta_converged: bool = False
     stamp_ns: int = 0
@@ -356,7 +360,7 @@ class SnapshotReader(Board):
                 raise SnapshotError(f"'{self.name}': no whole estimate in {timeout_s} s")
         parts, start = {}, 0
         for key, shape in self.shapes.items():
-            size = shape[0] * shape[1]
+            size = math.prod(shape)
             parts[key] = values[start : start + size].reshape(shape).copy()
             start += size
         flags, source = int(words[FLAGS]), int(words[SOURCE])
@@ -388,4 +392,5 @@ def nothing_known(n: int, bodies: int, effects: int) -> Snapshot:
     """A snapshot of NaN for n joints, to be completed with `dataclasses.replace`."""
     per_joint, per_body = np.full((n, 6), np.nan), np.full((bodies, 10), np.nan)
     per_effect = np.full((effects, n), np.nan)
-    return Snapshot(per_joint, per_joint, per_body, per_body, per_effect, per_effect, per_effect)
+    bodies_too = per_joint, per_joint, per_body, per_body
+    return Snapshot(*bodies_too, per_effect, per_effect, per_effect, np.full(n, np.nan))

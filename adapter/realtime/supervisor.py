@@ -199,13 +199,15 @@ class Supervisor:
         else:
             self.unlearned += 1
 
-    def keep(self, sample: JointSample, command: Array | None) -> None:
+    def keep(
+        self, sample: JointSample, command: Array | None, external: Array | None = None
+    ) -> None:
         """Hand a sample to the recorder; never waits."""
         if self.recorder is None or self.samples is None:
             return
         self.kept += 1
         if self.recorder.held:
-            self.raw.fill(self._record, sample, command)
+            self.raw.fill(self._record, sample, command, external)
             self.samples.push(self._record)
 
     def look_after(self) -> None:

@@ -114,6 +114,7 @@ class Publisher:
             effects=learner.theta.effect_values,
             effects_std=self._std[2],
             effect_shapes=learner.theta.shapes,
+            torque_std=np.sqrt(learner.theta.variance()),
             lam_converged=learner.schema.converged,
             theta_converged=learner.theta_converged,
             stamp_ns=learner.stamp_ns,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.batch import learn_batch
 from adapter.runs.config import PipelineSettings
+from adapter.runs.contacts import ReplayObserver, contacts_of
 from adapter.runs.outcome import Outcome, collect
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
@@ -46,6 +47,7 @@ class Replay:
         tick_ns: compute time of the front end by sample (exact mode only).
         wall_s: time spent on learning, without reading the file.
         span_s: time that the samples span in the recording.
+        contacts: see `contacts.contacts_of`; of the exact mode and a fixed base only.
     """
 
     outcome: Outcome
@@ -54,6 +56,7 @@ class Replay:
     tick_ns: NDArray[np.int64]
     wall_s: float
     span_s: float
+    contacts: list[dict[str, Any]] = field(default_factory=list)
 
 
 def one_after_other(logs: Sequence[Log]) -> Log:
@@ -138,16 +141,27 @@ def replay(
             pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
     if resume is not None:
         load_checkpoint(pipeline.learner, resume)
+    observer = None
+    if every == 1 and not documented.tree.floating:
+        observer = ReplayObserver(documented, pipeline.learner)
     started = time.perf_counter()
-    run = _exact if every == 1 else _batch
-    tick_ns = run(log, stop, pipeline, every, progress or (lambda done: None))
+    progress = progress or (lambda done: None)
+    if every == 1:
+        tick_ns = _exact(log, stop, pipeline, progress, observer)
+    else:
+        tick_ns = _batch(log, stop, pipeline, every, progress)
     wall_s = time.perf_counter() - started
     span_s = 1e-9 * float(log.stamp_ns[stop - 1] - log.stamp_ns[0])
-    return Replay(collect(pipeline.learner), pipeline, stop, tick_ns, wall_s, span_s)
+    contacts = [] if observer is None else contacts_of(observer.observer, documented)
+    return Replay(collect(pipeline.learner), pipeline, stop, tick_ns, wall_s, span_s, contacts)
 
 
 def _exact(
-    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
+    log: Log,
+    stop: int,
+    pipeline: Pipeline,
+    progress: Progress,
+    observer: ReplayObserver | None,
 ) -> NDArray[np.int64]:
     tick_ns = np.zeros(stop, dtype=np.int64)
     front_end, learner = pipeline.front_end, pipeline.learner
@@ -164,6 +178,8 @@ def _exact(
         tick_ns[i] = time.perf_counter_ns() - before
         if state is not None:
             learner.step(state)
+        if observer is not None:
+            observer.step(sample)
         if i % 500 == 0:
             progress(i)
     return tick_ns

@@ -28,6 +28,7 @@ from drivers.interface import Array, DriverError, JointSample, LinkMotion
 
 JOINT_STATES = "/joint_states"
 JOINT_COMMANDS = "/joint_commands"
+EXTERNAL_TORQUES = "/external_torques"
 LINK_TWISTS = "/link_twists/"
 LINK_ACCELS = "/link_accels/"
 LINK_IMUS = "/link_imus/"
@@ -152,6 +153,11 @@ class McapWriter:
         """Record (n,) commanded joint torques, N m."""
         data = self._encode(self._commands, stamp_ns, tau, tau, tau)
         self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
+
+    def write_external(self, stamp_ns: int, tau: Array) -> None:
+        """Record (n,) torques that the surroundings put on the joints, N m."""
+        data = self._encode(self._commands, stamp_ns, tau, tau, tau)
+        self._add(self._channel(EXTERNAL_TORQUES, JOINT_STATE), stamp_ns, data)
 
     def write_estimate(self, stamp_ns: int, estimate: Mapping[str, Any]) -> None:
         """Record an estimate as JSON; arrays become lists, not-a-number null."""

@@ -1,0 +1,68 @@
+"""The contact observer beside a live learner: it follows the estimate that is published."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from adapter.control.observer import ContactObserver
+from adapter.model.spatial import Array
+from adapter.realtime.snapshot import SnapshotReader
+from drivers.interface import JointSample
+
+REFRESH_TICKS = 50
+
+
+class FollowingObserver:
+    """Steps an observer and lets it go on with each new estimate that has converged.
+
+    Args:
+        observer: of the documented arm, fresh.
+        stops: whether a contact ends the motion, once something was learned.
+        names: of the joints.
+    """
+
+    def __init__(
+        self, observer: ContactObserver, stops: bool = False, names: Sequence[str] = ()
+    ) -> None:
+        self.observer, self._stops, self._names = observer, stops, names
+        self._reader: SnapshotReader | None = None
+        self._ticks = self._version = 0
+
+    def attach(self, name: str) -> None:
+        """Follow the estimate of this name from now on. Raises SnapshotError."""
+        self.detach()
+        self._reader = SnapshotReader(name)
+
+    def detach(self) -> None:
+        """Follow no longer; what was read last stays."""
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
+
+    @property
+    def alarm(self) -> str | None:
+        """Why the motion has to end; None while nothing pushes."""
+        contact = self.observer.contact
+        if contact is None or not self._stops or not self._version:
+            return None
+        j = contact.joint
+        name = f" ({self._names[j]})" if self._names else ""
+        return (
+            f"something pushes joint {j + 1}{name} with {contact.torque[j]:+.1f} N m, "
+            f"{abs(contact.torque[j]) / contact.std[j]:.0f} standard deviations of the learned "
+            "model: look what touches the arm; the arm is stopped"
+        )
+
+    def step(self, sample: JointSample) -> Array:
+        """External torque (n,) N m with this sample."""
+        self._ticks += 1
+        if self._reader is not None and self._ticks % REFRESH_TICKS == 0:
+            self._refresh(self._reader)
+        return self.observer.step(sample)
+
+    def _refresh(self, reader: SnapshotReader) -> None:
+        new = reader.read()
+        if new.version == self._version or not (new.lam_converged and new.theta_converged):
+            return
+        self._version = new.version
+        self.observer.adopt(new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std)

@@ -1,0 +1,157 @@
+"""The contact observer: external torque held to a known push, noise, changes of parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from adapter.control.contact_kind import Kind, kind_of
+from adapter.control.observer import ContactObserver, ObserverSettings
+from adapter.errors import SettingsError
+from adapter.realtime.following import FollowingObserver
+from adapter.realtime.snapshot import SnapshotWriter, nothing_known
+from drivers.interface import JointSample
+from sim.effects import payload
+from sim.truth import panda
+from tests.helpers.arm_data import Motion, arm, panda_model, pin_model, record, rnea
+
+STD = np.full(7, 0.05)
+NONE = np.zeros((0, 7))
+
+
+def samples_with(external: np.ndarray, begin_s: float, seed: int = 3) -> list[JointSample]:
+    """Motion of 4 s with a real arm's noise; from `begin_s` on something puts these torques on."""
+    data = record(arm(), Motion(4.0, seed, low_hz=0.1))
+    tau = data.tau.copy()
+    tau[round(1e3 * begin_s) :] -= external
+    return [
+        JointSample(int(t), q, dq, own)
+        for t, q, dq, own in zip(data.stamp_ns, data.q, data.dq, tau, strict=True)
+    ]
+
+
+def learned_observer() -> ContactObserver:
+    """One that knows the arm."""
+    model = panda_model()
+    observer = ContactObserver(model)
+    observer.adopt(model.lam, model.theta, NONE, NONE, STD)
+    return observer
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_push_is_seen_at_once_and_is_as_large_as_it_is(seed: int) -> None:
+    """5 N m on joint 2 and 4 on joint 4, as 10 N at the hand make."""
+    external = np.array([0.0, 5.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+    observer = learned_observer()
+    late = []
+    for sample in samples_with(external, 3.0, seed):
+        torque = observer.step(sample)
+        if sample.stamp_ns > 3.2e9:
+            late.append(torque.copy())
+    (contact,) = observer.contacts
+    assert 0.0 <= 1e-9 * contact.begin_ns - 3.0 < 0.03
+    assert contact.joint in (1, 3)
+    assert contact.end_ns is None
+    assert np.abs(np.mean(late, axis=0) - external).max() < 0.3
+    wrench, std = observer.wrench()
+    assert (std > 0.0).all() and np.isfinite(wrench).all()
+
+
+def test_parameters_may_change_at_any_time() -> None:
+    """New parameters each 20 ms, a little other each time, look like no push."""
+    model, observer = panda_model(), learned_observer()
+    rng = np.random.default_rng(1)
+    for k, sample in enumerate(samples_with(np.zeros(7), 5.0)):
+        if k % 20 == 0:
+            theta = model.theta * (1.0 + 1e-3 * rng.standard_normal(model.theta.shape))
+            observer.adopt(model.lam, theta, NONE, NONE, STD)
+        observer.step(sample)
+    assert observer.contacts == []
+
+
+def test_what_is_no_number_changes_nothing() -> None:
+    """Readings and parameters that are not finite, holes, a clock that is set back."""
+    model, observer = panda_model(), learned_observer()
+    samples = samples_with(np.zeros(7), 5.0)
+    for k, sample in enumerate(samples):
+        if k % 97 == 0:
+            observer.step(JointSample(sample.stamp_ns, sample.q, sample.dq * np.nan, sample.tau))
+            observer.adopt(model.lam, model.theta * np.nan, NONE, NONE, STD)
+        if k % 1000 == 500:
+            observer.step(JointSample(0, sample.q, sample.dq, sample.tau))
+        if k % 700 < 650:
+            assert np.isfinite(observer.step(sample)).all()
+    assert observer.contacts == []
+
+
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_a_load_is_no_push_aside(seed: int) -> None:
+    """A body of 1 kg that hangs on the hand from 2 s on, by Pinocchio."""
+    truth, motion = panda(), Motion(4.0, seed, low_hz=0.3)
+    data = record(arm(), motion)
+    q, dq, ddq = data.true[:3]
+    held = pin_model(truth, payload(1.0, (0.0, 0.02, 0.12)))
+    more = rnea(held, q, dq, ddq) - rnea(pin_model(truth), q, dq, ddq)
+    model, observer = panda_model(), learned_observer()
+    for k, stamp_ns in enumerate(data.stamp_ns):
+        tau = data.tau[k] + (more[k] if k >= 2000 else 0.0)
+        observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
+    contact = observer.contacts[0]
+    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
+    kind = kind_of(contact, observer.frames, model.gravity, model.limits.effort)
+    assert kind == Kind.LOAD
+
+
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_a_push_aside_is_no_load(seed: int) -> None:
+    """10 N along y of the base at the hand from 2 s on, by Pinocchio's Jacobian."""
+    truth, data = pin_model(panda()), record(arm(), Motion(4.0, seed, low_hz=0.3))
+    scratch, model, observer = truth.createData(), panda_model(), learned_observer()
+    for k, stamp_ns in enumerate(data.stamp_ns):
+        tau = data.tau[k].copy()
+        if k >= 2000:
+            jacobian = pin.computeJointJacobian(truth, scratch, data.true[0][k], 7)
+            turn = scratch.oMi[7].rotation.T @ np.array([0.0, 10.0, 0.0])
+            tau -= jacobian[:3].T @ turn
+        observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
+    contact = observer.contacts[0]
+    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
+    kind = kind_of(contact, observer.frames, model.gravity, model.limits.effort)
+    assert kind == Kind.PUSH
+
+
+@pytest.mark.parametrize("name", ["bandwidth_hz", "sigmas", "hold_s"])
+def test_settings_are_judged(name: str) -> None:
+    """None may be zero."""
+    with pytest.raises(SettingsError, match=name):
+        ObserverSettings(**{name: 0.0})
+
+
+def test_a_contact_ends_a_motion_where_that_is_asked_for() -> None:
+    """Not by the documented model, not without leave; by what was learned, with joint and size."""
+    external = np.array([0.0, 8.0, 0.0, 6.0, 0.0, 0.0, 0.0])
+    model = panda_model()
+    for stops in (False, True):
+        following = FollowingObserver(ContactObserver(model), stops, model.tree.joint_names)
+        board = SnapshotWriter.create(model.tree.joint_names, name=None)
+        try:
+            following.attach(board.name)
+            some = nothing_known(7, 7, 0)
+            known = {"lam": model.lam, "theta": model.theta, "torque_std": STD}
+            board.publish(replace(some, **known, lam_converged=True, theta_converged=True))
+            alarms = []
+            for sample in samples_with(external, 3.0):
+                following.step(sample)
+                if following.alarm is not None:
+                    alarms.append((1e-9 * sample.stamp_ns, following.alarm))
+            assert bool(alarms) == stops
+            if stops:
+                assert 3.0 <= alarms[0][0] < 3.03
+                assert "panda_joint" in alarms[0][1] and "standard deviations" in alarms[0][1]
+        finally:
+            following.detach()
+            board.unlink()
+            board.close()
