@@ -123,7 +123,9 @@ class Motion:
         from scipy.signal import sosfiltfilt  # long to load; no loop needs it
 
         fs, band_hz = 1.0 / (self.t[1] - self.t[0]), float(self.bands_hz[joint])
-        if not 0.0 < band_hz < 0.5 * fs:
+        if band_hz == 0.0:  # nothing of it stands out of the noise
+            return np.full_like(x, x.mean())
+        if not band_hz < 0.5 * fs:
             return x
         return np.asarray(sosfiltfilt(_low_pass(band_hz, round(fs, RATE_DIGITS)), x, axis=0))
 

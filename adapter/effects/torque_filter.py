@@ -36,7 +36,7 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     by_rates = True
     learned, step = 1, 1e-4  # c; how late a torque is, is for `gap` to say
     positive = ("c",)
-    log_odds = -1.0
+    log_odds = -8.0
     inexact = 0.02
     simpler = ((LATE, 0.03),)
     form = LATE
