@@ -119,7 +119,7 @@ def test_unknown_limits_allow_anything() -> None:
     assert len(states) > 2600 and front_end.refused["out_of_range"] == 0
 
 
-@pytest.mark.parametrize(("share", "stretch"), [(0.1, 1), (0.0, 1), (0.02, 4)])
+@pytest.mark.parametrize(("share", "stretch"), [(0.1, 1), (np.nan, 1), (0.02, 4)])
 def test_an_arm_faster_than_documented_is_said_and_learned_from(share: float, stretch: int) -> None:
     """Its positions move as fast as its speeds say; three times the documented speed or not."""
     whole = moving()
