@@ -10,7 +10,7 @@ import numpy as np
 from drivers.interface import DriverError, JointSample, LinkMotion
 from sim.dynamics import link_motion
 from sim.effects import ENCODER, TORQUE
-from sim.engine import PERIOD_S, Engine
+from sim.engine import PERIOD_S, SUBSTEPS, Engine
 from sim.imus import Imus
 from sim.noise import SensorNoise, levels_of
 from sim.noise_levels import NoiseLevels
@@ -53,6 +53,7 @@ class Plant:
         noise: NoiseLevels | None = None,
         links: bool | tuple[str, ...] = False,
         q0: Array | None = None,
+        substeps: int = SUBSTEPS,
     ) -> None:
         """Set up the arm at rest at t = 0.
 
@@ -63,6 +64,7 @@ class Plant:
             links: whether the links' motion is measured; or names of links with a sensor glued
                 on, anyhow (`sim.imus`).
             q0: (n,) posture at the start, rad; the truth's by default.
+            substeps: of a tick.
         """
         self.truth = truth
         self.saturated, self.braked = False, True
@@ -72,7 +74,7 @@ class Plant:
         self._imus = (
             None if isinstance(links, bool) else Imus(truth.link_names, links, seed, PERIOD_S)
         )
-        self._engine = Engine(truth)
+        self._engine = Engine(truth, substeps=substeps)
         sensing = any(effect.place in (ENCODER, TORQUE) for effect in truth.effects)
         self._sensors = Sensors(truth, PERIOD_S) if sensing else None
         self._noise = SensorNoise(noise or levels_of("real"), truth.n, seed)

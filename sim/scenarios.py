@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sim.effects import Effect, payload, per_joint
-from sim.engine import PERIOD_S
+from sim.engine import PERIOD_S, SUBSTEPS
 from sim.imus import Imus
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
@@ -50,9 +50,9 @@ class Scenario:
     def __post_init__(self) -> None:
         Imus(self.truth.link_names, self.imus, self.seed, PERIOD_S)
 
-    def plant(self, q0: Array | None = None) -> Plant:
+    def plant(self, q0: Array | None = None, substeps: int = SUBSTEPS) -> Plant:
         """A fresh arm at t = 0, at rest at q0 (n,) rad or at the truth's own posture."""
-        return Plant(self.truth, self.seed, self.noise, self.imus or self.links, q0)
+        return Plant(self.truth, self.seed, self.noise, self.imus or self.links, q0, substeps)
 
     def as_dict(self) -> dict[str, Any]:
         """What a truth file holds."""

@@ -42,6 +42,8 @@ def reading(driver: Driver) -> Callable[[], None]:
         taken_ns[0] = now_ns
         for _ in range(min(count, MOST_READS)):
             driver.read()
+            if driver.arrived_ns >= now_ns:  # it had to be waited for: no more is there
+                return
 
     return read
 

@@ -248,10 +248,11 @@ def _go(
         robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
     )
     deadman = maybe_real and controller is not None
-    effects, names = config.pipeline.learner.effects, robot.tree.joint_names
-    watching = FollowingObserver(
-        ContactObserver(robot, effects), config.safety.stop_at_contact, names
-    )
+    safety, watching = config.safety, None
+    if safety.watch_contacts or safety.stop_at_contact:
+        observer = ContactObserver(robot, config.pipeline.learner.effects)
+        names = robot.tree.joint_names
+        watching = FollowingObserver(observer, safety.stop_at_contact, names)
     result = run_live(
         driver,
         front_end,
@@ -262,6 +263,8 @@ def _go(
     )
     for write in filter(None, later):
         write()
+    if watching is None:
+        return result
     return dataclasses.replace(result, contacts=contacts_of(watching.observer, robot))
 
 

@@ -236,12 +236,24 @@ class ContactObserver:
         self.contact: Contact | None = None
         self.contacts: list[Contact] = []
         self._kept, self._now = np.zeros((3, n)), np.zeros((4, n))
-        self._last, self._wrench = (np.zeros(n), np.zeros(n)), np.zeros((2, 6))
+        self._reading, self._wrench = np.zeros((3, n)), np.zeros((2, 6))
         self._noise, self._age_s = np.zeros((n, n)), 0.0
         self._anew, self._stamp_ns, self._since, self._recent = True, 0, 0, 0.0
         effort = np.where(np.isfinite(effort), effort, 0.0)
         self._errors = np.array([UNLEARNED_EFFORT * effort, np.full(n, UNLEARNED_WEIGHT)])
         self._take_over()
+        self._compile()
+
+    def _compile(self) -> None:
+        """Compile what a step calls, on numbers of no meaning: the loop has no time for it."""
+        n = len(self.std)
+        none, one, now = np.zeros(n), np.ones(n), np.ones((4, n))
+        bodies = self._model.frames, self._model.theta, self._model.gravity
+        ask(bodies, (none, none), none, self._own, self._errors, now)
+        step = 1e-3, self._pole, 1.0, True
+        balance(none.copy(), np.zeros((3, n)), now, none, step, np.eye(n))
+        distance_of(none, np.eye(n), now, one)
+        hand_wrench(self.frames, none, none, one, np.zeros((2, 6)))
 
     def adopt(
         self, lam: Array, theta: Array, effects: Array, shapes: Array, torque_std: Array
@@ -267,7 +279,7 @@ class ContactObserver:
         self._own = np.array([self._model.motor_inertia(), turn])
         if not self._anew:
             before = self._now[:2].copy()
-            self._ask_model(*self._last, 0.0)
+            self._ask_model(self._reading[0], self._reading[1], 0.0)
             self._kept[:2] += self._now[:2] - before
 
     def _ask_model(self, q: Array, dq: Array, dt_s: float) -> None:
@@ -279,14 +291,15 @@ class ContactObserver:
 
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample; one that is not finite leaves it as it was."""
-        q, dq, tau = sample.q, sample.dq, sample.tau
-        if not (np.isfinite(q).all() and np.isfinite(dq).all() and np.isfinite(tau).all()):
+        if not np.isfinite(sample.q + sample.dq + sample.tau).all():
             return self.torque
+        q, dq, tau = self._reading  # of its own: other arrays may be of a kind to compile for
+        q[:], dq[:], tau[:] = sample.q, sample.dq, sample.tau
         dt_s = 1e-9 * (sample.stamp_ns - self._stamp_ns)
         if self._anew or not 0.0 < dt_s <= LONGEST_S:
             dt_s = math.inf
         self._ask_model(q, dq, dt_s)
-        self._anew, self._stamp_ns, self._last = False, sample.stamp_ns, (q, dq)
+        self._anew, self._stamp_ns = False, sample.stamp_ns
         if dt_s < math.inf:
             self._age_s += dt_s
         step = dt_s, self._pole, self._age_s, self.contact is None
@@ -329,5 +342,5 @@ class ContactObserver:
 
         What the torques do not show has the standard deviation of not knowing.
         """
-        hand_wrench(self.frames, self._last[0], self.torque, self.std, self._wrench)
+        hand_wrench(self.frames, self._reading[0], self.torque, self.std, self._wrench)
         return self._wrench[0].copy(), self._wrench[1].copy()

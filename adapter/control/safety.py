@@ -194,6 +194,9 @@ class ArmWatch:
         self.now = np.zeros((len(Now), n))
         self.now[Now.EXPECTED] = self.now[Now.OFFSET] = np.nan
         self.saturated = self.rate_limited = 0
+        look(  # compiled now, not in the first tick
+            self.now.copy(), self._limits, self._times.copy(), self._bounds.copy(), (0.0, 0.0, 0.0)
+        )
 
     @property
     def room(self) -> Array:

@@ -114,6 +114,7 @@ class SafetySettings:
         start_share: of the effort limit, beyond the expected torque, that a command has at the
             start of a motion.
         rise_s: of motion as expected until it has all of `ControlSettings.effort_share`.
+        watch_contacts: whether the contact observer runs beside the loop; see README for its cost.
         stop_at_contact: whether what the contact observer sees ends the motion, too, once θ has
             converged. A load that is picked up in motion is a contact.
     """
@@ -126,6 +127,7 @@ class SafetySettings:
     saturated_s: float = 0.1
     start_share: float = 0.5
     rise_s: float = 5.0
+    watch_contacts: bool = False
     stop_at_contact: bool = False
 
     def __post_init__(self) -> None:

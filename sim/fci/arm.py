@@ -16,6 +16,7 @@ from sim.rigid_bodies import payload_theta
 from sim.scenarios import FLANGE_M, Scenario
 from sim.truth import Array, Truth
 
+SERVED_SUBSTEPS = 2  # of 0.5 ms: friction in four takes most of a millisecond on a slow machine
 EXTERNAL_HZ = 10.0  # low pass of the external torque; the robot's own is not published
 EXTERNAL_GAIN = 1.0 - np.exp(-2 * np.pi * EXTERNAL_HZ * TICK_S)
 # The joint impedance controller is scaled by the arm's inertia. 60 1/s, that of the plant's brakes,
@@ -44,7 +45,7 @@ class Arm:
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         self.truth = known_arm(scenario.truth)
         self._motors = motor_inertias(scenario.truth)
-        self._plant: Plant = scenario.plant()
+        self._plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
         self._n = self.truth.n
         self._still = np.zeros(self._n)
         self.refresh(settings)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.control.controller import ExcitationController
+from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.urdf import read_urdf
@@ -44,6 +44,13 @@ def parts(seed: int = 5):
     """Front end and controller of a Panda."""
     motion = ExcitationSettings(seed=seed)
     return FrontEnd(PANDA), ExcitationController(MotionLimits.of(PANDA), motion)
+
+
+def swinging_parts(seed: int = 5):
+    """The same of an arm that swings by itself: held softly near where it is, it is no trouble."""
+    motion = ExcitationSettings(seed=seed, range_share=0.05)
+    soft = ControlSettings(stiffness=[20.0] * 7)
+    return FrontEnd(PANDA), ExcitationController(MotionLimits.of(PANDA), motion, soft)
 
 
 def live_options(duration_s: float | None, ring_s: float = 5.0) -> LiveOptions:

@@ -105,7 +105,7 @@ def test_every_state_arrives_in_order_and_as_in_one_thread(tmp_path, monkeypatch
 @pytest.mark.parametrize("fault", [{"fail_read": 700}, {"fail_command": 700}])
 def test_a_driver_that_fails_is_stopped_and_all_is_kept(tmp_path, fault):
     arm, path = tools.Swinging(**fault), tmp_path / "a.mcap"
-    front_end, controller = tools.parts()
+    front_end, controller = tools.swinging_parts()
     result = run_live(
         arm,
         front_end,
@@ -180,7 +180,7 @@ def test_a_learner_that_dies_stops_neither_arm_nor_display(tmp_path, monkeypatch
     monkeypatch.setenv("TEST_DIARY", str(tmp_path / "diary"))
     lines: list[str] = []
     path, diary = tmp_path / "a.mcap", tmp_path / "diary"
-    front_end, controller = tools.parts()
+    front_end, controller = tools.swinging_parts()
     result = run_live(
         tools.Swinging(),
         front_end,

@@ -16,9 +16,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.control.controller import ControlSettings, ExcitationController
-from adapter.control.limits import MotionLimits
-from adapter.control.settings import ExcitationSettings
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
 from adapter.realtime.session import run_lockstep
@@ -262,9 +259,7 @@ def _failing_at(part, name: str, count: int):
 @pytest.mark.parametrize("where", ["read", "command", "filter", "control"])
 def test_a_bug_in_a_tick_stops_the_arm_and_closes_the_recording(tmp_path, where):
     arm, path = Broken(where), tmp_path / "a.mcap"
-    front_end, limits = tools.parts()[0], MotionLimits.of(tools.PANDA)
-    soft = ControlSettings(stiffness=[20.0] * 7)  # this arm swings by itself: that is no trouble
-    controller = ExcitationController(limits, ExcitationSettings(seed=5), soft)
+    front_end, controller = tools.swinging_parts()
     if where == "control":
         controller = _failing_at(controller, "step", 700)
     if where == "filter":
