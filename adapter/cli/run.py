@@ -20,12 +20,12 @@ from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.excitation import RandomMotion
-from adapter.control.feedforward import Feedforward, ModelFeedforward
+from adapter.control.feedforward import Feedforward, ModelFeedforward, not_learned
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
 from adapter.control.settings import ExcitationSettings, gentle
-from adapter.effects.active import lasting_effects, with_bodies
+from adapter.effects.active import with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -206,11 +206,9 @@ def controller_of(
         forward = expected
     elif args.feedforward == "learned":
         effects = config.pipeline.learner.effects
-        whole = with_bodies(robot)
-        lasting = lasting_effects(whole.effects, robot.tree.n)
-        known = [active for active in lasting if active.effect.name not in effects]
+        known, gravity = not_learned(robot, effects), with_bodies(robot).gravity
         bound = FeedforwardBound(robot, expected)
-        forward = LearnedFeedforward(robot.tree, whole.gravity, effects, tool, known, bound)
+        forward = LearnedFeedforward(robot.tree, gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
     limits = MotionLimits.of(robot)
     draw: DrawMotion = RandomMotion

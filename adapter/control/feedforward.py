@@ -49,6 +49,13 @@ class Feedforward(Protocol):
         """Torques (n,) N m of holding still with nothing bent: gravity. Raises nothing."""
 
 
+def not_learned(documented: SelfModel, effect_names: Sequence[str]) -> list[Active]:
+    """Lasting effects of a documented model but for its bodies and for those that are learned."""
+    whole = with_bodies(documented)
+    lasting = lasting_effects(whole.effects, whole.tree.n)
+    return [active for active in lasting if active.effect.name not in effect_names]
+
+
 class ModelFeedforward:
     """Inverse dynamics of a fixed-base model, compiled; some 7 µs a call for 7 joints.
 

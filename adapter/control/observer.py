@@ -22,8 +22,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adapter.control.feedforward import ModelFeedforward
-from adapter.effects.active import lasting_effects, with_bodies
+from adapter.control.feedforward import ModelFeedforward, not_learned
+from adapter.effects.active import with_bodies
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -222,13 +222,13 @@ class ContactObserver:
         settings: ObserverSettings | None = None,
     ) -> None:
         self.settings, n = settings or ObserverSettings(), documented.tree.n
-        effort, whole = documented.limits.effort, with_bodies(documented)
+        effort = documented.limits.effort
         self._model = ModelFeedforward.of(documented)
         self._learned = ModelFeedforward(
             documented.tree,
-            documented.gravity,
+            with_bodies(documented).gravity,
             effect_names,
-            lasting_effects(whole.effects, n),
+            not_learned(documented, effect_names),
         )
         self._tool = documented.theta_with_tool() - documented.theta
         self._pole = 2.0 * math.pi * self.settings.bandwidth_hz
@@ -257,19 +257,20 @@ class ContactObserver:
 
     def adopt(
         self, lam: Array, theta: Array, effects: Array, shapes: Array, torque_std: Array
-    ) -> None:
-        """Go on with what was learned; anything that is not finite changes nothing.
+    ) -> bool:
+        """Go on with what was learned, or say that it is not finite: then nothing changes.
 
         Args:
             lam, theta, effects, shapes: λ (n, 6), θ (n, 10), (e, n), as in a `Snapshot`.
             torque_std: (n,) what it leaves unexplained, N m.
         """
         if not all(np.isfinite(x).all() for x in (lam, theta, torque_std)):
-            return
+            return False
         self._learned.set(lam, theta + self._tool, np.nan_to_num(effects), shapes)
         self._model = self._learned
         self._errors = np.array([torque_std, np.zeros(len(torque_std))])
         self._take_over()
+        return True
 
     def _take_over(self) -> None:
         """What was believed of the momentum changes with the parameters: a fresh start from one

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 from adapter.control.observer import ContactObserver
 from adapter.model.spatial import Array
-from adapter.realtime.snapshot import SnapshotReader
+from adapter.realtime.estimates import EstimateFollower
 from drivers.interface import JointSample
 
 REFRESH_TICKS = 500  # an estimate taken over costs some 0.2 ms
 
 
-class FollowingObserver:
+class FollowingObserver(EstimateFollower):
     """Steps an observer and lets it go on with each new estimate that has converged.
 
     Args:
@@ -24,26 +24,15 @@ class FollowingObserver:
     def __init__(
         self, observer: ContactObserver, stops: bool = False, names: Sequence[str] = ()
     ) -> None:
+        super().__init__()
         self.observer, self._stops, self._names = observer, stops, names
-        self._reader: SnapshotReader | None = None
-        self._ticks = self._version = 0
-
-    def attach(self, name: str) -> None:
-        """Follow the estimate of this name from now on. Raises SnapshotError."""
-        self.detach()
-        self._reader = SnapshotReader(name)
-
-    def detach(self) -> None:
-        """Follow no longer; what was read last stays."""
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
+        self._ticks, self._learned = 0, False
 
     @property
     def alarm(self) -> str | None:
         """Why the motion has to end; None while nothing pushes."""
         contact = self.observer.contact
-        if contact is None or not self._stops or not self._version:
+        if contact is None or not self._stops or not self._learned:
             return None
         j = contact.joint
         name = f" ({self._names[j]})" if self._names else ""
@@ -56,13 +45,8 @@ class FollowingObserver:
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample."""
         self._ticks += 1
-        if self._reader is not None and self._ticks % REFRESH_TICKS == 0:
-            self._refresh(self._reader)
+        new = self.new_estimate() if self._ticks % REFRESH_TICKS == 0 else None
+        if new is not None:
+            values = new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std
+            self._learned = self.observer.adopt(*values) or self._learned
         return self.observer.step(sample)
-
-    def _refresh(self, reader: SnapshotReader) -> None:
-        new = reader.read()
-        if new.version == self._version or not (new.lam_converged and new.theta_converged):
-            return
-        self._version = new.version
-        self.observer.adopt(new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std)

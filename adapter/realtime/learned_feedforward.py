@@ -17,7 +17,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, regressors
-from adapter.realtime.snapshot import SnapshotReader
+from adapter.realtime.estimates import EstimateFollower
 
 LOAD_SHARE, LOAD_OFF_M = 0.25, 0.15  # of the arm's own mass, at the last link; off its origin
 FRICTION_SHARE = 0.1  # of the effort limit
@@ -59,7 +59,7 @@ class FeedforwardBound:
         return bound
 
 
-class LearnedFeedforward:
+class LearnedFeedforward(EstimateFollower):
     """Inverse dynamics of the estimate that a learner publishes; ready once θ has converged.
 
     Attach it (`attach`) when the snapshot exists; before that it is not ready.
@@ -85,32 +85,18 @@ class LearnedFeedforward:
         known: Sequence[Active] = (),
         bound: FeedforwardBound | None = None,
     ) -> None:
+        super().__init__()
         self._model = ModelFeedforward(tree, gravity, effect_names, known)
         self._tool = np.zeros((tree.n, 10))
         if tool_theta is not None:
             self._tool[-1] = tool_theta
-        self._reader: SnapshotReader | None = None
-        self._ready, self._version = False, 0
+        self._ready = False
         self._bound, self._std = bound, np.zeros((tree.n, 10))
         self._asked = np.zeros((3, tree.n))
         self._most = np.full(tree.n, np.inf)
-        self._jump, self._left = (
-            np.zeros((2, tree.n)),
-            0,
-        )  # of the last change, and calls to fade it
+        self._jump, self._left = np.zeros((2, tree.n)), 0  # of the last change; calls to fade it
         self._believed, self._trust = True, 1.0
         self.notes: list[str] = []
-
-    def attach(self, name: str) -> None:
-        """Follow the estimate of this name from now on. Raises SnapshotError."""
-        self.detach()
-        self._reader = SnapshotReader(name)
-
-    def detach(self) -> None:
-        """Follow no longer; what was read last stays."""
-        if self._reader is not None:
-            self._reader.close()
-        self._reader = None
 
     @property
     def ready(self) -> bool:
@@ -119,18 +105,15 @@ class LearnedFeedforward:
 
     def refresh(self) -> None:
         """Take over the newest estimate if it is valid; one that is not leaves the last."""
-        if self._reader is None:
-            return
-        snapshot = self._reader.read()
-        usable = snapshot.lam_converged and snapshot.theta_converged
-        if usable and snapshot.version != self._version:
+        snapshot = self.new_estimate()
+        if snapshot is not None:
             theta = snapshot.theta + self._tool
             if np.isfinite(theta).all() and np.isfinite(snapshot.lam).all():
                 before = self._learned()
                 effects = np.nan_to_num(snapshot.effects)
                 self._model.set(snapshot.lam, theta, effects, snapshot.effect_shapes)
                 self._fade_from(before)
-                self._version, self._std = snapshot.version, snapshot.theta_std
+                self._std = snapshot.theta_std
         if self._ready and self._bound is not None:
             q, dq, ddq = self._asked
             self._most = self._bound.at(q, dq, ddq, self._std)

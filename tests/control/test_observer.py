@@ -123,6 +123,24 @@ def test_a_push_aside_is_no_load(seed: int) -> None:
     assert kind == Kind.PUSH
 
 
+def test_friction_that_is_documented_and_learned_counts_once() -> None:
+    """Each joint's 0.5 N m s/rad; counted twice it would push the arm with 0.5 dq."""
+    model, name = panda_model(), "viscous_friction"
+    known = {"effect": name, "parameters": {"Fv": 0.5}}
+    rough = replace(model, effects=tuple({**known, "joints": [j]} for j in range(1, 8)))
+    data = record(arm(), Motion(4.0, 3, low_hz=0.1))
+    observer = ContactObserver(rough, (name,))
+    observer.adopt(model.lam, model.theta, np.full((1, 7), 0.5), np.full((1, 7), np.nan), STD)
+    worst = 0.0
+    for k, stamp_ns in enumerate(data.stamp_ns):
+        tau = data.tau[k] + 0.5 * data.true[1][k]
+        torque = observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
+        worst = max(worst, np.abs(torque[4:]).max())
+    assert np.abs(data.dq[:, 4:]).max() > 1.0
+    assert worst < 0.3
+    assert observer.contacts == []
+
+
 @pytest.mark.parametrize("name", ["bandwidth_hz", "sigmas", "hold_s"])
 def test_settings_are_judged(name: str) -> None:
     """None may be zero."""
