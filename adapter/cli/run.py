@@ -24,6 +24,7 @@ from adapter.control.feedforward import Feedforward, ModelFeedforward, not_learn
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
+from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings, gentle
 from adapter.effects.active import with_bodies
 from adapter.model.model_file import dumps
@@ -47,7 +48,7 @@ from drivers.files.mcap import read_log
 from drivers.interface import Driver
 from drivers.registry import HARDWARE, joint_count, open_driver, split_address
 
-DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion]
+DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
 
 

@@ -16,9 +16,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from adapter.control.excitation import RandomMotion, smooth_step
+from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward
 from adapter.control.limits import MotionLimits, need_same_robot
+from adapter.control.path_motion import PathMotion, smooth_step
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
 from adapter.control.safety import ArmWatch, Now
 from adapter.control.settings import ExcitationSettings, SafetySettings
@@ -158,7 +159,7 @@ class ExcitationController:
         motion: ExcitationSettings | None = None,
         control: ControlSettings | None = None,
         feedforward: Feedforward | None = None,
-        draw: Callable[[MotionLimits, Array, ExcitationSettings], RandomMotion] = RandomMotion,
+        draw: Callable[[MotionLimits, Array, ExcitationSettings], PathMotion] = RandomMotion,
         expected: Feedforward | None = None,
     ) -> None:
         control = control or ControlSettings()
@@ -169,7 +170,7 @@ class ExcitationController:
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
         self._effort = limits.effort * control.effort_share
-        self.reference: RandomMotion | None = None
+        self.reference: PathMotion | None = None
         self.start: JointSample | None = None
         self._tau, self._bias, self._still = np.zeros(n), np.zeros(n), np.zeros(n)
         self._fade_s, self._ticks = 0.0, 0
@@ -322,7 +323,7 @@ class ExcitationController:
             (self._with_model if share else self._feedback_only).add(error)
         return tau
 
-    def _of_model(self, model: Feedforward, ref: RandomMotion) -> Array:
+    def _of_model(self, model: Feedforward, ref: PathMotion) -> Array:
         tau = model(ref.q, ref.dq, ref.ddq)
         if self._adds_gravity:
             tau = tau - model.unbent(ref.q)

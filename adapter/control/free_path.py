@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from adapter.control.cell import Cell
-from adapter.control.excitation import RandomMotion, sums_of_sines
+from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
+from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings
 from adapter.control.shapes import Capsule, capsules_of
 from adapter.errors import MeansError, SettingsError
@@ -34,7 +35,11 @@ ATTEMPTS, SAME_SIZE, SHRINK = 48, 3, 0.8  # motions drawn, of one size, and the 
 POSES, ALWAYS = 100, 0.95  # two bodies that are near in so many of so many random poses are joined
 SAME_START = 1e-3  # rad: from so near the same motion is free, too, to a millimetre or so
 LOOKS = 100  # between two calls of `meanwhile`
+DIFFERENCE_RAD = 1e-4  # between two poses that a gradient is taken from
 BEYOND_S = 5.0  # of path, after the last stop should have ended
+
+# From limits, where the arm is, settings, attempt and size.
+Draw = Callable[[MotionLimits, Array, ExcitationSettings, int, float], PathMotion]
 
 
 @dataclass(frozen=True)
@@ -109,7 +114,7 @@ class ArmInCell:
         self._pairs = [pair for pair in self._pairs if frozenset(pair.names) not in allowed]
 
     def clearance(
-        self, motion: RandomMotion, path_s: float, at_least: float | None = None
+        self, motion: PathMotion, path_s: float, at_least: float | None = None
     ) -> Clearance:
         """The least distance from path time 0 to `path_s`, to 5 mm.
 
@@ -120,13 +125,11 @@ class ArmInCell:
         """
         speed = motion.bounds()[2]
         least = Clearance(np.inf, ("nothing", "nothing"), 0.0)
-        path = np.zeros((3, len(speed)))
         looks = 0
         for pair in tuple(self._pairs):
             nearing, s = float(pair.arms @ speed), 0.0
             while nearing > 0.0 and s <= path_s:
-                sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, path)
-                place_frames(self._frames, path[0], self._R, self._o)
+                place_frames(self._frames, motion.path(s)[0], self._R, self._o)
                 distance = self._distance(pair)
                 looks += 1
                 if looks % LOOKS == 0:
@@ -147,6 +150,24 @@ class ArmInCell:
         found = [Clearance(self._distance(pair), pair.names, 0.0) for pair in self._pairs]
         nothing = Clearance(np.inf, ("nothing", "nothing"), 0.0)
         return min(found, key=lambda each: each.distance, default=nothing)
+
+    def too_near(self, q: Array, at_least: float) -> tuple[float, Array]:
+        """Squared shortfalls of all distances, m², summed over poses (m, n), and their gradient
+        (m, n), m²/rad."""
+        total, slope = 0.0, np.zeros_like(q)
+        for pose, own in zip(q, slope, strict=True):
+            place_frames(self._frames, pose, self._R, self._o)
+            near = [(p, d) for p in self._pairs if (d := self._distance(p)) < at_least]
+            if not near:
+                continue
+            total += sum((at_least - distance) ** 2 for _, distance in near)
+            for j in range(len(pose)):
+                moved = pose.copy()
+                moved[j] += DIFFERENCE_RAD
+                place_frames(self._frames, moved, self._R, self._o)
+                rise = [(self._distance(p) - d) * (at_least - d) for p, d in near if p.arms[j]]
+                own[j] = -2.0 * sum(rise) / DIFFERENCE_RAD
+        return total, slope
 
     def placed(self, q: Array) -> list[tuple[Array, float]]:
         """Ends (2, 3) in base axes and radius of every capsule in one pose (n,)."""
@@ -293,19 +314,18 @@ class FreeMotion:
     Args:
         arm: in its cell.
         duration_s: until the safe stop begins.
+        draw: makes a motion of an attempt and a size.
 
     Attributes:
         least: the least distance of the motion drawn last; None before.
     """
 
-    def __init__(self, arm: ArmInCell, duration_s: float) -> None:
-        self.arm, self._duration_s = arm, duration_s
+    def __init__(self, arm: ArmInCell, duration_s: float, draw: Draw = RandomMotion) -> None:
+        self.arm, self._duration_s, self._draw = arm, duration_s, draw
         self.least: Clearance | None = None
         self._checked: tuple[Array, ExcitationSettings, int] | None = None
 
-    def __call__(
-        self, limits: MotionLimits, q0: Array, settings: ExcitationSettings
-    ) -> RandomMotion:
+    def __call__(self, limits: MotionLimits, q0: Array, settings: ExcitationSettings) -> PathMotion:
         """A motion from q0 (n,), the same for the same seed.
 
         Raises:
@@ -314,7 +334,7 @@ class FreeMotion:
         if self._checked is not None:
             before, same, k = self._checked
             if settings == same and np.abs(q0 - before).max() < SAME_START:
-                return RandomMotion(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
+                return self._draw(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
         margin, nearest = self.arm.cell.margin, self.arm.at(q0)
         if nearest.distance < margin:
             raise SettingsError(
@@ -323,7 +343,7 @@ class FreeMotion:
             )
         path_s = self._duration_s + settings.stop_s + BEYOND_S
         for k in range(ATTEMPTS):
-            motion = RandomMotion(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
+            motion = self._draw(limits, q0, settings, k, SHRINK ** (k // SAME_SIZE))
             nearest = self.arm.clearance(motion, path_s, margin)
             if nearest.distance >= margin:
                 self.least = self.arm.clearance(motion, path_s)

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from adapter.control.cell import Cell
-from adapter.control.excitation import RandomMotion, sums_of_sines
 from adapter.control.free_path import ArmInCell, Clearance
 from adapter.control.limits import MotionLimits
+from adapter.control.path_motion import PathMotion
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.report.html import fill, write_whole
 from adapter.report.skeleton import from_a_corner
@@ -33,30 +33,23 @@ VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
 def write_plan(
     path: str | Path,
     arm: ArmInCell,
-    motion: RandomMotion,
+    motion: PathMotion,
     limits: MotionLimits,
     nearest: Clearance,
     lines: Sequence[str],
 ) -> Path:
     """Write the page of a motion in its cell. Raises RunFolderError."""
-    poses = [_pose(motion, s) for s in np.linspace(0.0, max(nearest.path_s, 30.0), POSES)]
+    start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
+    poses = [motion.path(s)[0].copy() for s in np.linspace(0.0, max(nearest.path_s, 30.0), POSES)]
     context: dict[str, Any] = {
         "robot": arm.model.name,
         "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {arm.cell.margin:g} m",
         "ignored": [" and ".join(pair) for pair in arm.ignored],
-        "views": [
-            _view(arm, poses, _pose(motion, nearest.path_s), motion.q, view) for view in VIEWS
-        ],
+        "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
         "joints": _joint_panels(motion, limits, arm.model.tree.joint_names),
         "lines": lines,
     }
     return write_whole(path, fill(TEMPLATE, context))
-
-
-def _pose(motion: RandomMotion, s: float) -> Array:
-    out = np.zeros((3, len(motion.q)))
-    sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, out)
-    return out[0].copy()
 
 
 def _view(
@@ -113,7 +106,7 @@ def _outlines(cell: Cell) -> list[Array]:
     return found
 
 
-def _joint_panels(motion: RandomMotion, limits: MotionLimits, names: Sequence[str]) -> list[Panel]:
+def _joint_panels(motion: PathMotion, limits: MotionLimits, names: Sequence[str]) -> list[Panel]:
     """Ranges against limits, and speeds as shares of theirs."""
     lower, upper, speed, acceleration, jerk = motion.bounds()
     ranges, shares = Drawing("half"), Drawing("half")

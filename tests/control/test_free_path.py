@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from adapter.control.cell import Box, Cell, Cylinder, Hand, Plane
-from adapter.control.excitation import RandomMotion, sums_of_sines
+from adapter.control.designed import DesignedMotion, Designer
+from adapter.control.excitation import RandomMotion
 from adapter.control.free_path import ArmInCell, FreeMotion
+from adapter.control.information import Information
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings, gentle
 from adapter.control.shapes import capsules_of
@@ -29,10 +31,8 @@ SPAN_S = 8.0
 
 
 def _poses(motion, every_s):
-    out = np.zeros((3, 7))
     for s in np.arange(0.0, SPAN_S, every_s):
-        sums_of_sines(s, motion.centre, motion.amplitude, motion.omega, motion.phase, out)
-        yield out[0].copy()
+        yield motion.path(s)[0].copy()
 
 
 def _along(ends, count=25):
@@ -160,3 +160,28 @@ def test_a_panda_with_a_hand_in_its_file_needs_room_for_it():
     hand += '<child link="hand"/><origin xyz="0 0 0.1"/></joint></robot>'
     model = model_from_urdf((folder / "panda.urdf").read_text().replace("</robot>", hand))
     assert len(capsules_of(model)) == len(capsules_of(PANDA)) + 1
+
+
+def test_what_comes_too_near_says_which_way_out():
+    arm = ArmInCell(PANDA, Cell(box=(Box("box", (0.2, 0.1, 0.4), (0.5, 0.45, 0.75)),)))
+    rng = np.random.default_rng(0)
+    poses = rng.uniform(LIMITS.lower, LIMITS.upper, (12, 7))
+    short, slope = arm.too_near(poses, 0.1)
+    assert short > 0.0
+    for _ in range(4):
+        way = rng.normal(size=poses.shape)
+        up, down = (arm.too_near(poses + s * 1e-4 * way, 0.1)[0] for s in (1, -1))
+        assert (slope * way).sum() == pytest.approx((up - down) / 2e-4, rel=0.05, abs=0.02)
+    assert arm.too_near(READY[None], 0.02) == (0.0, pytest.approx(0.0))
+
+
+def test_a_designed_motion_keeps_clear_of_the_cell_too():
+    box = Box("box", (0.2, 0.1, 0.4), (0.5, 0.45, 0.75))
+    arm = ArmInCell(PANDA, Cell(box=(box,)))
+    designer = Designer(Information(PANDA), steps=25).within(arm)
+    motion = FreeMotion(arm, 12.0, designer)(LIMITS, READY, ExcitationSettings(seed=1))
+    assert isinstance(motion, DesignedMotion)
+    nearest = min(arm.at(q).distance for q in _poses(motion, 0.05))
+    assert nearest >= arm.cell.margin - 1e-3
+    width = np.subtract(*motion.bounds()[1::-1])
+    assert width.max() > 0.5  # it was not merely shrunk to nothing
