@@ -19,6 +19,7 @@ b = d^2 - c, of first order where b is zero.
 | x_torque_saturation | the sensor's curve bends: s tanh(tau/s) | s (N m) |
 | x_held_joint | a stiff spring holds it where it is when this begins | none |
 | x_wall | a stiff plane across the hand's way when this begins, `gap` ahead | gap (m) |
+| x_floor | a stiff level plane below the hand, with friction | height (m, base axes) |
 """
 
 from __future__ import annotations
@@ -71,8 +72,10 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "x_torque_saturation": (TORQUE, ("s",), ()),
     "x_held_joint": (OBSTACLE, (), ()),
     "x_wall": (OBSTACLE, (), ("gap",)),
+    "x_floor": (OBSTACLE, ("height",), ()),
 }
 PAIRS = ("x_cross_viscous", "x_torque_crosstalk")  # joints [from, to]
+WITHOUT_JOINTS = ("signal_delay", "x_wall", "x_floor")
 LENGTHS = {"inertia": 6, "dtheta": 10}
 POSITIVE = {
     "joint_elasticity": "k",
@@ -225,7 +228,7 @@ def _check_keys(effect: Effect) -> None:
 def _check_joints(effect: Effect) -> None:
     """Raises ValueError for a wrong number of joints or joints that do not count from 1."""
     joints = effect.joints
-    whole = effect.place in (BODY, WRENCH) or effect.name in ("signal_delay", "x_wall")
+    whole = effect.place in (BODY, WRENCH) or effect.name in WITHOUT_JOINTS
     if any(j < 1 for j in joints):
         raise ValueError(f"{effect.name} is on joints {list(joints)}; they count from 1")
     if effect.name == "link_inertia" and len(joints) != 1:

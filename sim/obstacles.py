@@ -1,7 +1,8 @@
-"""What is in an arm's way: something that holds joints, or a wall before the hand.
+"""What is in an arm's way: something that holds joints, a wall before the hand, or a floor.
 
-Both are stiff springs with dampers that appear at an instant, wherever the arm is then: joints
-are held at the angles they have, a wall stands across the way that the hand goes, so far ahead.
+All are stiff springs with dampers that appear at an instant: joints are held at the angles they
+have then, a wall stands across the way that the hand goes, so far ahead. A floor is level, at a
+height; what touches it does not slide before it is pushed sideways by half of what it is pressed.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from sim.truth import Array
 # Our choice: a joint gives 0.02 rad to 100 N m, a wall 5 mm to 100 N.
 HOLD_STIFFNESS, HOLD_DAMPING = 5000.0, 50.0  # N m/rad, N m s/rad
 WALL_STIFFNESS, WALL_DAMPING = 20000.0, 200.0  # N/m, N s/m
+GRIP = 0.5  # friction of the floor
 HAND = np.eye(4)  # in the last link's frame
 HAND[2, 3] = 0.107  # m, the flange
 
@@ -26,7 +28,7 @@ class Obstacles:
 
     Attributes:
         torque: (n,) N m that they put on the joints at present.
-        force: N, of walls on the hand.
+        force: N, of walls and floors on the hand.
     """
 
     def __init__(self, effects: Iterable[Effect], n: int) -> None:
@@ -49,6 +51,8 @@ class Obstacles:
                 self._places.pop(k, None)
             elif effect.name == "x_wall":
                 against -= self._wall(k, effect, q, dq, frames)
+            elif effect.name == "x_floor":
+                against -= self._floor(k, effect, q, dq, frames)
             else:
                 joints = effect.columns(self._n)
                 at, _ = self._places.setdefault(k, (q.copy(), 0.0))
@@ -74,3 +78,21 @@ class Obstacles:
         push = max(WALL_STIFFNESS * depth + WALL_DAMPING * float(way @ speed), 0.0)
         self.force += push
         return np.asarray(-push * (J[:3].T @ way))
+
+    def _floor(self, k: int, effect: Effect, q: Array, dq: Array, frames: Frames) -> Array:
+        """Torque (n,) N m of a level plane upon the hand."""
+        pose, J = end_effector(frames, q, HAND)
+        hand, speed = pose[:3, 3], J[:3] @ dq
+        depth = effect.number("height") - hand[2]
+        if depth <= 0.0:
+            self._places.pop(k, None)
+            return np.zeros(self._n)
+        touched, _ = self._places.setdefault(k, (hand.copy(), 0.0))
+        push = WALL_STIFFNESS * (touched - hand) - WALL_DAMPING * speed
+        push[2] = max(WALL_STIFFNESS * depth - WALL_DAMPING * speed[2], 0.0)
+        side, most = float(np.hypot(*push[:2])), GRIP * push[2]
+        if side > most:  # it slides, and what it holds on to comes along
+            push[:2] *= most / side
+            touched[:2] = hand[:2] + push[:2] / WALL_STIFFNESS
+        self.force += float(np.linalg.norm(push))
+        return np.asarray(J[:3].T @ push)

@@ -12,7 +12,7 @@ from sim.noise_levels import NOISES, check_levels
 
 DEFAULT_SCENARIO = "nominal"
 COMMON_OPTIONS = ("noise", "links", "levels", "imus", "trouble")
-TROUBLES = ("held", "wall", "load", "t_s")
+TROUBLES = ("held", "wall", "floor", "load", "t_s")
 
 
 class ScenarioKind(NamedTuple):

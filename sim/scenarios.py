@@ -102,10 +102,20 @@ def friction(rng: np.random.Generator) -> Truth:
 
 
 def real_drives(rng: np.random.Generator) -> Truth:
-    """The same with the inertia of its motors, which a light wrist cannot be controlled without."""
-    arm = friction(rng)
-    motors = per_joint("motor_inertia", "B", facts_of("panda")["motors"]["B"])
-    return arm.with_changes(effects=arm.effects + motors)
+    """The same arm with friction that sticks, and the inertia of its motors.
+
+    Without the one it creeps where a force controller holds it at rest by its noisy sensors, and
+    without the other its light wrist cannot be controlled.
+    """
+    facts = facts_of("panda")
+    losses = facts["friction"]
+    effects = per_joint("viscous_friction", "Fv", losses["Fv"])
+    effects += per_joint("motor_inertia", "B", facts["motors"]["B"])
+    effects += tuple(
+        Effect("bristle_friction", (j,), {"Fc": level, "s0": losses["s0"]})
+        for j, level in enumerate(losses["Fc"], 1)
+    )
+    return panda().with_changes(effects=effects)
 
 
 def wall_mounted(rng: np.random.Generator) -> Truth:
@@ -161,13 +171,15 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
     Args:
         truth: the arm.
         trouble: `held` (numbers of joints) held from `t_s` on, `wall` (m ahead of the hand)
-            standing there from `t_s` on, `load` (kg at the flange) carried up to `t_s`.
+            standing there from `t_s` on, `floor` (its height in m, base axes), `load` (kg at the flange) carried up to `t_s`.
     """
     effects, since = list(truth.effects), (float(trouble.get("t_s", 0.0)), None)
     if "held" in trouble:
         effects.append(Effect("x_held_joint", tuple(trouble["held"]), {}, since))
     if "wall" in trouble:
         effects.append(Effect("x_wall", (), {"gap": float(trouble["wall"])}, since))
+    if "floor" in trouble:
+        effects.append(Effect("x_floor", (), {"height": float(trouble["floor"])}, since))
     if "load" in trouble:
         com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
         load = payload(float(trouble["load"]), com)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
 PERIOD_NS = 1_000_000
+ANSWER_NS = 500_000  # a client's own part of a period (Franka FCI documentation)
 SPIN_NS = 60_000  # waiting actively for the last part: a wake-up costs the system that much
 ABSOLUTE = 1  # TIMER_ABSTIME, <time.h>
 PRIORITY = 80  # of SCHED_FIFO: above any client loop but those that take 99
@@ -28,11 +29,10 @@ def _sleep_to(deadline_ns: int) -> None:
 
 
 class Ticks:
-    """Waits for one tick after the other; lost periods are counted, not caught up with.
+    """Waits for one tick after the other; lost time is counted, not caught up with.
 
-    Attributes:
-        stalled: periods that went by without a tick, each of them 1 ms by which the simulated
-            world is behind the clock on the wall.
+    From one tick's end to the next a client has half a millisecond, as at a real robot: where the
+    simulation of a tick took longer than the other half, the world slips by so much.
     """
 
     def __init__(
@@ -41,22 +41,24 @@ class Ticks:
         sleep: Callable[[int], None] = _sleep_to,
     ) -> None:
         self._now, self._sleep = now, sleep
-        self.stalled = 0
-        self._due = 0
+        self._due = self._slipped = 0
+
+    @property
+    def stalled(self) -> int:
+        """Milliseconds by which the simulated world is behind the clock on the wall."""
+        return self._slipped // PERIOD_NS
 
     def restart(self) -> None:
         """The next tick is one period from now."""
         self._due = self._now()
 
     def wait(self) -> None:
-        """Return at the next tick; a whole period too late, the world slips."""
-        self._due += PERIOD_NS
-        wake = self._due - SPIN_NS
+        """Return at the next tick, to be called at the end of the one before."""
         now = self._now()
-        lost = (now - self._due) // PERIOD_NS
-        if lost > 0:
-            self.stalled += lost
-            self._due += lost * PERIOD_NS
+        late = max(now + ANSWER_NS - self._due - PERIOD_NS, 0)
+        self._slipped += late
+        self._due += PERIOD_NS + late
+        wake = self._due - SPIN_NS
         while now < wake:
             self._sleep(wake)
             now = self._now()

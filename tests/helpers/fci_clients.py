@@ -45,8 +45,15 @@ def demand(protocol: int) -> None:
 
 
 @contextlib.contextmanager
-def robot(protocol: int, *faults: str, seed: int = 3):
-    """A simulated robot on the port that the clients know; one at a time on a machine.
+def robot(
+    protocol: int,
+    *faults: str,
+    seed: int = 3,
+    patience_s: float = PATIENCE_S,
+    more: tuple[str, ...] = (),
+):
+    """A simulated robot on the port that the clients know, with more of its options; one at a time
+    on a machine.
 
     Yields a function that ends the robot and returns its summary.
     """
@@ -55,7 +62,7 @@ def robot(protocol: int, *faults: str, seed: int = 3):
         options = [word for fault in faults for word in ("--fault", fault)]
         command = [
             sys.executable, "-m", "sim.fci", "--protocol", str(protocol), "--seed", str(seed),
-            "--json", str(summary), "--patience", str(PATIENCE_S), *options,
+            "--json", str(summary), "--patience", str(patience_s), *options, *more,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])
         try:

@@ -56,3 +56,23 @@ def test_a_wall_stands_across_the_hand_s_way_and_only_pushes_back() -> None:
 def test_trouble_that_cannot_be_is_refused(trouble, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         check("nominal", {"trouble": trouble})
+
+
+def test_a_floor_carries_the_hand_and_lets_it_slide_only_when_pushed_hard() -> None:
+    arm = build("nominal").truth
+    pose, J = end_effector(arm.frames, arm.ready, HAND)
+    floor = Obstacles(build("nominal", trouble={"floor": pose[2, 3] + 1e-3}).truth.effects, arm.n)
+    way = np.linalg.pinv(J)  # of joint motions that move the hand
+
+    def pushed(x: float, z: float) -> np.ndarray:
+        """Force on the hand when it stands so far off the start."""
+        q = arm.ready + way @ [x, 0.0, z, 0.0, 0.0, 0.0]
+        floor.act(0.0, q, np.zeros(7), arm.frames)
+        return np.linalg.pinv(end_effector(arm.frames, q, HAND)[1].T) @ floor.torque
+
+    assert pushed(0.0, 0.0)[:3] == pytest.approx([0.0, 0.0, 20.0], abs=0.1)
+    assert pushed(2e-4, 0.0)[:3] == pytest.approx([-4.0, 0.0, 20.0], abs=0.1)
+    assert pushed(2e-2, 0.0)[0] == pytest.approx(-0.5 * pushed(2e-2, 0.0)[2], rel=0.01)
+    assert pushed(2e-2 - 1e-4, 0.0)[0] == pytest.approx(2.0 - 0.5 * pushed(2e-2, 0.0)[2], abs=0.3)
+    assert not pushed(0.0, 2e-3).any()
+    assert floor.force == 0.0

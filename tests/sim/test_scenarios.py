@@ -143,7 +143,8 @@ def test_truth_file_says_what_the_arm_is(name, tmp_path):
         assert (load["effect"], load["interval_s"]) == ("payload", [20.0, None])
         assert load["parameters"]["m"] == 1.0
     elif name in ("friction", "real_drives"):
-        coulomb = [e for e in told["effects"] if e["effect"] == "coulomb_friction"]
+        kind = {"friction": "coulomb_friction", "real_drives": "bristle_friction"}[name]
+        coulomb = [e for e in told["effects"] if e["effect"] == kind]
         assert [e["parameters"]["Fc"] for e in coulomb] == facts_of("panda")["friction"]["Fc"]
         assert [e["joints"] for e in coulomb] == [[j] for j in range(1, 8)]
     else:

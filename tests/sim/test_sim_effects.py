@@ -419,7 +419,7 @@ def test_every_effect_of_the_catalogue_is_tested_here():
     tested = {row[0] for row in TORQUES} | {row[0].name for row in BODIES + SENSORS}
     tested |= {"x_cross_viscous", "external_wrench", "backlash"}
     tested |= {"bristle_friction", "torque_filter"}
-    tested |= {"x_held_joint", "x_wall"}  # in `test_obstacles`
+    tested |= {"x_held_joint", "x_wall", "x_floor"}  # in `test_obstacles`
     assert tested == set(SPECS)
 
 
