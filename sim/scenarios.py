@@ -171,7 +171,8 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
     Args:
         truth: the arm.
         trouble: `held` (numbers of joints) held from `t_s` on, `wall` (m ahead of the hand)
-            standing there from `t_s` on, `floor` (its height in m, base axes), `load` (kg at the flange) carried up to `t_s`.
+            standing there from `t_s` on, `floor` (its height in m, base axes), `load` (kg at the
+            flange) carried up to `t_s`.
     """
     effects, since = list(truth.effects), (float(trouble.get("t_s", 0.0)), None)
     if "held" in trouble:

@@ -66,7 +66,8 @@ def panda_py_kinds() -> tuple[Kinds, Callable[[], None]]:
         x, turn = arm.get_position(), arm.get_orientation()
 
         def step(t: float) -> None:
-            control.set_control(x + [0.0, 0.08 * np.sin(2 * np.pi * t / 3), 0.0], turn)
+            aside = 0.08 * np.sin(2 * np.pi * t / 3)
+            control.set_control(x + np.array([0.0, aside, 0.0]), turn)
             seen.append(arm.get_position()[1] - x[1])
 
         held(control, 3.0, step)
@@ -128,19 +129,16 @@ def franky_kinds() -> tuple[Kinds, Callable[[], None]]:
     def went(begun: Any, by: tuple[float, ...], within_m: float = 5e-3) -> None:
         assert np.abs(place() - begun - by).max() < within_m, place() - begun
 
-    def shifted(x: float, y: float, z: float) -> Any:
-        """In the base's axes, seen from the hand, which looks down."""
-        return f.CartesianMotion(f.Affine([x, -y, -z]), relative)
-
     def joints() -> None:
         arm.move(f.JointMotion(f.JointState(home)))
         assert np.abs(arm.current_joint_state.position - home).max() < 5e-3
 
     def pose() -> None:
-        begun = place()
-        arm.move(shifted(0.05, 0.03, -0.05))
-        went(begun, (0.05, 0.03, -0.05))
-        arm.move(shifted(-0.05, -0.03, 0.05))
+        begun, by = arm.current_cartesian_state.pose.end_effector_pose, (0.05, 0.03, -0.05)
+        goal = f.Affine(begun.translation + by, begun.quaternion)
+        arm.move(f.CartesianMotion(goal))
+        went(begun.translation, by)
+        arm.move(f.CartesianMotion(begun))
 
     def turn() -> None:
         begun = place()
@@ -180,7 +178,7 @@ def franky_kinds() -> tuple[Kinds, Callable[[], None]]:
         arm.move(motion, asynchronous=True)
         time.sleep(2.0)
         went(begun, (0.0, 0.0, -0.03), 1.5e-2)
-        arm.stop()
+        arm.move(f.TorqueStopMotion())  # `stop` would raise at the next motion, on a real arm too
         joints()
 
     def settings() -> None:
