@@ -11,7 +11,8 @@ from drivers.files.bounded import parse_json
 from sim.noise_levels import NOISES, check_levels
 
 DEFAULT_SCENARIO = "nominal"
-COMMON_OPTIONS = ("noise", "links", "levels", "imus", "trouble")
+ROBOTS = ("panda", "fr3")
+COMMON_OPTIONS = ("noise", "links", "levels", "imus", "trouble", "robot")
 TROUBLES = ("held", "wall", "floor", "load", "t_s")
 
 
@@ -49,6 +50,8 @@ def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
         raise ValueError(f"{name}: links is {links!r}; have: True, False")
     if noise not in NOISES:
         raise ValueError(f"no noise {noise!r}; have: {', '.join(NOISES)}")
+    if options.get("robot", ROBOTS[0]) not in ROBOTS:
+        raise ValueError(f"no robot {options['robot']!r}; have: {', '.join(ROBOTS)}")
     check_levels(options.get("levels", {}))
     imus = options.get("imus", [])
     if not isinstance(imus, list) or not all(isinstance(x, str) for x in imus):

@@ -15,9 +15,9 @@ from sim.engine import PERIOD_S, SUBSTEPS
 from sim.imus import Imus
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
-from sim.options import SCENARIOS, check
+from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
-from sim.truth import Array, Truth, facts_of, panda, turn
+from sim.truth import Array, Truth, documented, facts_of, turn
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
@@ -72,14 +72,16 @@ class Scenario:
         Path(path).write_text(json.dumps(self.as_dict(), indent=1) + "\n", "utf-8")
 
 
-def nominal(rng: np.random.Generator) -> Truth:
+def nominal(rng: np.random.Generator, robot: str) -> Truth:
     """The documented arm."""
-    return panda()
+    return documented(robot)
 
 
-def bent_link(rng: np.random.Generator, angle_deg: float = 5.0, offset_m: float = 0.02) -> Truth:
+def bent_link(
+    rng: np.random.Generator, robot: str, angle_deg: float = 5.0, offset_m: float = 0.02
+) -> Truth:
     """Every joint frame turned by up to `angle_deg` and shifted by up to `offset_m`."""
-    arm = panda()
+    arm = documented(robot)
     angles = np.radians(angle_deg) * rng.random(arm.n)
     lengths = offset_m * rng.random(arm.n)
     turns = np.array([_turn_about(_direction(rng), angle) for angle in angles])
@@ -87,27 +89,31 @@ def bent_link(rng: np.random.Generator, angle_deg: float = 5.0, offset_m: float 
     return arm.with_changes(R=arm.R @ turns, p=arm.p + shifts)
 
 
-def payload_at_20s(rng: np.random.Generator, mass: float = 1.0, t_s: float = 20.0) -> Truth:
+def payload_at_20s(
+    rng: np.random.Generator, robot: str, mass: float = 1.0, t_s: float = 20.0
+) -> Truth:
     """A ball of `mass` kg at the flange after `t_s`."""
     com = np.array([SIDE_STEP_M, 0.0, FLANGE_M + STAND_OFF_M])
     ball = payload(mass, com, 0.4 * mass * BALL_RADIUS_M**2 * np.eye(3), t_s)
-    return panda().with_changes(effects=(ball,))
+    return documented(robot).with_changes(effects=(ball,))
 
 
-def friction(rng: np.random.Generator) -> Truth:
+def friction(rng: np.random.Generator, robot: str) -> Truth:
     """The documented arm with the friction published for it."""
-    losses = facts_of("panda")["friction"]
+    losses = facts_of(robot)["friction"]
     viscous = per_joint("viscous_friction", "Fv", losses["Fv"])
-    return panda().with_changes(effects=viscous + per_joint("coulomb_friction", "Fc", losses["Fc"]))
+    return documented(robot).with_changes(
+        effects=viscous + per_joint("coulomb_friction", "Fc", losses["Fc"])
+    )
 
 
-def real_drives(rng: np.random.Generator) -> Truth:
+def real_drives(rng: np.random.Generator, robot: str) -> Truth:
     """The same arm with friction that sticks, and the inertia of its motors.
 
     Without the one it creeps where a force controller holds it at rest by its noisy sensors, and
     without the other its light wrist cannot be controlled.
     """
-    facts = facts_of("panda")
+    facts = facts_of(robot)
     losses = facts["friction"]
     effects = per_joint("viscous_friction", "Fv", losses["Fv"])
     effects += per_joint("motor_inertia", "B", facts["motors"]["B"])
@@ -115,12 +121,12 @@ def real_drives(rng: np.random.Generator) -> Truth:
         Effect("bristle_friction", (j,), {"Fc": level, "s0": losses["s0"]})
         for j, level in enumerate(losses["Fc"], 1)
     )
-    return panda().with_changes(effects=effects)
+    return documented(robot).with_changes(effects=effects)
 
 
-def wall_mounted(rng: np.random.Generator) -> Truth:
+def wall_mounted(rng: np.random.Generator, robot: str) -> Truth:
     """The documented arm on a wall: the base's z axis is level, its x axis points down."""
-    arm = panda()
+    arm = documented(robot)
     return arm.with_changes(gravity=turn(1, np.pi / 2).T @ arm.gravity)
 
 
@@ -143,16 +149,18 @@ def build(name: str, seed: int = 0, **options: Any) -> Scenario:
     Args:
         name: one of `options.SCENARIOS`.
         seed: decides truth and noise.
-        options: `noise` ("real" or "none"), `links` (bool: measure link motion or not), `levels`
-            (a mapping of single noise levels to change, see `NoiseLevels`), `imus` (names of links
-            with a sensor glued on), `trouble` (see `in_trouble`), and those of the scenario:
-            `angle_deg`, `offset_m` of bent_link, `mass` (kg), `t_s` of payload_at_20s.
+        options: `robot` ("panda" or "fr3"), `noise` ("real" or "none"), `links` (bool: measure
+            link motion or not), `levels` (a mapping of single noise levels to change, see
+            `NoiseLevels`), `imus` (names of links with a sensor glued on), `trouble` (see
+            `in_trouble`), and those of the scenario: `angle_deg`, `offset_m` of bent_link, `mass`
+            (kg), `t_s` of payload_at_20s.
 
     Raises:
         ValueError: unknown name, option or level, or a value out of range; with the choices.
     """
     numbers = check(name, options)
-    truth = DRAWN_BY[name](np.random.default_rng([seed, TRUTH_STREAM]), **numbers)
+    rng, robot = np.random.default_rng([seed, TRUTH_STREAM]), options.get("robot", ROBOTS[0])
+    truth = DRAWN_BY[name](rng, robot, **numbers)
     return Scenario(
         name,
         seed,

@@ -6,7 +6,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +16,38 @@ from sim.effects import Effect
 
 Array = NDArray[np.float64]
 
+JOINT_LIMITS = ("lower", "upper", "velocity", "effort", "acceleration")
 BETA_IS_ZERO = 1e-9  # below it (in sin β) only α + γ exists
+
+
+class Slowing(NamedTuple):
+    """How fast joints may go towards the ends of their ranges, (n,) each: `models/fr3.toml`."""
+
+    deceleration: Array
+    offset: Array
+    lower: Array
+    upper: Array
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Joint limits, (n,) each: rad, rad, rad/s, N m, rad/s²."""
+    """Joint limits, (n,) each: rad, rad, rad/s, N m, rad/s²; `slowing` where speed hangs on it."""
 
     lower: Array
     upper: Array
     velocity: Array
     effort: Array
     acceleration: Array
+    slowing: Slowing | None = None
+
+    def speeds(self, q: Array) -> tuple[Array, Array]:
+        """The least and the greatest velocity (n,) rad/s that joints may have at q (n,) rad."""
+        if self.slowing is None:
+            return -self.velocity, self.velocity
+        hard, offset, lower, upper = self.slowing
+        room = np.maximum([q - lower, upper - q], 0.0)
+        down, up = np.clip(np.sqrt(2.0 * hard * room) - offset, 0.0, self.velocity)
+        return -down, up
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,15 +126,22 @@ class Truth:
 
 def panda() -> Truth:
     """The Panda as documented, with the inertias of Gaz et al. 2019 and without friction."""
-    facts = facts_of("panda")
+    return documented("panda")
+
+
+def documented(robot: str) -> Truth:
+    """One of `options.ROBOTS` as documented, without friction."""
+    facts = facts_of(robot)
     joints = facts["joint"]
+    slowing = {key: np.array(values) for key, values in facts.get("slowing", {}).items()}
+    rows = {key: np.array([j[key] for j in joints]) for key in JOINT_LIMITS}
     return Truth(
         joint_names=tuple(j["name"] for j in joints),
         link_names=tuple(j["link"] for j in joints),
         R=np.array([from_rpy(j["rpy"]) for j in joints]),
         p=np.array([j["xyz"] for j in joints]),
         theta=np.array([theta_of(j["mass"], j["com"], j["inertia"]) for j in joints]),
-        limits=Limits(*(np.array([j[k] for j in joints]) for k in Limits.__slots__)),
+        limits=Limits(**rows, slowing=Slowing(**slowing) if slowing else None),
         gravity=np.array(facts["robot"]["gravity"]),
         ready=np.array(facts["robot"]["ready"]),
     )
@@ -126,8 +153,11 @@ def lam_of(turns: Array, p: Array) -> Array:
 
 
 def facts_of(robot: str) -> dict[str, Any]:
-    """The data file of a robot in `sim/models`."""
-    return tomllib.loads((resources.files("sim") / "models" / f"{robot}.toml").read_text("utf-8"))
+    """The data file of a robot in `sim/models`, with what it shares with another one."""
+    text = (resources.files("sim") / "models" / f"{robot}.toml").read_text("utf-8")
+    facts = tomllib.loads(text)
+    like = facts.pop("like", None)
+    return facts if like is None else facts_of(like) | facts
 
 
 def body_of(theta: Array) -> tuple[float, Array, Array]:

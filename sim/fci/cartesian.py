@@ -10,6 +10,7 @@ from numba import njit
 
 from sim.dynamics import Frames, cross, end_effector
 from sim.fci.codec import TICK_S, Generator, RobotCommand
+from sim.fci.joint_limits import ROOM, LimitErrors, broken
 from sim.truth import Array, Limits
 
 ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
@@ -18,8 +19,6 @@ ELBOW_TOLERANCE = 1e-2  # rad, chosen
 REACHED = 1e-3  # m and rad, so far the joints may be from a pose; else it is out of reach
 RIGID = 1e-4  # so far R^T R of a pose may be from the identity
 ELBOW_SPEED = 2.175  # rad/s (Franka FCI documentation)
-# Poses start from f32 states, and differences over 1 ms enlarge that.
-ROOM, SPEED_ROOM = 1.1, 1.001
 
 START = "cartesian_position_motion_generator_start_pose_invalid"
 FRAME = "cartesian_position_motion_generator_invalid_frame_flag"
@@ -30,8 +29,12 @@ START_ELBOW = "cartesian_motion_generator_start_elbow_invalid"
 START_SIGN = "start_elbow_sign_inconsistent"
 SIGN = "cartesian_motion_generator_elbow_sign_inconsistent"
 ELBOW = "cartesian_motion_generator_elbow_limit_violation"
-JOINT_POSITION = "cartesian_motion_generator_joint_position_limits_violation"
-JOINT_VELOCITY = "cartesian_motion_generator_joint_velocity_limits_violation"
+JOINTS_BROKEN = LimitErrors(
+    "cartesian_motion_generator_joint_position_limits_violation",
+    "cartesian_motion_generator_joint_velocity_limits_violation",
+    "cartesian_motion_generator_joint_velocity_discontinuity",
+    "cartesian_motion_generator_joint_acceleration_discontinuity",
+)
 
 Reach = Callable[[Array, Array, float], tuple[Array, float]]
 
@@ -54,8 +57,8 @@ HAND_LIMITS = {
 class CartesianMotion:
     """Desired motion of the end effector; derivatives are backward differences over a tick.
 
-    Joint positions and speeds that follow from it are held to the arm's limits, joint
-    accelerations are not. Without an elbow in the command the joints take the nearest posture.
+    The joint motion that follows from it is held to the arm's limits. Without an elbow in the
+    command the joints take the nearest posture.
 
     Args:
         kind: by pose or by velocity.
@@ -127,16 +130,16 @@ class CartesianMotion:
             if not within(value, most):
                 return error
         q, missed = self._reach(self.q, pose, elbow)
-        if not missed <= REACHED or not self._in_range(q):
-            return JOINT_POSITION
-        if not (np.abs(q - self.q) <= self._limits.velocity * SPEED_ROOM * TICK_S).all():
-            return JOINT_VELOCITY
+        if not missed <= REACHED:
+            return JOINTS_BROKEN.position
+        before = self.q, self.dq, self.ddq
         self._take_joints(q)
+        found = broken(self._limits, JOINTS_BROKEN, q, (self.dq, self.ddq, before[2]))
+        if found is not None:
+            self.q, self.dq, self.ddq = before
+            return found
         self.pose, self.twist, self.acceleration, self._fresh = pose, twist, acceleration, False
         return None
-
-    def _in_range(self, q: Array) -> bool:
-        return bool(((q >= self._limits.lower) & (q <= self._limits.upper)).all())
 
     def _take_joints(self, q: Array) -> None:
         dq = (q - self.q) / TICK_S

@@ -10,8 +10,8 @@ from sim.ending import Ending
 from sim.fci.codec import HOST, PORT
 from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
+from sim.fci.options import chosen
 from sim.fci.server import FciServer
-from sim.options import options_of
 from sim.scenarios import build
 
 EXIT_OK, EXIT_USAGE = 0, 2
@@ -20,7 +20,7 @@ EXIT_OK, EXIT_USAGE = 0, 2
 def run(args: argparse.Namespace) -> int:
     """Serve until SIGTERM, SIGINT or the end of the duration; the process's exit code."""
     try:
-        scenario = build(args.scenario, args.seed, **options_of(args.set))
+        scenario = build(args.scenario, args.seed, **chosen(args))
         hand = _hand(args)
         try:
             server = FciServer(

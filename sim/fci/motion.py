@@ -7,19 +7,18 @@ import numpy as np
 from sim.fci.arm import Arm
 from sim.fci.cartesian import HAND_LIMITS, CartesianMotion
 from sim.fci.codec import JOINTS, TICK_S, ControllerMode, Generator, Request, RobotCommand
+from sim.fci.joint_limits import LimitErrors, broken
 from sim.truth import Array, Limits
 
 START_TOLERANCE = 1e-3  # rad, first position from q_d; the robot's own is not published
-JERK_PER_ACCELERATION = 500.0  # 1/s: 7500 rad/s³ at 15 rad/s² (Franka FCI documentation)
-# Differences over 1 ms of positions that the client had as f32 are off by up to 500 rad/s³
-# (and 2e-4 rad/s), which a motion along its limits shall not be blamed for.
-ROOM, SPEED_ROOM = 1.1, 1.001
 
 START_POSE = "joint_position_motion_generator_start_pose_invalid"
-POSITION = "joint_motion_generator_position_limits_violation"
-VELOCITY = "joint_motion_generator_velocity_limits_violation"
-ACCELERATION = "joint_motion_generator_velocity_discontinuity"
-JERK = "joint_motion_generator_acceleration_discontinuity"
+BROKEN = LimitErrors(
+    "joint_motion_generator_position_limits_violation",
+    "joint_motion_generator_velocity_limits_violation",
+    "joint_motion_generator_velocity_discontinuity",
+    "joint_motion_generator_acceleration_discontinuity",
+)
 WINDOW = 100  # commands that the success rate counts (Franka FCI documentation)
 MOST_MISSED = 20  # in a row, then communication_constraints_violation
 # Until the first command the client still changes over from replies to states. Chosen here: longer
@@ -64,25 +63,10 @@ class DesiredMotion:
 
     def _go(self, q: Array, dq: Array) -> str | None:
         ddq = (dq - self.dq) / TICK_S
-        jerk = (ddq - self.ddq) / TICK_S
-        found = self._broken(q, dq, ddq, jerk)
+        found = broken(self._limits, BROKEN, q, (dq, ddq, self.ddq))
         if found is None:
             self.q, self.dq, self.ddq, self._fresh = q, dq, ddq, False
         return found
-
-    def _broken(self, q: Array, dq: Array, ddq: Array, jerk: Array) -> str | None:
-        """The first limit that is not kept; written so that a NaN keeps none."""
-        limits = self._limits
-        if not ((q >= limits.lower) & (q <= limits.upper)).all():
-            return POSITION
-        if not (np.abs(dq) <= limits.velocity * SPEED_ROOM).all():
-            return VELOCITY
-        most = limits.acceleration * ROOM
-        if not (np.abs(ddq) <= most).all():
-            return ACCELERATION
-        if not (np.abs(jerk) <= JERK_PER_ACCELERATION * most).all():
-            return JERK
-        return None
 
 
 def allowed(controller: int, generator: int, version: int) -> bool:

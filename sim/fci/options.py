@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from sim.faults import describe, read_fault
 from sim.fci.codec import HOST, PORT, VERSIONS
@@ -11,6 +12,8 @@ from sim.fci.faults import KINDS
 from sim.fci.gripper import WIDEST
 from sim.options import add_scenario, options_of
 from sim.options import check as check_scenario
+
+ROBOT = {5: "panda", 10: "fr3"}  # by protocol
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,12 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--json", type=Path, default=None, metavar="FILE", help="write the summary there as well")
 
 
+def chosen(args: argparse.Namespace) -> dict[str, Any]:
+    """The scenario's options; the arm is the one that speaks the protocol, if none is named."""
+    return {"robot": ROBOT[args.protocol]} | options_of(args.set)
+
+
 def check(args: argparse.Namespace) -> None:
     """Raises ValueError for an arm, a fault or a patience that does not exist."""
     if not 0.0 <= args.patience < float("inf"):
         raise ValueError(f"--patience takes seconds from 0 up, got {args.patience}")
     if not 0.0 <= args.object <= WIDEST:
         raise ValueError(f"--object takes 0 to {WIDEST} m, got {args.object}")
-    check_scenario(args.scenario, options_of(args.set))
+    check_scenario(args.scenario, chosen(args))
     for text in args.fault:
         read_fault(text, KINDS)

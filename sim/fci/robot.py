@@ -219,7 +219,9 @@ class Robot:
         found = []
         if arm.outside:
             found.append(POSITION_LIMITS)
-        if (np.abs(arm.dq) > arm.truth.limits.velocity).any():
+        slowest, fastest = arm.truth.limits.speeds(arm.q)
+        near_end = (arm.dq < slowest - STANDING) | (arm.dq > fastest + STANDING)
+        if (near_end | (np.abs(arm.dq) > arm.truth.limits.velocity)).any():
             found.append(TOO_FAST)
         if arm.saturated:
             found.append(TORQUE_RANGE)

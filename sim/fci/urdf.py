@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from xml.sax.saxutils import quoteattr
 
+import numpy as np
+
 from sim.scenarios import FLANGE_M
 from sim.truth import Array, Truth, body_of, to_rpy
 
 NAME = "simulated_arm"
-# The margin by which the speed limit is lowered near a position limit: v <= sqrt(2 a d) + offset.
-VELOCITY_OFFSET = 0.0  # rad/s
 
 
 def robot_urdf(truth: Truth) -> str:
@@ -40,13 +40,15 @@ def _joint(truth: Truth, j: int) -> str:
         "effort": limits.effort[j],
     }
     said = " ".join(f'{key}="{float(value)!r}"' for key, value in numbers.items())
-    slowing = float(limits.acceleration[j])
+    slowing, offset = limits.acceleration, np.zeros(truth.n)
+    if limits.slowing is not None:
+        slowing, offset = limits.slowing.deceleration, limits.slowing.offset
     return (
         f'<joint name="joint{j + 1}" type="revolute">'
         f'<origin xyz="{_row(truth.p[j])}" rpy="{_row(to_rpy(truth.R[j]))}"/>'
         f'<parent link="link{j}"/><child link="link{j + 1}"/><axis xyz="0 0 1"/><limit {said}/>'
-        f'<position_based_velocity_limits velocity_offset="{VELOCITY_OFFSET!r}"'
-        f' deceleration_limit="{slowing!r}"/></joint>'
+        f'<position_based_velocity_limits velocity_offset="{float(offset[j])!r}"'
+        f' deceleration_limit="{float(slowing[j])!r}"/></joint>'
     )
 
 

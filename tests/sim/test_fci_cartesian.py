@@ -120,6 +120,39 @@ def test_poses_that_break_a_limit(still, what, error):
 
 
 @pytest.mark.parametrize(
+    ("acceleration", "ticks", "error"),
+    [
+        (10.0, 10, PREFIX + "joint_velocity_discontinuity"),
+        (3.0, 1, PREFIX + "joint_acceleration_discontinuity"),
+        (1.0, 1, None),
+    ],
+)
+def test_joints_that_a_hand_within_its_limits_would_jerk(still, acceleration, ticks, error):
+    still.request(move(0, 3))
+    rate = 0.0
+    for k in range(40):
+        rate += 1e-3 * acceleration * min((k + 1) / ticks, 1.0)
+        still.tick(answer(twist=np.array([0.0, 0.0, rate, 0.0, 0.0, 0.0])))
+    assert still.violations == ([] if error is None else [error])
+
+
+def test_an_fr3_slows_down_towards_the_end_of_a_joint():
+    robot = Robot(build("nominal", 1, robot="fr3"), 10)
+    motion = Request("Move", 1, 10, struct.pack("<II", 0, 1) + bytes(105))
+    assert robot.request(motion)[12] == 1
+    rate = np.zeros(7)
+    for _ in range(2500):  # joint 7 at 1 rad/s from 0.785 rad towards 3.016
+        rate[6] = min(rate[6] + 0.005, 1.0)
+        robot.tick(RobotCommand(0, ZERO, rate.copy(), ZERO, False, False))
+        if robot.motion is None:
+            break
+    reached = robot.arm.q[6]
+    robot.arm.close()
+    assert robot.violations == ["joint_motion_generator_velocity_limits_violation"]
+    assert reached == pytest.approx(3.0196 - 1.35**2 / 34.0, abs=1e-2)
+
+
+@pytest.mark.parametrize(
     ("elbow", "error"),
     [
         ((0.5, -1.0), PREFIX + "start_elbow_invalid"),

@@ -8,7 +8,7 @@ import pytest
 
 from sim.effects import payload
 from sim.scenarios import FLANGE_M
-from sim.truth import panda
+from sim.truth import documented, panda
 from tests.helpers import fci_clients
 from tests.helpers.arm_data import pin_model
 from tests.helpers.fci_clients import TOLD
@@ -51,9 +51,9 @@ def visited(request):
     return visit(request.param, MODEL[request.param], *SHARED)
 
 
-def oracle(q, dq, load=None):
-    """Gravity (7,), mass matrix (7, 7) and Coriolis torques (7,) of the Panda by Pinocchio."""
-    model, still = pin_model(panda(), load), np.zeros(7)
+def oracle(q, dq, load=None, robot="panda"):
+    """Gravity (7,), mass matrix (7, 7) and Coriolis torques (7,) of an arm by Pinocchio."""
+    model, still = pin_model(documented(robot), load), np.zeros(7)
     data = model.createData()
     gravity = pin.rnea(model, data, q, still, still)
     columns = [pin.rnea(model, data, q, still, unit) - gravity for unit in np.eye(7)]
@@ -152,7 +152,7 @@ def test_the_robot_s_model_is_the_arm(visited):
     if visited.protocol == 5:
         check_library(seen)
     else:
-        gravity, columns, _ = oracle(np.array(seen["q"]), np.zeros(7))
+        gravity, columns, _ = oracle(np.array(seen["q"]), np.zeros(7), robot="fr3")
         np.testing.assert_allclose(seen["gravity"], gravity, atol=1e-3)
         np.testing.assert_allclose(np.reshape(seen["mass"], (7, 7)), columns, atol=1e-4)
 

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfreqz
 
+from adapter.model.robots import documented as known
+from adapter.model.robots.known import facts_of as facts_about
 from drivers.interface import JointSample
 from sim.effects import effect_from
 from sim.noise import BAND_HZ, RATE_HZ, SensorNoise, band_response, levels_of
-from sim.options import SCENARIOS
+from sim.options import ROBOTS, SCENARIOS
 from sim.scenarios import build
 from sim.truth import facts_of, panda, turn
 
@@ -100,6 +102,8 @@ def test_scenarios_refuse_what_they_do_not_know():
         build("nomnal")
     with pytest.raises(ValueError, match=r"no option 'mas'; have: mass, t_s, noise"):
         build("payload_at_20s", mas=1.0)
+    with pytest.raises(ValueError, match="no robot 3; have: panda, fr3"):
+        build("nominal", robot=3)
     with pytest.raises(ValueError, match="have: real, none"):
         build("nominal", noise="loud")
     with pytest.raises(ValueError, match="no noise level 'hum'; have: dq_above"):
@@ -149,6 +153,23 @@ def test_truth_file_says_what_the_arm_is(name, tmp_path):
         assert [e["joints"] for e in coulomb] == [[j] for j in range(1, 8)]
     else:
         assert not told["effects"]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_what_is_simulated_is_what_a_user_has_documented(robot):
+    arm, theirs = build("nominal", robot=robot).truth, known(robot)
+    assert arm.joint_names == theirs.tree.joint_names
+    np.testing.assert_allclose(arm.theta, theirs.theta, rtol=0.0, atol=1e-12)
+    for key in ("lower", "upper", "velocity", "effort"):
+        np.testing.assert_array_equal(getattr(arm.limits, key), getattr(theirs.limits, key))
+    facts = facts_about(theirs)
+    np.testing.assert_array_equal(arm.limits.acceleration, facts.acceleration)
+    if facts.speed_by_position is not None:
+        near_end = arm.limits.upper - 0.1
+        fastest = np.minimum(facts.speed_by_position.between(near_end, near_end), 10.0)
+        assert arm.limits.speeds(near_end)[1] == pytest.approx(
+            np.minimum(fastest, arm.limits.velocity)
+        )
 
 
 def test_nominal_arm_is_the_documented_one():
