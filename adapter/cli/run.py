@@ -252,6 +252,8 @@ def _go(
         observer = ContactObserver(robot, config.pipeline.learner.effects)
         names = robot.tree.joint_names
         watching = FollowingObserver(observer, safety.stop_at_contact, names)
+        if controller is not None:
+            controller.observer = observer
     result = run_live(
         driver,
         front_end,

@@ -19,6 +19,7 @@ import numpy as np
 from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward
 from adapter.control.limits import MotionLimits, need_same_robot
+from adapter.control.observer import ContactObserver
 from adapter.control.path_motion import PathMotion, smooth_step
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
 from adapter.control.safety import ArmWatch, Now
@@ -149,6 +150,8 @@ class ExcitationController:
         expected: a model of the arm, to tell what pushes it; nothing tells that where None.
 
     Attributes:
+        observer: once it has learned, it says what pushes the arm, in place of `expected`; whoever
+            sets it has it see each sample before `step` does.
         reference: the motion; None before the first sample.
         start: the sample that it was drawn from.
     """
@@ -166,6 +169,7 @@ class ExcitationController:
         n = len(limits.effort)
         self.limits, self.motion = limits, motion or ExcitationSettings()
         self.feedforward, self.draw = feedforward, draw
+        self.observer: ContactObserver | None = None
         self._expected, self._safety = expected, control.safety
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
@@ -173,7 +177,7 @@ class ExcitationController:
         self.reference: PathMotion | None = None
         self.start: JointSample | None = None
         self._tau, self._bias, self._still = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._fade_s, self._ticks = 0.0, 0
+        self._fade_s, self._ticks, self._explained = 0.0, 0, np.zeros(n)
         self._carry: Callable[[Array], None] | None = None
         self._feedback_only, self._with_model = ErrorTally(n), ErrorTally(n)
         self._take_on(DEFAULT_PERIOD_NS, False)
@@ -279,11 +283,23 @@ class ExcitationController:
         now = watch.now
         now[0], now[1], now[2], now[3] = tau, self._tau, ref.q - sample.q, sample.dq
         if model is not None:
-            now[4], now[5] = sample.tau, model(ref.q, ref.dq, ref.ddq)
+            now[4] = sample.tau
+            if self.observer is not None and self.observer.learned:
+                self._listen(self.observer)
+            else:
+                now[5] = model(ref.q, ref.dq, ref.ddq)
             if self._ticks % CARRY_TICKS == 0:
                 self._tell_weight(model.unbent(ref.q))
         self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
         return self._tau.copy()
+
+    def _listen(self, observer: ContactObserver) -> None:
+        """Expect what the observer does; what its model has newly explained is no offset."""
+        now = self._watch.now
+        now[Now.EXPECTED], now[Now.STD] = observer.expected, observer.std
+        if observer.explained is not self._explained:
+            now[Now.OFFSET] += observer.explained - self._explained
+            self._explained = observer.explained
 
     def _tell_weight(self, gravity: Array) -> None:
         """What carries the arm (n,) N m: kept where the arm adds it, else told where asked for."""

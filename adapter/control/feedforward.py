@@ -7,8 +7,18 @@ from typing import Protocol
 
 import numpy as np
 
+from adapter.control.instant import (
+    COLUMNS,
+    Row,
+    fill_torque,
+    friction_of,
+    joint_table,
+    shares_of,
+    wind_table,
+)
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.by_joint import WAYS_RAD, ByJoint, JointSignals, smooth_sign
+from adapter.effects.base import LearnedEffect
+from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
 from adapter.effects.catalogue import effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.errors import SettingsError
@@ -16,7 +26,6 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, torques, wrench_torques
-from adapter.signals.bristles import Bristles, wind
 
 
 class Feedforward(Protocol):
@@ -57,7 +66,7 @@ def not_learned(documented: SelfModel, effect_names: Sequence[str]) -> list[Acti
 
 
 class ModelFeedforward:
-    """Inverse dynamics of a fixed-base model, compiled; some 7 µs a call for 7 joints.
+    """Inverse dynamics of a fixed-base model, compiled; some 5 µs a call for 7 joints.
 
     What a model's effects do to a motion is computed from one instant: the links follow the
     encoders without the rates of a gear's twist, a gear with play leans on the flank that pushes
@@ -76,6 +85,8 @@ class ModelFeedforward:
     Attributes:
         frames, theta: of the rigid bodies in use; θ (n, 10) with the tool.
         gravity: (3,) m/s².
+        table: (`Row`, n) of its joints.
+        odd: whether any effect is none that `table` can hold: `beside` then says its torque.
     """
 
     notes: Sequence[str] = ()
@@ -91,19 +102,19 @@ class ModelFeedforward:
             raise SettingsError("feed-forward needs a fixed base; this model's base floats")
         n = tree.n
         self.gravity = np.asarray(gravity, dtype=np.float64)
-        self._parent, self._base = tree.parent, base_at_rest(gravity)[None]
+        self._parent, self._base = tree.parent, base_at_rest(gravity)
         self._effects = effects_by_name(effect_names)
-        self._known = by_joint(known, n) if known else None
-        # position, velocity, acceleration, torque: a table of one instant each
-        self._signals, self._still = np.zeros((4, 1, n)), np.zeros(n)
-        self._motion = JointMotion(*self._signals[:3])
-        self._bristles, self._bent = Bristles.unknown(n), np.zeros(len(WAYS_RAD) * n)
-        self._straight = np.zeros((len(WAYS_RAD), n))
+        self._units = [_shares_of_effect(effect) for effect in self._effects]
+        self._known, self._shares = _split(known, n)
+        self.table, self._still = joint_table(n), np.zeros(n)
+        self._q, self._dq, self._ddq, self._tau = self.table[: Row.TAU + 1]
+        # position, velocity, acceleration, torque of the links: a table of one instant each
+        self._links = np.zeros((4, 1, n))
         self._asked: tuple[Array | None, ...] = (None, None, None)
         self._said = self._still
         self.set(np.zeros((n, 6)), np.zeros((n, 10)), np.zeros((len(self._effects), n)))
         self(*np.zeros((3, n)))  # compiled now, not in the first tick
-        self._bristles.place[:] = np.nan
+        self.table[Row.PLACE] = np.nan
 
     @classmethod
     def of(cls, model: SelfModel) -> ModelFeedforward:
@@ -140,93 +151,125 @@ class ModelFeedforward:
         self.theta = np.array(theta, dtype=np.float64).reshape(-1, 10)
         if shapes is None:
             shapes = np.full(np.shape(effect_values), np.nan)
-        taken = zip(self._effects, effect_values, shapes, strict=True)
-        parts = [(effect, value * effect.shares(shape)) for effect, value, shape in taken]
-        self._parts = [part for part in parts if part[1].any()]
+        shares, self._parts = self._shares.copy(), []
+        taken = zip(self._effects, self._units, effect_values, shapes, strict=True)
+        for effect, units, values, shape in taken:
+            parts = values * effect.shares(shape)
+            if units is not None:
+                shares += units @ parts
+            elif parts.any():
+                self._parts.append((effect, parts))
+        self.table[Row.SHARES :] = shares
+        self.odd = self._known is not None or bool(self._parts)
 
     def __call__(self, q: Array, dq: Array, ddq: Array) -> Array:
         """Torques (n,) N m of a motion, which goes on from the one asked for before."""
         asked = self._asked
         if q is not asked[0] or dq is not asked[1] or ddq is not asked[2]:
-            self._asked, self._said = (q, dq, ddq), self._moved(q, dq, ddq)
+            self._asked, self._said = (q, dq, ddq), self._torque(q, dq, ddq, True)
         return self._said.copy()
-
-    def _moved(self, q: Array, dq: Array, ddq: Array) -> Array:
-        wind(np.inf, q, dq, self._bristles, self._bent)
-        return self._torque(q, dq, ddq, self._bent.reshape(-1, len(q)))
 
     def unbent(self, q: Array) -> Array:
         """Torques (n,) N m of holding still with nothing bent."""
-        return self._torque(q, self._still, self._still, self._straight)
+        return self._torque(q, self._still, self._still, False)
 
-    def beside_bodies(self, q: Array, dq: Array, dt_s: float) -> Array:
-        """Torques (n,) N m beside those of the rigid bodies, but for what ddq asks for.
+    def _torque(self, q: Array, dq: Array, ddq: Array, bends: bool) -> Array:
+        self._q[:], self._dq[:], self._ddq[:] = q, dq, ddq
+        fill_torque(self.frames, self.theta, self._base, self.table, bends)
+        return self._tau + self._odd(1.0 if bends else 0.0) if self.odd else self._tau.copy()
+
+    def odd_beside(self, q: Array, dq: Array, dt_s: float) -> Array:
+        """Torques (n,) N m beside the bodies that `table` does not hold, but for what ddq asks for.
 
         Args:
             q, dq: (n,) as measured, dt_s after those of the call before: bristles follow them.
         """
-        wind(dt_s, q, dq, self._bristles, self._bent)
-        return self._beside(q, dq, self._still, self._bent.reshape(-1, len(q)))
+        self._q[:], self._dq[:], self._ddq[:] = q, dq, 0.0
+        wind_table(self.table, dt_s)
+        return self._odd()
 
     def friction(self, dq: float) -> Array:
         """(n,) N m: half of what turning from -dq to dq (rad/s) changes, far from the turn."""
-        still, speed = self._still, np.full(len(self._still), dq)
-        ahead = self._beside(still, speed, still, self._straight + 1.0)
-        return 0.5 * (ahead - self._beside(still, -speed, still, self._straight - 1.0))
+        return friction_of(self.table, dq) + self._half_change(Row.DQ, dq)
 
     def motor_inertia(self) -> Array:
         """(n,) kg m²: what is beside the bodies and follows the joint's own acceleration."""
-        still, one = self._still, np.ones(len(self._still))
-        return self._beside(still, still, one, self._straight) - self._beside(
-            still, still, still, self._straight
-        )
+        own: Array = self.table[Row.SHARES + 4] + self._half_change(Row.DDQ, 1.0)
+        return own
 
-    def _torque(self, q: Array, dq: Array, ddq: Array, bent: Array) -> Array:
-        self._set_motion(q, dq, ddq)
-        tau = self._rigid()
-        return tau + self._beside(q, dq, ddq, bent, tau)
+    def _half_change(self, row: Row, size: float) -> Array:
+        """(n,) N m: half of what the odd torques change from -size to size; bent that way."""
+        if not self.odd:
+            return self._still
+        before, said = self.table.copy(), []
+        for way in (1.0, -1.0):
+            self._q[:], self._dq[:], self._ddq[:] = 0.0, 0.0, 0.0
+            self.table[row] = way * size
+            self.table[Row.BENT : Row.SHARES] = way if row == Row.DQ else 0.0
+            said.append(self._odd())
+        self.table[:] = before
+        return 0.5 * (said[0] - said[1])
 
-    def _set_motion(self, q: Array, dq: Array, ddq: Array) -> None:
-        """Where the links move otherwise than the joints say, theirs."""
-        signals, known = self._signals, self._known
-        signals[0, 0], signals[1, 0], signals[2, 0] = q, dq, ddq
-        if known is not None and known.moves:
-            self._to_links(known)
-
-    def _beside(
-        self, q: Array, dq: Array, ddq: Array, bent: Array, rigid: Array | None = None
-    ) -> Array:
-        """What comes on top of the rigid bodies' torques (n,), computed here where it is needed."""
-        signals, known = self._signals, self._known
-        more: Array = np.zeros(len(q))
-        if known is not None:
-            if rigid is None:
-                self._set_motion(q, dq, ddq)
-                rigid = self._rigid()
-            link, speed, pull = signals[0, 0], signals[1, 0], signals[2, 0]
-            more = more + known.torque(JointSignals(link, speed, pull, rigid, bent=bent))
-            if known.pushed:
-                push = np.empty((1, len(rigid), 1))
-                wrench_torques(self.frames, signals[0], known.wrench[:, None], push)
-                more = more - push[0, :, 0]
-            more = more + known.gain * (rigid + more)
-        at = JointSignals(q, dq, ddq, bent=bent)
+    def _odd(self, bent: float = 1.0) -> Array:
+        """(n,) N m of what `table` does not hold, for the motion in it; bends times `bent`."""
+        bends = bent * self.table[Row.BENT : Row.SHARES]
+        at = JointSignals(self._q, self._dq, self._ddq, bent=bends)
+        more = np.zeros(len(self._q)) if self._known is None else self._of_known(self._known, at)
         for effect, parts in self._parts:
             for part, column in zip(parts, effect.basis(at), strict=True):
                 more += part * column
         return more
 
+    def _of_known(self, known: ByJoint, at: JointSignals) -> Array:
+        """What known effects change in the torques (n,) of the bodies."""
+        links = self._links
+        links[0, 0], links[1, 0], links[2, 0] = at.q, at.dq, at.ddq
+        straight = self._rigid()
+        if known.moves:
+            self._to_links(known)
+        rigid, (q, dq, ddq) = self._rigid(), links[:3, 0]
+        more = rigid - straight + known.torque(JointSignals(q, dq, ddq, rigid, bent=at.bent))
+        if known.pushed:
+            push = np.empty((1, len(rigid), 1))
+            wrench_torques(self.frames, links[0], known.wrench[:, None], push)
+            more = more - push[0, :, 0]
+        return more + known.gain * (straight + more)
+
     def _rigid(self) -> Array:
-        tau = self._signals[3]
-        torques(self.frames, self.theta, self._motion, self._base, tau)
+        tau = self._links[3]
+        torques(self.frames, self.theta, JointMotion(*self._links[:3]), self._base[None], tau)
         return tau[0].copy()
 
     def _to_links(self, known: ByJoint) -> None:
         """Put the links' motion in place of what the encoders say."""
-        (q,), (dq,), (ddq,), (tau,) = self._signals
+        (q,), (dq,), (ddq,), (tau,) = self._links
         lag = known.half_play * smooth_sign(dq)
-        if known.compliance.any():
-            self._rigid()
         pull = JointTorques(tau, self._still, self._still)
         to_links(JointMotion(q, dq, ddq), pull, Gears.of(known))
         q -= lag
+
+
+def _shares_of_effect(effect: LearnedEffect) -> Array | None:
+    """(COLUMNS, K) of each part of a learned effect, by its unit; None where of none."""
+    shares = []
+    for k in range(len(effect.basis(JointSignals(*np.zeros((3, 1)))))):
+
+        def part(at: JointSignals, k: int = k) -> Array:
+            return effect.basis(at)[k]
+
+        found = shares_of(part, 1)
+        if found is None:
+            return None
+        shares.append(found)
+    return np.hstack(shares)
+
+
+def _split(known: Sequence[Active], n: int) -> tuple[ByJoint | None, Array]:
+    """Known effects that a table does not hold, and the shares (COLUMNS, n) of those it does."""
+    nothing = np.zeros((COLUMNS, n))
+    if not known:
+        return None, nothing
+    sums = by_joint(known, n)
+    bodies = sums.moves or sums.pushed or bool(sums.gain.any())
+    shares = None if bodies else shares_of(sums.torque, n)
+    return (sums, nothing) if shares is None else (None, shares)

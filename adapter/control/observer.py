@@ -19,10 +19,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 
 from adapter.control.feedforward import ModelFeedforward, not_learned
+from adapter.control.instant import Row, beside, wind_table
 from adapter.effects.active import with_bodies
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
@@ -32,7 +34,9 @@ from drivers.interface import JointSample
 
 LONGEST_S = 0.02  # a longer step of the stamps begins anew
 SLOW_S, NOISE_S = 0.3, 5.0  # what is slower is no noise; over which noise is measured
+AGO_NS, LONG_AGO_S = 15_000_000, 0.1  # readings before, between which a momentum's rate is taken
 WARM_UP_S = 1.0  # of noise before the first contact is believed
+SPIKE_S = 0.01  # times the effort limit: the momentum that one reading may be off by
 CLIP = 3.0  # standard deviations that count at most where noise is measured
 TURN_DQ, TURN_SHARE = 0.03, 0.3  # rad/s; share of friction that is unknown at a slower joint
 PROBE_DQ = 0.1  # rad/s, at which friction is asked for
@@ -63,74 +67,97 @@ class ObserverSettings:
                 raise SettingsError(f"observer.{name} must be above zero")
 
 
+class Of(IntEnum):
+    """Rows of the observer's table, (n,) each; the last n are the covariance of its noise."""
+
+    Q = 0  # rad, and the next two: the reading
+    DQ = 1  # rad/s
+    TAU = 2  # N m
+    TORQUE = 3  # external, N m; followed
+    STD = 4  # filled, without a contact, N m
+    MOMENTUM = 5  # as it is believed, N m s
+    RATE = 6  # of it at the instant before, but for the external torque, N m
+    SLOW = 7  # mean of the external torque, N m
+    NOW = 8  # momentum by the model
+    DRIFT = 9  # dT/dq - g less friction, N m
+    UNSURE = 10  # standard deviation of the model's torque, N m
+    TURN = 11  # the same for friction around a turn of the joint
+    INERTIA = 12  # of the motor, kg m²
+    TURNING = 13  # what `TURN` is around a turn
+    ERROR = 14  # what `UNSURE` is, but for
+    WEIGHT = 15  # this share of the weight
+    ODD = 16  # torque beside the bodies that the table of the joints does not hold, N m
+    EXPECTED = 17  # filled: measured torque without the external one, N m
+    SPIKE = 18  # by which the momentum is off at most in a step, N m s: no more is believed
+    NOISE = 19
+
+
 @jit
-def ask(bodies, state, beside, own, errors, now):
+def ask(bodies, joints, table, winds, dt_s):
     """Fill what `balance` wants to know of the model.
 
     Args:
-        bodies: their frames, θ and gravity; state: q, dq (n,); beside: (n,) torques beside them.
-        own: (2, n) motor inertia, kg m²; torque that is unknown around a turn, N m.
-        errors: (2, n) standard deviation of the torque, N m, and its share of the weight.
-        now: (4, n) p; dT/dq - g less friction; standard deviations of the model and of a turn.
+        bodies: their frames, θ and gravity; joints: table of the model's joints at q, dq.
+        table: of the observer; winds: whether bristles follow now, dt_s after the last time.
     """
     frames, theta, gravity = bodies
-    q, dq = state
-    n = q.shape[0]
+    n = table.shape[1]
+    q, dq = joints[Row.Q.value], joints[Row.DQ.value]
+    if winds:
+        wind_table(joints, dt_s)
     out = np.empty((3, n))
     momenta(frames, theta, q, dq, gravity, out)
     for j in range(n):
-        now[0, j] = out[0, j] + own[0, j] * dq[j]
-        now[1, j] = out[1, j] - out[2, j] - beside[j]
-        now[2, j] = errors[0, j] + errors[1, j] * abs(out[2, j])
-        now[3, j] = own[1, j] if abs(dq[j]) < TURN_DQ else 0.0
+        table[Of.NOW.value, j] = out[0, j] + table[Of.INERTIA.value, j] * dq[j]
+        more = beside(joints, j, True) + table[Of.ODD.value, j]
+        table[Of.DRIFT.value, j] = out[1, j] - out[2, j] - more
+        weight = abs(out[2, j])
+        table[Of.UNSURE.value, j] = table[Of.ERROR.value, j] + table[Of.WEIGHT.value, j] * weight
+        turns = abs(dq[j]) < TURN_DQ
+        table[Of.TURN.value, j] = table[Of.TURNING.value, j] if turns else 0.0
 
 
 @jit
-def balance(r, kept, now, tau, step, noise):
-    """Take one instant; the external torque r (n,) follows. False where it begins anew.
+def balance(table, step):
+    """Take one instant; the external torque follows, and the covariance of its noise.
 
-    Args:
-        r: (n,) external torque, N m.
-        kept: (3, n) p as it is believed; its rates of the instant before but for r; slow mean of r.
-        now: (4, n) as `ask` fills it; tau: (n,) measured.
-        step: (dt_s, rate of both poles in 1/s, age of the noise in s, whether r is noise alone);
-            dt_s is infinite where it begins anew.
-        noise: (n, n) covariance of r's noise, (N m)²; follows.
+    `step`: (dt_s, rate of both poles in 1/s, age of the noise in s, whether the external torque is
+    noise alone).
     """
     dt_s, pole, age_s, quiet = step
-    n = r.shape[0]
-    if dt_s == math.inf:
-        for j in range(n):
-            kept[0, j], kept[1, j] = now[0, j], tau[j] + now[1, j]
-        return False
+    n = table.shape[1]
+    r, slow, noise = table[Of.TORQUE.value], table[Of.SLOW.value], table[Of.NOISE.value :]
     memory = math.exp(-pole * dt_s)
-    slow, young = math.exp(-dt_s / SLOW_S), age_s < WARM_UP_S
+    slowly, young = math.exp(-dt_s / SLOW_S), age_s < WARM_UP_S
     part = dt_s / min(max(age_s, dt_s), NOISE_S) if quiet else 0.0
     own, scale = np.empty(n), 0.0
     for j in range(n):
-        rate = tau[j] + now[1, j]
-        ahead = kept[0, j] + dt_s * (0.5 * (rate + kept[1, j]) + r[j])
-        error = now[0, j] - ahead
-        kept[0, j], kept[1, j] = ahead + (1.0 - memory * memory) * error, rate
+        rate = table[Of.TAU.value, j] + table[Of.DRIFT.value, j]
+        before = table[Of.RATE.value, j]
+        ahead = table[Of.MOMENTUM.value, j] + dt_s * (0.5 * (rate + before) + r[j])
+        most = table[Of.SPIKE.value, j]
+        error = min(max(table[Of.NOW.value, j] - ahead, -most), most)
+        table[Of.MOMENTUM.value, j] = ahead + (1.0 - memory * memory) * error
+        table[Of.RATE.value, j] = rate
         r[j] += (1.0 - memory) * (1.0 - memory) * error / dt_s
-        kept[2, j] = slow * kept[2, j] + (1.0 - slow) * r[j]
-        own[j] = r[j] - kept[2, j]
-        scale = max(scale, own[j] ** 2 / (noise[j, j] + now[2, j] ** 2))
+        slow[j] = slowly * slow[j] + (1.0 - slowly) * r[j]
+        own[j] = r[j] - slow[j]
+        scale = max(scale, own[j] ** 2 / (noise[j, j] + table[Of.UNSURE.value, j] ** 2))
     share = part if young or not scale > CLIP * CLIP else part * CLIP * CLIP / scale
     for i in range(n):
         for j in range(n):
             noise[i, j] += share * own[i] * own[j] - part * noise[i, j]
-    return True
 
 
 @jit
-def distance_of(r, noise, now, std):
-    """Of r (n,) from nothing, in standard deviations of all joints; std (n,) N m is filled."""
-    n = r.shape[0]
+def distance_of(table):
+    """Of the external torque from nothing, in standard deviations of all joints; fills `STD`."""
+    n = table.shape[1]
+    r, noise = table[Of.TORQUE.value], table[Of.NOISE.value :]
     L, x, total = np.zeros((n, n)), np.empty(n), 0.0
     for i in range(n):
-        extra = now[2, i] ** 2 + now[3, i] ** 2
-        std[i] = math.sqrt(noise[i, i] + extra)
+        extra = table[Of.UNSURE.value, i] ** 2 + table[Of.TURN.value, i] ** 2
+        table[Of.STD.value, i] = math.sqrt(noise[i, i] + extra)
         for j in range(i + 1):
             value = noise[i, j] + (extra if i == j else 0.0)
             for k in range(j):
@@ -142,6 +169,36 @@ def distance_of(r, noise, now, std):
         x[i] /= L[i, i]
         total += x[i] * x[i]
     return math.sqrt(total)
+
+
+@jit
+def observe(bodies, joints, table, step):
+    """One reading, all of it; the distance of the external torque from nothing.
+
+    Zero where it begins anew, NaN for a reading that is no number: then nothing changes.
+
+    Args:
+        bodies, joints, table: as for `ask`.
+        step: as for `balance`, with an infinite dt_s where it begins anew; whether bristles follow.
+    """
+    dt_s, pole, age_s, quiet, winds = step
+    n = table.shape[1]
+    for j in range(n):
+        if not math.isfinite(table[0, j] + table[1, j] + table[2, j]):
+            return math.nan
+    for j in range(n):
+        joints[Row.Q.value, j], joints[Row.DQ.value, j] = table[0, j], table[1, j]
+    ask(bodies, joints, table, winds, dt_s)
+    if dt_s == math.inf:
+        for j in range(n):
+            table[Of.EXPECTED.value, j] = table[Of.TAU.value, j] + table[Of.TORQUE.value, j]
+            table[Of.MOMENTUM.value, j] = table[Of.NOW.value, j]
+            table[Of.RATE.value, j] = table[Of.TAU.value, j] + table[Of.DRIFT.value, j]
+        return 0.0
+    balance(table, (dt_s, pole, age_s, quiet))
+    for j in range(n):
+        table[Of.EXPECTED.value, j] = table[Of.TAU.value, j] + table[Of.TORQUE.value, j]
+    return distance_of(table)
 
 
 @jit
@@ -210,6 +267,10 @@ class ContactObserver:
     Attributes:
         torque: (n,) that the surroundings put on the joints, N m.
         std: (n,) its standard deviation without a contact, N m.
+        learned: whether it goes by what was learned.
+        explained: (n,) N m, sum of what new parameters took for the arm's own torque; a new array
+            with each of them.
+        expected: (n,) N m that the last reading would have had without a push.
         distance: of `torque` from nothing, in standard deviations over all joints.
         contact: the one that lasts; None where nothing pushes.
         contacts: all so far, at most `MOST_CONTACTS`.
@@ -232,28 +293,30 @@ class ContactObserver:
         )
         self._tool = documented.theta_with_tool() - documented.theta
         self._pole = 2.0 * math.pi * self.settings.bandwidth_hz
-        self.torque, self.std, self.distance = np.zeros(n), np.full(n, np.inf), 0.0
+        self._table = table = np.zeros((Of.NOISE + n, n))
+        self._q, self._dq, self._tau = table[: Of.TORQUE]
+        self.torque, self.std, self.distance = table[Of.TORQUE], table[Of.STD], 0.0
+        self.std[:], self.expected, self.explained = np.inf, table[Of.EXPECTED], np.zeros(n)
         self.contact: Contact | None = None
         self.contacts: list[Contact] = []
-        self._kept, self._now = np.zeros((3, n)), np.zeros((4, n))
-        self._reading, self._wrench = np.zeros((3, n)), np.zeros((2, 6))
-        self._noise, self._age_s = np.zeros((n, n)), 0.0
+        self._wrench, self._age_s = np.zeros((2, 6)), 0.0
         self._anew, self._stamp_ns, self._since, self._recent = True, 0, 0, 0.0
+        self._past = ((0, np.zeros((2, n))),) * 2  # stamps and readings (2, n) of a little before
+        table[Of.SPIKE] = SPIKE_S * effort
         effort = np.where(np.isfinite(effort), effort, 0.0)
-        self._errors = np.array([UNLEARNED_EFFORT * effort, np.full(n, UNLEARNED_WEIGHT)])
+        table[Of.ERROR], table[Of.WEIGHT] = UNLEARNED_EFFORT * effort, UNLEARNED_WEIGHT
         self._take_over()
         self._compile()
 
     def _compile(self) -> None:
         """Compile what a step calls, on numbers of no meaning: the loop has no time for it."""
         n = len(self.std)
-        none, one, now = np.zeros(n), np.ones(n), np.ones((4, n))
-        bodies = self._model.frames, self._model.theta, self._model.gravity
-        ask(bodies, (none, none), none, self._own, self._errors, now)
-        step = 1e-3, self._pole, 1.0, True
-        balance(none.copy(), np.zeros((3, n)), now, none, step, np.eye(n))
-        distance_of(none, np.eye(n), now, one)
-        hand_wrench(self.frames, none, none, one, np.zeros((2, 6)))
+        table, one = np.ones_like(self._table), np.ones(n)
+        table[Of.NOISE :] = np.eye(n)
+        joints = self._model.table.copy()
+        ask(self._bodies, joints, table, True, 1e-3)
+        observe(self._bodies, joints, table, (1e-3, self._pole, 1.0, True, True))
+        hand_wrench(self.frames, 0.0 * one, 0.0 * one, one, np.zeros((2, 6)))
 
     def adopt(
         self, lam: Array, theta: Array, effects: Array, shapes: Array, torque_std: Array
@@ -266,47 +329,78 @@ class ContactObserver:
         """
         if not all(np.isfinite(x).all() for x in (lam, theta, torque_std)):
             return False
+        before = self._ask_twice()
         self._learned.set(lam, theta + self._tool, np.nan_to_num(effects), shapes)
-        self._model = self._learned
-        self._errors = np.array([torque_std, np.zeros(len(torque_std))])
+        if not self.learned:
+            self._learned.table[: Row.SHARES] = self._model.table[: Row.SHARES]
+            self._model, self._age_s = self._learned, 0.0  # its noise is another
+        self._table[Of.ERROR], self._table[Of.WEIGHT] = torque_std, 0.0
         self._take_over()
+        if not self._anew:
+            self._explain(self._ask_twice() - before)
         return True
 
-    def _take_over(self) -> None:
-        """What was believed of the momentum changes with the parameters: a fresh start from one
-        noisy reading would look like a push.
-        """
-        turn = TURN_SHARE * np.abs(self._model.friction(PROBE_DQ))
-        self._own = np.array([self._model.motor_inertia(), turn])
-        if not self._anew:
-            before = self._now[:2].copy()
-            self._ask_model(self._reading[0], self._reading[1], 0.0)
-            self._kept[:2] += self._now[:2] - before
+    def _explain(self, change: Array) -> None:
+        """Go on from a change (2, 2, n) of momentum and drift, now and a little before.
 
-    def _ask_model(self, q: Array, dq: Array, dt_s: float) -> None:
-        """Fill what `balance` wants to know of the model at (n,) q, dq."""
+        A fresh start from one noisy reading would look like a push, and so would a torque that is
+        taken for an external one only until the observer has followed.
+        """
+        now, then = change
+        dt_s = 1e-9 * (self._stamp_ns - self._past[0][0])
+        gone = now[1] - ((now[0] - then[0]) / dt_s if 0.0 < dt_s < LONG_AGO_S else 0.0)
+        self._table[[Of.MOMENTUM, Of.RATE]] += now
+        self._table[[Of.TORQUE, Of.SLOW, Of.EXPECTED]] -= gone
+        self.explained = self.explained + gone
+
+    def _ask_twice(self) -> Array:
+        """(2, 2, n) momentum and drift by the model in use, now and a little before."""
+        model, said = self._model, []
+        for q, dq in (model.table[: Row.DQ + 1].copy(), self._past[0][1]):
+            joints, table = model.table.copy(), self._table.copy()
+            joints[Row.Q], joints[Row.DQ] = q, dq
+            if model.odd:
+                table[Of.ODD] = model.odd_beside(q, dq, 0.0)
+            ask(self._bodies, joints, table, False, 0.0)
+            said.append(table[[Of.NOW, Of.DRIFT]])
+        return np.array(said)
+
+    @property
+    def learned(self) -> bool:
+        """See the class."""
+        return self._model is self._learned
+
+    def _take_over(self) -> None:
+        """What stands still of the model in use."""
         model = self._model
-        beside = model.beside_bodies(q, dq, dt_s)
-        bodies = model.frames, model.theta, model.gravity
-        ask(bodies, (q, dq), beside, self._own, self._errors, self._now)
+        self._bodies = model.frames, model.theta, model.gravity
+        self._table[Of.TURNING] = TURN_SHARE * np.abs(model.friction(PROBE_DQ))
+        self._table[Of.INERTIA] = model.motor_inertia()
 
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample; one that is not finite leaves it as it was."""
-        if not np.isfinite(sample.q + sample.dq + sample.tau).all():
-            return self.torque
-        q, dq, tau = self._reading  # of its own: other arrays may be of a kind to compile for
-        q[:], dq[:], tau[:] = sample.q, sample.dq, sample.tau
+        self._q[:], self._dq[:], self._tau[:] = sample.q, sample.dq, sample.tau
         dt_s = 1e-9 * (sample.stamp_ns - self._stamp_ns)
         if self._anew or not 0.0 < dt_s <= LONGEST_S:
             dt_s = math.inf
-        self._ask_model(q, dq, dt_s)
-        self._anew, self._stamp_ns = False, sample.stamp_ns
+        model, age_s = self._model, self._age_s + (dt_s if dt_s < math.inf else 0.0)
+        if model.odd:
+            if not np.isfinite(self._table[: Of.TORQUE]).all():
+                return self.torque
+            self._table[Of.ODD] = model.odd_beside(self._q, self._dq, dt_s)
+        step = dt_s, self._pole, age_s, self.contact is None, not model.odd
+        distance = observe(self._bodies, model.table, self._table, step)
+        if distance != distance:
+            return self.torque
+        if self._anew and np.abs(self._dq).max() < TURN_DQ:  # what holds it is known at once
+            self.torque[:] = self._table[Of.SLOW] = -self._table[Of.RATE]
+            self.expected[:] = self._tau + self.torque
+        self._anew, self._stamp_ns, self._age_s = False, sample.stamp_ns, age_s
+        if sample.stamp_ns - self._past[1][0] > AGO_NS:
+            self._past = self._past[1], (sample.stamp_ns, self._table[: Of.TAU].copy())
         if dt_s < math.inf:
-            self._age_s += dt_s
-        step = dt_s, self._pole, self._age_s, self.contact is None
-        if balance(self.torque, self._kept, self._now, tau, step, self._noise):
-            self.distance = distance_of(self.torque, self._noise, self._now, self.std)
-            if self._age_s > WARM_UP_S:
+            self.distance = distance
+            if age_s > WARM_UP_S:
                 self._judge(sample, dt_s)
         return self.torque
 
@@ -343,5 +437,5 @@ class ContactObserver:
 
         What the torques do not show has the standard deviation of not knowing.
         """
-        hand_wrench(self.frames, self._reading[0], self.torque, self.std, self._wrench)
+        hand_wrench(self.frames, self._model.table[Row.Q], self.torque, self.std, self._wrench)
         return self._wrench[0].copy(), self._wrench[1].copy()

@@ -51,6 +51,11 @@ class Now(IntEnum):
     CARRIED = 6  # gravity that the arm carries itself
     EXTERNAL = 7  # filled: torque that nothing explains
     OFFSET = 8  # filled: what the model is off by
+    STD = 9  # of a learned model's torque; 0 where none was learned
+
+
+MOST, LEAST = len(Cause), len(Cause) + 1  # further rows of the limits: what `EXTERNAL` is between
+SIGMAS = 8.0  # of the standard deviation: as many as for a contact
 
 
 _WHAT = {
@@ -71,6 +76,15 @@ _WHAT = {
         "its load changed, or its model is wrong",
     ),
 }
+
+
+@jit
+def limit_push(now, limits):
+    """How much push is too much: less where a learned model knows well what to expect."""
+    for j in range(now.shape[1]):
+        std, most = now[Now.STD.value, j], limits[MOST, j]
+        least = max(limits[LEAST, j], SIGMAS * std)
+        limits[Cause.EXTERNAL.value, j] = min(most, least) if std > 0.0 else most
 
 
 @jit
@@ -99,7 +113,7 @@ def command(now, room, most, step, modelled):
     """Bring `WANTED` into the limits as `COMMAND`; whether any was cut, and any was too quick.
 
     Args:
-        now: (9, n); room, most, step: (n,) N m beyond the expected torque, at all, and from the
+        now: (10, n); room, most, step: (n,) N m beyond the expected torque, at all, and from the
             last command; modelled: the expected torque is known.
     """
     cut = quick = False
@@ -124,7 +138,7 @@ def command(now, room, most, step, modelled):
 def judge(now, limits, times, hold_s, dt_s):
     """(cause, joint, calm) of one tick, cause -1 for none; `times` (4, n) s beyond each limit.
 
-    `limits` (4, n) are rad, s, N m, W.
+    `limits` (6, n) are rad, s, N m, W, N m, N m.
     """
     calm, moving = True, False
     cause, joint = -1, 0
@@ -151,6 +165,7 @@ def look(now, limits, times, bounds, numbers):
 
     `bounds` (3, n): room, most, step; `numbers`: hold_s, dt_s, share that the offset follows by.
     """
+    limit_push(now, limits)
     modelled = find_push(now, limits[Cause.EXTERNAL.value], numbers[2])
     cut, quick = command(now, bounds[0], bounds[1], bounds[2], modelled)
     cause, joint, calm = judge(now, limits, times, numbers[0], numbers[1])
@@ -167,7 +182,7 @@ class ArmWatch:
         most: (n,) N m, torque that a command may have in the end.
 
     Attributes:
-        now: (9, n), see `Now`; whoever calls `step` fills the first seven rows.
+        now: (10, n), see `Now`; whoever calls `step` fills the first seven rows, and the last.
         saturated, rate_limited: commands that were cut at a torque, at the torque rate.
     """
 
@@ -185,6 +200,8 @@ class ArmWatch:
                 np.full(n, settings.saturated_s),
                 settings.external_share * limits.effort,
                 settings.power_share * limits.effort * limits.velocity,
+                settings.external_share * limits.effort,
+                settings.learned_share * limits.effort,
             ]
         )
         self._start = settings.start_share * np.minimum(limits.effort, ENDLESS)

@@ -26,13 +26,13 @@ class FollowingObserver(EstimateFollower):
     ) -> None:
         super().__init__()
         self.observer, self._stops, self._names = observer, stops, names
-        self._ticks, self._learned = 0, False
+        self._ticks = 0
 
     @property
     def alarm(self) -> str | None:
         """Why the motion has to end; None while nothing pushes."""
         contact = self.observer.contact
-        if contact is None or not self._stops or not self._learned:
+        if contact is None or not self._stops or not self.observer.learned:
             return None
         j = contact.joint
         name = f" ({self._names[j]})" if self._names else ""
@@ -48,5 +48,5 @@ class FollowingObserver(EstimateFollower):
         new = self.new_estimate() if self._ticks % REFRESH_TICKS == 0 else None
         if new is not None:
             values = new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std
-            self._learned = self.observer.adopt(*values) or self._learned
+            self.observer.adopt(*values)
         return self.observer.step(sample)

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from adapter.control.feedforward import ModelFeedforward
+from adapter.control.instant import Row
+from adapter.effects.by_joint import JointSignals
+from adapter.effects.catalogue import CATALOGUE, LEARNED
 from adapter.effects.torque import ModelTorque
 from adapter.model.robots import documented
 from tests.helpers.robot_models import relative
@@ -90,3 +93,27 @@ def test_an_effect_that_is_over_is_not_asked_for() -> None:
     ours, _ = both(replace(documented("panda"), effects=(over,)))
     bare, _ = both(documented("panda"))
     np.testing.assert_array_equal(ours, bare)
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_what_is_learned_of_an_effect_is_added(name: str) -> None:
+    """Compiled or not, it is what the effect's own file says."""
+    panda, rng = documented("panda"), np.random.default_rng(4)
+    effect, values = CATALOGUE[name], rng.uniform(0.1, 0.3, N)
+    shape = np.full(N, effect.shapes[1] if effect.shapes else np.nan)
+    bare = ModelFeedforward(panda.tree, panda.gravity)
+    bare.set(panda.lam, panda.theta, np.zeros((0, N)))
+    forward = ModelFeedforward(panda.tree, panda.gravity, (name,))
+    forward.set(panda.lam, panda.theta, values[None], shape[None])
+    for q, dq, ddq in rng.uniform(-1.0, 1.0, (20, 3, N)):
+        said = forward(q, dq, ddq)
+        at = JointSignals(q, dq, ddq, bent=forward.table[Row.BENT : Row.SHARES])
+        more = values * effect.torque_per_unit(at, shape)
+        np.testing.assert_allclose(said - bare(q, dq, ddq), more, atol=1e-9)
+    away = np.full(N, 0.5)
+    slides = JointSignals(0 * away, away, 0 * away, bent=np.ones((4, N)))
+    back = JointSignals(0 * away, -away, 0 * away, bent=-np.ones((4, N)))
+    half = effect.torque_per_unit(slides, shape) - effect.torque_per_unit(back, shape)
+    np.testing.assert_allclose(forward.friction(0.5), 0.5 * values * half, atol=1e-9)
+    inertia = values if name == "motor_inertia" else np.zeros(N)
+    np.testing.assert_allclose(forward.motor_inertia(), inertia, atol=1e-9)

@@ -72,6 +72,40 @@ def test_parameters_may_change_at_any_time() -> None:
     assert observer.contacts == []
 
 
+def test_what_new_parameters_explain_is_no_push() -> None:
+    """An arm whose model has 10 kg too many at the hand, until it is learned in motion."""
+    model, heavy = panda_model(), panda_model().theta.copy()
+    heavy[-1, 0] += 10.0
+    observer = ContactObserver(replace(model, theta=heavy))
+    samples = samples_with(np.zeros(7), 5.0)
+    before: np.ndarray = np.zeros(7)
+    for k, sample in enumerate(samples):
+        if k == 2500:
+            before = observer.torque.copy()
+            assert not observer.learned and np.abs(before).max() > 8.0
+            observer.adopt(model.lam, model.theta, NONE, NONE, STD)
+            gone = before - observer.torque
+            np.testing.assert_allclose(observer.explained, gone, atol=1e-9)
+            np.testing.assert_allclose(observer.expected, sample.tau, atol=3.0)
+        observer.step(sample)
+        if k >= 2500:
+            assert observer.learned and np.abs(observer.torque).max() < 3.0
+    assert np.abs(before).max() > 8.0
+
+
+def test_one_reading_that_cannot_be_is_not_believed_whole() -> None:
+    """20 rad/s more in one reading, of one joint after the other: less than half of the effort."""
+    observer, worst = learned_observer(), 0.0
+    effort = panda_model().limits.effort
+    for k, sample in enumerate(samples_with(np.zeros(7), 5.0)):
+        dq = sample.dq.copy()
+        if k % 200 == 199:
+            dq[k // 200 % 7] += 20.0
+        torque = observer.step(replace(sample, dq=dq))
+        worst = max(worst, float(np.abs(torque / effort).max()))
+    assert 0.05 < worst < 0.5
+
+
 def test_what_is_no_number_changes_nothing() -> None:
     """Readings and parameters that are not finite, holes, a clock that is set back."""
     model, observer = panda_model(), learned_observer()
