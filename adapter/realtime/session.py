@@ -246,7 +246,6 @@ def run_lockstep(
     duration_s: float | None = None,
     *,
     each: Callable[[JointSample, Array | None], None] | None = None,
-    observer: ObserverLike | None = None,
 ) -> LockstepResult:
     """Run an arm as fast as it goes; the learner sees what it would see live.
 
@@ -258,7 +257,6 @@ def run_lockstep(
         duration_s: of the arm's own stamps, until the safe stop begins; None runs to the end of
             the stream.
         each: called at the end of each tick with the sample and the command.
-        observer: takes each sample; None where nobody wants to know what pushes the arm.
 
     Raises:
         DriverError: the arm cannot be reached.
@@ -277,7 +275,6 @@ def run_lockstep(
 
     driver.connect()
     session = Session(driver, front_end, controller, learn, keep, duration_s)
-    session.observer = observer
     try:
         if controller is not None:
             session.get_ready(controller.prepare)
