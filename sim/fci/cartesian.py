@@ -78,6 +78,7 @@ class CartesianMotion:
     ) -> None:
         self._by_pose = kind == Generator.CARTESIAN_POSITION
         self._limits, self._hand, self._reach, self._fresh = limits, hand, reach, True
+        self._leads_elbow = False
         self.q, self.dq, self.ddq = q.copy(), np.zeros(len(q)), np.zeros(len(q))
         self.pose, self.twist, self.acceleration = pose.copy(), np.zeros(6), np.zeros(6)
 
@@ -86,6 +87,7 @@ class CartesianMotion:
         elbow, found = np.nan, self._wrong_elbow(command.elbow)
         if found is not None:
             return found
+        self._leads_elbow = command.elbow is not None
         if command.elbow is not None:
             elbow = float(command.elbow[0])
         if not self._by_pose:
@@ -99,10 +101,12 @@ class CartesianMotion:
         return self._go(pose.copy(), step / TICK_S, elbow)
 
     def extrapolate(self) -> None:
-        """A command is missing: go on with constant acceleration."""
+        """A command is missing: go on with constant acceleration, of an elbow that is led too."""
         self.twist = self.twist + self.acceleration * TICK_S
         self.pose = moved(self.pose, self.twist)
-        self._take_joints(self._reach(self.q, self.pose, np.nan)[0])
+        elbow = self.q[2] + (self.dq[2] + self.ddq[2] * TICK_S) * TICK_S
+        goal = elbow if self._leads_elbow else np.nan
+        self._take_joints(self._reach(self.q, self.pose, goal)[0])
 
     def ends(self) -> str | None:
         """The error of finishing now: the motion would have to stand still at the next tick."""

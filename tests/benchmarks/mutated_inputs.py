@@ -44,6 +44,45 @@ WORDS = (
     ),
     *(b"&a;", b"[/bold]", b"%s", b"../..", b"\r\n", b",", b";", b"", b" "),
 )
+CELL = b"""[cell]
+table = true
+reach = 0.8
+margin = 0.05
+[[cell.box]]
+name = "crate"
+size = [0.4, 0.3, 0.2]
+xyz = [0.6, 0.0, 0.1]
+rpy = [0.0, 0.0, 0.5]
+[[cell.cylinder]]
+name = "post"
+radius = 0.05
+length = 1.0
+xyz = [0.0, 0.7, 0.5]
+[[cell.plane]]
+name = "wall"
+normal = [1.0, 0.0, 0.0]
+offset = -0.6
+[cell.hand]
+length = 0.1
+radius = 0.06
+"""
+MJCF = b"""<mujoco model="arm"><compiler angle="radian"/><worldbody><body name="base">
+<geom type="box" size="0.1 0.1 0.1"/><body name="upper" pos="0 0.1 0.2" euler="0.2 0.3 0.5">
+<inertial pos="0.01 0 0.1" mass="2" fullinertia="0.02 0.018 0.01 0.001 0 0.002"/>
+<joint name="shoulder" axis="0 1 0" pos="0.02 0 -0.05" ref="0.2" range="-1.6 2" limited="true"/>
+<body name="lower" pos="0 0 0.3"><geom type="capsule" size="0.03 0.1" pos="0 0 0.1"/>
+<joint name="elbow" axis="0.6 0 0.8" armature="0.3" stiffness="2" damping="0.1"/></body></body>
+</body></worldbody><actuator><motor joint="elbow" ctrlrange="-30 30"/></actuator></mujoco>
+"""
+LINK = """<link name="l{0}"><inertial><origin xyz="0 0.01 0.1"/><mass value="{1}"/>
+<inertia ixx="0.02" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{0}" type="revolute"><parent link="l{1}"/>
+<child link="l{2}"/><axis xyz="0 1 0"/>
+<origin xyz="0 0 0.2" rpy="0.3 0 0.2"/>
+<limit lower="-2" upper="2" velocity="3" effort="50"/></joint>"""
+JOINTS = enumerate(("shoulder", "elbow", "wrist"), 1)  # of the recordings
+PARTS = [LINK.format(0, 4), *(LINK.format(k, 3) + JOINT.format(x, k - 1, k) for k, x in JOINTS)]
+URDF = ('<robot name="arm">' + "".join(PARTS) + "</robot>").encode()
 NUMBERS = (0, 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
 Refusals = tuple[type[BaseException], ...]
 
@@ -98,7 +137,9 @@ def wires() -> dict[str, Decoder]:
     from drivers.damiao.bus import message_for, unpack_datagram
     from drivers.damiao.settings import BusSettings
     from drivers.damiao.tables import troubles_of
+    from drivers.fci import codec as fci
     from drivers.fci.codec import ReplyParser, StateDecoder, WireError, connect_reply, status_reply
+    from sim.fci.codec import BadRequest, RequestReader, read_command
     from tests.helpers import fci_peer
     from tests.helpers.damiao_tools import LIMITS, reply_bytes
 
@@ -117,6 +158,7 @@ def wires() -> dict[str, Decoder]:
     stream = b"".join(fci_peer.reply(c, k, payload) for k, (c, payload) in enumerate(parts))
     message = message_for(BusSettings("x"), 0x11, good)
     register = damiao.write_register(1, damiao.PMAX, 12.5)
+    asked = fci.request(0, 1, struct.pack("<HH", 5, 4000)) + fci.request(2, 2) + fci.request(12, 3)
     found = {
         f"fci state {p}": Decoder(
             [fci_peer.state(p, 5, q=range(7), modes=(1, 2, 2))],
@@ -128,6 +170,13 @@ def wires() -> dict[str, Decoder]:
     }
     return {
         **found,
+        "fci requests": Decoder(
+            [asked, fci.request(1, 1, struct.pack("<II", 2, 1) + bytes(48))],
+            lambda x: [a.move_modes() for a in RequestReader(5).feed(x) if a.name == "Move"],
+            (BadRequest,),
+            0.05,
+        ),
+        "fci command": Decoder([bytes(370)], lambda x: read_command(x, 5), (), 0.05),
         "fci replies": Decoder([stream], replies, (WireError,), 0.12),
         "can reply": Decoder([good], lambda x: damiao.state(scales, x), (damiao.WireError,), 0.15),
         "can register": Decoder(
@@ -147,6 +196,7 @@ def wires() -> dict[str, Decoder]:
 
 def files(folder: Path) -> dict[str, Decoder]:
     """What disks hold."""
+    from adapter.effects.robots import read_robot
     from adapter.errors import ModelError, SettingsError
     from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
     from adapter.model.model_file import dumps, loads
@@ -198,6 +248,8 @@ def files(folder: Path) -> dict[str, Decoder]:
         "model.json": Decoder([model], text(loads), wrong, 0.01, True),
         "urdf": Decoder([PANDA.read_bytes()], text(model_from_urdf), wrong, 0.005, True),
         "toml": Decoder([toml], at("x.toml", read_config), (SettingsError,), 0.03, True),
+        "mjcf": Decoder([MJCF], at("x.xml", read_robot), wrong, 0.003, True),
+        "cell": Decoder([CELL], at("c.toml", read_config), (SettingsError,), 0.03, True),
         "csv": Decoder([csv], at("x.csv", read_table), driver, 0.03, True),
         "npz": Decoder(
             [table.read_bytes(), (folder / "u.npz").read_bytes()],
@@ -251,6 +303,8 @@ def commands(folder: Path) -> dict[str, Decoder]:
     from tests.helpers.robot_models import PANDA
 
     model, urdf = dumps(documented("panda")).encode(), PANDA.read_bytes()
+    (folder / "a.urdf").write_bytes(URDF)
+    arm, kept = str(folder / "a.urdf"), ("--no-report", "--quiet", "--out", str(folder / "out"))
     log = foreign(folder / "b.mcap", payloads(samples(40))).read_bytes()
     csv = b"time,q,dq,tau\n" + b"".join(b"%.3f,1.5,2e-3,-7\n" % (1e-3 * k) for k in range(20))
     columns = ("--columns", "time=0,q=1,dq=2,tau=3", "--to", str(folder / "to.mcap"))
@@ -278,8 +332,13 @@ def commands(folder: Path) -> dict[str, Decoder]:
         "diff": (urdf, given("x.urdf", "diff", "panda", "FILE"), True),
         "import": (csv, given("x.csv", "import", "FILE", *columns, "--joints", "a"), True),
         "recover": (log, given("x.mcap", "recover", "FILE", *mended), False),
-        "gap": (urdf, given("x.urdf", "gap", str(folder / "b.mcap"), "--model", "FILE", "--quiet",
-                            "--out", str(folder / "gap")), True),
+        "gap ROBOT": (URDF, given("x.urdf", "gap", str(folder / "b.mcap"), "--model", "FILE",
+                                  "--quiet", "--out", str(folder / "gap")), True),
+        "gap LOG": (log, given("x.mcap", "gap", "FILE", "--model", arm, "--quiet",
+                               "--out", str(folder / "gap")), False),
+        "replay LOG": (log, given("x.mcap", "replay", "FILE", "--robot", arm, *kept), False),
+        "replay ROBOT": (URDF, given("x.urdf", "replay", str(folder / "b.mcap"), "--robot", "FILE",
+                                     *kept), True),
         "discover": (log, given("x.mcap", "discover", "FILE"), False),
         "load": (log, given("x.mcap", "load", "FILE"), False),
     }  # fmt: skip
@@ -303,11 +362,10 @@ def hear_alarm(*about: Any) -> None:
 def try_one(name: str, count: int, seconds: float, seed: int, keep: Path) -> dict[str, Any]:
     """A decoder's account, in this process."""
     said: dict[str, Any] = {"tried": 0, "taken": 0, "refused": 0, "faults": [], "worst_s": 0.0}
-    with tempfile.TemporaryDirectory() as place:
+    with tempfile.TemporaryDirectory() as place, contextlib.chdir(place):  # MuJoCo leaves a log
         decoder = next(found for key, found in everything(Path(place)) if key == name)
         for good in decoder.seeds:
-            with contextlib.suppress(*decoder.refuses):
-                decoder.read(good)
+            decoder.read(good)  # one that is refused would be no seed
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         most = pages * resource.getpagesize() + LIMIT_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
@@ -346,6 +404,7 @@ def main_trials() -> int:
     add("--json", type=Path)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
+    args.keep = args.keep.resolve()
     args.keep.mkdir(parents=True, exist_ok=True)
     if args.only is not None:
         print(json.dumps(try_one(args.only, args.count, args.seconds, args.seed, args.keep)))
