@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
 from adapter.model.robots import documented
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
+from adapter.realtime.session import run_lockstep
 from adapter.realtime.snapshot import SnapshotError, SnapshotWriter, nothing_known
+from adapter.signals.front_end import FrontEnd
+from drivers.interface import JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
 
 PANDA = documented("panda")
 N = PANDA.tree.n
@@ -158,3 +165,44 @@ def test_the_bound_is_set_by_a_load_friction_and_the_standard_deviation():
     assert (sure > 0.1 * PANDA.limits.effort).all()
     assert (unsure >= sure).all() and unsure.max() > sure.max()
     np.testing.assert_allclose(lost, 2.0 * sure)
+
+
+def test_a_false_load_in_a_motion_stays_within_the_bound_and_the_motion_goes_on() -> None:
+    """20 kg too many are published while an embedded arm moves by what was learned before."""
+    limits, documented_model = MotionLimits.of(PANDA), ModelFeedforward.of(PANDA)
+    bound, forward = FeedforwardBound(PANDA, ModelFeedforward.of(PANDA)), bounded()
+    heavy = PANDA.theta.copy()
+    heavy[-1, 0] += 20.0
+    known = replace(nothing_known(N, N, 0), lam=PANDA.lam, lam_converged=True, theta_converged=True)
+    none = np.zeros((N, 10))
+    board = SnapshotWriter.create(PANDA.tree.joint_names, name=None)
+    board.publish(replace(known, theta=PANDA.theta, theta_std=none))
+    forward.attach(board.name)
+    controller = ExcitationController(limits, None, None, forward, expected=documented_model)
+    gains, ticks, beyond, share = ControlSettings().gains(limits), 0, 0.0, 0.0
+
+    def note(sample: JointSample, tau: np.ndarray | None) -> None:
+        nonlocal ticks, beyond, share
+        ticks += 1
+        if ticks == 1500:
+            board.publish(replace(known, theta=heavy, theta_std=none))
+        ref = controller.reference
+        if ticks < 1200 or tau is None or ref is None:
+            return
+        fed_back = gains[0] * (ref.q - sample.q) + gains[1] * (ref.dq - sample.dq)
+        model = documented_model(ref.q, ref.dq, ref.ddq)
+        apart = np.abs(tau - fed_back - model) - bound.at(ref.q, ref.dq, ref.ddq, none)
+        beyond, share = max(beyond, apart.max()), max(share, np.abs(tau / limits.effort).max())
+
+    arm = PyBulletArm(build("nominal", 1).plant())
+    try:
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=note)
+    finally:
+        arm.close()
+        controller.detach()
+        board.close()
+        board.unlink()
+    assert result.fault is None and result.tracking is not None
+    assert "fell back" in result.tracking["notes"][0]
+    assert result.samples > 3000 and share < 1.0
+    assert beyond < 1.0
