@@ -75,6 +75,15 @@ def configure(
     return dataclasses.replace(config, gravity=gravity, pipeline=pipeline, excitation=excitation)
 
 
+def with_motion(args: argparse.Namespace, config: Config) -> Config:
+    """The same with the motion that the command line asks for. Raises SettingsError."""
+    asked = {"kind": args.excitation, "share": args.speed, "range_share": args.range}
+    if args.move is not None:
+        asked["move"] = tuple(name.strip() for name in args.move.split(",") if name.strip())
+    said = {key: value for key, value in asked.items() if value is not None}
+    return dataclasses.replace(config, excitation=dataclasses.replace(config.excitation, **said))
+
+
 def recording_metadata(
     config: Config, robot: SelfModel, command: str, **more: Any
 ) -> dict[str, Any]:

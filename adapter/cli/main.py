@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from adapter.cli import (
     diff_options,
     discover_options,
+    excite_options,
     files_options,
     gap_options,
     load_options,
@@ -47,6 +48,11 @@ COMMANDS = {  # in the order of --help
         "where run would move the arm",
         "adapter.cli.plan:run",
         (ExitCode.NOT_READY,),
+    ),
+    "excite": Command(
+        excite_options.declare,
+        "design a motion that teaches most, or that tells effects apart",
+        "adapter.cli.excite:run",
     ),
     "replay": Command(
         replay_options.declare,

@@ -58,6 +58,14 @@ def add_joints(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_motion(parser: argparse.ArgumentParser) -> None:
+    """What limits a motion."""
+    add = parser.add_argument
+    add("--speed", type=float, metavar="SHARE", help="of the joints' speed limits, at most")
+    add("--range", type=float, metavar="SHARE", help="of the joints' ranges, at most")
+    add("--move", metavar="A,B,C", help="joints that move; the others stand still")
+
+
 def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
     """Names given to `--joints`."""
     if args.joints is None:

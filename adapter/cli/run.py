@@ -13,19 +13,21 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from adapter.cli.agreement import agree, need_somebody, reading
-from adapter.cli.common import configure, recording_metadata, robot_of
+from adapter.cli.common import configure, recording_metadata, robot_of, with_motion
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.control.controller import ControlSettings, ExcitationController
+from adapter.control.designed import Designer
 from adapter.control.excitation import RandomMotion
 from adapter.control.feedforward import Feedforward, ModelFeedforward, not_learned
 from adapter.control.free_path import ArmInCell, FreeMotion
+from adapter.control.information import Information
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
 from adapter.control.path_motion import PathMotion
-from adapter.control.settings import ExcitationSettings, gentle
+from adapter.control.settings import DESIGNED, ExcitationSettings, gentle
 from adapter.effects.active import with_bodies
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
@@ -72,17 +74,25 @@ class RunPlan:
         config: all settings.
         world: the simulated arm; None for one that may be real. The learner is told nothing of it.
         maybe_real: the arm may be a real one.
+        feedforward: model that helps the controller; where nobody says, the documented one helps a
+            designed motion, which feedback alone would follow with too large an error.
     """
 
     robot: SelfModel
     config: Config
     world: SimulationLike | None
     maybe_real: bool
+    feedforward: str
 
     def free_motion(self, duration_s: float) -> FreeMotion:
         """What draws a motion that is free in the cell. Raises SettingsError, MeansError."""
-        arm = ArmInCell(self.robot, self.config.cell)
-        return FreeMotion(arm, duration_s + self.config.excitation.slow_s)
+        arm, motion = ArmInCell(self.robot, self.config.cell), self.config.excitation
+        draw = self.designer().within(arm) if motion.kind == DESIGNED else RandomMotion
+        return FreeMotion(arm, duration_s + motion.slow_s, draw)
+
+    def designer(self) -> Designer:
+        """What designs a motion, wherever it goes."""
+        return Designer(Information(self.robot, self.config.pipeline.filter))
 
 
 def run_plan(args: argparse.Namespace) -> RunPlan:
@@ -102,7 +112,7 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     )
     robot, locked = present(robot, names, args.driver)
     warn(locked)
-    config = _limited(args, configure(args, None, robot))
+    config = with_motion(args, configure(args, None, robot))
     if world is not None and world.scenario.imus:
         pipeline = with_imus(config.pipeline, world.scenario.imus)
         config = dataclasses.replace(config, pipeline=pipeline)
@@ -110,16 +120,9 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     if maybe_real and _may_move(args):
         need_complete(robot)
         config = dataclasses.replace(config, excitation=gentle(config.excitation))
-    return RunPlan(config.apply(robot), config, world, maybe_real)
-
-
-def _limited(args: argparse.Namespace, config: Config) -> Config:
-    """The same with the motion that the command line asks for. Raises SettingsError."""
-    asked = {"share": args.speed, "range_share": args.range}
-    if args.move is not None:
-        asked["move"] = tuple(name.strip() for name in args.move.split(",") if name.strip())
-    said = {key: value for key, value in asked.items() if value is not None}
-    return dataclasses.replace(config, excitation=dataclasses.replace(config.excitation, **said))
+    usual = "documented" if config.excitation.kind == DESIGNED else "none"
+    forward = args.feedforward or usual
+    return RunPlan(config.apply(robot), config, world, maybe_real, forward)
 
 
 def _joints_of_arm(address: str, world: SimulationLike | None) -> tuple[str, ...]:
@@ -203,16 +206,16 @@ def controller_of(
     forward: Feedforward | None = None
     expected = ModelFeedforward.of(robot)
     tool = None if robot.tool is None else robot.tool.theta()
-    if args.feedforward == "documented":
+    if plan.feedforward == "documented":
         forward = expected
-    elif args.feedforward == "learned":
+    elif plan.feedforward == "learned":
         effects = config.pipeline.learner.effects
         known, gravity = not_learned(robot, effects), with_bodies(robot).gravity
         bound = FeedforwardBound(robot, expected)
         forward = LearnedFeedforward(robot.tree, gravity, effects, tool, known, bound)
     control = ControlSettings(safety=config.safety)
     limits = MotionLimits.of(robot)
-    draw: DrawMotion = RandomMotion
+    draw: DrawMotion = plan.designer() if plan.config.excitation.kind == DESIGNED else RandomMotion
     if plan.maybe_real:
         draw = free = plan.free_motion(args.duration)
         free.arm.meanwhile = reading(driver)
@@ -342,7 +345,7 @@ def _conclude(
         recorded=result.recorded,
         unrecorded=result.unrecorded,
         tracking=result.tracking,
-        feedforward=args.feedforward,
+        feedforward=plan.feedforward,
     )
     learned = Learned(outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, args.driver)

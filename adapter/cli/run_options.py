@@ -6,7 +6,8 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import NAMES, add_learning, check_learning
+from adapter.cli.options import NAMES, add_learning, add_motion, check_learning
+from adapter.control.settings import KINDS
 from adapter.errors import UsageError
 from adapter.model.robots import names as robot_names
 from drivers.registry import NAMELESS, SCHEMES, split_address
@@ -18,7 +19,7 @@ SIMULATED = ("panda",)
 def declare(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
-        "Move an arm on smooth random trajectories (or only listen) and learn λ and θ at its "
+        "Move an arm on smooth trajectories (or only listen) and learn λ and θ at its "
         "rate, in real time."
     )
     add = parser.add_argument
@@ -41,9 +42,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="move an arm that may be real although what it holds at rest is not the weight that "
         "the model says",
     )
-    add("--speed", type=float, metavar="SHARE", help="of the joints' speed limits, at most")
-    add("--range", type=float, metavar="SHARE", help="of the joints' ranges, at most")
-    add("--move", metavar="A,B,C", help="joints that move; the others stand still")
+    add(
+        "--excitation",
+        choices=KINDS,
+        help="motion: random (default), or designed to teach most in the time",
+    )
+    add_motion(parser)
     add("--duration", type=float, default=30.0, metavar="S", help="default 30")
     add(
         "--scenario",
@@ -63,8 +67,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add(
         "--feedforward",
         choices=FEEDFORWARD,
-        default="none",
-        help="model that helps the controller; its worth is told as tracking error",
+        help="model that helps the controller (default none; for a designed motion documented); "
+        "its worth is told as tracking error",
     )
     add("--record", type=Path, metavar="FILE", help="default: in the results")
     add("--no-record", action="store_true", help="keep no recording")

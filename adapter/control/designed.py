@@ -7,12 +7,14 @@ Each joint follows a Fourier series through where the arm stands,
 so that every limit is a set of linear inequalities on a joint's coefficients x = (a, b): they are
 kept if its gauge, the largest of (linear function / limit), is at most one. Coefficients climb on
 
-    f(x) = log det(H) / rank - MIX log trace(W H^-1),   H = known + samples * mean information
+    f(x) = log det(H) / rank - MIX log trace(W H^-1) - EVEN log(trace(B) trace(B^-1)),
+    H = known + seconds * information a second,   B = mean of Y'Y of the base parameters
 
-(D-optimal, and what is known worst counts more: Swevers et al., IEEE T-RA 13, 1997), less a
-penalty where links come too near to what they must not touch; after each step, coefficients
-outside the limits are scaled back onto them. The true extremes of a period are held against the
-limits, where a random motion, which never repeats, has to hold sums of amplitudes against them.
+(D-optimal; what is known worst counts more; and, where nothing is known yet, the condition number:
+Swevers et al., Optimal robot excitation and identification, IEEE T-RA 13, 1997), less a penalty
+where links come too near to what they must not touch; after each step, coefficients outside the
+limits are scaled back onto them. The true extremes of a period are held against the limits, where
+a random motion, which never repeats, has to hold sums of amplitudes against them.
 """
 
 from __future__ import annotations
@@ -40,8 +42,12 @@ from adapter.model.spatial import Array
 MOST_HARMONICS = 16
 TABLE_PER_WAVE, GRID_PER_WAVE = 12, 32  # instants of the information and of the limits, a wave
 STEPS, FIRST_STEP = 150, 0.1  # rounds, and rad/s of the first
-MIX = 0.3
+MIX, EVEN = 0.3, 0.6
+ROUND = 1e-9  # of the largest; joints that are not to move leave parameters that nothing shows
 MOMENTUM, MEMORY = 0.8, 0.95
+SPEED_ROOM = (
+    0.8  # of the speed wanted: a designed motion reaches it, and an arm lags and overshoots
+)
 LEAST_ROOM = 0.02  # rad that a joint at the edge of what it may use is still given
 NEAR_LOOKS, NEAR_WEIGHT, MORE_M = 24, 50.0, 0.02  # poses a round; 1/m²; beyond the margin
 DIFFERENCE = 1e-5
@@ -148,7 +154,7 @@ class Gauge:
         self._width = settings.range_share * (upper - lower)
         self._up, self._down = np.fmax(self._up, 1e-9), np.fmax(self._down, 1e-9)
         self._share, self._limits = settings.share, limits
-        self._velocity = settings.share * limits.velocity
+        self._velocity = SPEED_ROOM * settings.share * limits.velocity
         self._ramps, self._jerk_ramps = ramp_pairs(settings), ramp_factors(settings)
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
@@ -189,7 +195,7 @@ class Designer:
     Attributes:
         information: of the arm.
         known: (rank, rank) information that is there already; None for none.
-        samples: independent ones that the motion will bring, for the sum with `known`.
+        seconds: of the motion, for the sum with `known`.
         too_near: what keeps links away from what they must not touch; nothing where None.
         free: whether a motion does so all along; a motion that does not is made smaller.
         meanwhile: called every few milliseconds, so that an arm's samples can be read.
@@ -198,7 +204,7 @@ class Designer:
 
     information: Information
     known: Array | None = None
-    samples: float = 300.0
+    seconds: float = 10.0
     too_near: TooNear | None = None
     free: Callable[[SineMotion], bool] = field(default=lambda motion: True)
     meanwhile: Callable[[], None] = field(default=lambda: None)
@@ -289,33 +295,29 @@ class Designer:
     ) -> tuple[float, Array]:
         """f and its gradient (n, 2 k).
 
-        f depends on the motion through H alone, so its gradient is that of the sum over the table
-        of |Y' K|², K K' being the derivative of f by H; that sum is differentiated by differences,
-        one signal of one joint in all instants at a time.
+        f depends on the motion through H and B alone, sums over rows y y', so its gradient is that
+        of the sum of y' G y, G being the derivative of f by the sum; that is differentiated by
+        differences, one signal of one joint in all instants at a time.
         """
         motion = q0 + table.q @ x.T, table.dq @ x.T, table.ddq @ x.T
         told, count = self.information, len(table.q)
-        H = told.prior + self.samples * told.mean(*motion)
-        if self.known is not None:
-            H = H + self.known
-        C = np.linalg.inv(H)
-        W = told.in_wanted_units()
-        left = float(np.trace(W @ C))
-        value = float(np.linalg.slogdet(H)[1]) / len(H) - MIX * np.log(left)
-        inner = C / len(H) + (MIX / left) * (C @ W @ C)
-        onto = told.basis @ np.linalg.cholesky(0.5 * (inner + inner.T))
-        slope, share = np.zeros_like(x), self.samples / count
+        samples = self.seconds * told.samples_per_s
+        Z, U = told.rows(*motion)
+        value, of_H, of_own = self._value(samples * (Z.T @ Z) / count, U.T @ U / count)
+        slope = np.zeros_like(x)
+
+        G = told.on_rows(samples / count * of_H, of_own / count)
 
         def gains() -> Array:
             self.meanwhile()
-            rows = told.weighted(*motion, onto)
-            return np.asarray((rows**2).sum(axis=1).reshape(count, -1).sum(axis=1))
+            Y = told.regressor(*motion).swapaxes(0, 1)
+            return np.asarray(((Y @ G) * Y).sum(axis=(0, 2)))
 
         before = gains()
         for signal, own in zip(motion, (table.q, table.dq, table.ddq), strict=True):
             for j in np.flatnonzero(np.any(x, axis=1)):
                 signal[:, j] += DIFFERENCE
-                slope[j] += share * (own.T @ (gains() - before)) / DIFFERENCE
+                slope[j] += own.T @ (gains() - before) / DIFFERENCE
                 signal[:, j] -= DIFFERENCE
         if self.too_near is not None:
             chosen = (rng.random() + np.arange(NEAR_LOOKS)) * count / NEAR_LOOKS
@@ -324,6 +326,22 @@ class Designer:
             value -= NEAR_WEIGHT * short
             slope -= NEAR_WEIGHT * (push.T @ table.q[chosen])
         return value, slope
+
+    def _value(self, brought: Array, inertial: Array) -> tuple[float, Array, Array]:
+        """f, and its derivatives by both matrices."""
+        H = self.information.prior + brought
+        if self.known is not None:
+            H = H + self.known
+        C, W, B = np.linalg.inv(H), self.information.in_wanted_units(), inertial
+        B = B + ROUND * np.trace(B) * np.eye(len(B))
+        D = np.linalg.inv(B)
+        even = EVEN if self.known is None else 0.0
+        left, most, least = (float(np.trace(part)) for part in (W @ C, B, D))
+        value = float(np.linalg.slogdet(H)[1]) / len(H) - MIX * np.log(left)
+        value -= even * np.log(most * least)
+        of_H = C / len(H) + (MIX / left) * (C @ W @ C)
+        of_own = even * (D @ D / least - np.eye(len(B)) / most)
+        return value, of_H, of_own
 
 
 def _harmonics(settings: ExcitationSettings) -> Array:
@@ -347,7 +365,7 @@ def _within(
             (low >= np.minimum(lower, q0) - 1e-12)
             & (high <= np.maximum(upper, q0) + 1e-12)
             & (high - low <= settings.range_share * (upper - lower))
-            & (speed <= share * limits.speed_between(low, high))
+            & (speed <= SPEED_ROOM * share * limits.speed_between(low, high))
             & (acceleration <= share * limits.acceleration)
             & (jerk <= share * limits.jerk)
         )

@@ -22,6 +22,8 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import BODY_SIZE, base_parameters
 from adapter.physics.rigid_arm import RigidArm
+from adapter.signals.filters import JointFilter
+from adapter.signals.settings import FilterSettings
 
 # Before any data: so many times a body of 1 kg, 10 cm across, and an effect's own prior.
 BELIEF = 5.0
@@ -61,27 +63,31 @@ class Information:
 
     Args:
         model: as documented; its inertias have no say.
+        filtering: of the signals that are learned from: how long it takes a step, and how many of
+            its samples are worth an independent one.
         effects: names of those learned beside the inertias, of the motion of the instant alone.
         torque_std: (n,) N m, noise of the joint torques; None for `NOISE_SHARE` of the effort.
-        smoothing_s: how long the filter takes a step of torque; what jumps is as smooth.
 
     Attributes:
         basis: (columns, rank) orthonormal, of what torques depend on.
         prior: (rank, rank) information from before.
         size: (columns,) usual size of each parameter.
+        samples_per_s: independent ones.
     """
 
     def __init__(
         self,
         model: SelfModel,
+        filtering: FilterSettings | None = None,
         effects: Sequence[str] = EFFECTS,
         torque_std: Array | None = None,
-        smoothing_s: float = 0.0,
     ) -> None:
         self._model, self._arm = model, RigidArm.of(model)
         self._effects: list[LearnedEffect] = list(effects_by_name(effects))
-        self._smoothing_s = smoothing_s
         n = model.tree.n
+        joints = JointFilter(n, filtering)
+        self._smoothing_s = joints.delay_s
+        self.samples_per_s = 1.0 / (joints.noise_gain * joints.settings.period_s)
         if torque_std is None:
             effort = model.limits.effort
             torque_std = NOISE_SHARE * np.where(np.isfinite(effort), effort, 10.0)
@@ -89,6 +95,7 @@ class Information:
         gravity = np.array(model.gravity)
         extra = self._columns if self._effects else None
         self.basis = base_parameters(model.tree, model.lam, gravity, extra=extra).basis
+        self._inertial = base_parameters(model.tree, model.lam, gravity).basis
         own = [np.full(n, effect.learned_std) for effect in self._effects]
         self.size = np.concatenate([np.tile(BODY_SIZE, n), *own])
         scaled = self.basis / (BELIEF * self.size[:, None])
@@ -101,14 +108,25 @@ class Information:
             return rigid
         return np.concatenate([rigid, self._columns(q, dq, ddq)], axis=2)
 
-    def weighted(self, q: Array, dq: Array, ddq: Array, onto: Array) -> Array:
-        """(m n, k) of the regressor in units of the noise, times a matrix (columns, k)."""
-        Y = self.regressor(q, dq, ddq) * self._weight[:, None]
-        return np.asarray(Y.reshape(-1, Y.shape[2]) @ onto)
+    def rows(self, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
+        """Regressors of a table, on what torques depend on: (m n, rank) in units of the noise,
+        and (m n, own rank) of the inertias alone, in N m."""
+        Y = self.regressor(q, dq, ddq)
+        own = Y[:, :, : len(self._inertial)].reshape(-1, len(self._inertial))
+        Y = (Y * self._weight[:, None]).reshape(-1, Y.shape[2])
+        return Y @ self.basis, own @ self._inertial
+
+    def on_rows(self, of_first: Array, of_second: Array) -> Array:
+        """(n, columns, columns) by joint: a sum of quadratic forms in both kinds of `rows` as one
+        form in a row of the regressor."""
+        G = self._weight[:, None, None] ** 2 * (self.basis @ of_first @ self.basis.T)
+        k = len(self._inertial)
+        G[:, :k, :k] += self._inertial @ of_second @ self._inertial.T
+        return np.asarray(G)
 
     def mean(self, q: Array, dq: Array, ddq: Array) -> Array:
         """(rank, rank) information of one independent sample, in the mean over a table."""
-        Z = self.weighted(q, dq, ddq, self.basis)
+        Z, _ = self.rows(q, dq, ddq)
         return np.asarray(Z.T @ Z / len(q))
 
     def expected(self, information: Array, share: float) -> Expected:
@@ -125,6 +143,10 @@ class Information:
         exists = np.linalg.norm(shown, axis=1) > SHOWN * self.size
         names, units = self._names()
         return Expected(names, units, std, share * self.size, exists & (std < 0.5 * before))
+
+    def condition(self, q: Array, dq: Array, ddq: Array) -> float:
+        """Condition number of a table's regressor of the base parameters, inertias alone."""
+        return float(np.linalg.cond(self.rows(q, dq, ddq)[1]))
 
     def in_wanted_units(self) -> Array:
         """(rank, rank) W: trace(W C) is the sum of all variances over sizes squared, C (rank,

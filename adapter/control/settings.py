@@ -11,6 +11,7 @@ from adapter.errors import SettingsError
 # up with, do not bring a joint to its limit.
 REAL_SHARE = 0.75
 SLOW_S, SLOW_SHARE = 10.0, 0.1  # an arm that may be real starts so slowly for so long
+RANDOM, DESIGNED = KINDS = ("random", "designed")
 
 
 @dataclass(frozen=True)
@@ -18,8 +19,9 @@ class ExcitationSettings:
     """How the arm moves.
 
     Attributes:
-        seed: of the random motion.
-        sines: in each joint's motion.
+        kind: `random`, or `designed` to teach most (`adapter.control.designed`).
+        seed: of the motion.
+        sines: in each joint's random motion; a designed one has every multiple of `low_hz`.
         low_hz, high_hz: between these frequencies.
         share: of the velocity, acceleration and jerk limits that is never exceeded.
         range_share: of a joint's range that is used at most.
@@ -33,6 +35,7 @@ class ExcitationSettings:
         slow_share: share of the speed meanwhile.
     """
 
+    kind: str = RANDOM
     seed: int = 0
     sines: int = 5
     low_hz: float = 0.1
@@ -48,6 +51,8 @@ class ExcitationSettings:
     slow_share: float = 0.1
 
     def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise SettingsError(f"no excitation '{self.kind}'; have: {', '.join(KINDS)}")
         if self.sines < 1:
             raise SettingsError(f"excitation.sines must be at least 1, got {self.sines}")
         if not 0.0 < self.low_hz < self.high_hz:

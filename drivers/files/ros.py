@@ -3,7 +3,7 @@
 `SCHEMAS` are their definitions (`ros2msg`) as MCAP wants them: the definition of the message,
 followed by those of all messages it uses, each after a line of 80 `=` and a line `MSG:
 package/Name`. Field names, types and order are facts of the public packages builtin_interfaces,
-std_msgs, geometry_msgs, nav_msgs and sensor_msgs (ROS 2 Humble and later).
+std_msgs, geometry_msgs, nav_msgs, sensor_msgs and trajectory_msgs (ROS 2 Humble and later).
 
 Written: CDR (XCDR1) little endian, encapsulation header 00 01 00 00. Read: plain CDR of either
 byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes). Alignment counts from
@@ -31,6 +31,9 @@ _SEPARATOR = "=" * 80
 _FIELDS = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec\n",
+    "trajectory_msgs/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\n"
+    "float64[] accelerations\nfloat64[] effort\nbuiltin_interfaces/Duration time_from_start\n",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
     "geometry_msgs/Accel": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular\n",
@@ -42,6 +45,7 @@ _FIELDS = {
 }
 _HEADER = ("std_msgs/Header", "builtin_interfaces/Time")
 JOINT_STATE = "sensor_msgs/msg/JointState"
+JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
 IMU = "sensor_msgs/msg/Imu"
@@ -69,6 +73,11 @@ SCHEMAS = {
         "std_msgs/Header header\n"
         "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n",
         _HEADER,
+    ),
+    JOINT_TRAJECTORY: _schema(
+        "std_msgs/Header header\nstring[] joint_names\n"
+        "trajectory_msgs/JointTrajectoryPoint[] points\n",
+        (*_HEADER, "trajectory_msgs/JointTrajectoryPoint", "builtin_interfaces/Duration"),
     ),
     TWIST_STAMPED: _schema(
         "std_msgs/Header header\ngeometry_msgs/Twist twist\n",
@@ -131,6 +140,10 @@ class _MessageBuilder:
         self._piece.clear()
         self._size += 8 * number
 
+    def rest(self) -> bytes:
+        """What follows the last run of doubles."""
+        return bytes(self._piece)
+
 
 def _stamp(stamp_ns: int) -> bytes:
     sec, nanosec = divmod(stamp_ns, SECOND_NS)
@@ -190,6 +203,34 @@ class JointStateEncoder:
                 _raw(tau, self._shape, "effort") if has_tau else b"",
             )
         )
+
+
+def encode_joint_trajectory(
+    joint_names: Sequence[str], times_ns: NDArray[np.int64], motion: Array
+) -> bytes:
+    """One JointTrajectory, without efforts, its stamp 0: to be started when it comes.
+
+    Args:
+        joint_names: n of them.
+        times_ns: (m,) from the start.
+        motion: (m, 3, n) q, dq, ddq: rad, rad/s, rad/s².
+    """
+    n, body = len(joint_names), _MessageBuilder()
+    body.text("")
+    body.count(n)
+    for name in joint_names:
+        body.text(name)
+    body.count(len(times_ns))
+    parts: list[bytes] = []
+    for since_ns, point in zip(times_ns, motion, strict=True):
+        for row in point:
+            body.count(n)
+            body.doubles(n)
+            parts += [body.pieces[-1], _raw(row, (n,), "point")]
+        body.count(0)  # efforts
+        for value in divmod(int(since_ns), SECOND_NS):
+            body.count(value)
+    return b"".join((CDR_LE, _stamp(0), *parts, body.rest()))
 
 
 class MotionEncoder:

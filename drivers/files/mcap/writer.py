@@ -12,22 +12,26 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import Writer
+from numpy.typing import NDArray
 
 from drivers.files.ros import (
     ACCEL_STAMPED,
     IMU,
     JOINT_STATE,
+    JOINT_TRAJECTORY,
     SCHEMAS,
     TWIST_STAMPED,
     CdrError,
     ImuEncoder,
     JointStateEncoder,
     MotionEncoder,
+    encode_joint_trajectory,
 )
 from drivers.interface import Array, DriverError, JointSample, LinkMotion
 
 JOINT_STATES = "/joint_states"
 JOINT_COMMANDS = "/joint_commands"
+JOINT_TRAJECTORY_TOPIC = "/joint_trajectory"
 EXTERNAL_TORQUES = "/external_torques"
 LINK_TWISTS = "/link_twists/"
 LINK_ACCELS = "/link_accels/"
@@ -122,6 +126,11 @@ class McapWriter:
         """Record (n,) positions, velocities and torques: rad, rad/s, N m."""
         data = self._encode(self._states, stamp_ns, q, dq, tau)
         self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
+
+    def write_trajectory(self, times_ns: NDArray[np.int64], motion: Array) -> None:
+        """Write a planned motion as one trajectory: (m,) from its start, (m, 3, n) q, dq, ddq."""
+        data = encode_joint_trajectory(self.joint_names, times_ns, motion)
+        self._add(self._channel(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY), 0, data)
 
     def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
         """Record the measured motion of the links, in the order of `link_names`.

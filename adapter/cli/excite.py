@@ -1,0 +1,278 @@
+"""`adapter excite`: a motion that teaches most, or that tells effects apart; nothing moves."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.cli.agreement import PLAN_PAGE
+from adapter.cli.common import robot_of, with_motion
+from adapter.cli.excite_options import numbers
+from adapter.cli.exit_codes import ExitCode
+from adapter.control.designed import DesignedMotion, Designer
+from adapter.control.excitation import RandomMotion, plan_lines
+from adapter.control.free_path import ArmInCell, FreeMotion
+from adapter.control.information import Expected, Information
+from adapter.control.limits import MotionLimits, need_complete
+from adapter.control.path_motion import PathMotion
+from adapter.control.settings import ExcitationSettings
+from adapter.control.sweeps import MOVES, SweepMotion
+from adapter.effects.splits import DecidingExperiment
+from adapter.errors import SettingsError
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.report.plan_page import write_plan
+from adapter.runs.config import read_config
+from adapter.runs.library import filtered
+from adapter.runs.terminal import results_folder, say, show
+from drivers.files.bounded import parse_json, read_text
+from drivers.files.mcap.writer import McapWriter, to_json
+
+TABLE, COMPARED = 300, 3  # instants of a path that are judged, random motions beside
+TENTH = 0.1  # of a period, between two durations that are looked at
+WORST = 8  # parameters that are shown
+SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Known:
+    """What logs tell already.
+
+    Attributes:
+        information: (rank, rank); None without logs.
+        torque_std: (n,) N m, what is left of their torques; None without logs.
+        start: (n,) rad, where the first one starts; None without logs.
+    """
+
+    information: Array | None = None
+    torque_std: Array | None = None
+    start: Array | None = None
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    robot = robot_of(args, args.robot)
+    config = with_motion(args, read_config(args.config))
+    robot, settings = config.apply(robot), config.excitation
+    if args.seed is not None:
+        settings = replace(settings, seed=args.seed)
+    need_complete(robot)
+    limits, arm = MotionLimits.of(robot), ArmInCell(robot, config.cell)
+    noise = numbers("--noise", args.noise)
+    std = _of_joints("--noise", noise, robot)
+    told = Information(robot, config.pipeline.filter, torque_std=std)
+    known = _known(args.logs, robot, told) if args.logs else Known()
+    if noise is None and known.torque_std is not None:
+        told = Information(robot, config.pipeline.filter, torque_std=known.torque_std)
+        known = _known(args.logs, robot, told)
+    start = _of_joints("--at", numbers("--at", args.at), robot)
+    q0 = start if start is not None else known.start
+    q0 = 0.5 * (limits.lower + limits.upper) if q0 is None else q0
+    folder = results_folder(args.out, "excite")
+    if args.gap is not None:
+        todo = _measured_next(args.gap, robot)
+        draw = partial(_sweeps, todo)
+        motion = FreeMotion(arm, _sweeps(todo, limits, q0, settings).length_s, draw)
+        swept = motion(limits, q0, settings)
+        assert isinstance(swept, SweepMotion)
+        _write(args, folder, arm, swept, limits, swept.length_s)
+        return ExitCode.DONE
+    designer = Designer(told, known.information).within(arm)
+    designed = FreeMotion(arm, designer.seconds, designer)(limits, q0, settings)
+    assert isinstance(designed, DesignedMotion)
+    seconds, expected = _until(told, known, designed, args)
+    for line in _told(told, known, designed, limits, seconds, expected):
+        show(line)
+    _write(args, folder, arm, designed, limits, seconds)
+    if args.json is not None:
+        args.json.write_text(to_json(_figures(told, designed, seconds, expected)))
+    return ExitCode.DONE
+
+
+def _of_joints(option: str, values: list[float] | None, robot: SelfModel) -> Array | None:
+    if values is None:
+        return None
+    if len(values) != robot.tree.n or not np.isfinite(values).all():
+        raise SettingsError(f"{option} needs {robot.tree.n} finite numbers, got {len(values)}")
+    return np.array(values)
+
+
+def _known(logs: list[Path], robot: SelfModel, told: Information) -> Known:
+    """Of several logs the information adds up; the torque's noise is what no parameters explain."""
+    total = np.zeros_like(told.prior)
+    left, count, start = np.zeros(robot.tree.n), 0, None
+    for path in logs:
+        signals = filtered(path, robot)
+        every = max(1, round(len(signals.q) / max(1.0, signals.time_s[-1] * told.samples_per_s)))
+        q, dq, ddq, tau = (np.ascontiguousarray(x[::every]) for x in signals[1:])
+        if not len(q):
+            raise SettingsError(f"{path}: nothing in it can be learned from")
+        total += len(q) * told.mean(q, dq, ddq)
+        Y = told.regressor(q, dq, ddq)
+        x = np.linalg.lstsq(Y.reshape(-1, Y.shape[2]) @ told.basis, tau.ravel(), rcond=None)[0]
+        left += ((tau - Y @ (told.basis @ x)) ** 2).sum(axis=0)
+        count += len(q)
+        start = q[0] if start is None else start
+    return Known(total, np.sqrt(left / count), start)
+
+
+def _until(
+    told: Information, known: Known, motion: DesignedMotion, args: argparse.Namespace
+) -> tuple[float, Expected]:
+    """How long it takes, s of path, and what is known then; `--longest` where it is not enough."""
+    tenth = TENTH * motion.period_s
+    instants = motion.table(TABLE)
+    size = round(TABLE * TENTH)
+    brought = known.information if known.information is not None else np.zeros_like(told.prior)
+    k = 0
+    while True:
+        part = np.arange(k * size, (k + 1) * size) % TABLE
+        H = told.mean(*(signal[part] for signal in instants))
+        brought = brought + tenth * told.samples_per_s * H
+        k += 1
+        expected = told.expected(brought, args.std)
+        enough = expected.worst <= 1.0 and k * TENTH >= 1.0
+        if enough or (k + 1) * tenth > args.longest:
+            return k * tenth, expected
+
+
+def _told(
+    told: Information,
+    known: Known,
+    motion: DesignedMotion,
+    limits: MotionLimits,
+    seconds: float,
+    expected: Expected,
+) -> list[str]:
+    """What the motion teaches, beside random motion."""
+    before = known.information if known.information is not None else np.zeros_like(told.prior)
+    drawn = []
+    for attempt in range(COMPARED):
+        other = RandomMotion(limits, motion.q, motion.settings, attempt)
+        path = np.array([other.path(s).copy() for s in np.linspace(0.0, seconds, TABLE)])
+        table = tuple(path[:, k].copy() for k in range(3))
+        H = before + seconds * told.samples_per_s * told.mean(*table)
+        worst = told.expected(H, 1.0).std / expected.std
+        drawn.append((float(np.median(worst[expected.shown])), told.condition(*table)))
+    wide, condition = np.median(np.array(drawn), axis=0)
+    reached = "is" if expected.worst <= 1.0 else f"is not (worst: {expected.worst:.2g} times that)"
+    shown = int(expected.shown.sum())
+    lines = [
+        f"After {seconds:.0f} s each of the {shown} parameters that torques show {reached} as "
+        "sure as wanted.",
+        f"Random motion leaves them {wide:.1f} times as unsure (median); the condition number of "
+        f"the base parameters' regressor is {told.condition(*motion.table(TABLE)):.0f}, random "
+        f"motion's {condition:.0f}.",
+    ]
+    ratio = np.where(expected.shown, expected.std / expected.wanted, 0.0)
+    for k in np.argsort(-ratio)[:WORST]:
+        std, unit = expected.std[k], expected.units[k]
+        lines.append(f"  {expected.names[k]:28} +- {std:.2g} {unit} ({ratio[k]:.0%} of the wanted)")
+    return lines
+
+
+def _figures(
+    told: Information, motion: DesignedMotion, seconds: float, expected: Expected
+) -> dict[str, Any]:
+    return {
+        "seconds": seconds,
+        "period_s": motion.period_s,
+        "condition": told.condition(*motion.table(TABLE)),
+        "parameters": [
+            dict(zip(("name", "unit", "std", "wanted", "shown"), row, strict=True))
+            for row in zip(
+                expected.names,
+                expected.units,
+                expected.std.tolist(),
+                expected.wanted.tolist(),
+                expected.shown.tolist(),
+                strict=True,
+            )
+        ],
+    }
+
+
+def _measured_next(path: Path, robot: SelfModel) -> list[tuple[int, DecidingExperiment]]:
+    """The experiments of a gap report that a motion can make, by joint. Raises SettingsError."""
+    try:
+        report = parse_json(read_text(path))
+        findings = [(str(f["split_by"]), list(f["joints"])) for f in report["findings"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SettingsError(f"{path}: not the JSON of `adapter gap`: {error}") from None
+    found: dict[tuple[int, DecidingExperiment], None] = {}
+    for text, joints in findings:
+        for experiment in MOVES:
+            if experiment.do in text:
+                found.update({(int(j) - 1, experiment): None for j in joints})
+    wanted = [(j, e) for j, e in found if 0 <= j < robot.tree.n]
+    others = {text.partition(":")[0] for text, _ in findings if text}
+    others -= {experiment.do for _, experiment in wanted}
+    for text in sorted(others):
+        say(f"No motion alone does this: {text}.")
+    if not wanted:
+        raise SettingsError(
+            f"{path}: no experiment that a motion can make is asked for; design one that teaches "
+            "all (without --gap)"
+        )
+    for j, experiment in wanted:
+        show(f"{robot.tree.joint_names[j]}: {experiment.do}")
+    return wanted
+
+
+def _sweeps(
+    todo: list[tuple[int, DecidingExperiment]],
+    limits: MotionLimits,
+    q0: Array,
+    settings: ExcitationSettings,
+    attempt: int = 0,
+    size: float = 1.0,
+) -> SweepMotion:
+    return SweepMotion(limits, q0, settings, todo, size)
+
+
+def _write(
+    args: argparse.Namespace,
+    folder: Path,
+    arm: ArmInCell,
+    motion: PathMotion,
+    limits: MotionLimits,
+    seconds: float,
+) -> None:
+    """The page and both files of a motion from its start to rest."""
+    names = arm.model.tree.joint_names
+    least = arm.clearance(motion, seconds)
+    lines = plan_lines(motion, limits, names, seconds)
+    lines.insert(-1, f"Nearest on the way: {least} (margin {arm.cell.margin:g} m).")
+    write_plan(folder / PLAN_PAGE, arm, motion, limits, least, lines)
+    times_ns, points = _points(motion, seconds, args.rate)
+    with (folder / "motion.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        heads = [f"{kind}_{name}" for kind in ("q", "dq", "ddq") for name in names]
+        writer.writerow(["time_s", *heads])
+        for since_ns, point in zip(times_ns, points, strict=True):
+            writer.writerow([f"{1e-9 * since_ns:.6f}", *(f"{x:.9g}" for x in point.ravel())])
+    recording = McapWriter(folder / "motion.mcap", names, overwrite=True)
+    recording.write_trajectory(times_ns, points)
+    recording.close()
+    for line in lines:
+        show(line)
+    show(f"{len(points)} points at {args.rate:g} Hz: {folder / 'motion.csv'}, motion.mcap")
+    say(f"As a page: {folder / PLAN_PAGE}")
+
+
+def _points(motion: PathMotion, seconds: float, rate_hz: float) -> tuple[Any, Array]:
+    """(m,) ns and (m, 3, n) from rest to rest."""
+    step_ns = round(SECOND_NS / rate_hz)
+    rows = [np.array([motion.q, motion.dq, motion.ddq])]
+    while not motion.at_rest:
+        if motion.time_s >= seconds:
+            motion.begin_stop()
+        motion.advance(1e-9 * step_ns)
+        rows.append(np.array([motion.q, motion.dq, motion.ddq]))
+    return step_ns * np.arange(len(rows), dtype=np.int64), np.array(rows)

@@ -1,0 +1,84 @@
+"""`adapter excite`: what it writes is the motion that it tells of, read by another's decoder."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from adapter.cli.main import main
+from adapter.control.limits import MotionLimits
+from adapter.effects.splits import LOADS, SPEEDS
+from adapter.model.robots import documented
+
+pytest.importorskip("coal")
+LIMITS = MotionLimits.of(documented("panda"))
+LOG = "recordings/panda_nominal_6s.mcap"
+
+
+def _trajectory(path):
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        ((_, channel, _, message),) = reader.iter_decoded_messages()
+    assert channel.topic == "/joint_trajectory"
+    return message
+
+
+def test_goes_on_from_a_log_and_writes_the_motion_three_times(tmp_path, capsys):
+    line = ["excite", LOG, "--std", "2", "--rate", "100", "--longest", "30"]
+    assert main([*line, "--out", str(tmp_path), "--json", str(tmp_path / "e.json")]) == 0
+    told = capsys.readouterr().out
+    table = np.genfromtxt(tmp_path / "motion.csv", delimiter=",", names=True)
+    message = _trajectory(tmp_path / "motion.mcap")
+    assert list(message.joint_names) == list(documented("panda").tree.joint_names)
+    q = np.array([point.positions for point in message.points])
+    dq = np.array([point.velocities for point in message.points])
+    t = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points])
+    np.testing.assert_allclose(t, table["time_s"], atol=1e-6)
+    np.testing.assert_allclose(q[:, 1], table["q_panda_joint2"], atol=1e-8)
+    np.testing.assert_allclose(np.gradient(q, t, axis=0)[1:-1], dq[1:-1], atol=0.03)
+    assert np.diff(t) == pytest.approx(0.01)
+    assert (q >= LIMITS.lower).all() and (q <= LIMITS.upper).all()
+    assert np.abs(dq[[0, -1]]).max() == 0.0 and np.abs(dq).max() > 0.5
+    figures = json.loads((tmp_path / "e.json").read_text())
+    assert t[-1] == pytest.approx(figures["seconds"] + 1.0, abs=0.05)
+    shown = [row for row in figures["parameters"] if row["shown"]]
+    assert len(shown) > 60 and all(row["std"] <= row["wanted"] for row in shown)
+    assert f"{len(shown)} parameters" in told and (tmp_path / "plan.html").exists()
+
+
+def test_makes_the_motion_that_a_gap_report_asks_for(tmp_path, capsys):
+    report = {
+        "findings": [
+            {"split_by": f"{SPEEDS.do}: the one grows, the other stays", "joints": [2]},
+            {"split_by": f"{LOADS.do}: the one grows", "joints": [4]},
+        ]
+    }
+    path = tmp_path / "gap.json"
+    path.write_text(json.dumps(report))
+    assert main(["excite", "--gap", str(path), "--out", str(tmp_path), "--rate", "50"]) == 0
+    captured = capsys.readouterr()
+    assert "panda_joint2: move the joint at constant speeds" in captured.out
+    assert "No motion alone does this: repeat the motion with a ladder of loads" in captured.err
+    q = np.array([p.positions for p in _trajectory(tmp_path / "motion.mcap").points])
+    moved = np.ptp(q, axis=0) > 1e-6
+    assert moved.tolist() == [False, True, False, False, False, False, False]
+    np.testing.assert_allclose(q[-1], q[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--at", "0,1"], "needs 7 finite numbers, got 2"),
+        (["--at", "a,b"], "is not numbers with commas between"),
+        (["--std", "0"], "--std must be above 0"),
+        (["--gap", LOG], "not the JSON of `adapter gap`"),
+        (["--move", "elbow"], "no joint 'elbow' to move"),
+    ],
+)
+def test_wrong_use_is_one_sentence(options, said, tmp_path, capsys):
+    assert main(["excite", *options, "--out", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err.replace("\n", " ")
