@@ -64,23 +64,16 @@ def run(args: argparse.Namespace) -> int:
         settings = replace(settings, seed=args.seed)
     need_complete(robot)
     limits, arm = MotionLimits.of(robot), ArmInCell(robot, config.cell)
-    noise = numbers("--noise", args.noise)
-    std = _of_joints("--noise", noise, robot)
+    std = _of_joints("--noise", numbers("--noise", args.noise), robot)
     told = Information(robot, config.pipeline.filter, torque_std=std)
     known = _known(args.logs, robot, told) if args.logs else Known()
-    if noise is None and known.torque_std is not None:
+    if std is None and known.torque_std is not None:
         told = Information(robot, config.pipeline.filter, torque_std=known.torque_std)
         known = _known(args.logs, robot, told)
-    start = _of_joints("--at", numbers("--at", args.at), robot)
-    q0 = start if start is not None else known.start
-    q0 = 0.5 * (limits.lower + limits.upper) if q0 is None else q0
+    q0 = _start(args, arm, limits, known)
     folder = results_folder(args.out, "excite")
     if args.gap is not None:
-        todo = _measured_next(args.gap, robot)
-        draw = partial(_sweeps, todo)
-        motion = FreeMotion(arm, _sweeps(todo, limits, q0, settings).length_s, draw)
-        swept = motion(limits, q0, settings)
-        assert isinstance(swept, SweepMotion)
+        swept = _swept(args, arm, limits, q0, settings)
         _write(args, folder, arm, swept, limits, swept.length_s)
         return ExitCode.DONE
     designer = Designer(told, known.information).within(arm)
@@ -93,6 +86,36 @@ def run(args: argparse.Namespace) -> int:
     if args.json is not None:
         args.json.write_text(to_json(_figures(told, designed, seconds, expected)))
     return ExitCode.DONE
+
+
+def _start(args: argparse.Namespace, arm: ArmInCell, limits: MotionLimits, known: Known) -> Array:
+    """Where the motion starts, (n,) rad. Raises SettingsError where it is not free there."""
+    q0 = _of_joints("--at", numbers("--at", args.at), arm.model)
+    if q0 is None:
+        q0 = known.start if known.start is not None else 0.5 * (limits.lower + limits.upper)
+    nearest, margin = arm.at(q0), arm.cell.margin
+    if nearest.distance < margin:
+        at = ", ".join(f"{angle:.2f}" for angle in q0)
+        raise SettingsError(
+            f"no motion can start at {at} rad: {nearest}, where {margin:g} m are kept; give --at, "
+            "or describe the cell in --config ([cell])"
+        )
+    return q0
+
+
+def _swept(
+    args: argparse.Namespace,
+    arm: ArmInCell,
+    limits: MotionLimits,
+    q0: Array,
+    settings: ExcitationSettings,
+) -> SweepMotion:
+    """The motion that a gap report asks for, free in the cell."""
+    todo = _measured_next(args.gap, arm.model)
+    length_s = _sweeps(todo, limits, q0, settings).length_s
+    swept = FreeMotion(arm, length_s, partial(_sweeps, todo))(limits, q0, settings)
+    assert isinstance(swept, SweepMotion)
+    return swept
 
 
 def _of_joints(option: str, values: list[float] | None, robot: SelfModel) -> Array | None:

@@ -16,7 +16,7 @@ from adapter.cli.options import (
 from adapter.control.settings import DESIGNED
 from adapter.errors import UsageError
 
-SHARE, LONGEST_S, RATE_HZ = 0.1, 300.0, 200.0
+SHARE, LONGEST_S, RATE_HZ = 0.2, 300.0, 200.0
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +42,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         default=SHARE,
         metavar="SHARE",
         help="wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's usual "
-        f"size (default {SHARE:g}: 0.1 kg, 0.01 kg m, 0.001 kg m², 0.1 N m of friction)",
+        f"size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
     )
     add(
         "--noise",

@@ -9,7 +9,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from adapter.cli.main import main
+from adapter.cli.main import build_parser, main
+from adapter.cli.run import controller_of, open_arm, run_plan
+from adapter.control.designed import DesignedMotion
 from adapter.control.limits import MotionLimits
 from adapter.effects.splits import LOADS, SPEEDS
 from adapter.model.robots import documented
@@ -74,6 +76,7 @@ def test_makes_the_motion_that_a_gap_report_asks_for(tmp_path, capsys):
     [
         (["--at", "0,1"], "needs 7 finite numbers, got 2"),
         (["--at", "a,b"], "is not numbers with commas between"),
+        (["--at", "0,1.5,0,-0.2,0,1.5,0"], "no motion can start at 0.00, 1.50"),
         (["--std", "0"], "--std must be above 0"),
         (["--gap", LOG], "not the JSON of `adapter gap`"),
         (["--move", "elbow"], "no joint 'elbow' to move"),
@@ -82,3 +85,26 @@ def test_makes_the_motion_that_a_gap_report_asks_for(tmp_path, capsys):
 def test_wrong_use_is_one_sentence(options, said, tmp_path, capsys):
     assert main(["excite", *options, "--out", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err.replace("\n", " ")
+
+
+def test_run_follows_a_designed_motion_with_the_documented_model():
+    args = build_parser().parse_args(["run", "--excitation", "designed", "--move", "panda_joint4"])
+    plan = run_plan(args)
+    arm = open_arm(args, plan)
+    controller = controller_of(args, plan, arm)
+    arm.connect()
+    try:
+        controller.prepare(arm.read())
+        assert isinstance(controller.reference, DesignedMotion)
+        errors = []
+        for _ in range(3000):
+            sample = arm.read()
+            arm.command(controller.step(sample))
+            errors.append(np.abs(sample.q - controller.reference.q))
+        moved = np.abs(controller.reference.q - controller.start.q)
+    finally:
+        arm.close()
+    assert plan.feedforward == "documented" and np.max(errors) < 0.03
+    assert moved[3] > 0.01 and np.delete(moved, 3).max() == 0.0
+    random = run_plan(build_parser().parse_args(["run"]))
+    assert random.feedforward == "none"
