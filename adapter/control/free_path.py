@@ -177,6 +177,12 @@ class ArmInCell:
             for c in self.capsules
         ]
 
+    def skeleton(self, q: Array) -> list[Array]:
+        """Lines (2, 3) in base axes from the origin of the link before to each link's."""
+        place_frames(self._frames, q, self._R, self._o)
+        before = [np.zeros(3) if k == BASE else self._o[k] for k in self.model.tree.parent]
+        return [np.array(ends) for ends in zip(before, self._o.copy(), strict=True)]
+
     def _body(self, capsule: Capsule) -> tuple[Any, Array, Array]:
         """Shape, and its turn and place in the link's frame."""
         line = capsule.ends[1] - capsule.ends[0]

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 TEMPLATE = "plan.html"
 POSES = 80  # drawn along the path
+GOLDEN = 0.618034  # spreads them over the path without a step that a period could share
 RIM = 24  # corners of a circle
 VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
     ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; red: nearest"),
@@ -40,7 +41,8 @@ def write_plan(
 ) -> Path:
     """Write the page of a motion in its cell. Raises RunFolderError."""
     start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
-    poses = [motion.path(s)[0].copy() for s in np.linspace(0.0, max(nearest.path_s, 30.0), POSES)]
+    span_s = max(nearest.path_s, 30.0)
+    poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
     context: dict[str, Any] = {
         "robot": arm.model.name,
         "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {arm.cell.margin:g} m",
@@ -69,6 +71,8 @@ def _view(
         (start, ACCENT, 2.2, 1.0),
         (nearest, GOAL, 1.4, 1.0),
     ):
+        for ends in arm.skeleton(q) if alpha == 1.0 else ():
+            ax.plot(*project(ends).T, color=color, linewidth=0.7)
         for ends, _ in arm.placed(q):
             ax.plot(
                 *project(ends).T, color=color, linewidth=width, alpha=alpha, solid_capstyle="round"
