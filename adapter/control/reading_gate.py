@@ -131,8 +131,8 @@ _WHY = {
     "connection",
     ReadingVerdict.JUMPED: f"joint {{}} reads what no joint can move to {_SINCE}; look at "
     "its encoder",
-    ReadingVerdict.STUCK: "joint {} reads the same while it should move; the arm is stopped; look "
-    "at its encoder",
+    ReadingVerdict.STUCK: "joint {} reads the same while it should move; the arm is stopped; "
+    "something holds it, or its encoder stands still",
     ReadingVerdict.BROKEN_OFF: "the samples broke off and joint {} is elsewhere now; the arm is "
     "stopped; look at the connection",
 }
