@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.control.free_path import ArmInCell
+from adapter.control.free_path import SAME_START, ArmInCell
 from adapter.control.information import Information
 from adapter.control.limits import MotionLimits
 from adapter.control.path_motion import (
@@ -45,14 +45,12 @@ STEPS, FIRST_STEP = 150, 0.1  # rounds, and rad/s of the first
 MIX, EVEN = 0.3, 0.6
 ROUND = 1e-9  # of the largest; joints that are not to move leave parameters that nothing shows
 MOMENTUM, MEMORY = 0.8, 0.95
-SPEED_ROOM = (
-    0.8  # of the speed wanted: a designed motion reaches it, and an arm lags and overshoots
-)
+# Of the speed that is allowed: a designed motion reaches it, and an arm lags and overshoots.
+SPEED_ROOM = 0.8
 LEAST_ROOM = 0.02  # rad that a joint at the edge of what it may use is still given
 NEAR_LOOKS, NEAR_WEIGHT, MORE_M = 24, 50.0, 0.02  # poses a round; 1/m²; beyond the margin
 DIFFERENCE = 1e-5
 SHRINK, SMALLER = 0.95, 60  # where a motion is not free, and how often at most
-SAME_START = 1e-3  # rad: from so near the motion found before is used again
 
 # Sum over poses (m, n) of squared shortfalls of distance, m², and its gradient (m, n).
 TooNear = Callable[[Array], tuple[float, Array]]
@@ -209,16 +207,15 @@ class Designer:
     free: Callable[[SineMotion], bool] = field(default=lambda motion: True)
     meanwhile: Callable[[], None] = field(default=lambda: None)
     steps: int = STEPS
-    _last: tuple[Array, tuple[ExcitationSettings, int], Array] | None = None
+    _last: tuple[Array, ExcitationSettings, Array] | None = None
 
     def within(self, arm: ArmInCell) -> Designer:
         """The same that keeps an arm's links clear of its cell and of each other."""
         margin = arm.cell.margin
 
         def free(motion: SineMotion) -> bool:
-            return (
-                arm.clearance(motion, 2.0 * np.pi / motion.omega[0, 0], margin).distance >= margin
-            )
+            period_s = 2.0 * np.pi / motion.omega[0, 0]
+            return arm.clearance(motion, period_s, margin).distance >= margin
 
         def too_near(q: Array) -> tuple[float, Array]:
             return arm.too_near(q, margin + MORE_M)
@@ -237,7 +234,8 @@ class Designer:
 
         Args:
             limits: to keep; settings: of the motion.
-            attempt: another one climbs from elsewhere; size: share of the motion found.
+            attempt: has no say: what is not free is made smaller, and seldom gets better.
+            size: share of the motion found.
 
         Raises SettingsError as `RandomMotion` does.
         """
@@ -246,11 +244,11 @@ class Designer:
         omega = _harmonics(settings)
         if self._last is not None:
             before, what, x = self._last
-            if what == (settings, attempt) and np.abs(q0 - before).max() < SAME_START:
+            if what == settings and np.abs(q0 - before).max() < SAME_START:
                 return self._motion(limits, q0, settings, size * x)
         gauge = Gauge(limits, q0, settings, omega)
         moves = moving(limits, settings).astype(bool)
-        rng = np.random.default_rng([settings.seed, attempt])
+        rng = np.random.default_rng(settings.seed)
         x = rng.normal(size=(len(q0), 2 * len(omega))) / np.tile(omega, 2) * moves[:, None]
         x /= np.maximum(gauge(x)[0], 1e-9)[:, None]
         x = self._climb(gauge, q0, omega, x, rng)
@@ -258,7 +256,7 @@ class Designer:
             if self.free(self._motion(limits, q0, settings, x)):
                 break
             x = SHRINK * x
-        self._last = q0, (settings, attempt), x
+        self._last = q0, settings, x
         return self._motion(limits, q0, settings, size * x)
 
     def _motion(
