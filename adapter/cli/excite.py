@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -66,10 +67,11 @@ def run(args: argparse.Namespace) -> int:
     limits, arm = MotionLimits.of(robot), ArmInCell(robot, config.cell)
     std = _of_joints("--noise", numbers("--noise", args.noise), robot)
     told = Information(robot, config.pipeline.filter, torque_std=std)
-    known = _known(args.logs, robot, told) if args.logs else Known()
+    tables = [_table(path, robot, told) for path in args.logs]
+    known = _known(tables, told) if tables else Known()
     if std is None and known.torque_std is not None:
         told = Information(robot, config.pipeline.filter, torque_std=known.torque_std)
-        known = _known(args.logs, robot, told)
+        known = _known(tables, told)
     q0 = _start(args, arm, limits, known)
     folder = results_folder(args.out, "excite")
     if args.gap is not None:
@@ -126,22 +128,26 @@ def _of_joints(option: str, values: list[float] | None, robot: SelfModel) -> Arr
     return np.array(values)
 
 
-def _known(logs: list[Path], robot: SelfModel, told: Information) -> Known:
+def _table(path: Path, robot: SelfModel, told: Information) -> tuple[Array, Array, Array, Array]:
+    """q, dq, ddq, tau (m, n) of a log, as many as are independent. Raises SettingsError."""
+    signals = filtered(path, robot)
+    if not len(signals.q):
+        raise SettingsError(f"{path}: nothing in it can be learned from")
+    every = max(1, round(len(signals.q) / max(1.0, signals.time_s[-1] * told.samples_per_s)))
+    q, dq, ddq, tau = (np.ascontiguousarray(x[::every]) for x in signals[1:])
+    return q, dq, ddq, tau
+
+
+def _known(tables: Sequence[tuple[Array, Array, Array, Array]], told: Information) -> Known:
     """Of several logs the information adds up; the torque's noise is what no parameters explain."""
-    total = np.zeros_like(told.prior)
-    left, count, start = np.zeros(robot.tree.n), 0, None
-    for path in logs:
-        signals = filtered(path, robot)
-        every = max(1, round(len(signals.q) / max(1.0, signals.time_s[-1] * told.samples_per_s)))
-        q, dq, ddq, tau = (np.ascontiguousarray(x[::every]) for x in signals[1:])
-        if not len(q):
-            raise SettingsError(f"{path}: nothing in it can be learned from")
+    total, start = np.zeros_like(told.prior), tables[0][0][0]
+    left, count = np.zeros(len(start)), 0
+    for q, dq, ddq, tau in tables:
         total += len(q) * told.mean(q, dq, ddq)
         Y = told.regressor(q, dq, ddq)
         x = np.linalg.lstsq(Y.reshape(-1, Y.shape[2]) @ told.basis, tau.ravel(), rcond=None)[0]
         left += ((tau - Y @ (told.basis @ x)) ** 2).sum(axis=0)
         count += len(q)
-        start = q[0] if start is None else start
     return Known(total, np.sqrt(left / count), start)
 
 

@@ -330,7 +330,7 @@ class Designer:
         H = self.information.prior + brought
         if self.known is not None:
             H = H + self.known
-        C, W, B = np.linalg.inv(H), self.information.in_wanted_units(), inertial
+        C, W, B = np.linalg.inv(H), self.information.in_wanted_units, inertial
         B = B + ROUND * np.trace(B) * np.eye(len(B))
         D = np.linalg.inv(B)
         even = EVEN if self.known is None else 0.0

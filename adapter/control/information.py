@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -148,6 +149,7 @@ class Information:
         """Condition number of a table's regressor of the base parameters, inertias alone."""
         return float(np.linalg.cond(self.rows(q, dq, ddq)[1]))
 
+    @cached_property
     def in_wanted_units(self) -> Array:
         """(rank, rank) W: trace(W C) is the sum of all variances over sizes squared, C (rank,
         rank) being the covariance."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 
@@ -184,6 +185,7 @@ def ramp_factors(settings: ExcitationSettings) -> tuple[float, float]:
     return RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
 
 
+@lru_cache
 def ramp_pairs(settings: ExcitationSettings) -> Array:
     """(p, 2) what acceleration along the path and speed contribute while the rate r changes.
 

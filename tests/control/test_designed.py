@@ -18,6 +18,7 @@ from adapter.model.robots import documented
 from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import BODY_SIZE
 from sim.scenarios import build
+from tests.helpers.played import played
 
 PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
 LIMITS = MotionLimits.of(PANDA)
@@ -48,14 +49,7 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(robot, seed, share, sto
     how = ExcitationSettings(seed=seed, slow_s=slow, slow_share=0.3)
     motion = Designer(Information(model), steps=8)(limits, start, how)
     lower, upper, speed, acceleration, jerk = motion.bounds()
-    q, dq, ddq = [start], [np.zeros(7)], [np.zeros(7)]
-    while not motion.at_rest:
-        if motion.time_s >= stop_s:
-            motion.begin_stop()
-        motion.advance(DT)
-        for history, value in zip((q, dq, ddq), (motion.q, motion.dq, motion.ddq), strict=True):
-            history.append(value)
-    q, dq, ddq = (np.array(x) for x in (q, dq, ddq))
+    q, dq, ddq = played(motion, stop_s, DT)
     assert (q >= limits.lower - 1e-9).all() and (q <= limits.upper + 1e-9).all()
     assert (q >= lower - 1e-9).all() and (q <= upper + 1e-9).all()
     assert (np.abs(dq) <= speed + 1e-9).all()

@@ -20,6 +20,7 @@ from adapter.model.urdf import read_urdf
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
+from tests.helpers.played import played
 
 PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
 LIMITS = MotionLimits.of(PANDA)
@@ -53,14 +54,7 @@ def test_keeps_every_limit_for_every_seed_start_and_stop(
     start = _starts(share)
     how = ExcitationSettings(seed=seed, rests=rests, slow_s=slow, slow_share=slow_share)
     motion = RandomMotion(LIMITS, start, how)
-    q, dq, ddq = [start], [np.zeros(7)], [np.zeros(7)]
-    while not motion.at_rest:
-        if motion.time_s >= stop_s:
-            motion.begin_stop()
-        motion.advance(DT)
-        for history, value in zip((q, dq, ddq), (motion.q, motion.dq, motion.ddq), strict=True):
-            history.append(value)
-    q, dq, ddq = (np.array(x) for x in (q, dq, ddq))
+    q, dq, ddq = played(motion, stop_s, DT)
     assert (q >= LIMITS.lower - 1e-9).all() and (q <= LIMITS.upper + 1e-9).all()
     low, high = (
         np.minimum(LIMITS.lower + how.margin, start),

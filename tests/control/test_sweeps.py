@@ -12,6 +12,7 @@ from adapter.effects.splits import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS
 from adapter.errors import SettingsError
 from adapter.model.robots import documented
 from sim.scenarios import build
+from tests.helpers.played import played
 
 LIMITS = MotionLimits.of(documented("panda"))
 READY = build("nominal").truth.ready
@@ -19,13 +20,7 @@ DT = 4e-3
 
 
 def _played(motion):
-    rows = []
-    while not motion.at_rest:
-        if motion.time_s >= motion.length_s + 1.5:  # the soft start takes half of its time more
-            motion.begin_stop()
-        motion.advance(DT)
-        rows.append([motion.q, motion.dq, motion.ddq])
-    return np.moveaxis(np.array(rows), 1, 0)
+    return played(motion, motion.length_s + 1.5, DT)  # the soft start takes half of its time more
 
 
 @pytest.mark.parametrize("experiment", [SPEEDS, BOTH_WAYS, STILL, TURN, TURNS])
