@@ -299,7 +299,7 @@ class ContactObserver:
         self.std[:], self.expected, self.explained = np.inf, table[Of.EXPECTED], np.zeros(n)
         self.contact: Contact | None = None
         self.contacts: list[Contact] = []
-        self._wrench, self._age_s = np.zeros((2, 6)), 0.0
+        self._age_s = 0.0
         self._anew, self._stamp_ns, self._since, self._recent = True, 0, 0, 0.0
         self._past = ((0, np.zeros((2, n))),) * 2  # stamps and readings (2, n) of a little before
         table[Of.SPIKE] = SPIKE_S * effort
@@ -437,5 +437,6 @@ class ContactObserver:
 
         What the torques do not show has the standard deviation of not knowing.
         """
-        hand_wrench(self.frames, self._model.table[Row.Q], self.torque, self.std, self._wrench)
-        return self._wrench[0].copy(), self._wrench[1].copy()
+        both = np.empty((2, 6))
+        hand_wrench(self.frames, self._model.table[Row.Q], self.torque, self.std, both)
+        return both[0], both[1]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from adapter.control.observer import ContactObserver
 from adapter.model.spatial import Array
 from adapter.realtime.estimates import EstimateFollower
+from adapter.realtime.snapshot import ExternalTorque, SnapshotWriter
 from drivers.interface import JointSample
 
 REFRESH_TICKS = 500  # an estimate taken over costs some 0.2 ms
@@ -14,6 +15,8 @@ REFRESH_TICKS = 500  # an estimate taken over costs some 0.2 ms
 
 class FollowingObserver(EstimateFollower):
     """Steps an observer and lets it go on with each new estimate that has converged.
+
+    What it says of each sample is published beside the estimate.
 
     Args:
         observer: of the documented arm, fresh.
@@ -27,6 +30,19 @@ class FollowingObserver(EstimateFollower):
         super().__init__()
         self.observer, self._stops, self._names = observer, stops, names
         self._ticks = 0
+        self._board: SnapshotWriter | None = None
+
+    def attach(self, name: str) -> None:
+        """Follow the estimate of this name, and publish there. Raises SnapshotError."""
+        super().attach(name)
+        self._board = SnapshotWriter.attach(name)
+
+    def detach(self) -> None:
+        """Neither follow nor publish any longer."""
+        super().detach()
+        if self._board is not None:
+            self._board.close()
+        self._board = None
 
     @property
     def alarm(self) -> str | None:
@@ -49,4 +65,13 @@ class FollowingObserver(EstimateFollower):
         if new is not None:
             values = new.lam, new.theta, new.effects, new.effect_shapes, new.torque_std
             self.observer.adopt(*values)
-        return self.observer.step(sample)
+        external = self.observer.step(sample)
+        if self._board is not None:
+            self._board.publish_external(self._external(sample.stamp_ns))
+        return external
+
+    def _external(self, stamp_ns: int) -> ExternalTorque:
+        seen = self.observer
+        joint = None if seen.contact is None else seen.contact.joint
+        what = seen.torque, seen.std, *seen.wrench(), joint
+        return ExternalTorque(*what, seen.learned, stamp_ns)

@@ -1,8 +1,6 @@
-"""The present estimate in shared memory: one writer, any number of readers, never torn.
+"""What other processes may know of a run, in shared memory under a name.
 
-Two slots, each with a sequence number: the writer fills the slot that is not the newest, then
-names it the newest. A reader that was overtaken sees the number change and reads again; a
-writer that dies half-way leaves the other slot whole.
+The learner publishes its estimate, and the loop what pushes the arm, 1000 times a second.
 """
 
 from __future__ import annotations
@@ -20,53 +18,25 @@ from numpy.typing import NDArray
 from adapter.errors import MeansError
 from adapter.model.self_model import LAMBDA_SOURCES
 from adapter.model.spatial import Array
-from adapter.physics.kernels import jit
-from adapter.realtime.shared import SharedBlock, SharedMemoryError, fence
+from adapter.realtime.shared import SharedBlock, SharedMemoryError
+from adapter.realtime.slots import SEQUENCE, Slots, split
 from drivers.files.bounded import parse_json
 
-MAGIC = 0x5041534E41503033  # "PASNAP03"
-VERSION, KIND, N, BODIES, EFFECTS, PID, TEXT = 0, 8, 9, 10, 11, 12, 13  # words of the header
+MAGIC = 0x5041534E41503034  # "PASNAP04"
+VERSION, EXTERNAL_VERSION = 0, 1  # words of the header, as are the next ones
+KIND, N, BODIES, EFFECTS, PID, TEXT = range(8, 14)
 HEADER_WORDS, TEXT_BYTES = 16, 8192
-SEQUENCE, STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(6)  # words of a slot
-SLOT_WORDS = 8
+STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(1, 6)  # words of an estimate
+CONTACT = FLAGS  # of the external torque: joint (from 1) where it stands out in a contact, or 0
 LAM_CONVERGED, THETA_CONVERGED = 1, 2
 DEFAULT_NAME = "panda_adapter"
 READ_TIMEOUT_S = 0.2
 
+Shapes = dict[str, tuple[int, ...]]
+
 
 class SnapshotError(MeansError):
     """There is no estimate to read or no place to publish one; the message says why."""
-
-
-@jit
-def put(header, words, values, new_words, new_values):
-    """Publish; returns the version."""
-    version = header[VERSION] + 1
-    k = version & 1
-    words[k, SEQUENCE] = -1
-    fence()
-    words[k, 1:] = new_words[1:]
-    values[k] = new_values
-    fence()
-    words[k, SEQUENCE] = version
-    fence()
-    header[VERSION] = version
-    return version
-
-
-@jit
-def take(header, words, values, out_words, out_values):
-    """Copy the newest slot; False where the writer overtook."""
-    version = header[VERSION]
-    fence()
-    k = version & 1
-    if words[k, SEQUENCE] != version:
-        return False
-    fence()
-    out_words[:] = words[k]
-    out_values[:] = values[k]
-    fence()
-    return words[k, SEQUENCE] == version
 
 
 class Board:
@@ -84,8 +54,8 @@ class Board:
         """Lay the arrays over the block. Raises SnapshotError where it is not what it says."""
         head = 8 * HEADER_WORDS
         n, bodies, effects, text = (int(self._header[k]) for k in (N, BODIES, EFFECTS, TEXT))
-        least, size = min(n, bodies, effects, text), value_count(n, bodies, effects)
-        if least < 0 or text > TEXT_BYTES or block_size(size) > self._block.size:
+        least, fits = min(n, bodies, effects, text), text <= TEXT_BYTES
+        if least < 0 or not fits or block_size(n, bodies, effects) > self._block.size:
             raise foreign(self.name)
         try:
             names = parse_json(self._block.array((text,), np.uint8, head).tobytes())
@@ -96,35 +66,42 @@ class Board:
         self.effect_names: tuple[str, ...] = tuple(known)
         if (len(self.joint_names), len(self.effect_names)) != (n, effects):
             raise foreign(self.name)
-        self.shapes = {
-            "lam": (n, 6),
-            "lam_std": (n, 6),
-            "theta": (bodies, 10),
-            "theta_std": (bodies, 10),
-            "effects": (effects, n),
-            "effects_std": (effects, n),
-            "effect_shapes": (effects, n),
-            "torque_std": (n,),
-        }
-        start = head + TEXT_BYTES
-        self._words = self._block.array((2, SLOT_WORDS), np.int64, start)
-        self._values = self._block.array((2, size), np.float64, start + 16 * SLOT_WORDS)
-        self._some_words, self._some_values = np.zeros(SLOT_WORDS, np.int64), np.zeros(size)
+        self.shapes, self._external_shapes = estimate_shapes(n, bodies, effects), push_shapes(n)
+        start, size = head + TEXT_BYTES, value_count(self.shapes)
+        self._estimate: Slots | None = Slots(self._block, self._header[VERSION:], start, size)
+        start, size = start + Slots.bytes_of(size), value_count(self._external_shapes)
+        newest = self._header[EXTERNAL_VERSION:]
+        self._external: Slots | None = Slots(self._block, newest, start, size)
 
     def close(self) -> None:
         """Let go of the memory; may be called more than once."""
         self._header = np.zeros(0, np.int64)
-        self._words, self._values = np.zeros((0, 0), np.int64), np.zeros((0, 0))
+        self._estimate = self._external = None
         self._block.close()
 
 
-def value_count(n: int, bodies: int, effects: int) -> int:
-    return 13 * n + 20 * bodies + 3 * effects * n
+def estimate_shapes(n: int, bodies: int, effects: int) -> Shapes:
+    """Of an estimate's values, in their order."""
+    shapes: Shapes = dict.fromkeys(("lam", "lam_std"), (n, 6))
+    shapes |= dict.fromkeys(("theta", "theta_std"), (bodies, 10))
+    shapes |= dict.fromkeys(("effects", "effects_std", "effect_shapes"), (effects, n))
+    return shapes | {"torque_std": (n,)}
 
 
-def block_size(values: int) -> int:
-    """Bytes of a block for so many values."""
-    return 8 * (HEADER_WORDS + 2 * SLOT_WORDS + 2 * values) + TEXT_BYTES
+def push_shapes(n: int) -> Shapes:
+    """Of what pushes the arm."""
+    return {"torque": (n,), "torque_std": (n,), "wrench": (6,), "wrench_std": (6,)}
+
+
+def value_count(shapes: Shapes) -> int:
+    return sum(math.prod(shape) for shape in shapes.values())
+
+
+def block_size(n: int, bodies: int, effects: int) -> int:
+    """Bytes of a block."""
+    both = estimate_shapes(n, bodies, effects), push_shapes(n)
+    slots = sum(Slots.bytes_of(value_count(shapes)) for shapes in both)
+    return 8 * HEADER_WORDS + TEXT_BYTES + slots
 
 
 def foreign(name: str) -> SnapshotError:
@@ -228,6 +205,33 @@ class Snapshot:
         return 1e-9 * (time.monotonic_ns() - self.published_ns)
 
 
+@dataclass(frozen=True)
+class ExternalTorque:
+    """What pushes the arm from outside, at one instant.
+
+    Attributes:
+        torque: (n,) that the surroundings put on the joints, N m.
+        torque_std: (n,) its standard deviation without a contact, N m.
+        wrench: (6,) [f; m] on the last link at its origin that explains it best, in axes of the
+            base, N and N m.
+        wrench_std: (6,) its standard deviation; that of not knowing where no torque shows it.
+        contact_joint: (from 0) where it stands out most, while there is a contact; else None.
+        learned: whether it goes by the learned model, or still by the documented one.
+        stamp_ns: of the sample, on the arm's clock; version 0 before the first one (all NaN).
+        version, published_ns: as in a `Snapshot`.
+    """
+
+    torque: Array
+    torque_std: Array
+    wrench: Array
+    wrench_std: Array
+    contact_joint: int | None
+    learned: bool
+    stamp_ns: int
+    version: int = 0
+    published_ns: int = 0
+
+
 class SnapshotWriter(Board):
     """Publishes. Built by `create` in the process that owns the memory, `attach` in a worker."""
 
@@ -255,12 +259,13 @@ class SnapshotWriter(Board):
         text = json.dumps({"joints": list(joint_names), "effects": list(effect_names)}).encode()
         if len(text) > TEXT_BYTES:
             raise SnapshotError(f"the joint names take {len(text)} bytes; at most {TEXT_BYTES}")
-        board = cls(allocate(block_size(value_count(n, b, e)), name))
+        board = cls(allocate(block_size(n, b, e), name))
         h = board._header
         h[[N, BODIES, EFFECTS, PID, TEXT]] = n, b, e, os.getpid(), len(text)
         board._block.array((len(text),), np.uint8, 8 * HEADER_WORDS)[:] = list(text)
         board._map()
-        board._values[:] = np.nan
+        for slots in filter(None, (board._estimate, board._external)):
+            slots.blank()
         h[KIND] = MAGIC
         return board
 
@@ -276,23 +281,40 @@ class SnapshotWriter(Board):
 
         Raises ValueError for a shape that doesn't fit the board or an unknown λ source.
         """
-        start = 0
-        for key, shape in self.shapes.items():
-            value = np.asarray(getattr(snapshot, key))
-            if value.shape != shape:
-                raise ValueError(f"{key} must have shape {shape}, got {value.shape}")
-            self._some_values[start : start + value.size] = value.reshape(-1)
-            start += value.size
+        slots = self._filled(self._estimate, self.shapes, snapshot)
         if snapshot.lambda_source not in LAMBDA_SOURCES:
             choices = ", ".join(LAMBDA_SOURCES)
             raise ValueError(f"no lambda_source '{snapshot.lambda_source}'; have: {choices}")
-        words = self._some_words
+        words = slots.words
         words[STAMP], words[LEARNED] = snapshot.stamp_ns, snapshot.learned
         words[PUBLISHED] = time.monotonic_ns()
         words[FLAGS] = LAM_CONVERGED * bool(snapshot.lam_converged)
         words[FLAGS] += THETA_CONVERGED * bool(snapshot.theta_converged)
         words[SOURCE] = LAMBDA_SOURCES.index(snapshot.lambda_source)
-        return int(put(self._header, self._words, self._values, words, self._some_values))
+        return slots.put()
+
+    def publish_external(self, push: ExternalTorque) -> int:
+        """As `publish`, what pushes the arm; costs some 10 µs."""
+        slots = self._filled(self._external, self._external_shapes, push)
+        words, joint = slots.words, push.contact_joint
+        words[STAMP], words[LEARNED] = push.stamp_ns, push.learned
+        words[PUBLISHED] = time.monotonic_ns()
+        words[CONTACT] = 0 if joint is None else joint + 1
+        return slots.put()
+
+    def _filled(
+        self, slots: Slots | None, shapes: Shapes, source: Snapshot | ExternalTorque
+    ) -> Slots:
+        """The slots with the values of these shapes, one after the other. Raises ValueError."""
+        assert slots is not None, "closed"
+        start = 0
+        for key, shape in shapes.items():
+            value = np.asarray(getattr(source, key))
+            if value.shape != shape:
+                raise ValueError(f"{key} must have shape {shape}, got {value.shape}")
+            slots.values[start : start + value.size] = value.reshape(-1)
+            start += value.size
+        return slots
 
     def unlink(self) -> None:
         """Creator: remove the name."""
@@ -349,20 +371,8 @@ class SnapshotReader(Board):
 
         Raises SnapshotError where no whole one could be read in `timeout_s`, or after `close`.
         """
-        if not self._header.size:
-            raise SnapshotError(f"the reader of '{self.name}' was closed")
-        words, values = self._some_words, self._some_values
-        deadline = None
-        while not take(self._header, self._words, self._values, words, values):
-            now = time.monotonic()
-            deadline = deadline or now + timeout_s
-            if now > deadline:
-                raise SnapshotError(f"'{self.name}': no whole estimate in {timeout_s} s")
-        parts, start = {}, 0
-        for key, shape in self.shapes.items():
-            size = math.prod(shape)
-            parts[key] = values[start : start + size].reshape(shape).copy()
-            start += size
+        slots = self._taken(self._estimate, timeout_s)
+        words, parts = slots.words, split(slots.values, self.shapes)
         flags, source = int(words[FLAGS]), int(words[SOURCE])
         if not 0 <= source < len(LAMBDA_SOURCES):
             raise foreign(self.name)
@@ -377,6 +387,26 @@ class SnapshotReader(Board):
             published_ns=int(words[PUBLISHED]),
         )
 
+    def read_external(self, timeout_s: float = READ_TIMEOUT_S) -> ExternalTorque:
+        """What pushes the arm; of `version` 0 and NaN where nobody watches. Raises as `read`."""
+        slots = self._taken(self._external, timeout_s)
+        words, joint = slots.words, int(slots.words[CONTACT])
+        return ExternalTorque(
+            **split(slots.values, self._external_shapes),
+            contact_joint=joint - 1 if joint > 0 else None,
+            learned=bool(words[LEARNED]),
+            stamp_ns=int(words[STAMP]),
+            version=int(words[SEQUENCE]),
+            published_ns=int(words[PUBLISHED]),
+        )
+
+    def _taken(self, slots: Slots | None, timeout_s: float) -> Slots:
+        if slots is None:
+            raise SnapshotError(f"the reader of '{self.name}' was closed")
+        if not slots.take(timeout_s):
+            raise SnapshotError(f"'{self.name}': no whole estimate in {timeout_s} s")
+        return slots
+
     def __enter__(self) -> SnapshotReader:
         return self
 
@@ -384,7 +414,7 @@ class SnapshotReader(Board):
         self.close()
 
     def __del__(self) -> None:
-        if hasattr(self, "_words"):
+        if hasattr(self, "_estimate"):
             self.close()
 
 

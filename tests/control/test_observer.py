@@ -12,7 +12,7 @@ from adapter.control.contact_kind import Kind, kind_of
 from adapter.control.observer import ContactObserver, ObserverSettings
 from adapter.errors import SettingsError
 from adapter.realtime.following import FollowingObserver
-from adapter.realtime.snapshot import SnapshotWriter, nothing_known
+from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter, nothing_known
 from drivers.interface import JointSample
 from sim.effects import payload
 from sim.truth import panda
@@ -203,6 +203,15 @@ def test_a_contact_ends_a_motion_where_that_is_asked_for() -> None:
             if stops:
                 assert 3.0 <= alarms[0][0] < 3.03
                 assert "panda_joint" in alarms[0][1] and "standard deviations" in alarms[0][1]
+            with SnapshotReader(board.name) as reader:
+                told = reader.read_external()
+            observer, (wrench, wrench_std) = following.observer, following.observer.wrench()
+            assert told.learned and told.contact_joint in (1, 3) and told.version == 4000
+            assert told.stamp_ns == sample.stamp_ns
+            np.testing.assert_array_equal(told.torque, observer.torque)
+            np.testing.assert_array_equal(told.torque_std, observer.std)
+            np.testing.assert_array_equal(told.wrench, wrench)
+            np.testing.assert_array_equal(told.wrench_std, wrench_std)
         finally:
             following.detach()
             board.unlink()

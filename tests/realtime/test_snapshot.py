@@ -54,6 +54,15 @@ def test_what_is_published_is_read(board):
         np.testing.assert_array_equal(getattr(found, key), getattr(wanted, key))
 
 
+def test_nobody_watches_what_pushes_the_arm(board):
+    """The estimate alone is published: what pushes is not known, and that is said."""
+    board.publish(_of(1.0))
+    with SnapshotReader(board.name) as reader:
+        push = reader.read_external()
+    assert push.version == 0 and push.contact_joint is None and not push.learned
+    assert np.isnan(push.torque).all() and np.isnan(push.wrench_std).all()
+
+
 def test_what_does_not_fit_is_refused(board):
     with pytest.raises(ValueError, match="lam must have shape"):
         board.publish(replace(_of(1.0), lam=np.zeros((2, 6))))
