@@ -13,6 +13,7 @@ import io
 import json
 import resource
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -140,6 +141,7 @@ def wires() -> dict[str, Decoder]:
     from drivers.fci import codec as fci
     from drivers.fci.codec import ReplyParser, StateDecoder, WireError, connect_reply, status_reply
     from sim.fci.codec import BadRequest, RequestReader, read_command
+    from sim.fci.gripper import HEADER, GripperServer
     from tests.helpers import fci_peer
     from tests.helpers.damiao_tools import LIMITS, reply_bytes
 
@@ -154,6 +156,21 @@ def wires() -> dict[str, Decoder]:
             connect_reply(reply.payload)
             status_reply(reply.payload)
 
+    hand = GripperServer(port=0)
+
+    def to_hand(data: bytes) -> None:
+        ours, theirs = socket.socketpair()
+        with ours, theirs:
+            theirs.setblocking(False)
+            hand._tcp = theirs
+            ours.sendall(data)
+            for _ in range(4):
+                hand.poll()
+            hand._drop()
+
+    grip = HEADER.pack(0, 1, HEADER.size + 4) + struct.pack("<HH", 3, 9000)
+    grip += HEADER.pack(3, 2, HEADER.size + 16) + struct.pack("<2d", 0.04, 0.1)
+    grip += HEADER.pack(2, 3, HEADER.size + 40) + struct.pack("<5d", 0.03, 0.01, 0.01, 0.1, 20.0)
     parts = ((0, struct.pack("<BH", 0, 5)), (1, b"\1\0\0"), (12, b"\2\0\0"))
     stream = b"".join(fci_peer.reply(c, k, payload) for k, (c, payload) in enumerate(parts))
     message = message_for(BusSettings("x"), 0x11, good)
@@ -176,6 +193,7 @@ def wires() -> dict[str, Decoder]:
             (BadRequest,),
             0.05,
         ),
+        "gripper requests": Decoder([grip], to_hand, (), 0.02),
         "fci command": Decoder([bytes(370)], lambda x: read_command(x, 5), (), 0.05),
         "fci replies": Decoder([stream], replies, (WireError,), 0.12),
         "can reply": Decoder([good], lambda x: damiao.state(scales, x), (damiao.WireError,), 0.15),
@@ -287,6 +305,7 @@ def memory() -> dict[str, Decoder]:
         reader = SnapshotReader(block.name)
         try:
             reader.read(timeout_s=0.0)
+            reader.read_external(timeout_s=0.0)
         finally:
             reader.close()
 
@@ -342,10 +361,32 @@ def commands(folder: Path) -> dict[str, Decoder]:
         "discover": (log, given("x.mcap", "discover", "FILE"), False),
         "load": (log, given("x.mcap", "load", "FILE"), False),
     }  # fmt: skip
+    results = folder / "results"
+    given("x.mcap", "replay", "FILE", "--robot", arm, "--no-report", "--out", str(results))(log)
+    good = {path.name: path.read_bytes() for path in results.iterdir() if path.is_file()}
+    for name, data in good.items():
+        lines[f"report {name}"] = data, _reported(results, good, name), name.endswith("json")
     return {
         f"adapter {name}": Decoder([seed], run, (), 0.0005, text)
         for name, (seed, run, text) in lines.items()
     }
+
+
+def _reported(results: Path, good: dict[str, bytes], name: str) -> Callable[[bytes], object]:
+    """What makes the page of a run one of whose files was changed."""
+    from adapter.cli.exit_codes import ExitCode
+    from adapter.cli.main import main
+
+    def run(data: bytes) -> int:
+        for other, content in good.items():
+            (results / other).write_bytes(data if other == name else content)
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            code = main(["report", str(results)])
+        assert code in tuple(ExitCode) and "Traceback" not in said.getvalue()
+        return code
+
+    return run
 
 
 def everything(folder: Path) -> Iterator[tuple[str, Decoder]]:
