@@ -8,7 +8,9 @@ std_msgs, geometry_msgs, nav_msgs, sensor_msgs and trajectory_msgs (ROS 2 Humble
 Written: CDR (XCDR1) little endian, encapsulation header 00 01 00 00. Read: plain CDR of either
 byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes). Alignment counts from
 the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4 (encapsulation, plain
-CDR). Imu and Odometry are only read.
+CDR). Imu and Odometry are only read, and so is the beginning of three more messages of joints:
+control_msgs/DynamicJointState (ros-controls/control_msgs), franka_msgs/FrankaRobotState and
+franka_msgs/FrankaState (frankaemika/franka_ros2).
 
 Decoding is split in two: a parser finds *where* the numbers of a message lie (`Layout`), then
 numpy reads them, from one message or from all messages whose other bytes are the same. Encoders
@@ -48,6 +50,9 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 JOINT_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 ACCEL_STAMPED = "geometry_msgs/msg/AccelStamped"
+DYNAMIC_JOINT_STATE = "control_msgs/msg/DynamicJointState"
+FRANKA_ROBOT_STATE = "franka_msgs/msg/FrankaRobotState"
+FRANKA_STATE = "franka_msgs/msg/FrankaState"  # of ROS 2; that of ROS 1 comes with its definition
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 CDR_LE = b"\x00\x01\x00\x00"
@@ -60,6 +65,23 @@ _STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulati
 _MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
 IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
 ODOMETRY_DOUBLES = 85  # pose 7, its covariance 36, twist 6 (child frame), its covariance 36
+_COLLISION_DOUBLES = (
+    26  # flags before the joint state of a FrankaRobotState: 4 vectors, 2 of joints
+)
+_FRANKA_JOINTS = 7  # of the fixed arrays of a FrankaState, of which these follow its header:
+_FRANKA_RUNS = (
+    "",
+    "",
+    "q",
+    "",
+    "dq",
+    "",
+    "",
+    "",
+    "",
+    "tau",
+)  # between: q_d dq_d ddq_d theta dtheta
+_FRANKA_FLAGS = 6  # doubles of each of the first two
 _LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
@@ -267,12 +289,21 @@ class ImuEncoder(MotionEncoder):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where the numbers of a message lie: byte slices of its runs of doubles, and its texts."""
+    """Where the numbers of a message lie.
+
+    Attributes:
+        little: byte order.
+        frame_id, names: its texts.
+        doubles: places of the bytes of its runs of doubles.
+        varying: what else than the stamp may differ in messages of this layout; `doubles` where
+            empty. Behind the last of them nothing is looked at.
+    """
 
     little: bool
     frame_id: str
     names: tuple[str, ...]
-    doubles: tuple[slice, ...]
+    doubles: tuple[slice | NDArray[np.int64], ...]
+    varying: tuple[slice, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +360,10 @@ class _Cursor:
         except UnicodeDecodeError as error:
             raise CdrError(f"text at byte {start} is not UTF-8") from error
 
+    def stamp(self) -> slice:
+        start = self._advance(8, 4)
+        return slice(start, start + 8)
+
     def doubles(self, number: int) -> slice:
         start = self._advance(8 * number, self._double_align) if number else self._at
         return slice(start, start + 8 * number)
@@ -341,6 +376,61 @@ def parse_joint_state(data: Bytes) -> Layout:
     names = tuple(cursor.text() for _ in range(cursor.count()))
     runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
     return Layout(cursor.little, frame_id, names, runs)
+
+
+def parse_franka_robot_state(data: Bytes) -> Layout:
+    """Layout of a FrankaRobotState: the runs of its measured joint state. Raises CdrError."""
+    cursor = _Cursor(data)
+    cursor.text()
+    flags = cursor.doubles(_COLLISION_DOUBLES)
+    stamp = cursor.stamp()
+    frame_id = cursor.text()
+    names = tuple(cursor.text() for _ in range(cursor.count()))
+    runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
+    return Layout(cursor.little, frame_id, names, runs, (flags, stamp, *runs))
+
+
+def parse_franka_state(data: Bytes) -> Layout:
+    """Layout of a FrankaState of ROS 2, whose joints have no names: joint1, joint2, ...
+
+    Raises:
+        CdrError: it is no such message.
+    """
+    cursor = _Cursor(data)
+    frame_id = cursor.text()
+    runs = [cursor.doubles(_FRANKA_FLAGS if i < 2 else _FRANKA_JOINTS) for i in range(10)]
+    named = dict(zip(_FRANKA_RUNS, runs, strict=True))
+    names = tuple(f"joint{i + 1}" for i in range(_FRANKA_JOINTS))
+    doubles = (named["q"], named["dq"], named["tau"])
+    return Layout(cursor.little, frame_id, names, doubles, tuple(runs))
+
+
+def parse_dynamic_joint_state(data: Bytes) -> Layout:
+    """Layout of a DynamicJointState: position, velocity, effort of the joints that have them.
+
+    Interfaces that only some of the joints with a position (and effort, if any has one) tell
+    are absent. Raises CdrError.
+    """
+    cursor = _Cursor(data)
+    frame_id = cursor.text()
+    joints = [cursor.text() for _ in range(cursor.count())]
+    places: dict[str, dict[str, int]] = {}
+    runs = []
+    for index in range(cursor.count()):
+        interfaces = [cursor.text() for _ in range(cursor.count())]
+        run = cursor.doubles(cursor.count())
+        if index >= len(joints) or run.stop - run.start != 8 * len(interfaces):
+            raise CdrError("names and values differ in number")
+        places[joints[index]] = {name: run.start + 8 * k for k, name in enumerate(interfaces)}
+        runs.append(run)
+    named = [name for name in joints if "position" in places.get(name, ())]
+    names = [name for name in named if "effort" in places[name]] or named
+    doubles = []
+    for quantity in ("position", "velocity", "effort"):
+        starts = [places[name][quantity] for name in names if quantity in places[name]]
+        starts = starts if len(starts) == len(names) else []
+        doubles.append(np.add.outer(starts, np.arange(8)).ravel().astype(np.int64))
+    return Layout(cursor.little, frame_id, tuple(names), tuple(doubles), tuple(runs))
 
 
 def parse_motion(data: Bytes) -> Layout:
@@ -373,7 +463,7 @@ def decode_many(
 
     Args:
         rows: (m, size) bytes, one message a row.
-        parse: `parse_joint_state`, `parse_motion`, `parse_imu` or `parse_odometry`.
+        parse: one of the `parse_` above.
 
     Returns:
         The blocks, and (place, reason) of messages that cannot be read.
@@ -403,7 +493,8 @@ def decode_many(
 def _same_layout(rows: Rows, sample: NDArray[np.uint8], layout: Layout) -> NDArray[np.bool_]:
     same = (rows[:, : _STAMP.start] == sample[: _STAMP.start]).all(axis=1)
     start = _STAMP.stop
-    for run in layout.doubles:
+    for run in layout.varying or layout.doubles:
+        assert isinstance(run, slice)
         same &= (rows[:, start : run.start] == sample[start : run.start]).all(axis=1)
         start = run.stop
     return same

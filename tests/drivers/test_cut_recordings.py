@@ -232,7 +232,7 @@ def test_any_damage_ends_in_samples_or_a_sentence(whole, place, share, flip, len
 
 
 def test_describe_of_a_file_without_joint_states(tmp_path):
-    path = foreign(tmp_path / "a.mcap", payloads(ITEMS[:3]), topic="/other")
+    path = foreign(tmp_path / "a.mcap", payloads(ITEMS[:3]), topic="/other", schema="a/msg/B")
     facts = describe(path)
     assert "no message on /joint_states" in facts["problem"]
     assert facts["topics"]["/other"]["messages"] == 3

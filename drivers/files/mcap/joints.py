@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap.series import Series
+from drivers.files.mcap.series import JOINT_SCHEMAS, Series
 from drivers.files.ros import JOINT_STATE, Block
 from drivers.interface import Array, DriverError
 
@@ -90,12 +90,23 @@ def assemble_joints(
 
 
 def check_type(series: Series, path: Path) -> None:
-    """Raises DriverError where a topic isn't of JointState in CDR."""
-    if series.encoding != "cdr" or series.schema != JOINT_STATE:
+    """Raises DriverError where a topic doesn't hold the state of joints in CDR."""
+    if series.encoding != "cdr" or series.schema not in JOINT_SCHEMAS:
         raise DriverError(
             f"{path}: {series.topic} holds {series.schema or 'messages without a type'} encoded "
-            f"as {series.encoding or 'unknown'}; need {JOINT_STATE} as cdr"
+            f"as {series.encoding or 'unknown'}; need {JOINT_STATE} as cdr "
+            f"(or {', '.join(JOINT_SCHEMAS[1:])})"
         )
+
+
+def fits(series: Series, effort: bool) -> bool:
+    """Whether a topic tells positions (and efforts) of joints."""
+    if series.encoding != "cdr" or series.schema not in JOINT_SCHEMAS:
+        return False
+    needed = (0, 2) if effort else (0,)
+    return any(
+        b.layout.names and all(_run(b, run) is not None for run in needed) for b in series.blocks
+    )
 
 
 def _unreadable(series: Series, where: str) -> list[str]:

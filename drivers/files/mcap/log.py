@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.bounded import parse_json
+from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
-from drivers.files.mcap.joints import Commands, Joints, assemble_joints, read_commands
+from drivers.files.mcap.joints import Commands, Joints, assemble_joints, fits, read_commands
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
-from drivers.files.mcap.records import McapScan
-from drivers.files.mcap.series import Series, collect
+from drivers.files.mcap.records import McapScan, Scan
+from drivers.files.mcap.series import JOINT_SCHEMAS, Series, collect
 from drivers.files.mcap.writer import (
     ESTIMATES,
     JOINT_COMMANDS,
@@ -24,7 +25,7 @@ from drivers.files.mcap.writer import (
     LINK_TWISTS,
     METADATA,
 )
-from drivers.files.ros import IMU, JOINT_STATE
+from drivers.files.ros import IMU
 from drivers.interface import Array, DriverError
 
 
@@ -57,6 +58,7 @@ class Log:
             their record's name.
         attachments: files inside the recording.
         topics: all topics of the file.
+        topic: that of the joint states.
         truncated: the file has no proper end.
         warnings: what was repaired, left out or looks wrong, one sentence each.
     """
@@ -76,6 +78,7 @@ class Log:
     metadata: dict[str, Any] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     topics: dict[str, Topic] = field(default_factory=dict)
+    topic: str = JOINT_STATES
     truncated: bool = False
     warnings: list[str] = field(default_factory=list)
 
@@ -157,7 +160,7 @@ def _places(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[in
 def read_log(
     path: str | Path,
     joint_names: Sequence[str] | None = None,
-    topic: str = JOINT_STATES,
+    topic: str | None = None,
     *,
     sensors: bool = False,
     frames: bool = False,
@@ -166,9 +169,10 @@ def read_log(
     """Read a recording, cut or whole, by whatever recorder.
 
     Args:
-        path: an MCAP file; chunked or not; uncompressed, zstd or lz4.
+        path: an MCAP file, chunked or not, uncompressed, zstd or lz4; a rosbag2, folder or SQLite
+            file; a bag of ROS 1; any of these compressed (zstd, gzip).
         joint_names: joints that must be there, in the order wanted; all joints where None.
-        topic: of the joint states.
+        topic: of the joint states; where None `/joint_states`, else the only one that fits.
         sensors: read what sensors on links recorded beside the joints, for discovery: also
             Imu topics and link motion with stamps of its own, carried to the joint samples'
             stamps; efforts and velocities may be absent.
@@ -179,12 +183,10 @@ def read_log(
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
-    scan = McapScan(Path(path))
+    scan = open_scan(Path(path))
     tell = tuple(READERS) if frames else (IMU,) if imus else ()
     topics = collect(scan, lambda series: _wanted(series, topic, sensors, tell))
-    series = topics.get(topic)
-    if series is None or not series.count:
-        raise DriverError(_nothing_found(scan, topics, topic))
+    series = _chosen(scan, topics, topic, not sensors)
     with np.errstate(invalid="ignore"):  # not-a-number is counted, not computed with
         joints = assemble_joints(series, scan.path, joint_names, effort=not sensors)
     warnings = scan.warnings + joints.warnings
@@ -212,6 +214,7 @@ def read_log(
         metadata=metadata,
         attachments={a.name: bytes(a.data) for a in scan.attachments},
         topics=_summary(topics),
+        topic=series.topic,
         truncated=scan.truncated,
         warnings=warnings,
     )
@@ -219,8 +222,8 @@ def read_log(
 
 
 def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
-    """Topics, warnings and whether the file is cut, of any MCAP file. Raises DriverError."""
-    scan = McapScan(Path(path))
+    """Topics, warnings and whether the file is cut, of any recording. Raises DriverError."""
+    scan = open_scan(Path(path))
     return _summary(collect(scan, lambda series: False)), scan.warnings, scan.truncated
 
 
@@ -234,10 +237,33 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
             yield parse_json(region.data[region.start[i] : region.stop[i]].tobytes())
 
 
-def _wanted(series: Series, topic: str, sensors: bool, tell: Sequence[str]) -> bool:
+def _chosen(scan: Scan, topics: Mapping[str, Series], topic: str | None, effort: bool) -> Series:
+    """The topic that was named, or `/joint_states`, or the only one of use."""
+    series = topics.get(topic or JOINT_STATES)
+    if topic is not None or (series is not None and fits(series, effort)):
+        if series is None or not series.count:
+            raise DriverError(_nothing_found(scan, topics, topic or JOINT_STATES))
+        return series
+    fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, effort))
+    if len(fitting) > 1:
+        raise DriverError(
+            f"{scan.path}: {len(fitting)} topics tell joint states: {', '.join(fitting)}; choose "
+            "one (--topic NAME)"
+        )
+    if fitting:
+        scan.warnings.append(f"{scan.path}: joint states are those of {fitting[0]}")
+        return topics[fitting[0]]
+    if series is None or not series.count:
+        raise DriverError(_nothing_found(scan, topics, JOINT_STATES))
+    return series
+
+
+def _wanted(series: Series, topic: str | None, sensors: bool, tell: Sequence[str]) -> bool:
     """Whether the messages of a topic are decoded."""
     if series.topic in (topic, JOINT_COMMANDS) or series.schema in tell:
         return True
+    if series.schema in JOINT_SCHEMAS:
+        return topic is None
     if series.schema == IMU:
         return sensors
     return series.topic.startswith((LINK_TWISTS, LINK_ACCELS))
@@ -267,8 +293,8 @@ def _summary(topics: Mapping[str, Series]) -> dict[str, Topic]:
     return {k: Topic(s.schema, s.encoding, s.count) for k, s in sorted(topics.items())}
 
 
-def _nothing_found(scan: McapScan, topics: Mapping[str, Series], topic: str) -> str:
-    others = [name for name, s in topics.items() if s.schema == JOINT_STATE and name != topic]
+def _nothing_found(scan: Scan, topics: Mapping[str, Series], topic: str) -> str:
+    others = [name for name, s in topics.items() if s.schema in JOINT_SCHEMAS and name != topic]
     found = [f"{name} ({s.count} {s.schema or s.encoding})" for name, s in sorted(topics.items())]
     hint = f"; other topics of joint states: {', '.join(others)}" if others else ""
     cut = " up to the cut" if scan.truncated else ""
@@ -278,7 +304,7 @@ def _nothing_found(scan: McapScan, topics: Mapping[str, Series], topic: str) -> 
     )
 
 
-def _metadata(scan: McapScan) -> dict[str, Any]:
+def _metadata(scan: Scan) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for record in scan.metadata:
         if record.name == METADATA:

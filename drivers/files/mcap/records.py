@@ -41,10 +41,6 @@ _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its 
 _CRC_SIZE = 4
 _CHUNK_PLACE = struct.Struct("<16xQ")  # in a chunk index, behind two times
 _LENGTH = struct.Struct("<Q")
-_OTHER_FORMATS = {
-    b"SQLite format 3": "it is a rosbag2 of storage sqlite3: turn it into mcap (ros2 bag convert)",
-    b"#ROSBAG": "it is a ROS 1 bag: turn it into a rosbag2 of storage mcap",
-}
 _NOTED = frozenset(
     map(int, (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT))
 ) | {int(Opcode.CHUNK_INDEX)}
@@ -179,34 +175,50 @@ class _ChunkHead:
     last: int
 
 
-class McapScan:
-    """One pass over a file. Its attributes are complete once `regions` is exhausted.
+class Scan:
+    """One pass over a recording. Its attributes are complete once `regions` is exhausted.
 
     Attributes:
-        path: the file.
-        size: its bytes.
+        path: the file or folder.
         header: profile and library.
         schemas, channels: by number.
         metadata, attachments: in the order of the file.
         truncated: the file has no proper end.
-        lost_bytes: bytes behind the cut that hold no complete record.
+        passed: messages of topics that `regions` passes over.
         warnings: what was wrong with the file, one sentence each.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open the file. Raises DriverError where it cannot be an MCAP file."""
         self.path = path
-        self._data = _open(path)
-        self.size = len(self._data)
         self.header = Header("", "")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[Metadata] = []
         self.attachments: list[Attachment] = []
         self.truncated = False
+        self.passed: dict[str, int] = {}
+        self.warnings: list[str] = []
+
+    def regions(self) -> Iterator[Region]:
+        """Complete messages, in the order of the recording."""
+        raise NotImplementedError
+
+
+class McapScan(Scan):
+    """One pass over an MCAP file.
+
+    Attributes:
+        size: its bytes.
+        lost_bytes: bytes behind the cut that hold no complete record.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises DriverError where it cannot be an MCAP file."""
+        super().__init__(path)
+        self._data = _open(path)
+        self.size = len(self._data)
         self.lost_bytes = 0
         self._rescued = self._made = 0
-        self.warnings: list[str] = []
         self._chunks: list[int] = []
         self._read_index()
 
@@ -355,9 +367,6 @@ class McapScan:
 
 
 def _open(path: Path) -> memoryview:
-    if path.is_dir():
-        inside = ", ".join(sorted(p.name for p in path.glob("*.mcap"))) or "no .mcap file"
-        raise DriverError(f"{path}: is a folder; name the file in it (has: {inside})")
     try:
         with path.open("rb") as file:
             if path.stat().st_size == 0:
@@ -370,6 +379,7 @@ def _open(path: Path) -> memoryview:
         return data
     if MAGIC.startswith(begin):
         raise DriverError(f"{path}: is cut after {len(begin)} bytes; nothing was recorded")
-    kind = next((v for k, v in _OTHER_FORMATS.items() if bytes(data[: len(k)]) == k), None)
-    hint = kind or f"it begins with {begin!r}; `adapter import` turns tables into recordings"
-    raise DriverError(f"{path}: is not an MCAP recording; {hint}")
+    raise DriverError(
+        f"{path}: is not an MCAP recording, rosbag2 or ROS 1 bag; it begins with {begin!r}; "
+        "`adapter import` turns tables into recordings"
+    )

@@ -9,9 +9,12 @@ import numpy as np
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from drivers.files.mcap.records import McapScan, Region
+from drivers.files.mcap.records import Region, Scan
 from drivers.files.ros import (
     ACCEL_STAMPED,
+    DYNAMIC_JOINT_STATE,
+    FRANKA_ROBOT_STATE,
+    FRANKA_STATE,
     IMU,
     JOINT_STATE,
     ODOMETRY,
@@ -20,14 +23,24 @@ from drivers.files.ros import (
     Bytes,
     Layout,
     decode_many,
+    parse_dynamic_joint_state,
+    parse_franka_robot_state,
+    parse_franka_state,
     parse_imu,
     parse_joint_state,
     parse_motion,
     parse_odometry,
 )
 
-_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
+_JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     JOINT_STATE: parse_joint_state,
+    DYNAMIC_JOINT_STATE: parse_dynamic_joint_state,
+    FRANKA_ROBOT_STATE: parse_franka_robot_state,
+    FRANKA_STATE: parse_franka_state,
+}
+JOINT_SCHEMAS = tuple(_JOINT_PARSERS)  # messages with positions, velocities and efforts of joints
+PARSERS: dict[str, Callable[[Bytes], Layout]] = {
+    **_JOINT_PARSERS,
     TWIST_STAMPED: parse_motion,
     ACCEL_STAMPED: parse_motion,
     IMU: parse_imu,
@@ -60,7 +73,7 @@ class Series:
 
     def add(self, region: Region, which: NDArray[np.int64], times: NDArray[np.int64]) -> None:
         """Decode the messages `which` of a region and append them."""
-        parse = _PARSERS[self.schema]
+        parse = PARSERS[self.schema]
         sizes = (region.stop - region.start)[which]
         for size in np.unique(sizes):
             here = np.flatnonzero(sizes == size)
@@ -93,7 +106,7 @@ class Series:
         return part
 
 
-def schema_name(scan: McapScan, channel: Channel) -> str:
+def schema_name(scan: Scan, channel: Channel) -> str:
     """A channel's type, `pkg/msg/Name`; some recorders write `pkg/Name`."""
     schema = scan.schemas.get(channel.schema_id)
     if schema is None:
@@ -102,7 +115,7 @@ def schema_name(scan: McapScan, channel: Channel) -> str:
     return "/".join((parts[0], "msg", parts[1])) if len(parts) == 2 else schema.name
 
 
-def collect(scan: McapScan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
+def collect(scan: Scan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
     """Every topic of the file by name; those `wanted` are decoded, the others counted."""
     topics: dict[str, Series] = {}
     unknown = 0
@@ -115,7 +128,7 @@ def collect(scan: McapScan, wanted: Callable[[Series], bool]) -> dict[str, Serie
                 unknown += len(which)
                 continue
             series = _series(topics, scan, scan.channels[numbers[0]])
-            if wanted(series) and series.encoding == "cdr" and series.schema in _PARSERS:
+            if wanted(series) and series.encoding == "cdr" and series.schema in PARSERS:
                 series.add(region, which, times)
             else:
                 series.count += len(which)
@@ -123,10 +136,12 @@ def collect(scan: McapScan, wanted: Callable[[Series], bool]) -> dict[str, Serie
         scan.warnings.append(f"{scan.path}: {unknown} messages belong to no channel; left out")
     for channel in scan.channels.values():
         _series(topics, scan, channel)
+    for topic, count in scan.passed.items():
+        topics[topic].count += count
     return topics
 
 
-def _by_topic(scan: McapScan, numbers: NDArray[np.int64]) -> dict[str, list[int]]:
+def _by_topic(scan: Scan, numbers: NDArray[np.int64]) -> dict[str, list[int]]:
     """Channel numbers by topic; a topic with several publishers has several channels."""
     topics: dict[str, list[int]] = {}
     for number in numbers.tolist():
@@ -135,7 +150,7 @@ def _by_topic(scan: McapScan, numbers: NDArray[np.int64]) -> dict[str, list[int]
     return topics
 
 
-def _series(topics: dict[str, Series], scan: McapScan, channel: Channel) -> Series:
+def _series(topics: dict[str, Series], scan: Scan, channel: Channel) -> Series:
     if channel.topic not in topics:
         name = schema_name(scan, channel)
         topics[channel.topic] = Series(channel.topic, name, channel.message_encoding)

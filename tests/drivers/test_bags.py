@@ -1,0 +1,115 @@
+"""Bags of ROS 1 and rosbag2, written by `rosbags`, read like our own recordings."""
+
+import gzip
+
+import numpy as np
+import pytest
+import zstandard
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
+from drivers.files.mcap import read_log
+from drivers.interface import DriverError
+from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros2
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+KINDS = (
+    JOINT_STATE,
+    "control_msgs/msg/DynamicJointState",
+    "franka_msgs/msg/FrankaRobotState",
+    "franka_msgs/msg/FrankaState",
+)
+SEVEN = tuple(f"arm_joint{i + 1}" for i in range(7))
+
+
+def equal(log, motion):
+    assert np.array_equal(log.stamp_ns, motion.stamp_ns)
+    assert np.array_equal(log.q, motion.q)
+    assert np.array_equal(log.dq, motion.dq)
+    assert np.array_equal(log.tau, motion.tau)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_message_of_joints(tmp_path, kind):
+    motion = Motion.of(7)
+    path = write_ros2(tmp_path / "bag", {"/state": (kind, motion)}, SEVEN)
+    log = read_log(path)
+    equal(log, motion)
+    named = tuple(f"joint{i + 1}" for i in range(7)) if kind.endswith("FrankaState") else SEVEN
+    assert log.joint_names == named
+    assert log.topic == "/state"
+
+
+@pytest.mark.parametrize("storage", StoragePlugin)
+@pytest.mark.parametrize("compression", [None, CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_rosbag2_of_every_storage_and_compression(tmp_path, storage, compression):
+    topics = {"/joint_states": (JOINT_STATE, Motion.of())}
+    path = write_ros2(tmp_path / "bag", topics, storage=storage, compression=compression)
+    equal(read_log(path), topics["/joint_states"][1])
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+@pytest.mark.parametrize("kind", [JOINT_STATE, "franka_msgs/msg/FrankaState"])
+def test_ros1(tmp_path, kind, compression):
+    motion = Motion.of(7)
+    path = write_ros1(tmp_path / "a.bag", {"/states": (kind, motion)}, SEVEN, compression)
+    equal(read_log(path), motion)
+
+
+def test_a_single_file_under_a_hostile_name_and_packed(tmp_path):
+    motion = Motion.of()
+    folder = write_ros2(tmp_path / "bag", {"/joint_states": (JOINT_STATE, motion)})
+    content = next(folder.glob("*.db3")).read_bytes()
+    for name, data in (
+        ("50%20 of?it#1'.sqlite", content),
+        ("a.db3.gz", gzip.compress(content)),
+        ("a.db3.zstd", zstandard.compress(content)),
+    ):
+        (tmp_path / name).write_bytes(data)
+        log = read_log(tmp_path / name)
+        equal(log, motion)
+        assert log.path == tmp_path / name
+
+
+def test_several_topics_are_named_and_one_is_chosen(tmp_path):
+    left, right = Motion.of(seed=2), Motion.of(seed=3)
+    topics = {"/left/state": (JOINT_STATE, left), "/right/state": (KINDS[1], right)}
+    path = write_ros2(tmp_path / "bag", topics)
+    with pytest.raises(DriverError, match=r"2 topics .*: /left/state, /right/state; .*--topic"):
+        read_log(path)
+    equal(read_log(path, topic="/right/state"), right)
+    with pytest.raises(DriverError, match=r"no message on /middle; found: .*/left/state"):
+        read_log(path, topic="/middle")
+
+
+def test_the_usual_topic_comes_first_where_it_tells_efforts(tmp_path):
+    both = {"/joint_states": (JOINT_STATE, Motion.of()), "/other": (JOINT_STATE, Motion.of(seed=4))}
+    equal(read_log(write_ros2(tmp_path / "a", both)), both["/joint_states"][1])
+
+
+def test_others_of_ros1_reach_the_reader_too(tmp_path):
+    motion = Motion.of()
+    path = write_ros1(tmp_path / "a.bag", {"/joint_states": (JOINT_STATE, motion)})
+    assert read_log(path).topics["/joint_states"].messages == len(motion.stamp_ns)
+    assert read_log(path, tuple(reversed(JOINTS))).joint_names == tuple(reversed(JOINTS))
+
+
+@pytest.mark.parametrize("keep", [20, 100, 2000, 9000])
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+def test_cut_bags_are_named(tmp_path, kind, keep):
+    topics = {"/joint_states": (JOINT_STATE, Motion.of())}
+    if kind == "bag":
+        whole = write_ros1(tmp_path / "whole.bag", topics)
+    else:
+        whole = next(write_ros2(tmp_path / "bag", topics).glob("*.db3"))
+    path = tmp_path / f"cut.{kind}"
+    path.write_bytes(whole.read_bytes()[:keep])
+    with pytest.raises(DriverError, match=rf"cut\.{kind}: "):
+        read_log(path)
+
+
+def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):
+    monkeypatch.setattr("drivers.files.mcap.bags.CHUNK_LIMIT", 2**20)
+    path = tmp_path / "bomb.gz"
+    path.write_bytes(gzip.compress(b"SQLite format 3\0" + bytes(2**23)))
+    with pytest.raises(DriverError, match=r"bomb\.gz: would grow"):
+        read_log(path)

@@ -1,0 +1,138 @@
+"""Bags of ROS 1 and rosbag2 with messages of joints, written by `rosbags`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+JOINTS = ("arm_joint1", "arm_joint2", "arm_joint3")
+_ROBOT_STATE = """std_msgs/Header header
+franka_msgs/CollisionIndicators collision_indicators
+sensor_msgs/JointState measured_joint_state
+sensor_msgs/JointState desired_joint_state
+float64[7] ddq_d
+float64 time
+"""
+_COLLISION = (
+    "".join(f"geometry_msgs/Vector3 {x}\n" for x in "abcd") + "float64[7] e\nfloat64[7] f\n"
+)
+_OTHERS = ("q_d", "dq_d", "ddq_d", "theta", "dtheta", "dtau_j")
+_ORDER = ("q", "q_d", "dq", "dq_d", "ddq_d", "theta", "dtheta", "tau_j", "dtau_j")
+_FIXED = "".join(f"float64[7] {x}\n" for x in _ORDER)
+DEFINITIONS = {
+    "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values\n",
+    "control_msgs/msg/DynamicJointState": (
+        "std_msgs/Header header\nstring[] joint_names\nInterfaceValue[] interface_values\n"
+    ),
+    "franka_msgs/msg/CollisionIndicators": f"{_COLLISION}float64[7] e\nfloat64[7] f\n",
+    "franka_msgs/msg/FrankaRobotState": _ROBOT_STATE,
+    "franka_msgs/msg/FrankaState": (
+        f"std_msgs/Header header\nfloat64[6] a\nfloat64[6] b\n{_FIXED}float64 time\n"
+    ),
+}
+_ROS1_STATE = """std_msgs/Header header
+float64[7] tau_J
+float64 time
+float64[7] dq
+float64[7] q
+"""
+
+
+def _store(kind, definitions):
+    store = get_typestore(kind)
+    for name, text in definitions.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+ROS1 = _store(Stores.ROS1_NOETIC, {"franka_msgs/msg/FrankaState": _ROS1_STATE})
+ROS2 = _store(Stores.ROS2_HUMBLE, DEFINITIONS)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Stamps (m,) ns and signals (m, n) of joints."""
+
+    stamp_ns: np.ndarray
+    q: np.ndarray
+    dq: np.ndarray
+    tau: np.ndarray
+
+    @classmethod
+    def of(cls, joints=3, samples=60, period_ns=10_000_000, seed=1):
+        rng = np.random.default_rng(seed)
+        t = np.arange(samples) * period_ns * 1e-9
+        speed, size = rng.uniform(1, 3, joints), rng.uniform(0.2, 0.8, joints)
+        q = size * np.sin(np.outer(t, speed))
+        dq = size * speed * np.cos(np.outer(t, speed))
+        tau = 9.0 * np.cos(q) + rng.normal(0, 0.05, q.shape)
+        return cls(10**18 + np.arange(samples) * period_ns, q, dq, tau)
+
+
+def _header(store, stamp_ns, seq):
+    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(int(stamp_ns), 10**9))
+    more = {"seq": seq} if store is ROS1 else {}
+    return store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="base", **more)
+
+
+def joint_state(store, header, names, q, dq, tau):
+    kind = store.types["sensor_msgs/msg/JointState"]
+    return kind(header=header, name=list(names), position=q, velocity=dq, effort=tau)
+
+
+def message(store, kind, names, motion, i):
+    """Sample i as a message of a type; what the type has beside it is made up."""
+    header = _header(store, motion.stamp_ns[i], i)
+    q, dq, tau = motion.q[i], motion.dq[i], motion.tau[i]
+    make, filler = store.types[kind], np.full(7, 0.1 * i)
+    if kind == "sensor_msgs/msg/JointState":
+        return joint_state(store, header, names, q, dq, tau)
+    if kind == "control_msgs/msg/DynamicJointState":
+        value = store.types["control_msgs/msg/InterfaceValue"]
+        order = ["effort", "temperature", "position", "velocity"]
+        rows = [
+            value(order, np.array([c, 40.0 + i, a, b])) for a, b, c in zip(q, dq, tau, strict=True)
+        ]
+        sensor = value(["force.x"], np.array([1.0 * i]))
+        return make(header, ["wrist_sensor", *names], [sensor, *rows])
+    if kind == "franka_msgs/msg/FrankaRobotState":
+        corner = store.types["geometry_msgs/msg/Vector3"](i, 0.0, 0.0)
+        flags = store.types["franka_msgs/msg/CollisionIndicators"](*[corner] * 4, filler, filler)
+        measured = joint_state(store, header, names, q, dq, tau)
+        desired = joint_state(store, header, names, q + 1, dq, tau)
+        return make(header, flags, measured, desired, filler, float(i))
+    if store is ROS1:
+        return make(header, tau, float(i), dq, q)
+    arrays = dict.fromkeys(_OTHERS, filler)
+    return make(header, filler[:6], filler[:6], q=q, dq=dq, tau_j=tau, time=1.0, **arrays)
+
+
+def write_ros1(path, topics, names=JOINTS, compression=None):
+    """A bag of ROS 1; topics: name -> (type, Motion)."""
+    writer = Ros1Writer(path)
+    if compression:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    with writer:
+        _fill(writer, ROS1, topics, names, ROS1.serialize_ros1)
+    return path
+
+
+def write_ros2(path, topics, names=JOINTS, storage=None, compression=None, version=9):
+    """A folder of rosbag2; topics as above; storage and compression of rosbags' writer."""
+    writer = Ros2Writer(path, version=version, **({"storage_plugin": storage} if storage else {}))
+    if compression:
+        writer.set_compression(compression, CompressionFormat.ZSTD)
+    with writer:
+        _fill(writer, ROS2, topics, names, ROS2.serialize_cdr)
+    return path
+
+
+def _fill(writer, store, topics, names, serialize):
+    for topic, (kind, motion) in topics.items():
+        connection = writer.add_connection(topic, kind, typestore=store)
+        for i, stamp_ns in enumerate(motion.stamp_ns):
+            raw = serialize(message(store, kind, names, motion, i), kind)
+            writer.write(connection, int(stamp_ns), raw)
