@@ -16,9 +16,7 @@ sensor_msgs/JointState desired_joint_state
 float64[7] ddq_d
 float64 time
 """
-_COLLISION = (
-    "".join(f"geometry_msgs/Vector3 {x}\n" for x in "abcd") + "float64[7] e\nfloat64[7] f\n"
-)
+_COLLISION = "".join(f"geometry_msgs/Vector3 {x}\n" for x in "abcd")
 _OTHERS = ("q_d", "dq_d", "ddq_d", "theta", "dtheta", "dtau_j")
 _ORDER = ("q", "q_d", "dq", "dq_d", "ddq_d", "theta", "dtheta", "tau_j", "dtau_j")
 _FIXED = "".join(f"float64[7] {x}\n" for x in _ORDER)
