@@ -30,7 +30,7 @@ from drivers.files.mcap import read_log
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = read_log(args.log, sensors=True)
+    log = read_log(args.log, topic=args.topic, sensors=True)
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_json, check_files
+from adapter.cli.options import add_json, add_topic, check_logs
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +23,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="MCAP recording with link motion: Imu topics, "
         "or /link_twists/<link> and /link_accels/<link>",
     )
+    add_topic(parser)
     add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
     add(
         "--base",
@@ -32,4 +33,4 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
     add_json(parser)
-    parser.set_defaults(check=lambda args: check_files(args.log))
+    parser.set_defaults(check=lambda args: check_logs(args.log))

@@ -10,6 +10,7 @@ from adapter.cli.options import (
     add_json,
     add_motion,
     check_files,
+    check_logs,
     check_robot,
     locks_of,
 )
@@ -76,7 +77,8 @@ def _check(args: argparse.Namespace) -> None:
     locks_of(args)
     if args.robot is not None:
         check_robot(args.robot)
-    check_files(args.config, args.gap, *args.logs)
+    check_files(args.config, args.gap)
+    args.logs = check_logs(*args.logs)
     numbers("--at", args.at)
     numbers("--noise", args.noise)
     for name, least in (("std", 0.0), ("longest", 1.0), ("rate", 1.0)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
 from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table
-from adapter.signals.recording import describe
+from adapter.signals.recording import describe, summary
 from drivers.files.mcap import recover
 
 
@@ -56,10 +57,20 @@ def run_recover(args: argparse.Namespace) -> int:
 
 def run_info(args: argparse.Namespace) -> int:
     """Carry `info` out."""
-    facts = _model_facts(args.file) if args.file.suffix == ".json" else describe(args.file)
+    if args.file.suffix == ".json":
+        facts = _model_facts(args.file)
+        lines = [f"{key}: {value}" for key, value in facts.items()]
+    else:
+        facts = describe(args.file, args.topic)
+        lines = summary(facts)
+        if args.robot is not None and facts["problem"] is None:
+            # What predicts brings torch, which the rest of this file can do without.
+            predict = import_module("adapter.cli.teachable").predict
+            facts["teachable"], more = predict(args)
+            lines += more
     write_json(args.json, facts)
-    for key, value in facts.items():
-        show(f"{key}: {value}")
+    for line in lines:
+        show(line)
     return 0
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_json, check_files, check_robot
+from adapter.cli.options import (
+    add_joints,
+    add_json,
+    add_topic,
+    check_files,
+    check_robot,
+    locks_of,
+)
 
 
 def declare_import(parser: argparse.ArgumentParser) -> None:
@@ -46,9 +53,24 @@ def declare_recover(parser: argparse.ArgumentParser) -> None:
 
 def declare_info(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
+    parser.description = (
+        "What is in a recording or a model file. With --robot also what the recording can teach "
+        "of that arm: which combinations of parameters, how sure, and what is missing."
+    )
     parser.add_argument("file", type=Path, metavar="FILE")
+    add_topic(parser)
+    parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
+    add_joints(parser)
     add_json(parser)
-    parser.set_defaults(check=_check_file)
+    parser.set_defaults(check=_check_info)
+
+
+def _check_info(args: argparse.Namespace) -> None:
+    locks_of(args)
+    if args.robot is not None:
+        check_robot(args.robot)
+    if not args.file.is_dir():
+        check_files(args.file)
 
 
 def _check_file(args: argparse.Namespace) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -36,11 +36,13 @@ from adapter.runs.terminal import (
     write_json,
 )
 from adapter.simulate import Rollouts
+from drivers.files.mcap import Log, read_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    settings = GapSettings(validate_from_s=args.validate_from, hold_out=tuple(args.hold_out))
+    logs, hold_out = _opened(args)
+    settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out)
     if args.inertia_prior is not None:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:
@@ -52,10 +54,10 @@ def run(args: argparse.Namespace) -> int:
     rollouts = None if args.no_simulation else Rollouts(args.simulator)
     try:
         with _progress(args.quiet) as tell:
-            result = find_gap(args.logs, nominal, settings, rollouts, model_out, tell)
+            result = find_gap(logs, nominal, settings, rollouts, model_out, tell)
     except RecordingRefused as refusal:
-        names, logs = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
-        nothing = GapResult.untold(names, nominal.name, logs, args.model, str(refusal))
+        names, called = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
+        nothing = GapResult.untold(names, nominal.name, called, args.model, str(refusal))
         _write(args, folder, nothing, {"refused": refusal.kind})
         complain(refusal)
         return ExitCode.WRONG_USE
@@ -65,6 +67,16 @@ def run(args: argparse.Namespace) -> int:
         result = replace(_without_empty_rollouts(result), notes=notes, simulator=args.simulator)
     _conclude(args, folder, result)
     return 0
+
+
+def _opened(
+    args: argparse.Namespace,
+) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
+    """The recordings and those held out; read here where a topic was named. Raises DriverError."""
+    if args.topic is None:
+        return args.logs, tuple(args.hold_out)
+    read = {path: read_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
+    return [read[path] for path in args.logs], tuple(read[path] for path in args.hold_out)
 
 
 def _new_model(folder: Path, model: str) -> Path:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_joints, add_results, check_files, check_robot, locks_of
+from adapter.cli.options import (
+    add_joints,
+    add_results,
+    add_topic,
+    check_logs,
+    check_robot,
+    locks_of,
+)
 from adapter.errors import UsageError
 
 
@@ -20,7 +27,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "signs, other units) cannot be used."
     )
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="LOG", help="MCAP recording")
+    add("logs", nargs="+", type=Path, metavar="LOG", help="recording, or a folder of such")
+    add_topic(parser)
     add(
         "--model",
         required=True,
@@ -63,8 +71,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
+    args.logs, args.hold_out = check_logs(*args.logs), check_logs(*args.hold_out)
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
     locks_of(args)
     check_robot(args.model)
-    check_files(*args.logs, *args.hold_out)

@@ -15,8 +15,8 @@ from drivers.files.mcap import read_log
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = read_log(args.log)
-    empty = None if args.empty is None else read_log(args.empty)
+    log = read_log(args.log, topic=args.topic)
+    empty = None if args.empty is None else read_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
     load = find_load(log, robot, empty, args.frame, args.inertia_prior)
     warn(list(load.notes))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_joints, add_json, check_files, check_robot, locks_of
+from adapter.cli.options import add_joints, add_json, add_topic, check_logs, check_robot, locks_of
 from adapter.errors import UsageError
 
 
@@ -17,7 +17,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "Without --empty the documented arm is the reference."
     )
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="MCAP recording with the load, moving or at rest")
+    add("log", type=Path, metavar="LOG", help="recording with the load, moving or at rest")
+    add_topic(parser)
     add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
     add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
     add_joints(parser)
@@ -39,4 +40,4 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--inertia-prior must be in (0, 1], got {args.inertia_prior}")
     if args.robot is not None:
         check_robot(args.robot)
-    check_files(args.log, args.empty)
+    check_logs(args.log, args.empty)

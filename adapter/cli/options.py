@@ -16,6 +16,8 @@ from adapter.model.robots import names as robot_names
 
 MODES = ("moments", "sample")  # of `adapter.learning.learner`
 NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
+RECORDINGS = (".mcap", ".db3", ".bag")
+PACKED = (".gz", ".zst", ".zstd")
 MODEL_FILES = (".urdf", ".xml", ".json")
 
 
@@ -122,6 +124,40 @@ def check_robot(name: str) -> None:
             "(.xml) or a .json model file"
         )
     check_files(Path(name))
+
+
+def add_topic(parser: argparse.ArgumentParser) -> None:
+    """Which topic of a bag tells the joints."""
+    parser.add_argument(
+        "--topic", metavar="NAME", help="of the joint states, where a bag has several"
+    )
+
+
+def check_logs(*paths: Path | None) -> list[Path]:
+    """Recordings, and of folders that are no rosbag2 the recordings in them, in order of names.
+
+    Raises:
+        UsageError: one cannot be read, or a folder has none.
+    """
+    found: list[Path] = []
+    for path in (path for path in paths if path is not None):
+        if path.is_dir() and not (path / "metadata.yaml").is_file():
+            inside = sorted(p for p in path.iterdir() if _is_recording(p))
+            if not inside:
+                raise UsageError(f"{path}: no recording in this folder ({', '.join(RECORDINGS)})")
+            found += inside
+        else:
+            found.append(path)
+    check_files(*(path for path in found if not path.is_dir()))
+    return found
+
+
+def _is_recording(path: Path) -> bool:
+    """Whether the name of a file, packed or not, or a folder's content is a recording's."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    plain = path.with_suffix("") if path.suffix in PACKED else path
+    return plain.suffix in RECORDINGS
 
 
 def check_files(*paths: Path | None) -> None:

@@ -42,7 +42,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     first, *more = args.logs
-    whole = read_log(first, frames=args.base is not None, imus=True)
+    whole = read_log(first, topic=args.topic, frames=args.base is not None, imus=True)
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -51,7 +51,8 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(args.truth, robot)
     log = _joined(args, whole, robot)
     if more:
-        log = one_after_other([log, *(matching(read_log(path), robot) for path in more)])
+        others = (read_log(path, topic=args.topic) for path in more)
+        log = one_after_other([log, *(matching(other, robot) for other in others)])
     imus: tuple[str, ...] = ()
     if args.base is None:
         log, imus = with_link_imus(log, robot, args.imu)
@@ -156,7 +157,8 @@ def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | Non
     if args.validate_from is not None:
         return log.take(seconds(log) >= args.validate_from)
     if args.validate is not None:
-        return _joined(args, read_log(args.validate, frames=args.base is not None), robot)
+        other = read_log(args.validate, topic=args.topic, frames=args.base is not None)
+        return _joined(args, other, robot)
     return None
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from adapter.cli.options import add_learning, check_files, check_learning
+from adapter.cli.options import add_learning, add_topic, check_learning, check_logs
 from adapter.errors import UsageError
 
 
@@ -21,8 +21,10 @@ def declare(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         type=Path,
         metavar="LOG",
-        help="MCAP recording, ours or not; several of one arm are learned from in order",
+        help="recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
+        "learned from in order",
     )
+    add_topic(parser)
     add_learning(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
     add(
@@ -59,7 +61,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
     alone = {"--base": args.base, "--imu": args.imu, "--validate-from": args.validate_from}
     given = [option for option, value in alone.items() if value]
+    args.logs = check_logs(*args.logs)
     if given and len(args.logs) > 1:
         raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
     check_learning(args)
-    check_files(*args.logs, args.validate)
+    check_logs(args.validate)

@@ -72,11 +72,14 @@ def load_model(
     return read_robot(name, joints, lock=lock)
 
 
-def read_log(path: str | Path, joint_names: Sequence[str] | None = None) -> Log:
-    """Read a recording (MCAP), whole or cut, by whatever recorder.
+def read_log(
+    path: str | Path, joint_names: Sequence[str] | None = None, topic: str | None = None
+) -> Log:
+    """Read a recording (MCAP, rosbag2, ROS 1), whole or cut, by whatever recorder.
 
     Args:
-        path: the file, with `sensor_msgs/msg/JointState` on `/joint_states`.
+        path: the file, or a folder of rosbag2.
+        topic: of the joint states: `/joint_states`, else the only one that fits, where None.
         joint_names: joints that must be there, in the order wanted; all where None.
 
     Returns:
@@ -90,7 +93,7 @@ def read_log(path: str | Path, joint_names: Sequence[str] | None = None) -> Log:
     >>> adapter.read_log("recordings/panda_nominal_6s.mcap")
     Log(panda_nominal_6s.mcap: 6001 samples of 7 joints, 6.0 s)
     """
-    return read_mcap(path, joint_names, sensors=False)
+    return read_mcap(path, joint_names, topic, sensors=False)
 
 
 def make_log(

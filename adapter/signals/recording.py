@@ -9,28 +9,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap import Log, read_log, survey
+from drivers.files.mcap import Log, derive_velocity, looks_like_degrees, read_log, survey
 from drivers.interface import DriverError
 
-GAP_S = 0.05  # a longer step between samples is called a gap
-_LISTED = 10  # gaps that are listed one by one
+GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
+_LISTED = 10  # gaps and topics that are listed one by one
+_FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
+_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
-def describe(path: str | Path) -> dict[str, Any]:
+def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]:
     """A recording's contents and health, ready for JSON.
 
     Of a file without usable joint states only its topics are told, and `problem` says what is
     missing. Keys: file, bytes, truncated, problem, topics, warnings; with joint states also
-    joints, links, frames (topics that tell the motion of others), samples, start_s, duration_s,
+    joints, source (topic or columns of the joint states), units, teaches, links, frames (topics
+    that tell the motion of others), samples, start_s, duration_s,
     rate_hz, period_ms, jitter_ms, repeated_samples, repeated_stamps, backward_steps, not_finite,
     gaps, range, metadata, attachments.
 
     Raises:
         DriverError: the file is unreadable, empty or not MCAP.
     """
-    path = Path(path)
+    path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
     try:
-        log = read_log(path, frames=True)
+        log = log or read_log(path, topic=topic, frames=True)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
@@ -39,7 +42,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         facts = {"problem": None, **_joint_facts(log), **_timing(log)}
     return {
         "file": str(path),
-        "bytes": path.stat().st_size,
+        "bytes": sum(p.stat().st_size for p in (path, *path.rglob("*")) if p.is_file()),
         "truncated": truncated,
         "topics": {name: asdict(topic) for name, topic in topics.items()},
         "warnings": warnings,
@@ -47,11 +50,94 @@ def describe(path: str | Path) -> dict[str, Any]:
     }
 
 
+def summary(facts: dict[str, Any]) -> list[str]:
+    """The facts of `describe` in about ten lines."""
+    topics = facts["topics"]
+    lines = [f"{facts['file']}: {facts['bytes']} bytes{', cut' if facts['truncated'] else ''}"]
+    if facts["problem"] is not None:
+        lines.append(f"problem: {facts['problem']}")
+    else:
+        lines += _signal_lines(facts)
+    if topics:
+        told = [f"{k} ({t['schema'] or t['encoding']}, {t['messages']})" for k, t in topics.items()]
+        more = f" and {len(told) - _LISTED} more" if len(told) > _LISTED else ""
+        lines.append(f"topics: {', '.join(told[:_LISTED])}{more}")
+    return lines + [f"note: {warning}" for warning in facts["warnings"]]
+
+
+def _signal_lines(facts: dict[str, Any]) -> list[str]:
+    gaps, period, rate = facts["gaps"], facts["period_ms"], facts["rate_hz"]
+    count = len(facts["joints"])
+    steps = (
+        ""
+        if period is None
+        else (
+            f", steps {period['p50']:.3g} ms (longest 1 %: {period['p99']:.3g}, longest "
+            f"{period['max']:.3g})"
+        )
+    )
+    others = [f"{facts['commands']} commanded torques"] if facts["commands"] else []
+    others += [f"motion of {name}" for name in (*facts["links"], *facts["frames"])]
+    return [
+        f"joints: {count}, {', '.join(facts['joints'])}",
+        f"joint states: {facts['source']}; also: {', '.join(others) or 'nothing else'}",
+        f"rate: {'unknown' if rate is None else f'{rate:.4g} Hz'}, {facts['samples']} samples, "
+        f"{facts['duration_s']:.4g} s{steps}",
+        f"holes: {gaps['count']} (longer than {gaps['longer_than_s']:.3g} s), longest step "
+        f"{gaps['longest_s']:.3g} s",
+        f"repeats: {facts['repeated_samples']} samples, {facts['repeated_stamps']} stamps; "
+        f"{facts['backward_steps']} steps back in time; {facts['not_finite']} not a number",
+        *(_range_line(*item) for item in facts["range"].items()),
+        f"units: {facts['units']}",
+        f"can teach: {facts['teaches']}",
+    ]
+
+
+def _range_line(name: str, found: dict[str, list[float]]) -> str:
+    pairs = zip(found["min"], found["max"], strict=True)
+    return f"{name}: " + "  ".join(f"{low:.3g}..{high:.3g}" for low, high in pairs)
+
+
+def _units(log: Log) -> str:
+    """What the numbers look like; a joint's torque has no size that all arms share."""
+    said = ["positions look like degrees" if looks_like_degrees(log.q) else "positions rad"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = np.abs(derive_velocity(log.stamp_ns, log.q))
+        fast = slope > _FAST
+        ratio = float(np.median((np.abs(log.dq) / slope)[fast])) if fast.any() else np.nan
+    if not np.isfinite(ratio):
+        said.append("velocities cannot be judged")
+    elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
+        said.append("velocities rad/s")
+    else:
+        said.append(f"velocities {ratio:.3g} times the slope of the positions")
+    most = np.nanmax(np.abs(log.tau), initial=0.0)
+    return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m"])
+
+
+def _teaches(log: Log) -> str:
+    with np.errstate(invalid="ignore"):
+        moving = np.asarray(np.abs(log.dq) > _REST)
+    resting = [n for j, n in enumerate(log.joint_names) if not moving[:, j].any()]
+    seconds = float(moving.any(axis=1).mean()) * float(np.ptp(log.stamp_ns)) * 1e-9
+    said = [f"{seconds:.3g} s of motion"]
+    if resting:
+        said.append(f"at rest: {', '.join(resting)}")
+    if not np.any(np.nan_to_num(log.tau)):
+        said.append("no torques: nothing of inertias and friction")
+    if log.twists is None and not log.frames:
+        said.append("no link motion is recorded: it is synthesized from the documented lengths")
+    return "; ".join([*said, "--robot NAME|FILE predicts the parameters"])
+
+
 def _joint_facts(log: Log) -> dict[str, Any]:
     signals = {"q_rad": log.q, "dq_rad_s": log.dq, "tau_nm": log.tau}
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
         "joints": list(log.joint_names),
+        "source": log.topic,
+        "units": _units(log),
+        "teaches": _teaches(log),
         "links": list(log.link_names),
         "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],
         "samples": len(log),
@@ -99,12 +185,19 @@ def _timing(log: Log) -> dict[str, Any]:
 
 def _gaps(stamps: NDArray[np.int64]) -> dict[str, Any]:
     steps_s = np.diff(stamps) * 1e-9
-    places = np.flatnonzero(steps_s >= GAP_S)
+    forward = steps_s[steps_s > 0]
+    hole_s = max(GAP_S, _HOLE * float(np.median(forward))) if forward.size else GAP_S
+    places = np.flatnonzero(steps_s >= hole_s)
     listed = [
         {"after_s": float(stamps[i] - stamps[0]) * 1e-9, "length_s": float(steps_s[i])}
         for i in places[:_LISTED]
     ]
-    return {"count": int(places.size), "longest_s": float(steps_s.max(initial=0)), "first": listed}
+    return {
+        "longer_than_s": hole_s,
+        "count": int(places.size),
+        "longest_s": float(steps_s.max(initial=0)),
+        "first": listed,
+    }
 
 
 def _listed(values: NDArray[np.float64]) -> list[float]:

@@ -1,0 +1,53 @@
+"""What `adapter info LOG --robot R` predicts."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from adapter.cli.common import robot_of
+from adapter.control.teachable import teachable
+from adapter.signals.matching import matching, present
+from drivers.files.mcap import read_log
+
+
+def predict(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """What the recording teaches of a robot: figures and lines."""
+    log = read_log(args.file, topic=args.topic)
+    robot = robot_of(args, args.robot)
+    robot, locked = present(robot, log.joint_names, log.path)
+    log = matching(log, robot)
+    told = teachable(log, robot)
+    expected = told.expected
+    figures = {
+        "rank": told.rank,
+        "full_rank": told.full_rank,
+        "torque_std_nm": told.torque_std.tolist(),
+        "missing": list(told.missing),
+        "parameters": {
+            name: {"std": float(std), "unit": unit, "shown": bool(shown)}
+            for name, unit, std, shown in zip(
+                expected.names, expected.units, expected.std, expected.shown, strict=True
+            )
+        },
+    }
+    noise = "  ".join(f"{std:.2g}" for std in told.torque_std)
+    lines = [
+        f"{robot.name}: tells {told.rank} of the {told.full_rank} combinations of parameters that "
+        "torques depend on",
+        f"torque that no parameters explain, N m: {noise}",
+        *(f"missing: {sentence}" for sentence in told.missing),
+        *_by_part(figures["parameters"]),
+    ]
+    return figures, [*locked, *lines]
+
+
+def _by_part(parameters: dict[str, Any]) -> list[str]:
+    """A line for each link and joint: standard deviation of what is shown of it."""
+    parts: dict[str, list[str]] = {}
+    for name, value in parameters.items():
+        part, _, what = name.partition(" ")
+        said = parts.setdefault(part, [])
+        if value["shown"]:
+            said.append(f"{what} ±{value['std']:.2g} {value['unit']}")
+    return [f"{part}: {', '.join(said) or 'nothing shown'}" for part, said in parts.items()]
