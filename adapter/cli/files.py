@@ -11,9 +11,11 @@ from adapter.effects.active import check_effects
 from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
 from adapter.runs.terminal import show, warn, write_json
-from adapter.signals.importer import ImportSpec, import_table
+from adapter.signals.importer import ImportSpec, import_table, table_log
 from adapter.signals.recording import describe, summary
-from drivers.files.mcap import recover
+from drivers.files.mcap import Log, recover
+
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
 
 
 def run_import(args: argparse.Namespace) -> int:
@@ -29,6 +31,7 @@ def run_import(args: argparse.Namespace) -> int:
         flat=args.flat,
         period_s=args.period,
         overwrite=args.overwrite,
+        episode=args.episode,
     )
     report = import_table(spec, args.to)
     warn(list(report.warnings))
@@ -61,17 +64,28 @@ def run_info(args: argparse.Namespace) -> int:
         facts = _model_facts(args.file)
         lines = [f"{key}: {value}" for key, value in facts.items()]
     else:
-        facts = describe(args.file, args.topic)
+        log = opened(args)
+        facts = describe(args.file if log is None else log, args.topic)
         lines = summary(facts)
         if args.robot is not None and facts["problem"] is None:
             # What predicts brings torch, which the rest of this file can do without.
             predict = import_module("adapter.cli.teachable").predict
-            facts["teachable"], more = predict(args)
+            facts["teachable"], more = predict(args, log)
             lines += more
     write_json(args.json, facts)
     for line in lines:
         show(line)
     return 0
+
+
+def opened(args: argparse.Namespace) -> Log | None:
+    """A table as a recording; None of what is no table. Raises DriverError."""
+    path = args.file
+    table = path.with_suffix("") if path.suffix == ".gz" else path
+    if table.suffix not in TABLES and not (path / "meta" / "info.json").is_file():
+        return None
+    more = {"period_s": args.period, "episode": args.episode}
+    return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
 
 
 def _model_facts(path: Path) -> dict[str, Any]:

@@ -18,21 +18,29 @@ from adapter.cli.options import (
 def declare_import(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
-        "Turn CSV, whitespace tables or .npz into an MCAP recording. Sources are one FILE, or "
-        "SIGNAL=FILE for each of time, q, dq, tau."
+        "Turn tables (CSV, white space, either packed by gzip, .npz, .parquet, or the folder of a "
+        "LeRobot data set) into an MCAP recording. Sources are one FILE, or SIGNAL=FILE for each "
+        "of time, q, dq, tau."
     )
     add = parser.add_argument
     add("sources", nargs="+", metavar="[SIGNAL=]FILE")
     add("--to", type=Path, required=True, metavar="FILE", help="recording to write")
-    add("--columns", default="", metavar="MAP", help="as in time=0,q=1:8,dq=8:15,tau=tau_*")
-    add("--units", default="", metavar="MAP", help="as in q=deg,tau=mNm,time=ms")
+    _add_tables(parser)
     add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
     add("--joints", default="", metavar="LIST", help="joint names, commas between")
     add("--flat", action="store_true", help="one value per line")
-    add("--period", type=float, metavar="S", help="where there is no time")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add_json(parser)
     parser.set_defaults(check=_check_import)
+
+
+def _add_tables(parser: argparse.ArgumentParser) -> None:
+    """Where tables have which signal."""
+    add = parser.add_argument
+    add("--columns", default="", metavar="MAP", help="as in time=0,q=1:8,dq=8:15,tau=tau_*")
+    add("--units", default="", metavar="MAP", help="as in q=deg,tau=mNm,time=ms")
+    add("--period", type=float, metavar="S", help="where there is no time")
+    add("--episode", type=int, metavar="N", help="of a LeRobot data set with several")
 
 
 def _check_import(args: argparse.Namespace) -> None:
@@ -59,6 +67,7 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("file", type=Path, metavar="FILE")
     add_topic(parser)
+    _add_tables(parser)
     parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
     add_joints(parser)
     add_json(parser)

@@ -8,12 +8,12 @@ from typing import Any
 from adapter.cli.common import robot_of
 from adapter.control.teachable import teachable
 from adapter.signals.matching import matching, present
-from drivers.files.mcap import read_log
+from drivers.files.mcap import Log, read_log
 
 
-def predict(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str, Any], list[str]]:
     """What the recording teaches of a robot: figures and lines."""
-    log = read_log(args.file, topic=args.topic)
+    log = log or read_log(args.file, topic=args.topic)
     robot = robot_of(args, args.robot)
     robot, locked = present(robot, log.joint_names, log.path)
     log = matching(log, robot)

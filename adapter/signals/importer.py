@@ -1,8 +1,8 @@
 """Tables of joint signals from other tools, turned into a recording.
 
 A specification says which file, column and unit holds which signal; tables are number files as
-other tools write them (CSV, whitespace, one value a line, npz); the recording holds what they say,
-and the report what looks doubtful in it.
+other tools write them (CSV, whitespace, one value a line, npz, Parquet, LeRobot); the recording
+holds what they say, and the report what looks doubtful in it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.metadata
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.model_file import whole_file
-from adapter.signals.source_table import SourceTable, read_npz, read_table
-from drivers.files.mcap import McapWriter, derive_velocity, looks_like_degrees
+from adapter.signals.source_table import (
+    SourceTable,
+    lerobot_joints,
+    read_npz,
+    read_parquet,
+    read_table,
+)
+from drivers.files.mcap import Log, McapWriter, derive_velocity, looks_like_degrees
 from drivers.interface import Array, DriverError
 
 SIGNALS = ("time", "q", "dq", "tau")
@@ -32,10 +38,18 @@ UNITS: dict[str, dict[str, float]] = {
 ALL = ""  # the source of every signal that has none of its own
 _USUAL = {  # what signals are called where the user doesn't say
     "time": ("time", "times", "t", "stamp", "timestamp"),
-    "q": ("q", "positions", "position", "q[0-9]*", "q_*", "position*"),
-    "dq": ("dq", "velocities", "velocity", "dq[0-9]*", "dq_*", "velocity*"),
-    "tau": ("tau", "torques", "efforts", "effort", "tau[0-9]*", "tau_*", "torque*", "effort*"),
+    "q": ("q", "positions", "position", "q[0-9]*", "q_*", "position*", "observation.state"),
+    "dq": (
+        *("dq", "velocities", "velocity", "dq[0-9]*", "dq_*", "velocity*"),
+        "observation.velocity",
+    ),
+    "tau": (
+        *("tau", "torques", "efforts", "effort", "tau[0-9]*", "tau_*", "torque*", "effort*"),
+        *("observation.effort", "observation.torque"),
+    ),
 }
+_MOST = {"time": 9e9, "q": 1e4, "dq": 1e6, "tau": 1e6}  # SI; beyond, it is another quantity
+_WHAT = {"time": "time", "q": "angle", "dq": "velocity", "tau": "torque"}
 _STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
 _MOVING = 1e-2  # rad/s, a median slope below it says nothing
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
@@ -47,7 +61,7 @@ class ImportSpec:
 
     Attributes:
         sources: a file for each signal (time, q, dq, tau), "" for those without their own. Text
-            tables or .npz.
+            tables (packed by gzip or not), .npz, .parquet, or the folder of a LeRobot data set.
         columns: selectors of each signal in its file (`SourceTable.columns`), or the key
             in an .npz. Where absent: the usual names, or the whole of a signal's own file.
         units: time s, ms, us, ns; q rad, deg; dq rad, deg (per second; that of q where absent);
@@ -56,6 +70,7 @@ class ImportSpec:
         flat: files have one value a line, sample after sample (found out where time is a file).
         period_s: of the samples, where there is no time.
         overwrite: replace an existing recording.
+        episode: of a data set with several.
     """
 
     sources: Mapping[str, Path]
@@ -65,6 +80,7 @@ class ImportSpec:
     flat: bool = False
     period_s: float | None = None
     overwrite: bool = False
+    episode: int | None = None
 
     @classmethod
     def from_options(
@@ -134,25 +150,35 @@ def import_table(spec: ImportSpec, out: Path) -> ImportReport:
         DriverError: a file, column, signal or unit is missing or unreadable; the sentence names
             file, line or column, and the choices.
     """
+    log = table_log(spec)
+    if out.exists() and not spec.overwrite:
+        raise DriverError(f"{out}: exists; choose another name or delete it")
+    _write(spec, out, log.joint_names, (log.stamp_ns, log.q, log.dq, log.tau))
+    duration_s = float(np.ptp(log.stamp_ns)) * 1e-9
+    rate_hz = (len(log) - 1) / duration_s if duration_s > 0 else 0.0
+    return ImportReport(out, len(log), log.joint_names, duration_s, rate_hz, log.warnings)
+
+
+def table_log(spec: ImportSpec) -> Log:
+    """What tables say, as a recording in memory. Raises DriverError like `import_table`."""
     warnings: list[str] = []
     reader = _Reader(spec)
+    source = reader.source("q")
+    if not spec.joint_names and source is not None:
+        spec = replace(spec, joint_names=lerobot_joints(source))
     stamp_ns, q, dq, tau = _signals(reader, spec)
     names = spec.joint_names or tuple(f"joint{i + 1}" for i in range(q.shape[1]))
+    where = str(source)
     if not spec.joint_names:
-        warnings.append(f"{out}: no joint names given; they are called {names[0]} to {names[-1]}")
-    where = str(reader.source("q"))
+        warnings.append(f"{where}: no joint names given; they are called {names[0]} to {names[-1]}")
     if dq is None:
         dq = derive_velocity(stamp_ns, q)
         warnings.append(f"{where}: no velocities; derived from the positions")
     else:
         warnings += _velocity_doubts(where, stamp_ns, q, dq)
     warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
-    if out.exists() and not spec.overwrite:
-        raise DriverError(f"{out}: exists; choose another name or delete it")
-    _write(spec, out, names, (stamp_ns, q, dq, tau))
-    duration_s = float(np.ptp(stamp_ns)) * 1e-9
-    rate_hz = (len(q) - 1) / duration_s if duration_s > 0 else 0.0
-    return ImportReport(out, len(q), names, duration_s, rate_hz, warnings)
+    columns = reader.taken
+    return Log(Path(where), names, stamp_ns, q, dq, tau, warnings=warnings, topic=columns)
 
 
 def _write(
@@ -203,7 +229,27 @@ class _Reader:
         if path is None:
             return None
         values = self._npz(path, signal) if path.suffix == ".npz" else self._text(path, signal)
-        return None if values is None else values * factor
+        if values is None:
+            return None
+        with np.errstate(over="ignore"):
+            values = values * factor
+        wild = np.argwhere(np.abs(values) > _MOST[signal])
+        if len(wild):
+            row, column = wild[0].tolist()
+            table = self._tables.get(path)
+            place = f"row {row}" if table is None else table.place(row)
+            raise DriverError(
+                f"{path}: {place}: {values[row, column]:.4g} is no {_WHAT[signal]} (at most "
+                f"{_MOST[signal]:g} in SI units); are column and unit of {signal} right?"
+            )
+        return values
+
+    @property
+    def taken(self) -> str:
+        """Which columns were taken for which signal."""
+        chosen = self._spec.columns
+        said = [f"{s}={','.join(chosen[s])}" for s in SIGNALS if s in chosen]
+        return f"columns {' '.join(said)}" if said else "columns with the usual names"
 
     def need(self, signal: str) -> Array:
         """Like `read`. Raises DriverError where the signal isn't there."""
@@ -231,7 +277,10 @@ class _Reader:
 
     def _text(self, path: Path, signal: str) -> Array | None:
         if path not in self._tables:
-            self._tables[path] = read_table(path)
+            packed = path.suffix == ".parquet" or path.is_dir()
+            self._tables[path] = (
+                read_parquet(path, self._spec.episode) if packed else read_table(path)
+            )
         table = self._tables[path]
         if signal in self._spec.columns:
             return table.columns(self._spec.columns[signal], signal)

@@ -1,30 +1,48 @@
-"""Number files as other tools write them: CSV, white space, one value a line, npz."""
+"""Number files as other tools write them: CSV, white space, one value a line, npz, Parquet.
+
+Texts may be packed by gzip. A data set of LeRobot is a folder: `meta/info.json` names its joints,
+`data/` holds Parquet files in which a column of lists is a signal.
+"""
 
 from __future__ import annotations
 
 import csv
 import fnmatch
+import gzip
+import importlib
 import re
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from drivers.files.bounded import read_arrays
+from drivers.files.bounded import ARRAYS_LIMIT, parse_json, read_arrays, read_text
 from drivers.interface import Array, DriverError
 
+_SEPARATORS = (";", "\t", "|", ",")
+_GZIP = b"\x1f\x8b"
 _INDEX = re.compile(r"\d+")
 _RANGE = re.compile(r"(\d*):(\d*)")
 
 
 @dataclass(frozen=True, slots=True)
 class SourceTable:
-    """Columns (m, k) of one file and their names, () where the file has no header."""
+    """Columns (m, k) of one file and their names, () where the file has no header.
+
+    `lines` has the line of each row, () where the file has none.
+    """
 
     path: Path
     names: tuple[str, ...]
     values: Array
+    lines: tuple[int, ...] = ()
+
+    def place(self, row: int) -> str:
+        """Where a row stands in the file."""
+        return f"line {self.lines[row]}" if self.lines else f"row {row}"
 
     def columns(self, selectors: Sequence[str], what: str) -> Array:
         """The columns that selectors name, in their order.
@@ -56,6 +74,9 @@ class SourceTable:
     def _named(self, selector: str, what: str) -> list[int]:
         places = [i for i, name in enumerate(self.names) if name == selector]
         places = places or [
+            i for i, name in enumerate(self.names) if name.startswith(f"{selector}[")
+        ]
+        places = places or [
             i for i, name in enumerate(self.names) if fnmatch.fnmatchcase(name, selector)
         ]
         if not places:
@@ -68,7 +89,10 @@ class SourceTable:
 
     def has(self, selector: str) -> bool:
         """Whether a name or pattern finds a column."""
-        return any(fnmatch.fnmatchcase(name, selector) for name in self.names)
+        return any(
+            fnmatch.fnmatchcase(name, selector) or name.startswith(f"{selector}[")
+            for name in self.names
+        )
 
     def _having(self) -> str:
         return f"; named {', '.join(self.names)}" if self.names else ""
@@ -77,9 +101,10 @@ class SourceTable:
 def read_table(path: Path) -> SourceTable:
     """A text table; separator and header are found out, `#` lines are comments.
 
-    The separator is `;` (then with decimal commas, if there are commas), `,` or white space. A
-    first line with anything but numbers is the header; a comment right before the numbers is, if
-    it has as many words as they have columns.
+    The separator is `;`, a tab, `|`, `,` or white space: the first that leaves numbers in the
+    second line. Commas that separate nothing are decimal. A first line with anything but numbers
+    is the header; a comment right before the numbers is, if it has as many words as they have
+    columns.
 
     Raises:
         DriverError: unreadable or empty, or a line has another number of values or no number;
@@ -90,7 +115,7 @@ def read_table(path: Path) -> SourceTable:
     lines = [(number, text) for number, text in lines if not text.startswith("#")]
     if not lines:
         raise DriverError(f"{path}: holds no numbers")
-    separator = next((s for s in (";", ",") if s in lines[0][1]), None)
+    separator = _separator(lines[min(1, len(lines) - 1)][1], lines[0][1])
     names: list[str] = []
     words = _split(lines[0][1], separator)
     if not all(map(_is_number, _decimal_points(words, separator))):
@@ -100,10 +125,10 @@ def read_table(path: Path) -> SourceTable:
     if not lines:
         raise DriverError(f"{path}: holds a header ({', '.join(names)}) and no numbers")
     texts = [text for _, text in lines]
-    if separator == ";":
+    if separator != ",":
         texts = [text.replace(",", ".") for text in texts]
     try:
-        values = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None)
+        values = np.loadtxt(texts, delimiter=separator, ndmin=2, comments=None, quotechar='"')
     except ValueError as error:
         raise DriverError(_blame(path, lines, separator, names)) from error
     if names and len(names) != values.shape[1]:
@@ -111,7 +136,96 @@ def read_table(path: Path) -> SourceTable:
             f"{path}: the header names {len(names)} columns, line {lines[0][0]} has "
             f"{values.shape[1]} values"
         )
-    return SourceTable(path, tuple(names), values)
+    return SourceTable(path, tuple(names), values, tuple(number for number, _ in lines))
+
+
+def _separator(data: str, first: str) -> str | None:
+    """What separates the numbers of a line of data; where none does, those of the first line."""
+    for separator in (*_SEPARATORS, None):
+        words = _split(data, separator) if separator is None or separator in data else []
+        if words and all(map(_is_number, _decimal_points(words, separator))):
+            return separator
+    return next((s for s in _SEPARATORS if s in first), None)
+
+
+def read_parquet(path: Path, episode: int | None = None) -> SourceTable:
+    """The number columns of a Parquet file, or of one episode of a LeRobot data set (a folder).
+
+    A column of lists of k numbers becomes k columns, `name[0]` to `name[k - 1]`.
+
+    Raises:
+        DriverError: unreadable, no numbers, or several episodes and none chosen; says what it has.
+    """
+    try:
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ImportError as error:
+        raise DriverError(
+            f"{path}: Parquet is read with pyarrow; pip install 'panda-adapter[tables]'"
+        ) from error
+    files = sorted((path / "data").rglob("*.parquet")) if path.is_dir() else [path]
+    if not files:
+        raise DriverError(f"{path}: has no Parquet file in data/; is it a LeRobot data set?")
+    if episode is not None and path.is_dir():
+        files = [f for f in files if f.stem == f"episode_{episode:06d}"] or files
+    parts = []
+    for file in files:
+        try:
+            parts.append(_columns(parquet.ParquetFile(file), file))
+        except (OSError, ValueError, MemoryError) as error:  # pyarrow's own are ValueErrors
+            raise DriverError(f"{file}: cannot be read as Parquet: {error}") from error
+    if any(part.keys() != parts[0].keys() for part in parts):
+        raise DriverError(f"{path}: its files have different columns")
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if not whole or not len(next(iter(whole.values()))):
+        raise DriverError(f"{path}: holds no numbers")
+    rows = _of_episode(path, whole, episode)
+    return SourceTable(path, tuple(whole), np.column_stack([x[rows] for x in whole.values()]))
+
+
+def _columns(file: Any, path: Path) -> dict[str, Array]:
+    """Numbers and lists of numbers, all of one length."""
+    size = sum(file.metadata.row_group(i).total_byte_size for i in range(file.num_row_groups))
+    if size > ARRAYS_LIMIT:
+        raise DriverError(f"{path}: makes {size} bytes; at most {ARRAYS_LIMIT} are read")
+    found: dict[str, Array] = {}
+    for name, column in zip(file.schema_arrow.names, file.read().columns, strict=True):
+        values = np.asarray(column.to_numpy())
+        if values.dtype.kind == "O" and len(values) and isinstance(values[0], np.ndarray):
+            lengths = {np.shape(x) for x in values}
+            if len(lengths) == 1 and len(values[0].shape) == 1 and values[0].dtype.kind in "fiu":
+                table = np.stack(list(values)).astype(np.float64)
+                found |= {f"{name}[{k}]": table[:, k] for k in range(table.shape[1])}
+        elif values.dtype.kind in "fiu":
+            found[name] = values.astype(np.float64)
+    return found
+
+
+def _of_episode(path: Path, columns: dict[str, Array], episode: int | None) -> Any:
+    told = columns.get("episode_index")
+    if told is None:
+        return slice(None)
+    have = np.unique(told).astype(int).tolist()
+    if episode is None and len(have) > 1:
+        raise DriverError(
+            f"{path}: has {len(have)} episodes, {have[0]} to {have[-1]}; choose one (--episode N)"
+        )
+    if episode is not None and episode not in have:
+        raise DriverError(f"{path}: has no episode {episode}; have {have[0]} to {have[-1]}")
+    return slice(None) if episode is None else told == episode
+
+
+def lerobot_joints(path: Path) -> tuple[str, ...]:
+    """Names of the joints that a LeRobot data set tells, () where it tells none."""
+    info = path / "meta" / "info.json"
+    if not info.is_file():
+        return ()
+    try:
+        names = parse_json(read_text(info))["features"]["observation.state"]["names"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DriverError(f"{info}: does not describe observation.state: {error}") from error
+    names = names.get("motors", ()) if isinstance(names, dict) else names
+    whole = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    return tuple(names) if whole else ()
 
 
 def read_npz(path: Path) -> dict[str, Array]:
@@ -126,9 +240,17 @@ def read_npz(path: Path) -> dict[str, Array]:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Line numbers from 1 and stripped lines, without empty ones."""
     try:
-        content = path.read_text("utf-8-sig")
-    except OSError as error:
-        raise DriverError(f"{path}: cannot be read: {error.strerror}") from error
+        with path.open("rb") as file:
+            packed = file.read(len(_GZIP)) == _GZIP
+            file.seek(0)
+            source = gzip.GzipFile(fileobj=file) if packed else file
+            raw = source.read(ARRAYS_LIMIT + 1)
+        if len(raw) > ARRAYS_LIMIT:
+            raise DriverError(f"{path}: makes more than {ARRAYS_LIMIT >> 20} MiB of text")
+        content = raw.decode("utf-8-sig")
+    except (OSError, EOFError, zlib.error) as error:
+        said = getattr(error, "strerror", None) or error
+        raise DriverError(f"{path}: cannot be read: {said}") from error
     except UnicodeDecodeError as error:
         raise DriverError(f"{path}: is neither text nor .npz") from error
     stripped = ((i, line.strip()) for i, line in enumerate(content.splitlines(), 1))
@@ -138,11 +260,14 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 def _split(line: str, separator: str | None) -> list[str]:
     if separator is None:
         return line.split()
-    return [word.strip() for word in next(csv.reader([line], delimiter=separator))]
+    try:
+        return [word.strip() for word in next(csv.reader([line], delimiter=separator))]
+    except csv.Error:  # a field longer than any number
+        return [line]
 
 
 def _decimal_points(words: list[str], separator: str | None) -> list[str]:
-    return [w.replace(",", ".") for w in words] if separator == ";" else words
+    return words if separator == "," else [w.replace(",", ".") for w in words]
 
 
 def _is_number(word: str) -> bool:
