@@ -1,6 +1,7 @@
 """Bags of ROS 1 and rosbag2, written by `rosbags`, read like our own recordings."""
 
 import gzip
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ KINDS = (
     "franka_msgs/msg/FrankaRobotState",
     "franka_msgs/msg/FrankaState",
 )
+BAGS = Path(__file__).parents[2].parent / "shared" / "data" / "unisa_bags"
 SEVEN = tuple(f"arm_joint{i + 1}" for i in range(7))
 
 
@@ -105,6 +107,41 @@ def test_cut_bags_are_named(tmp_path, kind, keep):
     path.write_bytes(whole.read_bytes()[:keep])
     with pytest.raises(DriverError, match=rf"cut\.{kind}: "):
         read_log(path)
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+def test_any_damage_ends_in_samples_or_a_sentence(tmp_path, kind):
+    topics = {"/joint_states": (KINDS[1] if kind == "db3" else JOINT_STATE, Motion.of())}
+    if kind == "bag":
+        whole = write_ros1(tmp_path / "whole.bag", topics).read_bytes()
+    else:
+        whole = next(write_ros2(tmp_path / "bag", topics).glob("*.db3")).read_bytes()
+    rng, path, read = np.random.default_rng(7), tmp_path / f"x.{kind}", 0
+    for _ in range(40):
+        data = bytearray(whole)
+        for place in rng.integers(0, len(data), rng.integers(1, 12)):
+            data[place] = rng.integers(256)
+        path.write_bytes(data)
+        try:
+            read += len(read_log(path)) > 0
+        except DriverError as error:
+            assert f"x.{kind}: " in str(error)
+    assert read > 0
+
+
+def test_what_sqlite_has_not_written_in_is_said(tmp_path):
+    folder = write_ros2(tmp_path / "bag", {"/joint_states": (JOINT_STATE, Motion.of())})
+    path = next(folder.glob("*.db3"))
+    path.with_name(f"{path.name}-wal").write_bytes(b"")
+    assert "-wal is not read" in read_log(path).warnings[0]
+
+
+@pytest.mark.skipif(not BAGS.exists(), reason="../shared, which users do not have")
+@pytest.mark.parametrize(("name", "joints", "samples"), [("panda", 7, 727), ("ur10", 6, 3441)])
+def test_bags_of_real_arms(name, joints, samples):
+    log = read_log(BAGS / f"{name}_exciting_trajectory.db3")
+    assert (len(log), len(log.joint_names)) == (samples, joints)
+    assert np.isfinite(log.tau).all()
 
 
 def test_a_bomb_is_not_unpacked(tmp_path, monkeypatch):

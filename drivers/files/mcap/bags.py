@@ -1,7 +1,7 @@
 """Bags of ROS 1 and rosbag2, by the library `rosbags`, told like the records of an MCAP file.
 
 A file is known by its first bytes, not by its name. What lies in a compressed file is unpacked
-beside it in memory's temporary folder, at most `GROWTH_LIMIT` times its size. Messages of ROS 1
+into a temporary folder, at most `GROWTH_LIMIT` times its size. Messages of ROS 1
 become CDR; a FrankaState of ROS 1, whose fields differ between versions, becomes a JointState by
 the definition that its bag carries.
 """
@@ -88,9 +88,18 @@ def _described(path: Path) -> str:
 
 def _unpacked(path: Path, head: bytes) -> Scan:
     """What lies in a compressed file; errors and warnings name the file itself."""
-    unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
     folder = tempfile.TemporaryDirectory()
-    whole = Path(folder.name) / "unpacked"
+    try:
+        scan = _scan_unpacked(path, head, Path(folder.name) / "unpacked")
+    except BaseException:
+        folder.cleanup()
+        raise
+    weakref.finalize(scan, folder.cleanup)
+    return scan
+
+
+def _scan_unpacked(path: Path, head: bytes, whole: Path) -> Scan:
+    unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
     left = GROWTH_LIMIT * path.stat().st_size + CHUNK_LIMIT
     with path.open("rb") as packed, whole.open("wb") as out:
         try:
@@ -107,7 +116,6 @@ def _unpacked(path: Path, head: bytes) -> Scan:
     except DriverError as error:
         raise DriverError(str(error).replace(str(whole), str(path))) from error
     scan.path = path
-    weakref.finalize(scan, folder.cleanup)
     return scan
 
 
@@ -117,33 +125,40 @@ class BagScan(Scan):
     def __init__(self, path: Path, kind: str) -> None:
         """Args: path: of the bag; kind: ".db3", ".bag", or "" for a folder of rosbag2."""
         super().__init__(path)
-        self._folder = tempfile.TemporaryDirectory()
-        # Under a plain name: in that of the user `?` and `#` would be read as parts of an address.
-        self._link = Path(self._folder.name) / f"bag{kind}"
-        self._link.symlink_to(path.resolve())
+        self._whole, self._kind = path.resolve(), kind
         self._one = kind == ".bag"
+        if kind and path.with_name(f"{path.name}-wal").exists():
+            self.warnings.append(
+                f"{path}: what lies in {path.name}-wal is not read (sqlite3 opens "
+                "the file and writes it in)"
+            )
 
     def regions(self) -> Iterator[Region]:
         """The messages of known types; others are counted in `passed`. Raises DriverError."""
+        with tempfile.TemporaryDirectory() as folder:
+            # Under a plain name: in the user's `?` and `#` would be read as parts of an address.
+            link = Path(folder) / f"bag{self._kind}"
+            link.symlink_to(self._whole)
+            try:
+                yield from self._messages(link)
+            except Exception as error:  # rosbags' own, SQLite's, and those of damaged bytes
+                said = " ".join(str(error).replace(str(link), "it").split())[:200]
+                raise DriverError(
+                    f"{self.path}: is a damaged or unfinished bag: {said or type(error).__name__}"
+                    + (" (`rosbag reindex` may mend it)" if self._one else "")
+                ) from error
+
+    def _messages(self, link: Path) -> Iterator[Region]:
         name = "rosbags.rosbag1" if self._one else "rosbags.rosbag2"
-        try:
-            with importlib.import_module(name).Reader(self._link) as bag:
-                self._note(bag.connections)
-                chosen = [c for c in bag.connections if c.msgtype in PARSERS]
-                for c in bag.connections:
-                    if c not in chosen:
-                        self.passed[c.topic] = self.passed.get(c.topic, 0) + c.msgcount
-                if chosen:
-                    convert = _to_cdr(chosen) if self._one else None
-                    yield from self._packed(bag.messages(chosen), convert)
-        except DriverError:
-            raise
-        except Exception as error:  # rosbags raises its own, SQLite's, and those of damaged bytes
-            said = " ".join(str(error).replace(str(self._link), "it").split())[:200]
-            raise DriverError(
-                f"{self.path}: is a damaged or unfinished bag: {said or type(error).__name__}"
-                + (" (`rosbag reindex` may mend it)" if self._one else "")
-            ) from error
+        with importlib.import_module(name).Reader(link) as bag:
+            self._note(bag.connections)
+            chosen = [c for c in bag.connections if c.msgtype in PARSERS]
+            for c in bag.connections:
+                if c not in chosen:
+                    self.passed[c.topic] = self.passed.get(c.topic, 0) + c.msgcount
+            if chosen:
+                convert = _to_cdr(chosen) if self._one else None
+                yield from self._packed(bag.messages(chosen), convert)
 
     def _note(self, connections: list[Any]) -> None:
         for c in connections:
