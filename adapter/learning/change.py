@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from adapter.learning.settings import ChangeSettings
@@ -9,6 +11,7 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 
 BURST_BLOCK = 500  # samples
+PAUSE = 500  # samples until the next look, where an error was nothing that a hand carries
 
 
 @jit
@@ -31,6 +34,14 @@ def compare(error, fast, slow, samples, recent, level):
             power = min(power, 4.0 * level[j])
         level[j] += (power - level[j]) * min(1.0, max(m / slow, m / max(samples, m)))
     return np.sqrt(most), np.sqrt(total / n)
+
+
+def explained_share(columns: Array, error: Array) -> float:
+    """Share of the power of errors (m, n) that one set of parameters explains by (m, n, k)."""
+    left = error.ravel()
+    found = np.linalg.lstsq(columns.reshape(len(left), -1), left, rcond=None)[0]
+    rest = left - columns.reshape(len(left), -1) @ found
+    return 1.0 - float(rest @ rest) / max(float(left @ left), 1e-300)
 
 
 class ChangeDetector:
@@ -56,11 +67,14 @@ class ChangeDetector:
         """Whether an alarm waits for its confirmation."""
         return self._wait > 0
 
-    def look(self, error: Array) -> bool:
-        """Take torque errors (m, n); True when they say, for good, that something changed."""
+    def look(self, error: Array, explained: Callable[[], bool] = lambda: True) -> bool:
+        """Take torque errors (m, n); True when they say, for good, that something changed.
+
+        `explained` is asked at the end of a wait: whether a change can explain the errors since.
+        """
         s = self.settings
         if self.waiting:
-            return self._confirm(error)
+            return self._confirm(error, explained)
         self.samples += len(error)
         most, mean = compare(error, s.fast, s.slow, self.samples, self.recent, self.level)
         if s.enabled and self.samples >= self._armed_at and self._alarming(most, mean):
@@ -89,7 +103,7 @@ class ChangeDetector:
             or mean > max(s.all_factor, s.burst_factor * self._peaks[1])
         )
 
-    def _confirm(self, error: Array) -> bool:
+    def _confirm(self, error: Array, explained: Callable[[], bool]) -> bool:
         """Look on without touching the level; at the end of the wait the alarm must still hold."""
         level = self.level.copy()
         most, mean = compare(
@@ -100,6 +114,9 @@ class ChangeDetector:
             return False
         if not self._alarming(most, mean):
             self._block = np.maximum(self._block, (most, mean))
+            return False
+        if not explained():
+            self._armed_at = self.samples + PAUSE
             return False
         self._armed_at = self.samples + self.settings.rearm_after
         self.recent[:] = 0.0

@@ -40,8 +40,8 @@ class FrontEndLike(Protocol):
 
     layout: StateLayout
 
-    def step(self, sample: JointSample) -> Array | None:
-        """The filtered state that this sample completes, or None."""
+    def step(self, sample: JointSample) -> Array:
+        """The filtered states (k, size) that this sample completes."""
 
 
 class ObserverLike(Protocol):
@@ -165,11 +165,11 @@ class Session:
         self.had_ns = time.monotonic_ns()
         if driver.paced:
             self.began_ns = self.had_ns  # until here it waited for the arm
-        record = self._front_end.step(sample)
+        states = self._front_end.step(sample)
         self.stepped_ns = time.monotonic_ns()
         self.samples += 1
-        if record is not None:
-            self._pass_on(record)
+        for state in states:
+            self._pass_on(state)
         external = None if self.observer is None else self.observer.step(sample)
         command, trouble = self._move(sample)
         self._keep(sample, command, external)

@@ -30,11 +30,10 @@ class Pipeline:
 
     def step(self, sample: JointSample) -> bool:
         """Take one sample; whether it was learned from."""
-        state = self.front_end.step(sample)
-        if state is None:
-            return False
-        self.learner.step(state)
-        return True
+        states = self.front_end.step(sample)
+        for state in states:
+            self.learner.step(state)
+        return len(states) > 0
 
 
 def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEnd:

@@ -29,7 +29,7 @@ from drivers.files.mcap import Log
 from drivers.interface import DriverError, JointSample, LinkMotion
 
 FEWEST_FOR_NOISE = 50  # samples
-AT_ONCE = 2000  # samples that pass the front end in one table: as much as a processor's cache holds
+AT_ONCE = 2000  # states that pass the front end in one table: as much as a processor's cache holds
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
@@ -174,9 +174,9 @@ def _exact(
         base = None if log.base is None else log.base[i]
         sample = JointSample(int(log.stamp_ns[i]), *joints, links, base)
         before = time.perf_counter_ns()
-        state = front_end.step(sample)
+        states = front_end.step(sample)
         tick_ns[i] = time.perf_counter_ns() - before
-        if state is not None:
+        for state in states:
             learner.step(state)
         if observer is not None:
             observer.step(sample)
@@ -195,8 +195,8 @@ def _heard(log: Log) -> NDArray[np.bool_] | None:
 def _batch(
     log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
 ) -> NDArray[np.int64]:
-    def states(start: int) -> Array:
-        part = slice(start, min(start + AT_ONCE, stop))
+    def states(start: int, end: int) -> Array:
+        part = slice(start, min(end, stop))
         links = None
         if log.twists is not None and log.accels is not None:
             links = log.twists[part], log.accels[part]
@@ -204,7 +204,8 @@ def _batch(
         base = None if log.base is None else log.base[part]
         return pipeline.front_end.step_table(*joints, links, base)
 
-    tables = (states(start) for start in range(0, stop, AT_ONCE))
+    at_once = max(AT_ONCE // pipeline.front_end.filter.settings.states_per_sample, 1)
+    tables = (states(start, start + at_once) for start in range(0, stop, at_once))
     learn_batch(pipeline.learner, tables, every, progress)
     return np.zeros(0, dtype=np.int64)
 
@@ -223,6 +224,8 @@ def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[
         period_s = 1e-9 * float(np.median(steps))
         if not 0.8 < period_s / settings.period_s < 1.25:
             changes["period_s"] = period_s
+            widest_hz = FilterSettings(1e-9, period_s=period_s).widest_hz
+            changes["bandwidth_hz"] = min(settings.bandwidth_hz, widest_hz)
             warnings.append(
                 f"{log.path}: {1.0 / period_s:.0f} samples a second; the filter follows"
             )

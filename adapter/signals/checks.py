@@ -31,10 +31,12 @@ STREAK = 10  # so many old stamps in a row are a clock put back, not late sample
 # From one sample to the next a reading may change by so many times its usual change, plus, for
 # every period between them, these shares of documented speed and effort; a position, beyond what
 # its speed explains, by this share of a period's way at full speed.
+# Those of speed and effort are of a millisecond, or of a shorter period.
 USUAL_STEPS, Q_STEP, DQ_STEP, TAU_STEP = 6.0, 0.5, 0.02, 0.02
 PLAY_RAD = 0.012  # a motor crosses the play of its gear in no time: no step of an encoder
 USUAL_OVER = 200.0  # samples that "usual" looks back on
 JUMP_CONFIRMED = 3  # samples in a row that confirm a step of position
+GAP_PERIODS = 3.0  # samples that may be missing are no hole
 STUCK_RAD = 3e-3  # a joint's readings stand still while its speed would have brought it so far
 
 
@@ -54,6 +56,7 @@ class Verdict(IntEnum):
     ENCODER_JUMP = 10
     TIME_AHEAD = 11
     BASE_UNHEARD = 12
+    BETWEEN = 13  # of several within a millisecond, not the one that becomes a state
 
 
 class Rules(NamedTuple):
@@ -64,6 +67,7 @@ class Rules(NamedTuple):
         effort: (n,) |tau| from which a torque counts as saturated.
         floor: (3, n) change of q, dq, tau from sample to sample that is always believed.
         rest_dq: rad/s; gap_ns: a longer hole restarts the filter.
+        states: that a sample completes; samples: of which one becomes a state.
         gains: of the filter.
     """
 
@@ -72,6 +76,8 @@ class Rules(NamedTuple):
     floor: Array
     rest_dq: float
     gap_ns: int
+    states: int
+    samples: int
     gains: Gains
 
 
@@ -84,7 +90,7 @@ class Memory(NamedTuple):
         usual: (3, n) squares of the readings' usual changes.
         since: (n,) int64 stamps at which the joints' readings last changed.
         ahead: (c,) the reading whose stamp lay far ahead, as it goes into the filter.
-        marks: (10,) int64, see `Mark`.
+        marks: (11,) int64, see `Mark`.
         filter: of the filter.
         fastest: (n,) highest filtered |dq|, rad/s.
         bristles: in the joints.
@@ -115,6 +121,7 @@ class Mark(IntEnum):
     JUMPED = 7  # joint whose encoder jumped
     USUAL_DT = 8  # ns between samples
     LAST = 9  # stamp of `Memory.last`
+    WITHOUT = 10  # samples since the last one that became a state
 
 
 def rules_of(limits: Limits, settings: FrontEndSettings, joint_filter: JointFilter) -> Rules:
@@ -130,22 +137,22 @@ def rules_of(limits: Limits, settings: FrontEndSettings, joint_filter: JointFilt
         np.nan_to_num(velocity * settings.range_factor, nan=DQ_CAP),
         np.nan_to_num(known_effort * settings.range_factor, nan=TAU_CAP),
     ]
-    floor = np.array(
-        [
-            Q_STEP * joint_filter.settings.period_s * velocity,
-            DQ_STEP * velocity,
-            TAU_STEP * known_effort,
-        ]
-    )
+    period_s, times = joint_filter.settings.period_s, joint_filter.settings.states_per_sample
+    speed, torque = DQ_STEP * times * velocity, TAU_STEP * times * known_effort
+    floor = np.array([Q_STEP * period_s * velocity, speed, torque])
     floor[np.isnan(floor)] = np.inf
-    effort, gap_ns = known_effort * settings.saturation, round(1e9 * settings.max_gap_s)
-    return Rules(np.array(allowed), effort, floor, settings.rest_dq, gap_ns, joint_filter.gains)
+    effort = known_effort * settings.saturation
+    gap_ns = round(1e9 * max(settings.max_gap_s, GAP_PERIODS * period_s))
+    per = times, joint_filter.settings.samples_per_state
+    gains = joint_filter.gains
+    return Rules(np.array(allowed), effort, floor, settings.rest_dq, gap_ns, *per, gains)
 
 
 def packed(rules: Rules) -> Array:
     """The rules in one array; its inverse is in `unpacked`."""
     tables = (rules.range.ravel(), rules.effort, rules.floor.ravel())
-    return np.concatenate([*tables, [rules.rest_dq, rules.gap_ns, *rules.gains]])
+    numbers = rules.rest_dq, rules.gap_ns, rules.states, rules.samples
+    return np.concatenate([*tables, [*numbers, *rules.gains]])
 
 
 def room(n: int, base: int) -> int:
@@ -156,18 +163,17 @@ def room(n: int, base: int) -> int:
 
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 6,), (`room`,) and (n + 12,).
+    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + 13,).
 
     Behind the joints' 3 n the base's motion, b numbers, and the bristles', K n, pass the filter.
     """
-    n = whole.shape[0] - 12
-    at = 8 * n
-    rest_dq, gap_ns, k1, k2 = rules[at], rules[at + 1], rules[at + 2], rules[at + 3]
-    delay_ns, settle_ns = rules[at + 4], rules[at + 5]
-    gains = Gains(k1, k2, int(delay_ns), int(settle_ns))
+    n = whole.shape[0] - 13
+    rest_dq, gap_ns, states, samples = rules[8 * n], rules[8 * n + 1], rules[8 * n + 2], rules[-5]
+    gains = Gains(rules[-4], rules[-3], int(rules[-2]), int(rules[-1]))
     allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
-    own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, int(gap_ns), gains)
-    since, marks, times = whole[:n], whole[n : n + 10], whole[n + 10 :]
+    per = int(gap_ns), int(states), int(samples)
+    own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, per[0], per[1], per[2], gains)
+    since, marks, times = whole[:n], whole[n : n + 11], whole[n + 11 :]
     tables = memory[: 12 * n].reshape(4, 3, n)
     last, good, doubted, usual = tables[0], tables[1], tables[2], tables[3]
     size = (memory.shape[0] - (16 + len(WAYS_RAD)) * n) // 4

@@ -43,8 +43,9 @@ def steady_state_poles(settings: FilterSettings) -> tuple[float, float]:
     from filterpy.common import Q_continuous_white_noise
     from filterpy.kalman import KalmanFilter
 
-    period = settings.period_s
+    period = settings.step_s
     noise = USUAL_DQ_NOISE if settings.dq_noise is None else settings.dq_noise
+    noise *= math.sqrt(settings.states_per_sample)  # as if each step brought a sample of its own
     drive = settings.dq_drive
     if drive is None:
         # Kalman-Bucy: corner^4 = drive² / (noise² period)
@@ -150,11 +151,13 @@ class JointFilter:
 
     @property
     def noise_gain(self) -> float:
-        """Samples of white noise that one independent filtered sample is worth (ENBW)."""
+        """Filtered states that one independent of white noise is worth (ENBW)."""
         bandwidth_hz = self.gains.k2 / (
             4.0 * self.gains.k1
         )  # equivalent noise bandwidth of L, one-sided
-        return 1.0 / (2.0 * bandwidth_hz * self.settings.period_s)
+        s = self.settings
+        by_band = 1.0 / (2.0 * bandwidth_hz * s.step_s * s.samples_per_state)
+        return max(by_band, float(s.states_per_sample))
 
     def reset(self) -> None:
         """Forget everything; the next sample starts the filter anew, at rest on that sample."""

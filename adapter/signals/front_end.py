@@ -27,7 +27,7 @@ from adapter.signals.checks import (
 from adapter.signals.filters import NEVER, JointFilter, filter_step
 from adapter.signals.records import StateLayout, columns
 from adapter.signals.settings import FilterSettings, FrontEndSettings
-from adapter.signals.twist import TwistSynthesis
+from adapter.signals.twist import Raw, TwistSynthesis
 from drivers.interface import JointSample
 
 NOTEWORTHY = (
@@ -64,19 +64,17 @@ class Answers(NamedTuple):
     """What became of samples.
 
     Attributes:
-        records: (m, size), stamp and filtered signals filled where the verdict is GOOD.
         verdicts: (m,) int64 of `Verdict`.
         holes: (m, 2) int64 stamps before and behind a gap that restarted the filter; else 0.
     """
 
-    records: Array
     verdicts: NDArray[np.int64]
     holes: NDArray[np.int64]
 
 
 @jit
-def taken(samples, i, rules, memory, answers):
-    """Verdict on sample i; filtered into its record where it teaches something."""
+def taken(samples, i, rules, memory, answers, records):
+    """Verdict on sample i; the states since the one before are filtered into its records."""
     stamp, signals, marks = samples.stamps[i], samples.signals[i], memory.marks
     times, gains, n = memory.filter.times, rules.gains, rules.effort.shape[0]
     x = signals[: 3 * n].reshape(3, n)
@@ -112,8 +110,31 @@ def taken(samples, i, rules, memory, answers):
             answers.holes[i, 1] = ahead_ns
             filtered(ahead_ns, np.inf, memory.ahead[: signals.shape[0]].copy(), gains, memory)
             dt_s = 1e-9 * (stamp - ahead_ns)
-    settled = filtered(stamp, dt_s, signals, gains, memory)
+    settled, old, old_stamp = False, memory.filter.old[: signals.shape[0]].copy(), times[0]
+    many = rules.states if dt_s < np.inf else 1
+    for k in range(rules.states):  # all its records are filled, the first ones twice at a start
+        share = min((k + 1) / many, 1.0)
+        if k < many:
+            at = stamp if share == 1.0 else old_stamp + int(share * (stamp - old_stamp))
+            now = signals if share == 1.0 else old + share * (signals - old)
+            settled = filtered(at, dt_s / many, now, gains, memory)
+        fill(records[k], times[0] - gains.delay_ns, signals.shape[0], memory)
     return worth(stamp, x, settled, rules, memory)
+
+
+@jit
+def fill(row, stamp, known, memory):
+    """Let a record say what the filter says; `known` signals are the joints' and the base's."""
+    y, dy, n = memory.filter.y, memory.filter.dy, memory.good.shape[1]
+    at = columns(n, known > 3 * n)
+    row[:1].view(np.int64)[0] = stamp
+    row[at.q : at.ddq] = y[: 2 * n]
+    row[at.ddq : at.tau] = dy[n : 2 * n]
+    row[at.base - n : at.base] = y[2 * n : 3 * n]
+    if known > 3 * n:
+        row[at.base : at.base + BASE] = y[3 * n : 3 * n + BASE]
+        row[at.base + BASE : at.bent] = dy[3 * n + 3 : 3 * n + 6]  # rate of w
+    row[at.bent : at.rates] = y[known:]
 
 
 @jit
@@ -134,6 +155,7 @@ def worth(stamp, x, settled, rules, memory):
     """Verdict on a filtered sample: whether it teaches anything; remembers when it moved."""
     marks, n = memory.marks, x.shape[1]
     moving, fast = False, False
+    marks[Mark.WITHOUT] += 1
     for j in range(n):
         fast = fast or abs(x[1, j]) > rules.rest_dq
         moving = moving or abs(memory.filter.y[n + j]) >= rules.rest_dq
@@ -149,6 +171,9 @@ def worth(stamp, x, settled, rules, memory):
         return Verdict.AT_REST
     if stamp <= marks[Mark.SATURATED_UNTIL]:
         return Verdict.TORQUE_SATURATED
+    if marks[Mark.WITHOUT] < rules.samples:
+        return Verdict.BETWEEN
+    marks[Mark.WITHOUT] = 0
     return Verdict.GOOD
 
 
@@ -161,30 +186,17 @@ def process(signals, rules, memory, whole, records, answers):
     Args:
         signals: (m, 3 n + b) q, dq, tau, and the b = 9 numbers of a base that floats.
         rules, memory, whole: see `packed` and `unpacked`.
-        records: (m, size), filled where the verdict is GOOD.
+        records: (m K, size), K for each sample, filled where its verdict is GOOD.
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
     """
     own, kept = unpacked(rules, memory, whole)
     samples = Samples(answers[:, 0], signals)
-    found = Answers(records, answers[:, 1], answers[:, 2:])
-    n, y, dy = own.effort.shape[0], kept.filter.y, kept.filter.dy
-    floating = signals.shape[1] > 3 * n
-    at = columns(n, floating)
+    found = Answers(answers[:, 1], answers[:, 2:])
     for i in range(signals.shape[0]):
         found.holes[i] = 0
-        verdict = taken(samples, i, own, kept, found)
-        found.verdicts[i] = verdict
-        if verdict == Verdict.GOOD:
-            row = records[i]
-            row[:1].view(np.int64)[0] = samples.stamps[i] - own.gains.delay_ns
-            row[at.q : at.ddq] = y[: 2 * n]
-            row[at.ddq : at.tau] = dy[n : 2 * n]
-            row[at.base - n : at.base] = y[2 * n : 3 * n]
-            if floating:
-                row[at.base : at.base + BASE] = y[3 * n : 3 * n + BASE]
-                row[at.base + BASE : at.bent] = dy[3 * n + 3 : 3 * n + 6]  # rate of w
-            row[at.bent : at.rates] = y[signals.shape[1] :]
+        part = records[i * own.states : (i + 1) * own.states]
+        found.verdicts[i] = taken(samples, i, own, kept, found, part)
 
 
 class FrontEnd:
@@ -215,7 +227,7 @@ class FrontEnd:
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0
-        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + 12, dtype=np.int64)
+        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + 13, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
         self._memory.bristles.place[:] = np.nan
@@ -224,7 +236,7 @@ class FrontEnd:
             self._memory.marks[mark] = NEVER
         self.filter.use(self._memory.filter)
         self._signals, self._answers = np.empty((1, 3 * n + base)), np.zeros((1, 4), np.int64)
-        self._records = self.layout.new(1)
+        self._records = self.layout.new(self._rules.states)
         self.refused: Counter[str] = Counter()
         self.gaps: list[tuple[int, float]] = []
         self._told: list[str] = []
@@ -262,10 +274,11 @@ class FrontEnd:
         name = self.names[joint - 1]
         return f"the encoder of {name} jumped by {step:.3g} rad; reference the arm, then run again"
 
-    def step(self, sample: JointSample) -> Array | None:
-        """The filtered state that this sample completes, or None where it teaches nothing.
+    def step(self, sample: JointSample) -> Array:
+        """The filtered states (k, size) that this sample completes; none where it teaches nothing.
 
-        The record is reused by the next call. Reasons are counted in `refused`.
+        At 1 kHz it is one at most, at lower rates as many as milliseconds have gone by. The records
+        are reused by the next call. Reasons are counted in `refused`.
         """
         signals, answers, n = self._signals, self._answers, self.layout.n
         row = signals[0]
@@ -276,10 +289,9 @@ class FrontEnd:
         process(signals, self._packed, self._kept, self._whole, self._records, answers)
         if answers[0, 1]:
             self._refuse(answers[0, 1], sample, answers[0, 2:])
-            return None
-        record = self._records[0]
-        self.twist.fill(record, sample)
-        return record
+            return self._records[:0]
+        self.twist.fill(self._records, sample)
+        return self._records
 
     def step_table(
         self,
@@ -299,21 +311,20 @@ class FrontEnd:
         parts = [q, dq, tau]
         if self.layout.floating:
             parts.append(np.full((len(q), BASE), np.nan) if base is None else base)
-        signals = np.concatenate(parts, axis=1)
-        records, answers = self.layout.new(len(q)), np.zeros((len(q), 4), dtype=np.int64)
+        signals, states = np.concatenate(parts, axis=1), self._rules.states
+        records = self.layout.new(states * len(q))
+        answers = np.zeros((len(q), 4), dtype=np.int64)
         answers[:, 0] = stamp_ns
         process(signals, self._packed, self._kept, self._whole, records, answers)
         for i in np.flatnonzero(answers[:, 1]):
             sample = JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i])
             self._refuse(answers[i, 1], sample, answers[i, 2:])
-        good = answers[:, 1] == Verdict.GOOD
-        records = records[good]
-        self.twist.fill_table(
-            records,
-            q[good],
-            dq[good],
-            None if links is None else (links[0][good], links[1][good]),
-        )
+        good = np.flatnonzero(answers[:, 1] == Verdict.GOOD)
+        records = records.reshape(len(q), states, self.layout.size)[good]
+        records = records.reshape(states * len(good), self.layout.size)
+        last = states - 1 + states * np.arange(len(good))  # the others are of instants in between
+        own = None if links is None else (links[0][good], links[1][good])
+        self.twist.fill_table(records, Raw(last, q[good], dq[good], own))
         return records
 
     def _refuse(self, verdict: int, sample: JointSample, hole: NDArray[np.int64]) -> None:

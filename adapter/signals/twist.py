@@ -11,7 +11,10 @@ would shift products of fast signals.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -19,8 +22,26 @@ from adapter.physics.kernels import Frames, JointMotion, base_at_rest, frames_of
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns
 from drivers.interface import JointSample
 
+Indices = NDArray[np.intp]
+
 # No link of an arm moves faster: m/s, rad/s, m/s², rad/s².
 MOTION_CAP = np.repeat([30.0, 60.0, 2e3, 2e4], 3)
+
+
+class Raw(NamedTuple):
+    """Samples as they came, behind a filter that makes several states of each.
+
+    Attributes:
+        rows: (m,) the state that is of the sample's own instant; states between it and that of
+            the sample before are of instants at which no link was heard.
+        q, dq: (m, n).
+        links: twists and accels (m, n, 6), NaN where nothing was heard; None: of no link.
+    """
+
+    rows: Indices
+    q: Array
+    dq: Array
+    links: tuple[Array, Array] | None
 
 
 class TwistSynthesis:
@@ -38,61 +59,52 @@ class TwistSynthesis:
         self._frames = tuple(frames_of(documented.tree.parent, documented.lam))
         self._base = np.empty(0) if self.layout.floating else base_at_rest(documented.gravity)
 
-    def fill(self, record: Array, sample: JointSample) -> None:
-        """Complete a record whose q, dq, ddq are filled, for the sample that led to it."""
-        links = sample.links
-        if self._imus:
-            told = None if links is None else (links.twist[None], links.accel[None])
-            self._of_imus(record[None], sample.q[None], sample.dq[None], told)
-        elif links is None or self.layout.floating:
-            synthesize(self._frames, self._base, record[None])
-        else:
-            self._measured(
-                record[None], sample.q[None], sample.dq[None], links.twist[None], links.accel[None]
-            )
+    def fill(self, records: Array, sample: JointSample) -> None:
+        """Complete records whose q, dq, ddq are filled, the last of this sample's instant."""
+        said, last = sample.links, np.array([len(records) - 1])
+        links = None if said is None else (said.twist[None], said.accel[None])
+        self.fill_table(records, Raw(last, sample.q[None], sample.dq[None], links))
 
-    def fill_table(
-        self, records: Array, q: Array, dq: Array, links: tuple[Array, Array] | None
-    ) -> None:
-        """Complete records (m, size); raw q, dq (m, n), twists and accels (m, n, 6) beside them."""
+    def fill_table(self, records: Array, raw: Raw) -> None:
+        """Complete records (m, size) of these samples."""
         if self._imus:
-            self._of_imus(records, q, dq, links)
+            self._of_imus(records, raw)
             return
-        if links is None or self.layout.floating:
+        if raw.links is None or self.layout.floating:
             synthesize(self._frames, self._base, records)
             return
-        twists, accels = links
-        heard = ~np.isnan(twists).all(axis=(1, 2)) | ~np.isnan(accels).all(axis=(1, 2))
-        part = records[heard]
-        self._measured(part, q[heard], dq[heard], twists[heard], accels[heard])
-        records[heard] = part
-        part = records[~heard]
+        motion = np.concatenate(raw.links, axis=2)
+        said = np.asarray(~np.isnan(motion).all(axis=(1, 2)))
+        records[:, KIND] = LinkMotionKind.NONE
+        self._measured(records, raw, said, motion)
+        silent = ~said[np.searchsorted(raw.rows, np.arange(len(records)))]
+        part = records[silent]
         synthesize(self._frames, self._base, part)
-        records[~heard] = part
+        records[silent] = part
 
-    def _measured(self, records: Array, q: Array, dq: Array, twists: Array, accels: Array) -> None:
-        at = self.layout
-        records[:, at.motion_q], records[:, at.motion_dq] = q, dq
-        motion = np.concatenate([twists, accels], axis=2)
-        records[:, at.motion] = motion.reshape(len(records), 12 * at.n)
+    def _measured(self, records: Array, raw: Raw, said: NDArray[np.bool_], motion: Array) -> None:
+        """Motion (m, n, 12) of samples whose links said something."""
+        at, rows, motion = self.layout, raw.rows[said], motion[said]
+        records[rows, at.motion_q], records[rows, at.motion_dq] = raw.q[said], raw.dq[said]
+        records[rows, at.motion] = motion.reshape(len(rows), 12 * at.n)
         # a link that was not heard of at this stamp, or whose sensor is mad, leaves the body
         # schema a sample short
         usable = (np.abs(motion) < MOTION_CAP).all(axis=(1, 2))  # false for NaN
-        records[:, KIND] = np.where(usable, LinkMotionKind.MEASURED, LinkMotionKind.NONE)
+        records[rows, KIND] = np.where(usable, LinkMotionKind.MEASURED, LinkMotionKind.NONE)
 
-    def _of_imus(
-        self, records: Array, q: Array, dq: Array, links: tuple[Array, Array] | None
-    ) -> None:
-        at = self.layout
-        records[:, at.motion_q], records[:, at.motion_dq] = q, dq
-        records[:, at.motion], records[:, KIND] = 0.0, LinkMotionKind.IMU
-        if links is None:
+    def _of_imus(self, records: Array, raw: Raw) -> None:
+        at, rows = self.layout, raw.rows
+        records[:, at.motion], records[:, KIND] = 0.0, LinkMotionKind.NONE
+        records[rows, at.motion_q], records[rows, at.motion_dq] = raw.q, raw.dq
+        records[rows, KIND] = LinkMotionKind.IMU
+        if raw.links is None:
             return
-        told = np.concatenate([links[0][..., 3:], links[1][..., :3]], axis=2)  # w and a
+        twists, accels = raw.links
+        told = np.concatenate([twists[..., 3:], accels[..., :3]], axis=2)  # w and a
         heard = (np.abs(told) < MOTION_CAP[3:9]).all(axis=2)  # false for NaN
-        rows = records[:, at.motion].reshape(len(records), at.n, 12)
-        rows[..., 0], rows[..., 3:9] = heard, np.where(heard[..., None], told, 0.0)
-        records[:, at.motion] = rows.reshape(len(records), 12 * at.n)
+        motion = np.zeros((len(rows), at.n, 12))
+        motion[..., 0], motion[..., 3:9] = heard, np.where(heard[..., None], told, 0.0)
+        records[rows, at.motion] = motion.reshape(len(rows), 12 * at.n)
 
 
 @jit

@@ -130,6 +130,19 @@ def held_out_error_of(run: WithLoad, truth: Truth) -> np.ndarray:
     return rms(tau - model_torque(panda_model(), run.learner.schema.lam, run.theta, q, dq, ddq))
 
 
+@pytest.mark.parametrize("joint", [0, 4, 6])
+def test_what_no_hand_carries_is_no_change(joint: int) -> None:
+    """A joint that rubs more for half a second: friction of this joint alone."""
+    data = record(arm(), Motion(14.0, 11))
+    tau = data.tau.copy()
+    tau[12_000:12_500, joint] += 0.02 * panda_model().limits.effort[joint]
+    learner, doubted = learner_for(seed=11), 0
+    for state in states_of(replace(data, tau=tau)):
+        learner.step(state)
+        doubted += learner.change.waiting
+    assert doubted and not learner.changes
+
+
 def test_no_false_alarm() -> None:
     learner = learner_for(seed=11)
     for state in states_of(record(arm(), Motion(14.0, 11))):

@@ -107,10 +107,9 @@ def test_tables_equal_single_steps_bit_for_bit(folder: Path) -> None:
     rows = [
         state.copy()
         for i, stamp in enumerate(log.stamp_ns)
-        for state in [
-            one.step(JointSample(int(stamp), log.q[i], log.dq[i], log.tau[i], base=log.base[i]))
-        ]
-        if state is not None
+        for state in one.step(
+            JointSample(int(stamp), log.q[i], log.dq[i], log.tau[i], base=log.base[i])
+        )
     ]
     states = table.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
     assert len(rows) > 500 and np.array(rows).tobytes() == states.tobytes()

@@ -243,7 +243,7 @@ def test_noise_needs_samples() -> None:
     [
         ({"bandwidth_hz": 0.0}, "bandwidth_hz"),
         ({"bandwidth_hz": np.nan}, "bandwidth_hz"),
-        ({"bandwidth_hz": 200.0}, "tenth of the sample rate"),
+        ({"bandwidth_hz": 200.0}, "1000 samples a second; at most 100"),
         ({"dq_noise": -1.0}, "dq_noise"),
         ({"dq_drive": 0.0}, "dq_drive"),
         ({"period_s": 0.0}, "period_s"),

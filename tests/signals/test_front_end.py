@@ -32,9 +32,7 @@ def feed(front_end: FrontEnd, samples: list[JointSample]) -> np.ndarray:
     """What comes out, sample by sample; the record is reused, so it is copied at once."""
     rows = []
     for sample in samples:
-        state = front_end.step(sample)
-        if state is not None:
-            rows.append(state.copy())
+        rows.extend(front_end.step(sample).copy())
     return np.array(rows).reshape(-1, LAYOUT.size)
 
 

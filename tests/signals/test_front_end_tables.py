@@ -22,9 +22,7 @@ def run(samples: list[JointSample], known: bool = True) -> tuple[np.ndarray, Fro
     front_end = FrontEnd(model if known else replace(model, limits=Limits.unknown(N)))
     rows = []
     for sample in samples:
-        state = front_end.step(sample)
-        if state is not None:
-            rows.append(state.copy())
+        rows.extend(front_end.step(sample).copy())
     assert len(samples) == len(rows) + sum(front_end.refused.values())
     return np.array(rows).reshape(-1, LAYOUT.size), front_end
 

@@ -1,0 +1,158 @@
+"""One simulated log at many rates: what is learned from it, beside batch least squares.
+
+Each trial moves a PyBullet Panda with a real arm's friction and noise, measures its links, rests
+in between, and keeps every k-th sample. `make trials`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.control.controller import ExcitationController
+from adapter.control.feedforward import ModelFeedforward
+from adapter.control.limits import MotionLimits
+from adapter.control.settings import ExcitationSettings
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.torque import ModelTorque
+from adapter.learning.settings import LearnerSettings
+from adapter.model.self_model import SelfModel
+from adapter.physics.freedom import Freedom
+from adapter.realtime.session import run_lockstep
+from adapter.runs.config import PipelineSettings
+from adapter.runs.library import regressor
+from adapter.runs.outcome import completed_lambda, frame_errors, learned_model
+from adapter.runs.pipeline import make_front_end
+from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
+from adapter.signals.validation import EDGE_S, GRID_S, smooth, validation_torque_rmse
+from drivers.files.mcap import Log
+from drivers.interface import Array, JointSample
+from drivers.pybullet_arm import PyBulletArm
+from sim.scenarios import build
+from tests.helpers.arm_data import panda_model
+
+RATES = (1000, 500, 250, 125, 60, 30)
+ROW_EVERY = 5  # ms between two rows of the least squares
+
+
+def recorded(seed: int, seconds_long: float, slower: float, links: bool) -> tuple[Log, SelfModel]:
+    """A motion with rests of an arm with friction that sticks, and what the model should become."""
+    arm, robot = build("real_drives", seed, links=links), panda_model()
+    rests = tuple((at, at + 1.5) for at in np.arange(8.0, seconds_long - 3.0, 9.0))
+    low, high = 0.1 / slower, 1.0 / slower
+    motion = ExcitationSettings(seed=seed, low_hz=low, high_hz=high, rests=rests, share=0.7)
+    forward = ModelFeedforward.of(robot)
+    controller = ExcitationController(MotionLimits.of(robot), motion, feedforward=forward)
+    samples: list[JointSample] = []
+    driver = PyBulletArm(arm.plant())
+    try:
+        front_end = make_front_end(robot, PipelineSettings())
+        ended = run_lockstep(
+            driver, front_end, None, controller, seconds_long, each=lambda x, _: samples.append(x)
+        )
+    finally:
+        driver.close()
+    if ended.fault is not None:
+        raise SystemExit(f"seed {seed}: {ended.fault}")
+    q, dq, tau = (np.array([getattr(x, name) for x in samples]) for name in ("q", "dq", "tau"))
+    log = Log(Path("rate.mcap"), robot.tree.joint_names, _stamps(samples), q, dq, tau)
+    if links:
+        heard = [x.links for x in samples if x.links is not None]
+        twists, accels = (np.array([getattr(x, k) for x in heard]) for k in ("twist", "accel"))
+        log = replace(log, link_names=robot.tree.body_names, twists=twists, accels=accels)
+    return log, robot
+
+
+def _stamps(samples: list[JointSample]) -> np.ndarray:
+    return np.array([x.stamp_ns for x in samples], dtype=np.int64)
+
+
+def least_squares(log: Log, until_s: float, robot: SelfModel) -> Array:
+    """Held-out error (n,) N m of weighted least squares with friction, offset, motor inertia."""
+
+    def rows(part: Log) -> tuple[Array, Array]:
+        q, dq, ddq, tau = smooth(seconds(part), part.q, part.dq, part.tau)
+        edge = round(EDGE_S / GRID_S)
+        q, dq, ddq, tau = (x[edge:-edge:ROW_EVERY] for x in (q, dq, ddq, tau))
+        m, n = q.shape
+        X = np.zeros((m, n, 14 * n))
+        X[:, :, : 10 * n] = regressor(robot, q, dq, ddq)
+        for k, column in enumerate((dq, np.tanh(dq / 0.02), np.ones_like(q), ddq)):
+            for j in range(n):
+                X[:, j, (10 + k) * n + j] = column[:, j]
+        return X, tau
+
+    early = seconds(log) < until_s
+    (X, tau), (held, other) = rows(log.take(early)), rows(log.take(~early))
+    weight: Array = np.ones(tau.shape[1])
+    for _ in range(3):
+        A, b = (X / weight[:, None]).reshape(len(X) * len(weight), -1), (tau / weight).ravel()
+        scale = np.maximum(np.linalg.norm(A, axis=0), 1e-9)
+        found = np.linalg.lstsq(A / scale, b, rcond=1e-7)[0] / scale
+        weight = np.sqrt(np.mean((X @ found - tau) ** 2, axis=0))
+    return np.asarray(np.sqrt(np.mean((held @ found - other) ** 2, axis=0)))
+
+
+def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]:
+    """What is learned from every k-th sample."""
+    thin = log.take(np.arange(len(log)) % max(round(1000 / rate), 1) == 0)
+    until_s = 0.75 * float(seconds(log)[-1])
+    own, _ = fitted_to(thin, PipelineSettings().filter)
+    settings = PipelineSettings(filter=own, learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
+    done = replay(thin, robot, settings, ReplayOptions(every, until_s))
+    outcome, learner = done.outcome, done.pipeline.learner
+    model = learned_model(outcome, robot)
+    late = thin.take(seconds(thin) >= until_s)
+    error = validation_torque_rmse(seconds(late), late.q, late.dq, late.tau, ModelTorque(model))
+    best = least_squares(thin, until_s, robot)
+    theta = learner.theta
+    excess = np.sqrt(theta.variance() / theta.variance(theta.least_squares()))
+    freedom = Freedom.of(np.eye(6) - outcome.lam_identifiable, outcome.lam[:, 3:])
+    turn, shift = frame_errors(completed_lambda(outcome, robot).lam, robot.lam, freedom)
+    return {
+        "rate": rate,
+        "over_ls": (error / best).round(3).tolist(),
+        "error_nm": error.round(4).tolist(),
+        "over_same_moments": excess.round(3).tolist(),
+        "lam_converged": bool(outcome.lam_converged),
+        "theta_converged": bool(learner.theta_converged),
+        "changes": len(learner.changes),
+        "lam_rad": float(turn.max()),
+        "lam_m": float(shift.max()),
+        "theta": theta.theta.tolist(),
+        "effects": theta.effect_values.tolist(),
+        "refused": dict(done.pipeline.front_end.refused),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    add = parser.add_argument
+    add("--trials", type=int, default=5)
+    add("--first", type=int, default=200, help="first seed")
+    add("--rates", type=int, nargs="+", default=RATES)
+    add("--seconds", type=float, default=40.0)
+    add("--slower", type=float, default=1.0, help="than usual")
+    add("--links", action="store_true", help="links are measured")
+    add("--every", type=int, default=1)
+    add("--json", type=Path)
+    asked = parser.parse_args()
+    rows = []
+    for seed in range(asked.first, asked.first + asked.trials):
+        log, robot = recorded(seed, asked.seconds, asked.slower, asked.links)
+        for rate in asked.rates:
+            row = {"seed": seed, **at_rate(log, rate, robot, asked.every)}
+            rows.append(row)
+            shown = {k: v for k, v in row.items() if k not in ("theta", "effects")}
+            print(json.dumps(shown), flush=True)
+    if asked.json is not None:
+        asked.json.write_text(json.dumps(rows) + "\n")
+
+
+if __name__ == "__main__":
+    main()
