@@ -30,11 +30,10 @@ from adapter.realtime.session import run_lockstep
 from adapter.realtime.snapshot import SnapshotWriter, nothing_known
 from adapter.signals.front_end import FrontEnd
 from drivers.faults.driver import with_faults
-from drivers.interface import Driver, JointSample
-from drivers.pybullet_arm import PyBulletArm
+from drivers.interface import JointSample
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario, build
-from tests.helpers.fci_lockstep import FciLockstep
+from tests.helpers.lockstep_drivers import BEGINS_S, opened
 
 PANDA = documented("panda")
 N, LIMITS = PANDA.tree.n, MotionLimits.of(PANDA)
@@ -45,8 +44,6 @@ FAULTS = ("lost=0.02", "late=0.02", "repeated=0.05", "reordered=0.02", "corrupt=
 BOUND = 0.15  # of the effort limit: contact torque that may be left; also what a brake may hold
 NAMED = r"joint ?\d|usable joint reading|newer joint reading|reflex|without"
 KINDS = ("position", "speed", "acceleration", "jerk", "torque", "rate", "contact", "unnamed")
-# Motors of a CAN arm are switched on and settle first: 1.35 to 1.5 s here.
-BEGINS_S = {"sim": 0.0, "fci": 0.0, "can": 1.6}
 
 
 def world_of(rng: np.random.Generator, seed: int, begins_s: float) -> tuple[Scenario, str]:
@@ -66,35 +63,6 @@ def world_of(rng: np.random.Generator, seed: int, begins_s: float) -> tuple[Scen
         trouble["load"] = float(rng.uniform(0.5, 8.0))
     noise = str(rng.choice(["real", "none"]))
     return build("nominal", seed, noise=noise, trouble=trouble if kind != "none" else {}), kind
-
-
-def opened(name: str, world: Scenario) -> tuple[Driver, Obstacles]:
-    """The driver, and what is in the way of its arm."""
-    if name == "sim":
-        plant = world.plant()
-        return PyBulletArm(plant), plant._engine.obstacles
-    if name == "fci":
-        robot = FciLockstep(world)
-        return robot, robot.served.arm._plant._engine.obstacles
-    from drivers.damiao import holding
-    from drivers.damiao.arm import DamiaoArm
-    from sim.damiao.host import Lockstep
-    from sim.damiao.line import Line
-    from sim.damiao.server import Boards
-
-    class Clock:  # whoever waits lets the line's time pass
-        @staticmethod
-        def sleep(seconds: float) -> None:
-            line.advance_to(line.now_ns() + int(1e9 * seconds))
-
-    line = Line()
-    boards = Boards(line.boards, world, now_ns=line.now_ns)
-    line.attach(boards)
-    vars(holding)["time"] = Clock
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    address, names = "can://line?interface=virtual", world.truth.joint_names
-    arm = Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
-    return arm, boards.world._engine.obstacles
 
 
 class Account:

@@ -18,6 +18,8 @@ from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
+from tests.helpers.fci_lockstep import FciLockstep
+from tests.helpers.lockstep_drivers import BEGINS_S, opened
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
@@ -76,6 +78,52 @@ def test_it_stops_by_joint_and_cause_and_lets_go(trouble, safety, said) -> None:
     assert len(pushes) > 1000 * T_S
     assert left <= 0.2 * max(pushes)
     assert max(pushes) <= 1.2 * LIMITS.effort.max()
+
+
+ON_DRIVERS = [
+    ("fci", {"held": [2]}, {}, "joint 2 (panda_joint2)"),
+    ("fci", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "from where it should be"),
+    ("fci", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
+    ("fci", {"wall": 0.01, "t_s": 1.5}, {**FAR, "external_share": 0.2}, "is pushed"),
+    ("fci", {"load": 4.0}, {**FAR, "power_share": 0.1}, "would move with"),
+    ("can", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "joint 2 (panda_joint2) is "),
+    ("can", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
+    ("can", {"held": [2, 4]}, {**FAR, "external_share": 0.5}, "is pushed"),
+]
+
+
+@pytest.mark.parametrize(("name", "trouble", "safety", "said"), ON_DRIVERS)
+def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
+    """By joint and cause, without a jump; next to nothing is pushed 50 ms later."""
+    world = build("nominal", 1, trouble={"t_s": BEGINS_S[name] + T_S, **trouble})
+    arm, obstacles = opened(name, world)
+    if isinstance(arm, FciLockstep):  # else the robot's own reflex is sooner
+        for most in ("upper_torque", "upper_force"):
+            getattr(arm.served.settings, most)[:] = 1e3
+    controller = ExcitationController(
+        LIMITS,
+        ExcitationSettings(seed=1),
+        ControlSettings(safety=SafetySettings(**safety)),
+        expected=ModelFeedforward.of(PANDA),
+    )
+    commands, pushes = [], []
+
+    def note(sample: JointSample, tau) -> None:
+        pushes.append(np.abs(obstacles.torque).max())
+        if tau is not None:
+            commands.append(tau.copy())
+
+    try:
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=note)
+        for _ in range(0 if name == "can" else 50):  # there the stop itself takes its time
+            arm.read()
+        left = float(np.abs(obstacles.torque).max())
+    finally:
+        arm.close()
+    assert result.fault is not None
+    assert result.fault.startswith("joint ") and said in result.fault
+    assert (np.abs(np.diff(commands, axis=0)) <= 1e-3 * LIMITS.torque_rate + 1e-9).all()
+    assert left <= max(0.2 * max(pushes), 1.0)
 
 
 def test_what_was_learned_stops_a_held_arm_sooner() -> None:
