@@ -186,7 +186,11 @@ def test_a_change_is_looked_for_in_the_joints_torques(monkeypatch: pytest.Monkey
     model, parts, _ = falling(1)
     learner = OnlineLearner(model.tree, settings=LearnerSettings(wait_for_schema=False))
     seen: list[np.ndarray] = []
-    monkeypatch.setattr(learner.change, "look", lambda error: bool(seen.append(error.copy())))
+
+    def look(error: np.ndarray, *about: object) -> bool:
+        return bool(seen.append(error.copy()))
+
+    monkeypatch.setattr(learner.change, "look", look)
     state = states_of(parts[0])[0]
     expected = state[learner.layout.tau] - learner.predict(state[None])[0]
     learner.step(state)
