@@ -122,7 +122,6 @@ def trial(name: str, seed: int) -> tuple[Counter[str], str]:
     """What one trial broke, and how it ended."""
     rng = np.random.default_rng([seed, 14])
     world, trouble = world_of(rng, seed, BEGINS_S[name])
-    driver, obstacles = opened(name, world)
     fault = str(rng.choice(("", *FAULTS))) if trouble == "none" else ""
     fault = fault.format(j=int(rng.integers(1, N + 1)), t=round(float(rng.uniform(0.2, 1.2)), 3))
     forward, board = forward_of(rng)
@@ -131,28 +130,29 @@ def trial(name: str, seed: int) -> tuple[Counter[str], str]:
     )
     expected = ModelFeedforward.of(PANDA)
     controller = ExcitationController(LIMITS, motion, ControlSettings(), forward, expected=expected)
-    account = Account(controller, obstacles)
-    arm = with_faults(driver, fault, seed) if fault else driver
     said = ""
     try:
-        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, SECONDS, each=account.note)
-        said = result.fault or ""
-        for _ in range(0 if name == "can" else 150):  # there braking takes longer by itself
-            driver.read()
-        left = np.abs(obstacles.torque)
-        if said and trouble in ("held", "wall"):
-            account._count("contact", left > np.maximum(BOUND * LIMITS.effort, 1.0))
-    except SettingsError as error:  # before any motion
-        said = f"not started: {error}"
+        with opened(name, world) as (driver, obstacles):
+            account = Account(controller, obstacles)
+            arm = with_faults(driver, fault, seed) if fault else driver
+            try:
+                result = run_lockstep(
+                    arm, FrontEnd(PANDA), None, controller, SECONDS, each=account.note
+                )
+                said = result.fault or ""
+                for _ in range(0 if name == "can" else 150):  # there braking takes longer by itself
+                    driver.read()
+                left = np.abs(obstacles.torque)
+                if said and trouble in ("held", "wall"):
+                    account._count("contact", left > np.maximum(BOUND * LIMITS.effort, 1.0))
+            except SettingsError as error:  # before any motion
+                said = f"not started: {error}"
     finally:
-        driver.close()
         controller.detach()
         if board is not None:
             board.close()
             board.unlink()
-    if said and not re.search(
-        r"joint ?\d|usable joint reading|newer joint reading|reflex|without", said
-    ):
+    if said and not re.search(NAMED, said):
         account.broken["unnamed"] += 1
     cause = re.sub(r"-?\d+(\.\d+)?", "#", said)[:70] if said else "to its end"
     return (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,8 @@ from adapter.errors import ControlError, SettingsError
 from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
+from drivers.damiao import holding
+from drivers.fci import torque_control
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
@@ -96,34 +100,38 @@ ON_DRIVERS = [
 def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
     """By joint and cause, without a jump; next to nothing is pushed 50 ms later."""
     world = build("nominal", 1, trouble={"t_s": BEGINS_S[name] + T_S, **trouble})
-    arm, obstacles = opened(name, world)
-    if isinstance(arm, FciLockstep):  # else the robot's own reflex is sooner
-        for most in ("upper_torque", "upper_force"):
-            getattr(arm.served.settings, most)[:] = 1e3
-    controller = ExcitationController(
-        LIMITS,
-        ExcitationSettings(seed=1),
-        ControlSettings(safety=SafetySettings(**safety)),
-        expected=ModelFeedforward.of(PANDA),
-    )
     commands, pushes = [], []
+    with opened(name, world) as (arm, obstacles):
+        if isinstance(arm, FciLockstep):  # else the robot's own reflex is sooner
+            for most in ("upper_torque", "upper_force"):
+                getattr(arm.served.settings, most)[:] = 1e3
+        controller = ExcitationController(
+            LIMITS,
+            ExcitationSettings(seed=1),
+            ControlSettings(safety=SafetySettings(**safety)),
+            expected=ModelFeedforward.of(PANDA),
+        )
 
-    def note(sample: JointSample, tau) -> None:
-        pushes.append(np.abs(obstacles.torque).max())
-        if tau is not None:
-            commands.append(tau.copy())
+        def note(sample: JointSample, tau) -> None:
+            pushes.append(np.abs(obstacles.torque).max())
+            if tau is not None:
+                commands.append(tau.copy())
 
-    try:
         result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=note)
         for _ in range(0 if name == "can" else 50):  # there the stop itself takes its time
             arm.read()
         left = float(np.abs(obstacles.torque).max())
-    finally:
-        arm.close()
     assert result.fault is not None
     assert result.fault.startswith("joint ") and said in result.fault
     assert (np.abs(np.diff(commands, axis=0)) <= 1e-3 * LIMITS.torque_rate + 1e-9).all()
     assert left <= max(0.2 * max(pushes), 1.0)
+
+
+@pytest.mark.parametrize("name", BEGINS_S)
+def test_a_driver_in_lockstep_gives_the_clock_back(name) -> None:
+    with opened(name, build("nominal", 1)) as (arm, _):
+        arm.connect()
+    assert holding.time is torque_control.time is time
 
 
 def test_what_was_learned_stops_a_held_arm_sooner() -> None:

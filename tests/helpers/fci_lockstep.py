@@ -10,7 +10,7 @@ from typing import cast
 
 import numpy as np
 
-from drivers.fci import codec, torque_control
+from drivers.fci import codec
 from drivers.fci.codec import ReplyParser, State, StateDecoder
 from drivers.fci.connect import Channel
 from drivers.fci.torque_control import TorqueControl
@@ -23,7 +23,10 @@ VERSION = 5
 
 
 class FciLockstep:
-    """A driver like `FciArm`, one tick of the robot for each read."""
+    """A driver like `FciArm`, one tick of the robot for each read.
+
+    `torque_control` has to be given it in place of `time`, see `lockstep_drivers`.
+    """
 
     paced, can_move, adds_gravity, arrived_ns = False, True, True, 0
     delay_ns = period_ns = 1_000_000
@@ -48,7 +51,7 @@ class FciLockstep:
         return 1e-3 * self._id
 
     def connect(self) -> None:
-        vars(torque_control)["time"] = self
+        pass
 
     def read(self) -> JointSample:
         if self._control.fault is not None:

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from types import ModuleType
+from typing import Any
+
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
+from drivers.fci import torque_control
 from drivers.interface import Driver
 from drivers.pybullet_arm import PyBulletArm
 from sim.damiao.host import Lockstep
@@ -18,25 +24,48 @@ from tests.helpers.fci_lockstep import FciLockstep
 BEGINS_S = {"sim": 0.0, "fci": 0.0, "can": 1.6}
 
 
-def opened(name: str, world: Scenario) -> tuple[Driver, Obstacles]:
-    """The driver, and what is in the way of its arm."""
-    if name == "sim":
-        plant = world.plant()
-        return PyBulletArm(plant), plant._engine.obstacles
-    if name == "fci":
-        robot = FciLockstep(world)
-        return robot, robot.served.arm._plant._engine.obstacles
+@contextmanager
+def opened(name: str, world: Scenario) -> Iterator[tuple[Driver, Obstacles]]:
+    """The driver, not connected yet, and what is in the way of its arm; closed afterwards."""
+    with ExitStack() as after:
+        if name == "sim":
+            plant = world.plant()
+            driver: Driver = PyBulletArm(plant)
+            obstacles = plant._engine.obstacles
+        elif name == "fci":
+            driver = robot = FciLockstep(world)
+            obstacles = robot.served.arm._plant._engine.obstacles
+            after.enter_context(in_place_of_time(torque_control, robot))
+        else:
+            line = Line()
+            boards = Boards(line.boards, world, now_ns=line.now_ns)
+            line.attach(boards)
+            after.callback(boards.close)
+            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+            address, names = "can://line?interface=virtual", world.truth.joint_names
+            driver = Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
+            obstacles = boards.world._engine.obstacles
+            after.enter_context(in_place_of_time(holding, LineTime(line)))
+        after.callback(driver.close)
+        yield driver, obstacles
 
-    class Clock:  # whoever waits lets the line's time pass
-        @staticmethod
-        def sleep(seconds: float) -> None:
-            line.advance_to(line.now_ns() + int(1e9 * seconds))
 
-    line = Line()
-    boards = Boards(line.boards, world, now_ns=line.now_ns)
-    line.attach(boards)
-    vars(holding)["time"] = Clock
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    address, names = "can://line?interface=virtual", world.truth.joint_names
-    arm = Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
-    return arm, boards.world._engine.obstacles
+class LineTime:
+    """Whoever waits lets a line's time pass."""
+
+    def __init__(self, line: Line) -> None:
+        self._line = line
+
+    def sleep(self, seconds: float) -> None:
+        self._line.advance_to(self._line.now_ns() + int(1e9 * seconds))
+
+
+@contextmanager
+def in_place_of_time(module: ModuleType, clock: Any) -> Iterator[None]:
+    """Let one module have this clock where it asks `time`; its own again afterwards."""
+    own = vars(module)["time"]
+    vars(module)["time"] = clock
+    try:
+        yield
+    finally:
+        vars(module)["time"] = own
