@@ -12,6 +12,7 @@ from adapter.cli.names import effects_named
 from adapter.cli.options import joints_of, locks_of
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
+from adapter.gap.torque_gains import EffortUnit
 from adapter.learning.known_effects import learnable, not_taken_off
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_recorded, config_table, read_config
@@ -33,6 +34,12 @@ def robot_of_log(args: argparse.Namespace, log: Log, floating: bool = False) -> 
         path = Path(folder) / "documented.json"
         path.write_bytes(carried)
         return robot_of(args, str(path), floating)
+
+
+def effort_unit_of(args: argparse.Namespace) -> EffortUnit:
+    """The unit of recorded efforts that the command line tells."""
+    learn = args.tau_gain == "fit"
+    return EffortUnit(args.gain, learn, args.gears, args.known_load, tuple(args.loaded))
 
 
 def configure(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from adapter.cli.common import robot_of
+from adapter.cli.common import effort_unit_of, robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_robot
 from adapter.effects.export import robot_urdf
@@ -42,7 +42,8 @@ from drivers.files.mcap import Log, read_log
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     logs, hold_out = _opened(args)
-    settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out)
+    unit = effort_unit_of(args)
+    settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, unit=unit)
     if args.inertia_prior is not None:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:

@@ -6,9 +6,11 @@ import argparse
 from pathlib import Path
 
 from adapter.cli.options import (
+    add_effort_unit,
     add_joints,
     add_results,
     add_topic,
+    check_effort_unit,
     check_logs,
     check_robot,
     locks_of,
@@ -36,6 +38,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
     )
     add_joints(parser)
+    add_effort_unit(parser)
     add(
         "--inertia-prior",
         type=float,
@@ -75,4 +78,5 @@ def _check(args: argparse.Namespace) -> None:
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
     locks_of(args)
+    check_effort_unit(args)
     check_robot(args.model)

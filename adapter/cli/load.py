@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from adapter.cli.common import robot_of_log
+from adapter.cli.common import effort_unit_of, robot_of_log
 from adapter.gap.load import find_load
 from adapter.gap.load_words import as_json, robot_lines, sentence
+from adapter.gap.torque_gains import in_newton_metres
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
 from drivers.files.mcap import read_log
@@ -18,10 +19,15 @@ def run(args: argparse.Namespace) -> int:
     log = read_log(args.log, topic=args.topic)
     empty = None if args.empty is None else read_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
+    given = [log] if empty is None else [log, empty]
+    (log, *others), gains = in_newton_metres(given, robot, effort_unit_of(args), given[1:])
+    warn([] if gains is None else [*gains.notes, *gains.words()])
+    empty = others[0] if others else None
     load = find_load(log, robot, empty, args.frame, args.inertia_prior)
     warn(list(load.notes))
     files = {"recording": str(args.log), "empty": str(args.empty) if args.empty else None}
-    figures = {**as_json(load), **files, "model": robot.name}
+    learned = None if gains is None else gains.as_dict()
+    figures = {**as_json(load), **files, "model": robot.name, "torque_gains": learned}
     write_json(args.json, figures)
     shown = console if str(args.json) == "-" else output
     shown.print(sentence(load), soft_wrap=True)

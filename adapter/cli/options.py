@@ -133,6 +133,67 @@ def add_topic(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_effort_unit(parser: argparse.ArgumentParser) -> None:
+    """In which unit recordings tell the joints' efforts, where it is not N m at the link."""
+    add = parser.add_argument
+    add(
+        "--tau-gain",
+        metavar="G1,G2,...|fit",
+        help="N m per recorded unit (motor current: N m/A), one per joint of the model or one for "
+        "all; fit: learn them beside θ against the documented masses",
+    )
+    add(
+        "--gear",
+        metavar="G1,G2,...",
+        help="efforts are of the motors: turns of the motor per turn of the link, one per joint or "
+        "one for all; velocities and positions are of the links",
+    )
+    add(
+        "--known-load",
+        type=float,
+        metavar="KG",
+        help="mass of a body that the hand carries in the recordings of --loaded (default: in all "
+        "LOGs), so that --tau-gain fit knows the gains' scale",
+    )
+    add(
+        "--loaded",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=Path,
+        metavar="LOG",
+        help="with the known load, among the LOGs or beside them for the gains alone",
+    )
+
+
+def check_effort_unit(args: argparse.Namespace) -> None:
+    """Refuse what is no number and what goes with another option. Raises UsageError."""
+    learn = args.tau_gain == "fit"
+    args.gain = (
+        () if args.tau_gain is None or learn else numbers("--tau-gain", args.tau_gain, "fit")
+    )
+    args.gears = () if args.gear is None else numbers("--gear", args.gear)
+    args.loaded = check_logs(*args.loaded)
+    if args.loaded and args.known_load is None:
+        raise UsageError("--loaded names recordings of the known load; give its --known-load KG")
+    if args.known_load is not None and not learn:
+        raise UsageError("--known-load fixes the scale of learned gains; give --tau-gain fit too")
+    if args.known_load is not None and not 0.0 < args.known_load < math.inf:
+        raise UsageError(f"--known-load takes a mass above zero in kg, got {args.known_load}")
+
+
+def numbers(option: str, text: str, *words: str) -> tuple[float, ...]:
+    """Numbers with commas between, none of them zero. Raises UsageError."""
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if not values or not all(math.isfinite(x) and x != 0.0 for x in values):
+        choices = " or ".join(("numbers other than zero, with commas between", *words))
+        raise UsageError(f"{option} '{text}': takes {choices}")
+    return values
+
+
 def check_logs(*paths: Path | None) -> list[Path]:
     """Recordings, and of folders that are no rosbag2 the recordings in them, in order of names.
 

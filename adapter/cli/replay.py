@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from adapter.cli.common import configure, robot_of_log
+from adapter.cli.common import configure, effort_unit_of, robot_of_log
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.errors import SettingsError
+from adapter.gap.screen import check_effort_unit
+from adapter.gap.torque_gains import TorqueGains, in_newton_metres
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
@@ -49,10 +51,10 @@ def run(args: argparse.Namespace) -> int:
     config = configure(args, recorded, robot)
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
-    log = _joined(args, whole, robot)
-    if more:
-        others = (read_log(path, topic=args.topic) for path in more)
-        log = one_after_other([log, *(matching(other, robot) for other in others)])
+    logs = [_joined(args, whole, robot)]
+    logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
+    logs, gains = _in_newton_metres(args, logs, robot)
+    log = one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
     if args.base is None:
         log, imus = with_link_imus(log, robot, args.imu)
@@ -69,7 +71,10 @@ def run(args: argparse.Namespace) -> int:
     numbers = _figures(args, log, robot, reference, result)
     if front_end.first_moving_ns is None:
         warn([f"{source}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
+    numbers["torque_gains"] = None if gains is None else gains.as_dict()
     held_out = _held_out(args, log, robot)
+    if held_out is not None and args.validate is not None:
+        held_out = _as_understood(args, held_out, robot, gains)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
         rmse = held_out_rmse(held_out, model, config.pipeline)
@@ -111,6 +116,40 @@ def _figures(
         noise=noise_levels(log),
         gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
     )
+
+
+def _in_newton_metres(
+    args: argparse.Namespace, logs: list[Log], robot: SelfModel
+) -> tuple[list[Log], TorqueGains | None]:
+    """Recordings with efforts in N m, and the gains where they were learned.
+
+    Raises:
+        RecordingRefused: nobody says a unit, and efforts are motor currents.
+    """
+    unit = effort_unit_of(args)
+    if robot.tree.floating and not unit.is_given:
+        return logs, None
+    if unit.learn and robot.tree.floating:
+        raise SettingsError("--tau-gain fit needs a fixed base; give --tau-gain G1,G2,...")
+    until = args.validate_from
+    taught = logs if until is None else [x.take(seconds(x) < until) for x in logs]
+    if unit.learn:
+        say("learning the gains of the drives")
+    logs, gains = in_newton_metres(logs, robot, unit, taught)
+    if gains is not None:
+        logs[0].warnings.extend([*gains.notes, *gains.words()])
+    if gains is not None or not unit.is_given:
+        for log in logs:
+            check_effort_unit(log, robot)
+    return logs, gains
+
+
+def _as_understood(
+    args: argparse.Namespace, log: Log, robot: SelfModel, gains: TorqueGains | None
+) -> Log:
+    """Another recording with efforts in N m as those that were learned from."""
+    factors = effort_unit_of(args).factors(robot.tree.joint_names)
+    return replace(log, tau=log.tau * factors * (1.0 if gains is None else gains.gain))
 
 
 def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:

@@ -39,6 +39,7 @@ WHERE_IT_MOVES = (
         for name in ("viscous_friction", "motor_inertia")
     ),
 )
+COULOMB = CATALOGUE["coulomb_friction"]
 OFFSET, SENSORS_BAND = CATALOGUE["torque_offset"], CATALOGUE["torque_filter"]
 SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
@@ -92,7 +93,7 @@ def real_arm(
         loaded: recordings (from 0) in which the hand may hold something.
         shares: times the prior of the inertias that are tried, least first.
     """
-    loads = [_load(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
+    loads = [load_in(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
     trial = _beside(fit.with_named(loads), joints)
     for _ in range(WAY_ROUNDS):
         found, known = _as_wide_as_open(trial, shares)
@@ -103,9 +104,28 @@ def real_arm(
     return RealArm(found, known, len(loads))
 
 
+def as_driven(fit: Fit, joints: Sequence[int], first: Sequence[Named]) -> Fit:
+    """A fit with these effects first, and beside them friction, motors and offsets at zero.
+
+    Gearboxes rub much more than a Panda's joints, so that it counts how soon a joint slides:
+    Coulomb friction is beside that of bristles.
+
+    Args:
+        joints: (from 0) that move.
+    """
+    fit = _beside(fit.with_named(first), joints)
+    at_once = [_assumed(COULOMB, COULOMB.templates()[0], j) for j in joints]
+    return fit.with_named([*fit.named, *at_once])
+
+
+def load_in(fit: Fit, recording: int | None) -> Named:
+    """A load at zero in a recording, or in all where None."""
+    return replace(_named(HELD, fit.model.hand.templates()[1], -1), recording=recording)
+
+
 def with_a_load(fit: Fit) -> tuple[Named, ...]:
     """A load in the first recording, then what may be beside it in every joint, at zero."""
-    return _beside(fit.with_named([_load(fit, 0)]), range(fit.n)).named
+    return _beside(fit.with_named([load_in(fit, 0)]), range(fit.n)).named
 
 
 def fitting_way(fit: Fit, load: Named) -> Named:
@@ -205,10 +225,6 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
 
 def _assumed(effect: Effect, template: Template, joint: int) -> Named:
     return replace(_named(effect, template, joint), assumed=True)
-
-
-def _load(fit: Fit, recording: int | None) -> Named:
-    return replace(_named(HELD, fit.model.hand.templates()[1], -1), recording=recording)
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:

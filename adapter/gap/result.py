@@ -31,6 +31,7 @@ IN_FILE = (
     "model_in",
     "joint_names",
     "wall_s",
+    "torque_gains",
 )
 
 
@@ -197,6 +198,7 @@ class GapResult:
         stopped_after_rounds: the search had to stop then, and might have found more; None where
             it came to its end.
         wall_s: how long all that took.
+        torque_gains: of the drives, where they were learned (`torque_gains.TorqueGains`).
     """
 
     joint_names: tuple[str, ...]
@@ -223,6 +225,7 @@ class GapResult:
     loads: tuple[LogLoad, ...] = ()
     contradictions: tuple[str, ...] = ()
     in_sample: bool = False
+    torque_gains: dict[str, Any] | None = None
 
     def __repr__(self) -> str:
         if self.problem is not None:

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
+from adapter.gap.motor_currents import TorqueShares, torque_shares
+from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.timing import RecordingClock, check_timing, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
@@ -22,7 +24,7 @@ from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
 MOTION_S = 0.2  # of motion faster than half MOVES_DQ; less tells nothing of a joint
-SHORTEST_S = 1.5  # of a recording
+SHORTEST_S, FEWEST = 1.5, 100  # seconds and samples of a recording
 WANTED_RAD, WANTED_DQ = 0.3, 0.3  # what to ask for
 DEGREES = 180.0 / np.pi
 TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
@@ -84,11 +86,12 @@ class Screened:
     notes: list[str]
 
 
-def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
+def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) -> Screened:
     """Let a recording pass or say in one sentence why not.
 
     Args:
         log: as read; model: whose joints it should have; arm: the model's rigid body.
+        unit_known: somebody says that torques are in N m, however large they are.
 
     Raises:
         Refusal: another robot; no second of data; units or sign of velocities or positions;
@@ -102,7 +105,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
     silent = _silent(log, names)
-    judge_torque(log, model, arm, (q, dq, ddq, tau), renamed, recorded)
+    judge_torque(log, model, arm, (q, dq, ddq, tau), recorded if renamed else (), unit_known)
     notes = [*timing.words(), *outside, *_standing(names, moving, q, dq), *silent]
     return Screened(log, timing, moving, notes)
 
@@ -124,7 +127,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
-    if timing.span_s < SHORTEST_S or len(log) < 100:
+    if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
             RecordingFault.DATA,
             f"{log.path}: only {timing.span_s:.2g} s and {len(log)} usable samples of "
@@ -290,38 +293,80 @@ def judge_torque(
     model: SelfModel,
     arm: RigidArm,
     smoothed: tuple[Array, Array, Array, Array],
-    renamed: bool = False,
-    recorded: Sequence[str] = (),
+    renamed: Sequence[str] = (),
+    unit_known: bool = False,
 ) -> None:
     """Refuse torques in another unit, sign, order or without gravity.
 
     Args:
         smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
-        renamed: joints were matched by number, so it may be another arm altogether.
-        recorded: joint names of the recording.
+        renamed: joint names of a recording whose joints were matched by number, so that it may be
+            one of another arm altogether.
+        unit_known: somebody says that torques are in N m, however large they are.
 
     Raises:
         Refusal: see there.
     """
-    every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
-    t = GRID_S * np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
-    q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
-    comparison = TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, t))
+    comparison, tau = compared(model, arm, smoothed)
     as_is, *others = readings(comparison, tau)
     best = others[0]
     if renamed and min(as_is.cost, best.cost) > FOREIGN_COST:
         why = "the joints are named otherwise and its torques are not those of such an arm"
-        raise _another_robot(log, model, recorded, why)
+        raise _another_robot(log, model, renamed, why)
     tilt = best.kind == "mounting" and _angle(best.detail, arm.gravity) < TILT_RAD
-    if tilt or not convincing(comparison, best, as_is):
-        return
+    convinced = convincing(comparison, best, as_is) and not tilt
     if best.kind == "scale":
         cheap = (r for r in others if r.cost < best.cost + NAMED_UNIT_COST)
         best = next((r for r in cheap if unit(r)), best)
+    if unit_known:
+        convinced = convinced and best.kind != "scale"
+    elif not (convinced and best.kind == "scale" and unit(best)):
+        refuse_currents(log, model, torque_shares(comparison, tau))
+    if not convinced:
+        return
     raise RecordingRefused(
         RecordingFault(best.kind),
         f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}",
     )
+
+
+def check_effort_unit(log: Log, model: SelfModel) -> None:
+    """Refuse efforts that are motor currents, where there is motion enough to tell.
+
+    Args:
+        log: joints in the model's order; model: of an arm whose base is fixed.
+
+    Raises:
+        Refusal: see there.
+    """
+    rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
+    if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
+        return
+    log = rows_of(log, rows)
+    stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    smoothed = smooth(stamps_s, log.q, log.dq, log.tau)
+    refuse_currents(log, model, torque_shares(*compared(model, RigidArm.of(model), smoothed)))
+
+
+def refuse_currents(log: Log, model: SelfModel, shares: TorqueShares) -> None:
+    """Refuse efforts that are motor currents. Raises Refusal."""
+    if shares.are_currents:
+        said = currents_in_words(shares, model.tree.joint_names)
+        raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
+
+
+def compared(
+    model: SelfModel, arm: RigidArm, smoothed: tuple[Array, Array, Array, Array]
+) -> tuple[TorqueComparison, Array]:
+    """What efforts (m, n) are held against, and these, at so many instants as are judged.
+
+    Args:
+        smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
+    """
+    every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
+    t = GRID_S * np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
+    q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
+    return TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, t)), tau
 
 
 def _angle(a: Array, b: Array) -> float:

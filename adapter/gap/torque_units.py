@@ -75,25 +75,30 @@ class TorqueComparison:
     Args:
         arm: rigid body of the model, tool included.
         q, dq, ddq: (m, n) smoothed motion, some 25 Hz; tau_model: (m, n) N m of the model.
+
+    Attributes:
+        model: tau_model; sigma: (n,) N m, what no correction explains of it.
+        friction: (3, m, n) one, sign of the motion and dq: torques that do not hang on masses.
     """
 
     def __init__(self, arm: RigidArm, q: Array, dq: Array, ddq: Array, tau_model: Array) -> None:
         self.model, self._arm, self._q = tau_model, arm, q
         self.sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(tau_model**2, axis=0))
         self._row = np.sqrt(EFFECTIVE / len(q)) / self.sigma
+        self.friction = np.stack([np.ones_like(dq), smooth_sign(dq, ddq, SMOOTHING_S), dq])
         inertial = arm.regressor(q, dq, ddq) * _inertial_std(arm).ravel()
-        joint = self._at_joints(dq, ddq)
+        joint = self._at_joints()
         rows = [(x * self._row[None, :, None]).reshape(-1, x.shape[2]) for x in (inertial, joint)]
         self._columns = np.concatenate(rows, axis=1)
         self._factor = _ridge(self._columns)
         self._joint_columns = rows[1][:, : (len(FRICTION) - 1) * q.shape[1]]  # gains left out
         self._joint_factor = _ridge(self._joint_columns)
 
-    def _at_joints(self, dq: Array, ddq: Array) -> Array:
+    def _at_joints(self) -> Array:
         """(m, n, 4 n) torque per standard deviation of offset, friction and gain, in this order."""
-        m, n = dq.shape
+        m, n = self.model.shape
         joint = np.zeros((m, n, len(FRICTION), n))
-        columns = (np.ones_like(dq), smooth_sign(dq, ddq, SMOOTHING_S), dq, self.model)
+        columns = (*self.friction, self.model)
         for k, (std, column) in enumerate(zip(FRICTION, columns, strict=True)):
             for j in range(n):
                 joint[:, j, k, j] = std * column[:, j]

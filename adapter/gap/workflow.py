@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import Recorded
 from adapter.gap.timing import lateness
+from adapter.gap.torque_gains import EffortUnit, TorqueGains, in_newton_metres
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -62,6 +63,7 @@ class GapSettings:
         validate_from_s: with one recording: fit before it, score after it; None: by blocks.
         hold_out: recordings to score on, among those that are given or not. All others are
             fitted; where none is held out, blocks of time of all are in turn.
+        unit: of the recordings' efforts; N m where nobody says otherwise.
         rounds: of the search, each of which may name something; where they do not suffice the
             result says so. Counted, not timed: the same log gives the same result anywhere.
     """
@@ -70,6 +72,7 @@ class GapSettings:
     validate_from_s: float | None = None
     hold_out: tuple[Path | str | Log, ...] = ()
     rounds: int = ROUNDS
+    unit: EffortUnit = field(default_factory=EffortUnit)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.inertia_prior <= 1.0:
@@ -108,7 +111,7 @@ def find_gap(
     # dates of an earlier recording mean nothing in this one
     nominal = lasting(model if isinstance(model, SelfModel) else read_robot(str(model)))
     try:
-        task = _task(logs, nominal, settings, progress)
+        task, gains = _task(logs, nominal, settings, progress)
     except RecordingRefused as refusal:
         if not refusal.kind.is_an_answer:
             raise
@@ -131,6 +134,9 @@ def find_gap(
     result = replace(_result(task, measured, settings), model_in=name)
     if several is not None:
         result = several.told(result)
+    if gains is not None:
+        notes = (*gains.words(), *gains.notes, *result.notes)
+        result = replace(result, torque_gains=gains.as_dict(), notes=notes)
     if model_out is not None:
         save_model(model_of(task.model, measured.found.fit), model_out)
         result = replace(result, model_out=str(model_out))
@@ -151,8 +157,8 @@ def _with_what_is_held(
 
 def _task(
     logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
-) -> GapTask:
-    """Read and screen. Raises Refusal."""
+) -> tuple[GapTask, TorqueGains | None]:
+    """Read, convert and screen. Raises Refusal."""
     held = settings.hold_out
     kept = [log for log in logs if not any(_same(log, other) for other in held)]
     if not kept:
@@ -165,8 +171,12 @@ def _task(
         read.append(log if isinstance(log, Log) else read_log(Path(log)))
         model, said = present(model, read[-1].joint_names, name)
         locked += said
-    arm = RigidArm.of(model)
-    screened: list[Screened] = [refuse(log, model, arm) for log in read]
+    if settings.unit.learn:
+        progress("learning the gains of the drives")
+    learned_from = [_until(log, settings.validate_from_s) for log in read[: len(kept)]]
+    read, gains = in_newton_metres(read, model, settings.unit, learned_from)
+    arm, unit_known = RigidArm.of(model), settings.unit.is_given and gains is None
+    screened: list[Screened] = [refuse(log, model, arm, unit_known) for log in read]
     recordings = tuple(
         replace(Recorded.of(x.log, lateness(x.timing)), name=name)
         for x, name in zip(screened, names, strict=True)
@@ -178,7 +188,7 @@ def _task(
         fitted, scored = _split(recordings[0], settings.validate_from_s)
     said_of = zip(names, (x.notes for x in screened), strict=True)
     notes = (f"{name}: {x}" if len(names) > 1 else x for name, own in said_of for x in own)
-    return GapTask(
+    task = GapTask(
         model,
         fitted,
         scored,
@@ -187,6 +197,14 @@ def _task(
         one_clock=not held,
         notes=(*dict.fromkeys(locked), *notes),
     )
+    return task, gains
+
+
+def _until(log: Log, end_s: float | None) -> Log:
+    """A recording before a second of it; all of it where None."""
+    if end_s is None:
+        return log
+    return log.take(log.stamp_ns < log.stamp_ns[0] + round(1e9 * end_s))
 
 
 def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
