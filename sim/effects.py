@@ -17,7 +17,7 @@ b = d^2 - c, of first order where b is zero.
 | x_torque_crosstalk | joints [i, j]: sensor j reads share tau_i on top | share (1) |
 | x_torque_deadband | the sensor reads tau - clip(tau, -w, w) | w (N m) |
 | x_torque_saturation | the sensor's curve bends: s tanh(tau/s) | s (N m) |
-| x_held_joint | a stiff spring holds it where it is when this begins | none |
+| x_held_joint | a spring holds it where it is when this begins, or pushes | push (N m), k |
 | x_wall | a stiff plane across the hand's way when this begins, `gap` ahead | gap (m) |
 | x_floor | a stiff level plane below the hand, with friction | height (m, base axes) |
 """
@@ -70,7 +70,7 @@ SPECS: dict[str, tuple[str, tuple[str, ...], tuple[str, ...]]] = {
     "x_torque_crosstalk": (TORQUE, ("share",), ()),
     "x_torque_deadband": (TORQUE, ("w",), ()),
     "x_torque_saturation": (TORQUE, ("s",), ()),
-    "x_held_joint": (OBSTACLE, (), ()),
+    "x_held_joint": (OBSTACLE, (), ("push", "k")),
     "x_wall": (OBSTACLE, (), ("gap",)),
     "x_floor": (OBSTACLE, ("height",), ()),
 }

@@ -1,8 +1,9 @@
 """What is in an arm's way: something that holds joints, a wall before the hand, or a floor.
 
 All are stiff springs with dampers that appear at an instant: joints are held at the angles they
-have then, a wall stands across the way that the hand goes, so far ahead. A floor is level, at a
-height; what touches it does not slide before it is pushed sideways by half of what it is pressed.
+have then (or next to them, which pushes), a wall stands across the way that the hand goes, so far
+ahead. A floor is level, at a height; what touches it does not slide before it is pushed sideways by
+half of what it is pressed.
 """
 
 from __future__ import annotations
@@ -46,17 +47,18 @@ class Obstacles:
         """
         against, damping = np.zeros(self._n), np.zeros(self._n)
         self.force = 0.0
-        for k, effect in enumerate(self._effects):
+        for number, effect in enumerate(self._effects):
             if not effect.acts(t):
-                self._places.pop(k, None)
+                self._places.pop(number, None)
             elif effect.name == "x_wall":
-                against -= self._wall(k, effect, q, dq, frames)
+                against -= self._wall(number, effect, q, dq, frames)
             elif effect.name == "x_floor":
-                against -= self._floor(k, effect, q, dq, frames)
+                against -= self._floor(number, effect, q, dq, frames)
             else:
                 joints = effect.columns(self._n)
-                at, _ = self._places.setdefault(k, (q.copy(), 0.0))
-                against[joints] += HOLD_STIFFNESS * (q - at)[joints]
+                k = effect.number("k", HOLD_STIFFNESS)
+                at, _ = self._places.setdefault(number, (q + effect.number("push") / k, 0.0))
+                against[joints] += k * (q - at)[joints]
                 damping[joints] += HOLD_DAMPING
         self.torque = -against - damping * dq
         return against, damping

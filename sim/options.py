@@ -13,7 +13,7 @@ from sim.noise_levels import NOISES, check_levels
 DEFAULT_SCENARIO = "nominal"
 ROBOTS = ("panda", "fr3")
 COMMON_OPTIONS = ("noise", "links", "levels", "imus", "trouble", "robot")
-TROUBLES = ("held", "wall", "floor", "load", "t_s")
+TROUBLES = ("held", "wall", "floor", "load", "t_s", "push", "k")
 
 
 class ScenarioKind(NamedTuple):
@@ -64,8 +64,11 @@ def _check_trouble(trouble: Any) -> None:
     """Raises ValueError, naming the choices."""
     if not isinstance(trouble, dict) or not trouble.keys() <= set(TROUBLES):
         raise ValueError(f"trouble is {trouble!r}; have: a table of {', '.join(TROUBLES)}")
-    for key in trouble.keys() - {"held"}:
+    for key in trouble.keys() - {"held", "push"}:
         _size("trouble", key, trouble[key])
+    push = trouble.get("push", 0.0)
+    if not isinstance(push, int | float) or not math.isfinite(push):
+        raise ValueError(f"trouble: push is {push!r}; have: a number, N m, of either sign")
     held = trouble.get("held", [])
     if not isinstance(held, list) or not all(type(j) is int and j > 0 for j in held):
         raise ValueError(f"trouble: held is {held!r}; have: [NUMBER OF A JOINT, ...]")

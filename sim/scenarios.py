@@ -178,13 +178,14 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
 
     Args:
         truth: the arm.
-        trouble: `held` (numbers of joints) held from `t_s` on, `wall` (m ahead of the hand)
-            standing there from `t_s` on, `floor` (its height in m, base axes), `load` (kg at the
-            flange) carried up to `t_s`.
+        trouble: `held` (numbers of joints) held from `t_s` on, and pushed with `push` (N m) by a
+            spring of `k` (N m/rad), `wall` (m ahead of the hand) standing there from `t_s` on,
+            `floor` (its height in m, base axes), `load` (kg at the flange) carried up to `t_s`.
     """
     effects, since = list(truth.effects), (float(trouble.get("t_s", 0.0)), None)
     if "held" in trouble:
-        effects.append(Effect("x_held_joint", tuple(trouble["held"]), {}, since))
+        said: dict[str, Any] = {key: float(trouble[key]) for key in ("push", "k") if key in trouble}
+        effects.append(Effect("x_held_joint", tuple(trouble["held"]), said, since))
     if "wall" in trouble:
         effects.append(Effect("x_wall", (), {"gap": float(trouble["wall"])}, since))
     if "floor" in trouble:

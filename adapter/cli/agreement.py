@@ -13,7 +13,6 @@ from pathlib import Path
 from adapter.control.controller import ExcitationController
 from adapter.control.excitation import plan_lines
 from adapter.control.free_path import FreeMotion
-from adapter.control.resting import check_resting_torque
 from adapter.errors import SettingsError, UsageError
 from adapter.report.plan_page import write_plan
 from adapter.runs.terminal import say
@@ -70,8 +69,8 @@ def agree(
     assert isinstance(draw, FreeMotion) and draw.least is not None
     assert motion is not None and start is not None
     model, limits, least = draw.arm.model, controller.limits, draw.least
-    if not args.trust_model:
-        check_resting_torque(model, start.q, start.tau)
+    if controller.weight is not None and controller.weight.refusal is not None:
+        raise SettingsError(controller.weight.refusal)
     lines = plan_lines(motion, limits, model.tree.joint_names, duration_s)
     lines.insert(-1, f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).")
     say("\n".join(lines))

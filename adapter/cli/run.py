@@ -27,6 +27,7 @@ from adapter.control.information import Information
 from adapter.control.limits import MotionLimits, another_robot, need_complete
 from adapter.control.observer import ContactObserver
 from adapter.control.path_motion import PathMotion
+from adapter.control.resting import CarriedWeight
 from adapter.control.settings import DESIGNED, ExcitationSettings, gentle
 from adapter.effects.active import with_bodies
 from adapter.model.model_file import dumps
@@ -219,7 +220,10 @@ def controller_of(
     if plan.maybe_real:
         draw = free = plan.free_motion(args.duration)
         free.arm.meanwhile = reading(driver)
-    return ExcitationController(limits, config.excitation, control, forward, draw, expected)
+    controller = ExcitationController(limits, config.excitation, control, forward, draw, expected)
+    if plan.maybe_real and not args.trust_model:
+        controller.weight = CarriedWeight(robot)
+    return controller
 
 
 def _go(

@@ -22,6 +22,7 @@ from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.observer import ContactObserver
 from adapter.control.path_motion import PathMotion, smooth_step
 from adapter.control.reading_gate import ReadingGate, ReadingJudge
+from adapter.control.resting import CarriedWeight
 from adapter.control.safety import ArmWatch, Now
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
@@ -152,6 +153,8 @@ class ExcitationController:
     Attributes:
         observer: once it has learned, it says what pushes the arm, in place of `expected`; whoever
             sets it has it see each sample before `step` does.
+        weight: what the arm may hold before it is moved, and be carried with when it is braked;
+            None lets it be anything.
         reference: the motion; None before the first sample.
         start: the sample that it was drawn from.
     """
@@ -170,6 +173,7 @@ class ExcitationController:
         self.limits, self.motion = limits, motion or ExcitationSettings()
         self.feedforward, self.draw = feedforward, draw
         self.observer: ContactObserver | None = None
+        self.weight: CarriedWeight | None = None
         self._expected, self._safety = expected, control.safety
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
@@ -218,7 +222,7 @@ class ExcitationController:
 
         Raises SettingsError where it stands outside its limits or says nothing usable.
         """
-        held = self._still if self._adds_gravity else sample.tau
+        held = self._still if self._adds_gravity and self.weight is None else sample.tau
         for name, values in (("position", sample.q), ("velocity", sample.dq), ("torque", held)):
             if not np.isfinite(values).all():
                 raise SettingsError(
@@ -227,7 +231,10 @@ class ExcitationController:
                 )
         self.reference = ref = self.draw(self.limits, sample.q, self.motion)
         self.start = sample
-        self._tau = self._bias = np.array(held, dtype=np.float64)
+        own = self._still if self._adds_gravity else sample.tau
+        self._tau = self._bias = np.array(own, dtype=np.float64)
+        if self.weight is not None:
+            self.weight.begin(sample.q, sample.tau)
         self._gate = ReadingGate(self._new_judge(), self._period_ns)
         self._watch = ArmWatch(self.limits, self._safety, self._K, self._effort)
         self._started = False
@@ -289,7 +296,7 @@ class ExcitationController:
             else:
                 now[5] = model(ref.q, ref.dq, ref.ddq)
             if self._ticks % CARRY_TICKS == 0:
-                self._tell_weight(model.unbent(ref.q))
+                self._tell_weight(model.unbent(ref.q), ref.q)
         self._tau = watch.step(most, 1e-9 * min(step_ns, 2 * self._period_ns))
         return self._tau.copy()
 
@@ -301,16 +308,25 @@ class ExcitationController:
             now[Now.OFFSET] += observer.explained - self._explained
             self._explained = observer.explained
 
-    def _tell_weight(self, gravity: Array) -> None:
-        """What carries the arm (n,) N m: kept where the arm adds it, else told where asked for."""
+    def _tell_weight(self, gravity: Array, q: Array) -> None:
+        """What carries the arm (n,) N m: kept where the arm adds it, else told where asked for.
+
+        It is documented weight, or learned weight, and what this is off by, a push for one; within
+        what the arm may be carried with.
+        """
         if self._adds_gravity:
             self._watch.now[Now.CARRIED] = gravity
         elif self._carry is not None:
-            self._carry(gravity + self._watch.now[Now.OFFSET])
+            if self.observer is not None and self.observer.learned:
+                gravity = self.observer.weight(q)
+            carried = gravity + self._watch.now[Now.OFFSET]
+            self._carry(carried if self.weight is None else self.weight.within(q, carried))
 
     def _start(self, sample: JointSample) -> None:
         """The first reading has to be where the motion was drawn from; it may be long ago."""
         assert self.reference is not None
+        if self.weight is not None and self.weight.refusal is not None:
+            raise ControlError(f"{self.weight.refusal}; the arm was not moved")
         self._started = True
         away = np.abs(sample.q - self.reference.q)
         if (away > START_REACH).any():

@@ -427,6 +427,14 @@ class ContactObserver:
             contact.torque, contact.std = self.torque.copy(), self.std.copy()
         self._since += 1
 
+    def weight(self, q: Array) -> Array:
+        """(n,) N m of holding still at q (n,) rad, by the model in use."""
+        rows = self._model.table[: Row.TAU + 1]  # they belong to the last reading
+        kept = rows.copy()
+        weight = self._model.unbent(q)
+        rows[:] = kept
+        return weight
+
     @property
     def frames(self) -> Frames:
         """Where the joints are, by the model in use."""

@@ -10,7 +10,10 @@ turn: about an axis along gravity, say.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linprog
 
 from adapter.control.feedforward import ModelFeedforward
@@ -21,6 +24,7 @@ from adapter.physics.rigid_arm import RigidArm
 
 BAND_SHARE, LEAST_BAND = 0.1, 0.5  # of the effort limit, and N m: friction, offsets, model error
 LOAD_SHARE = 1 / 3  # of the mass of the moving links, that may hang on a hand unsaid
+LARGEST_SHARE = 0.01  # of the largest beside the sum beyond the band
 LOAD_REACH_M = 0.35  # of its centre from the frame of the last link, along each axis
 
 
@@ -33,50 +37,102 @@ def check_resting_torque(model: SelfModel, q: Array, tau: Array) -> None:
         tau: (n,) measured there, gravity included, N m.
 
     Raises:
-        SettingsError: with the joint and the numbers.
+        SettingsError: with every joint that is off, and the numbers.
     """
     if not (np.isfinite(q).all() and np.isfinite(tau).all()):
         raise SettingsError("the arm at rest does not measure every joint's position and torque")
-    said = ModelFeedforward.of(model).unbent(q)
-    effort = np.where(np.isfinite(model.limits.effort), model.limits.effort, 0.0)
-    band = np.maximum(BAND_SHARE * effort, LEAST_BAND)
-    heaviest = LOAD_SHARE * float(model.theta[:, 0].sum())
-    loads = _load_columns(model, q)
-    left = tau - said - loads @ _best_load(tau - said, loads, band, heaviest)
-    j = int(np.argmax(np.abs(left) / band))
-    if abs(left[j]) > band[j]:
-        raise SettingsError(
-            f"{model.tree.joint_names[j]} holds {tau[j]:+.1f} N m at rest where the model "
-            f"{model.name} says {said[j]:+.1f}; {abs(left[j]):.1f} N m of it no load of up to "
-            f"{heaviest:.1f} kg at the hand explains, and {band[j]:.1f} is what friction may be. "
-            "Is it another robot (--robot), mounted otherwise (--gravity X Y Z), carrying more "
-            "([tool] in --config) or leaning on something? --trust-model moves it all the same"
+    weight = CarriedWeight(model)
+    weight.begin(q, tau)
+    if weight.refusal is not None:
+        raise SettingsError(weight.refusal)
+
+
+class CarriedWeight:
+    """What an arm may be carried with: its model's weight, a load at the hand, and a band.
+
+    The load is what explains best the torques that were measured before the start. A push of
+    something that holds the arm is neither, and an arm that is braked must not keep it up.
+
+    Args:
+        model: with gravity and tool.
+
+    Attributes:
+        refusal: why the arm may not be moved; None where it holds what it may.
+    """
+
+    def __init__(self, model: SelfModel) -> None:
+        effort = np.where(np.isfinite(model.limits.effort), model.limits.effort, 0.0)
+        self._model, self._plain = model, ModelFeedforward.of(model)
+        self._band = np.maximum(BAND_SHARE * effort, LEAST_BAND)
+        self._heaviest = LOAD_SHARE * float(model.theta[:, 0].sum())
+        self._loaded = self._plain
+        self.refusal: str | None = None
+
+    def begin(self, q: Array, tau: Array) -> None:
+        """Find the load of an arm that holds tau (n,) N m at rest at q (n,) rad."""
+        said = self._plain.unbent(q)
+        hands, columns = _load_columns(self._model, q)
+        load = _best_load(tau - said, columns, self._band, self._heaviest)
+        theta = self._model.theta.copy()
+        theta[hands, :4] += load.reshape(-1, 4)
+        self._loaded = ModelFeedforward.of(replace(self._model, theta=theta))
+        left = tau - said - columns @ load
+        off = np.flatnonzero(np.abs(left) > (1.0 + 1e-6) * self._band)  # a load ends on it exactly
+        self.refusal = self._said(off, tau, said, left) if len(off) else None
+
+    def within(self, q: Array, wanted: Array) -> Array:
+        """What is nearest to `wanted` (n,) N m that may carry the arm at q (n,) rad."""
+        weight = self._loaded.unbent(q)
+        carried: Array = np.clip(wanted, weight - self._band, weight + self._band)
+        return carried
+
+    def _said(self, off: NDArray[np.intp], tau: Array, said: Array, left: Array) -> str:
+        each = ", ".join(
+            f"{self._model.tree.joint_names[j]} holds {tau[j]:+.1f} N m where the model says "
+            f"{said[j]:+.1f} ({abs(left[j]):.1f} unexplained, {self._band[j]:.1f} may be)"
+            for j in off
+        )
+        return (
+            f"at rest {each}; model {self._model.name}, friction of so much and any load of up to "
+            f"{self._heaviest:.1f} kg at the hand counted. Is something holding the arm or does it "
+            "lean on something, is it another robot (--robot), mounted otherwise (--gravity X Y Z) "
+            "or carrying more ([tool] in --config)? --trust-model moves it all the same"
         )
 
 
-def _load_columns(model: SelfModel, q: Array) -> Array:
-    """Torque (n, 4 hands) per kg and kg m of a load on each link that carries no other."""
+def _load_columns(model: SelfModel, q: Array) -> tuple[list[int], Array]:
+    """Links that carry no other, and torque (n, 4 hands) per kg and kg m of a load on each."""
     n, still = model.tree.n, np.zeros((1, model.tree.n))
     Y = RigidArm.of(model).regressor(q[None], still, still)[0].reshape(n, n, 10)
     hands = [link for link in range(n) if link not in model.tree.parent]
-    return Y[:, hands, :4].reshape(n, -1)
+    return hands, Y[:, hands, :4].reshape(n, -1)
 
 
 def _best_load(wanted: Array, loads: Array, band: Array, heaviest: float) -> Array:
-    """Mass and first moment (4 hands) with which least is left, in units of the band."""
-    count = loads.shape[1]
-    scaled = loads / band[:, None]
-    rows = [np.c_[sign * scaled, -np.ones(len(band))] for sign in (1.0, -1.0)]
-    ends = [sign * wanted / band for sign in (1.0, -1.0)]
+    """Mass and first moment (4 hands) with which least is left, in units of the band.
+
+    Least beyond the band over all joints, so that one that is pushed is not hidden by a load that
+    spreads it over others; within the band, the least of the largest.
+    """
+    n, count = loads.shape
+    scaled, one = loads / band[:, None], np.ones((n, 1))
+    rows, ends = [], []
+    for sign in (1.0, -1.0):  # unknowns: loads, what each joint is beyond its band, the largest
+        rows.append(np.c_[sign * scaled, -np.eye(n), 0.0 * one])
+        rows.append(np.c_[sign * scaled, 0.0 * np.eye(n), -one])
+        ends += [sign * wanted / band + 1.0, sign * wanted / band]
     for k in range(count):
         if k % 4:  # a first moment: at most the reach times its mass, to both sides
             for sign in (1.0, -1.0):
-                row = np.zeros(count + 1)
+                row = np.zeros(count + n + 1)
                 row[k], row[k - k % 4] = sign, -LOAD_REACH_M
                 rows.append(row[None])
                 ends.append(np.zeros(1))
-    goal = np.r_[np.zeros(count), 1.0]
-    bounds = [(0.0, heaviest) if k % 4 == 0 else (None, None) for k in range(count)]
-    found = linprog(goal, np.vstack(rows), np.concatenate(ends), bounds=[*bounds, (0.0, None)])
+    goal = np.r_[np.zeros(count), np.ones(n), LARGEST_SHARE]
+    bounds: list[tuple[float | None, float | None]] = [
+        (0.0, heaviest) if k % 4 == 0 else (None, None) for k in range(count)
+    ]
+    bounds += [(0.0, None)] * (n + 1)
+    found = linprog(goal, np.vstack(rows), np.concatenate(ends), bounds=bounds)
     load: Array = np.zeros(count) if found.x is None else found.x[:count]
     return load

@@ -182,6 +182,7 @@ class Lockstep(WrappedDriver):
         """Bring the arm to a stand. Raises DriverError."""
         with self._line.eager():
             self._driver.stop()
+        self._next_ns = self._line.next_whole_ns(self.period_ns)  # it took a while
 
     def close(self) -> None:
         """Release the driver."""
