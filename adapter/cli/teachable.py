@@ -7,6 +7,8 @@ from typing import Any
 
 from adapter.cli.common import robot_of
 from adapter.control.teachable import teachable
+from adapter.gap.screen import RecordingRefused, check_effort_unit
+from adapter.model.self_model import SelfModel
 from adapter.signals.matching import matching, present
 from drivers.files.mcap import Log, read_log
 
@@ -17,6 +19,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
     robot = robot_of(args, args.robot)
     robot, locked = present(robot, log.joint_names, log.path)
     log = matching(log, robot)
+    doubt = _doubt(log, robot)
     told = teachable(log, robot)
     expected = told.expected
     figures = {
@@ -24,6 +27,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         "full_rank": told.full_rank,
         "torque_std_nm": told.torque_std.tolist(),
         "missing": list(told.missing),
+        "effort_unit": doubt[0] if doubt else "N m",
         "parameters": {
             name: {"std": float(std), "unit": unit, "shown": bool(shown)}
             for name, unit, std, shown in zip(
@@ -39,7 +43,16 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         *(f"missing: {sentence}" for sentence in told.missing),
         *_by_part(figures["parameters"]),
     ]
-    return figures, [*locked, *lines]
+    return figures, [*locked, *doubt, *lines]
+
+
+def _doubt(log: Log, robot: SelfModel) -> list[str]:
+    """A sentence where efforts are motor currents and not N m."""
+    try:
+        check_effort_unit(log, robot)
+    except RecordingRefused as refusal:
+        return [str(refusal)]
+    return []
 
 
 def _by_part(parameters: dict[str, Any]) -> list[str]:

@@ -376,10 +376,14 @@ def _gain_places(fit: Fit) -> tuple[list[int], list[int]]:
 
 
 def _on_the_rest(task: _GainTask, fit: Fit, gain: Array) -> tuple[Array, Array]:
-    """(n,) N m rms error of a fit behind the data that it saw, and the size of the torque there."""
+    """(n,) N m rms error of a fit behind the data that it saw, and the size of the torque there.
+
+    Where joints stick counts here, so it is fitted, too.
+    """
     arm = RigidArm.of(task.model)
     parts = (r.part(slice(int(LEARNED_SHARE * len(r.t)), None)) for r in task.recordings)
     rest = [prepare(replace(part, tau=part.tau * gain), arm) for part in parts]
+    fit, _ = _settled(replace(fit, weights=()), task.load_kg if any(task.loaded) else None)
     step = np.ones(len(gain))
     at, off = _gain_places(fit)
     step[at] = 1.0 + fit.coefficients[off]

@@ -170,6 +170,8 @@ def test_commands_refuse_currents(tmp_path: Path, capfd: pytest.CaptureFixture[s
     with McapWriter(path, log.joint_names) as file:
         for row in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
             file.write(JointSample(*row))
+    assert main(["info", str(path), "--robot", "panda"]) == 0
+    assert "looks like motor current" in " ".join(capfd.readouterr().out.split())
     for arguments in (["gap", str(path), "--model", "panda"], ["replay", str(path)]):
         out = ["--out", str(tmp_path / arguments[0]), "--no-report"]
         assert main([*arguments, *out]) == 2
