@@ -139,7 +139,7 @@ class DamiaoArm:
         """Enable the motors and hold the arm where it is."""
         self._relieved: int | None = None
         if self.settings.guardian and self.settings.interface != VIRTUAL:
-            self._guardian = GuardianClient(self.settings, self.limits)
+            self._guardian = GuardianClient(self.settings, self.limits, self.joint_names)
         if any(value != MIT_MODE for value in mode):
             talk.write(codec.CTRL_MODE, MIT_MODE)
         if self._guardian is None and any(talk.register(codec.TIMEOUT)):
@@ -161,7 +161,7 @@ class DamiaoArm:
         self._driving = True
         self._beat()
         if self._guardian is not None:
-            self._guardian.memory.mode = GuardianMode.DRIVE
+            self._guardian.memory.mode = GuardianMode.BRAKE
         hold, self._carried = settle(self._stream, self.limits, self._carried, self._beat)
         self._hand_over(hold)
 
@@ -266,11 +266,11 @@ class DamiaoArm:
 
     def _need_leave(self) -> None:
         """Raises DriverError where the guardian has forbidden to drive on."""
-        joint = None if self._guardian is None else self._guardian.memory.forbidden
-        if joint is not None:
+        push = None if self._guardian is None else self._guardian.memory.forbidden
+        if push is not None:
             raise DriverError(
-                f"joint {joint + 1} ({self.joint_names[joint]}) is pushed although it stands "
-                "still: something holds the arm; the guardian process has stopped it"
+                f"{push.said(self.joint_names[push.joint])}: something holds the arm; the "
+                "guardian process has stopped it"
             )
 
     def stop(self) -> None:
@@ -281,6 +281,8 @@ class DamiaoArm:
         if self._bus is None or not self._driving:
             return
         self._driving = False
+        if self._guardian is not None:
+            self._guardian.memory.mode = GuardianMode.BRAKE
         if self._guardian is not None and not self._guardian.alive:
             self._replies.note("guardian gone", "the process that held the arm is gone; start anew")
         self._hand_over(brake(self._stream, self.limits, self._carried, self._beat))

@@ -9,7 +9,8 @@ driven and then fall. So this process, with its own handle on the bus, takes ove
 - when the loop asks for it: before its first command, and after its stop.
 
 It also looks whether the loop pushes an arm that stands still (`PushWatch`), and then forbids its
-commands: the loop's driver refuses them, naming the joint, and brakes.
+commands: the loop's driver refuses them, naming the joint, and brakes. A loop that goes on driving
+all the same is ended (SIGKILL: two that send commands would only take turns), and the arm braked.
 
 It sends the commands of `drivers.damiao.holding` at 200 Hz, until
 
@@ -41,7 +42,7 @@ import can
 from drivers.damiao import codec
 from drivers.damiao.bus import message_for, open_bus, wire_of
 from drivers.damiao.codec import Scales, WireError
-from drivers.damiao.holding import SINK_S, Braker, PushWatch
+from drivers.damiao.holding import SINK_S, Braker, Push, PushWatch
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
 
@@ -51,6 +52,8 @@ ROWS = 5  # held angle, angle, speed, torque that carries the arm, torque measur
 BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
+OBEY_S, OBEY_PERIODS = 0.03, 2  # in which a loop has to heed what was forbidden; the longer one
+MILLI = 1000  # the block's whole numbers are mN m
 GONE_S = 10.0
 READY = "ready"
 
@@ -62,6 +65,7 @@ class GuardianMode(IntEnum):
     DRIVE = 1  # take over when commands stop coming
     HOLD = 2  # hold the arm now
     RELEASED = 3  # go
+    BRAKE = 4  # as DRIVE, while the loop settles or brakes the arm
 
 
 class GuardianMemory:
@@ -111,13 +115,16 @@ class GuardianMemory:
         self._head[2] += 1
 
     @property
-    def forbidden(self) -> int | None:
-        """Joint (from 0) because of which the arm may not be driven on; None for none."""
-        return self._head[3] - 1 if self._head[3] else None
+    def forbidden(self) -> Push | None:
+        """What is pushed, so that the arm may not be driven on; None for nothing."""
+        if not self._head[3]:
+            return None
+        return Push(self._head[3] - 1, self._head[4] / MILLI, self._head[5] / MILLI)
 
-    @forbidden.setter
-    def forbidden(self, joint: int | None) -> None:
-        self._head[3] = 0 if joint is None else joint + 1
+    def forbid(self, push: Push) -> None:
+        """The arm may not be driven on."""
+        self._head[4], self._head[5] = round(MILLI * push.torque), round(MILLI * push.limit)
+        self._head[3] = push.joint + 1  # last: whoever reads it finds the others
 
     def put(
         self,
@@ -159,11 +166,18 @@ class Guardian:
         limits: of each motor.
         memory: from the loop.
         parent: process id of the loop.
+        names: of the joints.
     """
 
     def __init__(
-        self, settings: BusSettings, limits: Sequence[Scales], memory: GuardianMemory, parent: int
+        self,
+        settings: BusSettings,
+        limits: Sequence[Scales],
+        memory: GuardianMemory,
+        parent: int,
+        names: Sequence[str],
     ) -> None:
+        self._names, self._forbidden_s = names, 0.0
         self._settings, self._limits, self._memory, self._parent = settings, limits, memory, parent
         self._bus = open_bus(settings)
         self._wire = wire_of(self._bus)
@@ -186,12 +200,13 @@ class Guardian:
             alive = os.getppid() == self._parent
             if mode == GuardianMode.RELEASED or (mode == GuardianMode.IDLE and not alive):
                 return
-            driven = alive and mode == GuardianMode.DRIVE
+            driven = alive and mode in (GuardianMode.DRIVE, GuardianMode.BRAKE)
             if mode == GuardianMode.IDLE or (
                 driven and time.monotonic_ns() - memory.beat_ns < SILENCE_NS
             ):
                 self._braker = None
                 self._look(driven)
+                self._end_who_goes_on(mode)
                 time.sleep(WATCH_S)
                 continue
             if self._braker is None or mode != self._mode:
@@ -220,10 +235,20 @@ class Guardian:
             self._pushes.reset()
             return
         _, dq, carried, tau = self._memory.motion()
-        joint = self._pushes.step(dt_s, dq, carried, tau)
-        if joint is not None and self._memory.forbidden is None:
-            self._memory.forbidden = joint
-            self._say(f"joint {joint + 1} is pushed although it stands still; the arm is stopped")
+        push = self._pushes.step(dt_s, dq, carried, tau)
+        if push is not None and self._memory.forbidden is None:
+            self._memory.forbid(push)
+            self._forbidden_s = now_s
+            self._say(f"{push.said(self._names[push.joint])}; the arm is stopped")
+
+    def _end_who_goes_on(self, mode: GuardianMode) -> None:
+        """End a loop that drives on although it was forbidden; the arm is then braked from here."""
+        if mode != GuardianMode.DRIVE or self._memory.forbidden is None:
+            return
+        patience_s = max(OBEY_S, OBEY_PERIODS / self._settings.rate_hz)
+        if time.monotonic() - self._forbidden_s > patience_s and os.getppid() == self._parent:
+            self._say(f"process {self._parent} goes on driving; it is ended")
+            os.kill(self._parent, signal.SIGKILL)
 
     def _begin(self, mode: GuardianMode, alive: bool) -> None:
         self._wire.waiting()  # old replies
@@ -232,7 +257,7 @@ class Guardian:
         self._braker = Braker(
             self._limits, tau, self._memory.held() if mode == GuardianMode.HOLD else None
         )
-        if mode == GuardianMode.DRIVE:
+        if mode in (GuardianMode.DRIVE, GuardianMode.BRAKE):
             self._memory.count_taken()
             why = "the loop has sent nothing for 50 ms" if alive else "the loop's process is gone"
             self._say(f"{why}; the arm is braked and held. Support it, then: kill {os.getpid()}")
@@ -325,9 +350,8 @@ def main() -> None:
     settings = BusSettings(**said["settings"])
     limits = [Scales(*values) for values in said["limits"]]
     try:
-        guardian = Guardian(
-            settings, limits, GuardianMemory(said["block"], settings.joints), said["parent"]
-        )
+        memory = GuardianMemory(said["block"], settings.joints)
+        guardian = Guardian(settings, limits, memory, said["parent"], said["names"])
     except DriverError as error:
         print(error, flush=True)
         return

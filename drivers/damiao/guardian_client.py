@@ -31,6 +31,7 @@ class GuardianClient:
     Args:
         settings: of the bus.
         limits: of each motor.
+        names: of the joints.
 
     Attributes:
         memory: what it is told.
@@ -40,7 +41,9 @@ class GuardianClient:
         DriverError: it cannot be started, or cannot open the bus.
     """
 
-    def __init__(self, settings: BusSettings, limits: Sequence[Scales]) -> None:
+    def __init__(
+        self, settings: BusSettings, limits: Sequence[Scales], names: Sequence[str]
+    ) -> None:
         self._settings = settings
         with tempfile.TemporaryFile() as block:
             block.truncate(BLOCK_BYTES)
@@ -50,6 +53,7 @@ class GuardianClient:
                 "limits": [dataclasses.astuple(limit) for limit in limits],
                 "block": block.fileno(),
                 "parent": os.getpid(),
+                "names": list(names),
             }
             root = str(Path(drivers.__file__).resolve().parents[1])
             path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])

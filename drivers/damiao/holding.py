@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from drivers.damiao.codec import KD_MAX, KP_MAX, Scales, mit_command
 from drivers.damiao.stream import MotorStream
@@ -118,6 +119,21 @@ class Braker:
         ]
 
 
+class Push(NamedTuple):
+    """A joint (from 0) that is pushed although it stands still: torque and its limit, N m."""
+
+    joint: int
+    torque: float
+    limit: float
+
+    def said(self, name: str) -> str:
+        """In a sentence's beginning."""
+        return (
+            f"joint {self.joint + 1} ({name}) is pushed with {self.torque:+.1f} N m (limit "
+            f"{self.limit:.1f} N m) although it stands still"
+        )
+
+
 class PushWatch:
     """Finds a driven arm that is pushed although it stands still.
 
@@ -136,8 +152,8 @@ class PushWatch:
 
     def step(
         self, dt_s: float, dq: Sequence[float], carried: Sequence[float], tau: Sequence[float]
-    ) -> int | None:
-        """The joint (from 0) that is pushed for too long; None for none.
+    ) -> Push | None:
+        """What is pushed for too long; None for nothing.
 
         Args:
             dt_s: since the last call.
@@ -149,8 +165,10 @@ class PushWatch:
             full = stands and abs(tau[j]) > FULL_SHARE * most
             self._pushed_s[j] = self._pushed_s[j] + dt_s if pushed else 0.0
             self._full_s[j] = self._full_s[j] + dt_s if full else 0.0
-            if self._pushed_s[j] > PUSH_S or self._full_s[j] > FULL_S:
-                return j
+            if self._pushed_s[j] > PUSH_S:
+                return Push(j, tau[j] - carried[j], PUSH_SHARE * most)
+            if self._full_s[j] > FULL_S:
+                return Push(j, tau[j], FULL_SHARE * most)
         return None
 
 

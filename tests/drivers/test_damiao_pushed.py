@@ -19,7 +19,7 @@ from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.codec import Scales
 from drivers.damiao.guardian import BLOCK_BYTES, GuardianMemory
-from drivers.damiao.holding import Braker, PushWatch
+from drivers.damiao.holding import Braker, Push, PushWatch
 from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
@@ -91,9 +91,10 @@ def test_the_guardian_finds_an_arm_that_is_pushed_although_it_stands(
     dq, carried, tau, joint
 ) -> None:
     watch = PushWatch(LIMITS)
-    said = [watch.step(0.002, [dq, 0.0], [carried, 0.0], [tau, 0.0]) for _ in range(200)]
-    assert next((j for j in said if j is not None), None) == joint
-    assert said[0] is None
+    found = [watch.step(0.002, [dq, 0.0], [carried, 0.0], [tau, 0.0]) for _ in range(200)]
+    push = next((push for push in found if push is not None), None)
+    assert (None if push is None else push.joint) == joint
+    assert found[0] is None
 
 
 def test_a_forbidden_joint_is_read_by_the_loop() -> None:
@@ -103,7 +104,10 @@ def test_a_forbidden_joint_is_read_by_the_loop() -> None:
         assert loop.forbidden is None
         loop.put([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
         assert guardian.motion() == ([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
-        guardian.forbidden = 1
-        assert loop.forbidden == 1
+        guardian.forbid(Push(1, -80.25, 75.0))
+        assert loop.forbidden == Push(1, -80.25, 75.0)
+        assert loop.forbidden.said("elbow") == (
+            "joint 2 (elbow) is pushed with -80.2 N m (limit 75.0 N m) although it stands still"
+        )
         guardian.close()
         loop.close()

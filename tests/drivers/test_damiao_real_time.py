@@ -132,6 +132,60 @@ def gone(pid):
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
+DISOBEYS = """
+import sys, time
+import numpy as np
+from drivers.damiao.arm import DamiaoArm
+from tests.helpers.patience import connect
+arm = DamiaoArm(sys.argv[1], allow_motion=True)
+connect(arm)
+arm._need_leave = lambda: None
+print(arm.guardian_pid, flush=True)
+while True:
+    sample = arm.read()
+    arm.carry(np.full(7, 2.0))
+    arm.command(np.where(np.arange(7) == 1, 50.0, 2.0 - 0.5 * sample.dq))
+    time.sleep(0.005)
+"""
+
+
+@needs_multicast
+def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(served, capfd):
+    """The push is the whole of what joint 2 can; 0.1 s of it are a push, 50 ms more its end."""
+    address, bank = served
+    bank.held[1] = True
+    pushed_s, take = [], bank._take
+
+    def note(j, word):
+        take(j, word)
+        if j == 1 and bank.command[1][4] > 45.0:
+            pushed_s.append(time.monotonic())
+
+    bank._take = note
+    loop = subprocess.Popen(
+        [sys.executable, "-c", DISOBEYS, address], stdout=subprocess.PIPE, text=True
+    )
+    guardian = int(loop.stdout.readline())
+    try:
+        wait_for(lambda: pushed_s, "the loop pushes")
+        wait_for(lambda: abs(bank.command[1][4]) < 5.0, "the guardian brakes the arm")
+        assert loop.wait(10.0) == -signal.SIGKILL
+        time.sleep(0.6)
+        assert abs(bank.command[1][4]) < 5.0 and bank.status == [1] * N and not bank.limp
+        assert np.abs(bank.dq).max() < 0.02
+    finally:
+        loop.kill()
+        loop.wait()
+        loop.stdout.close()
+        os.kill(guardian, signal.SIGTERM)
+        ended(guardian)
+    said = capfd.readouterr().err
+    assert "joint 2 (joint2) is pushed with +48.0 N m (limit 40.5 N m)" in said
+    assert "goes on driving; it is ended" in said and "braked and held" in said
+    print(f"pushed for {pushed_s[-1] - pushed_s[0]:.3f} s")
+    assert pushed_s[-1] - pushed_s[0] < 0.5  # on a busy machine, too
+
+
 @needs_multicast
 @pytest.mark.parametrize("how", ["kill", "hang"])
 def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):

@@ -48,6 +48,7 @@ class Bank:
         self.command = np.zeros((n, 5))  # q, dq, kp, kd, tau
         self.heard_ns, self.now_ns = [0] * n, 0
         self.commanded, self.limp, self.writes = [False] * n, False, []
+        self.held = [False] * n  # something rigid keeps these joints where they are
 
     def advance(self, now_ns):
         if not self.now_ns:
@@ -65,7 +66,7 @@ class Bank:
             c = self.command
             tau = c[:, 2] * (c[:, 0] - self.q) + c[:, 3] * (c[:, 1] - self.dq) + c[:, 4]
             force = 0.0 if standing else np.where(on, tau, 0.0) - self.load
-            self.dq = self.dq + h * force / self.inertia
+            self.dq = np.where(self.held, 0.0, self.dq + h * force / self.inertia)
             self.q = self.q + h * self.dq
 
     def state(self, j, now_ns):
