@@ -18,6 +18,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
+from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
 from drivers.files.mcap import Log
 from drivers.interface import DriverError
@@ -127,6 +128,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
+    log, timing, said = _at_source(log, timing)
     if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
             RecordingFault.DATA,
@@ -135,7 +137,23 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         )
     _check_motion_units(log, model, timing)
     renamed = not set(model.tree.joint_names) <= set(recorded)
-    return log, timing, _outside_limits(log, model, recorded, renamed)
+    return log, timing, [*said, *_outside_limits(log, model, recorded, renamed)]
+
+
+def _at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
+    """The samples of `uniform` at the times of their states, where a publisher showed some twice."""
+    stamps = source_stamps(log.stamp_ns, log.q, log.dq)
+    moved_s = 1e-9 * float(np.abs(stamps - log.stamp_ns).max(initial=0))
+    if not moved_s:
+        return log, timing, []
+    log = replace(log, stamp_ns=stamps)
+    own = check_timing(stamps, log.q, log.dq, log.tau)
+    late = {key: getattr(own, key) for key in ("lateness_s", "lateness_std_s", "velocity_gain")}
+    said = (
+        "The repeats are states shown twice, not lost: after them the arm is where it was a period "
+        f"before. The times of the states are taken, up to {1e3 * moved_s:.2g} ms from the stamps."
+    )
+    return log, replace(timing, **late), [said]
 
 
 def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
