@@ -39,8 +39,9 @@ WHERE_IT_MOVES = (
         for name in ("viscous_friction", "motor_inertia")
     ),
 )
-COULOMB = CATALOGUE["coulomb_friction"]
-OFFSET, SENSORS_BAND = CATALOGUE["torque_offset"], CATALOGUE["torque_filter"]
+COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
+# Of a real arm: what its torques lack of the motion's band, and a table that is not level
+OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
 SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
 LAST_SHARE = 2.5  # of the last link at most: an error of it that looks like a load is called one
@@ -195,9 +196,9 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
     if not loaded and not _is_another_unit(arm, fit):
         return refitted(fit)[0]
     begun = arm.fit
-    if _is_another_unit(arm, fit):  # a real arm's: what its torques lack of the motion's band
-        band = _named(SENSORS_BAND, SENSORS_BAND.templates()[0], -1)
-        begun = begun.with_named([*begun.named, band])
+    if _is_another_unit(arm, fit):
+        whole = [_named(effect, effect.templates()[0], -1) for effect in OF_THE_WHOLE]
+        begun = begun.with_named([*begun.named, *whole])
     begun = _without_impossible(begun.with_noise())
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
     caution = CAUTION / seconds if _is_another_unit(arm, fit) else 0.0
