@@ -294,7 +294,9 @@ class _Scored:
 def _paying(task: GapTask, found: Found) -> Found:
     """As it foretells held-out data best: how it is weighed, corrections, single effects."""
     level = noise_floor(found.fit)
-    ways = (found, uncorrected(found), evenly(found))
+    ways = [found, uncorrected(found)]
+    if found.fit.caution:  # a real arm's: what its model gets wrong is slow, and no noise
+        ways.append(evenly(found))
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)
     while best.worse.any() and best.found.fit.named:
         fewer = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
