@@ -141,7 +141,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
 
 
 def _at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
-    """The samples of `uniform` at the times of their states, where a publisher showed some twice."""
+    """Samples of `uniform` at the times of their states, where a publisher showed some twice."""
     stamps = source_stamps(log.stamp_ns, log.q, log.dq)
     moved_s = 1e-9 * float(np.abs(stamps - log.stamp_ns).max(initial=0))
     if not moved_s:
