@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
+from adapter.cli import servo_gap
 from adapter.cli.common import effort_unit_of, robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_robot
@@ -41,6 +42,9 @@ from drivers.files.mcap import Log, read_log
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
+    positions = servo_gap.position_logs(args)
+    if positions is not None:
+        return servo_gap.run(args, *positions)
     logs, hold_out = _opened(args)
     unit = effort_unit_of(args)
     settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, unit=unit)

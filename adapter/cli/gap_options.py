@@ -38,6 +38,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
     )
     add_joints(parser)
+    add(
+        "--servo",
+        type=Path,
+        metavar="FILE",
+        help="recordings of a position-controlled arm (commanded and measured positions, no "
+        "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
+        "documented them, commands should be where the arm is)",
+    )
     add_effort_unit(parser)
     add(
         "--inertia-prior",

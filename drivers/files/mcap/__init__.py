@@ -2,15 +2,16 @@
 
 `/joint_states` (sensor_msgs/msg/JointState), `/link_twists/<link>` and `/link_accels/<link>`
 (geometry_msgs/msg/TwistStamped and AccelStamped, frame_id the link), `/joint_commands` (JointState
-with effort only), `/estimates` (JSON), a metadata record with configuration and version. Read only:
-sensor_msgs/msg/Imu on any topic; of a floating base also nav_msgs/msg/Odometry, TwistStamped and
-AccelStamped on any topic.
+with effort only; of an arm that takes positions, with position only), `/estimates` (JSON), a
+metadata record with configuration and version. Read only: sensor_msgs/msg/Imu on any topic; of a
+floating base also nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any topic.
 """
 
 from drivers.files.mcap.imus import READERS, FrameMotion
 from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
+from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
 from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
 
@@ -22,12 +23,14 @@ __all__ = [
     "FrameMotion",
     "Log",
     "McapWriter",
+    "PositionLog",
     "Recovery",
     "Topic",
     "derive_velocity",
     "looks_like_degrees",
     "read_estimates",
     "read_log",
+    "read_position_log",
     "recover",
     "survey",
     "to_json",

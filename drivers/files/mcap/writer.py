@@ -103,6 +103,7 @@ class McapWriter:
         self._channels: dict[str, int] = {}
         self._states = JointStateEncoder(self.joint_names)
         self._commands = JointStateEncoder(self.joint_names, fields=("effort",))
+        self._positions = JointStateEncoder(self.joint_names, fields=("position",))
         self._motions = tuple((name, MotionEncoder(name)) for name in self.link_names)
         self._imus = tuple(ImuEncoder(name) for name in self.link_names)
         try:
@@ -161,6 +162,16 @@ class McapWriter:
     def write_command(self, stamp_ns: int, tau: Array) -> None:
         """Record (n,) commanded joint torques, N m."""
         data = self._encode(self._commands, stamp_ns, tau, tau, tau)
+        self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
+
+    def write_position(self, stamp_ns: int, q: Array) -> None:
+        """Record (n,) positions of an arm that tells nothing else, rad."""
+        data = self._encode(self._positions, stamp_ns, q, q, q)
+        self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
+
+    def write_position_command(self, stamp_ns: int, q: Array) -> None:
+        """Record (n,) commanded joint positions, rad."""
+        data = self._encode(self._positions, stamp_ns, q, q, q)
         self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
 
     def write_external(self, stamp_ns: int, tau: Array) -> None:

@@ -1,0 +1,499 @@
+"""The gap between commanded and measured motion of an arm without torque signals.
+
+Which of the servos' numbers are other than documented (an arm whose servos nobody documented is
+ideal: where its commands are), and how far the motion of an unseen recording is foretold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.gap.fit import theta_prior
+from adapter.gap.screen import RecordingFault, RecordingRefused, moving_joints
+from adapter.gap.servo_fit import (
+    DELAY,
+    PARAMETERS,
+    Freedom,
+    JointFit,
+    JointTask,
+    first_guess,
+    fit_joint,
+)
+from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Load
+from adapter.gap.servo_model import ServoModel
+from adapter.gap.servo_signals import Track, loads
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import PositionLog
+
+ROUNDS = 2  # in which the load follows from the arm's simulated motion
+SURE = 4.0  # standard deviations from the documented value, from which on it is another one
+DOCUMENTED_SHARE = 0.01  # of a documented value, to which it is meant; one standard deviation
+DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
+SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
+TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
+BLOCK_S, FITTED_SHARE = (
+    2.0,
+    2.0 / 3.0,
+)  # of alternating blocks; of a recording, without held-out ones
+DRAWS = 8  # of inertias as wrong as the documentation may be
+OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
+SEEN_RAD = 1e-9  # of tracking error: a recording whose two columns are the same
+NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
+SHORTEST_S = 5.0
+
+UNITS = {
+    "servo_position_gain": ("kp", "N m/rad"),
+    "servo_velocity_gain": ("kd", "N m s/rad"),
+    "servo_delay": ("d", "s"),
+    "coulomb_friction": ("Fc", "N m"),
+    "viscous_friction": ("Fv", "N m s/rad"),
+    "motor_inertia": ("B", "kg m2"),
+}
+TITLES = {
+    "servo_position_gain": "position gain",
+    "servo_velocity_gain": "velocity gain",
+    "servo_delay": "delay of commands",
+    "coulomb_friction": "Coulomb friction",
+    "viscous_friction": "viscous friction",
+    "motor_inertia": "motor inertia (armature)",
+}
+DAMPS = ("servo_velocity_gain", "viscous_friction")
+WITH_FRICTION = "velocity gain and viscous friction together: no command's speed tells them apart"
+
+
+@dataclass(frozen=True)
+class ServoFinding:
+    """One effect on some joints, whose number is not the documented one.
+
+    Attributes:
+        effect: one of `UNITS`; joints: from 1.
+        values, std, documented: one for each joint, SI; documented is None where nobody says.
+        open: what cannot be told apart from it; empty where it stands alone.
+    """
+
+    effect: str
+    joints: tuple[int, ...]
+    values: tuple[float, ...]
+    std: tuple[float, ...]
+    documented: tuple[float | None, ...]
+    open: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ServoGap:
+    """All that is said of a position-controlled arm.
+
+    Attributes:
+        joint_names, model_name, recordings: of the arm, its model and the files.
+        findings: by effect; servos: the new model.
+        before, after: (n,) rad, rms tracking error of the documented and of the new servos on what
+            the fit has not seen: recordings held out, or the last third.
+        scored: which data these are, in words.
+        scale_open: joints (from 1) whose documented masses do not show the gains' scale.
+        notes: a sentence each.
+    """
+
+    joint_names: tuple[str, ...]
+    model_name: str
+    recordings: tuple[str, ...]
+    findings: tuple[ServoFinding, ...]
+    servos: ServoModel
+    before: Array
+    after: Array
+    scored: str
+    scale_open: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Arm:
+    """What every station needs: the documented arm and servos, recordings, inertias drawn."""
+
+    rigid: RigidArm
+    documented: ServoModel
+    tracks: tuple[Track, ...]
+    inertia_prior: float
+
+    def fixed(self, j: int) -> Array:
+        """(6,) documented parameters of a joint, as `Freedom` takes them."""
+        servos = self.documented
+        x = servos.table()[j]
+        kp = servos.position_gain[j]
+        if np.isfinite(kp):
+            x[LEAD:] *= kp
+        return np.array([*x, servos.delay_s])
+
+    def tasks(self, motions: Sequence[Array]) -> list[JointTask]:
+        """One for each joint, all judged readings, under the loads of these motions."""
+        each = [loads(self.rigid, motion) for motion in motions]
+        rows = [track.judged for track in self.tracks]
+        n = self.rigid.n
+        return [JointTask(j, self.tracks, [own[j] for own in each], rows) for j in range(n)]
+
+    def drawn_loads(self, motions: Sequence[Array]) -> list[list[list[Load]]]:
+        """Loads by draw, recording and joint of arms whose inertias are as wrong as they may be."""
+        rng, found = np.random.default_rng(0), []
+        for _ in range(DRAWS):
+            off = theta_prior(self.rigid.theta, self.inertia_prior)
+            theta = self.rigid.theta + off * rng.standard_normal(off.shape)
+            arm = self.rigid.changed(theta=theta)
+            found.append([loads(arm, motion) for motion in motions])
+        return found
+
+
+def explain(
+    logs: Sequence[PositionLog],
+    model: SelfModel,
+    documented: ServoModel | None = None,
+    hold_out: Sequence[PositionLog] = (),
+    inertia_prior: float = 0.02,
+    progress: Callable[[str], None] = lambda text: None,
+) -> ServoGap:
+    """Fit the servos of an arm of documented inertias, and name what is not as documented.
+
+    Args:
+        logs: of one arm, fitted; hold_out: of the same, foretold.
+        documented: the servos; ideal ones where None.
+        inertia_prior: by which share the model's inertias may be off, one standard deviation.
+
+    Raises:
+        RecordingRefused: too short, or nothing moves. DriverError: it lacks a joint.
+    """
+    names = model.tree.joint_names
+    documented = documented or ServoModel.ideal(names)
+    tracks = tuple(_track(log, names) for log in logs)
+    unseen = tuple(_track(log, names) for log in hold_out)
+    arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior)
+    progress("fitting each joint's servo")
+    tracks_noise = np.max([_noise(track) for track in tracks], axis=0)
+    error = np.max([documented.tracking_error(track, arm.rigid) for track in tracks], axis=0)
+    if np.all(error < NOISE_SHARE * tracks_noise):
+        fits: list[JointFit] = []
+        servos = documented
+    else:
+        fits = _named(arm, _rough(arm), progress)
+        servos = _servos(arm, fits)
+    progress("foretelling what was held out")
+    before, after, scored = _scored(arm, fits, servos, unseen)
+    found = _found(arm, fits)
+    return ServoGap(
+        joint_names=names,
+        model_name=model.name,
+        recordings=tuple(log.path.name for log in (*logs, *hold_out)),
+        findings=found.findings(),
+        servos=servos,
+        before=before,
+        after=after,
+        scored=scored,
+        scale_open=tuple(found.scale_open),
+        notes=(*(w for log in logs for w in log.warnings), *found.notes),
+    )
+
+
+def _track(log: PositionLog, names: tuple[str, ...]) -> Track:
+    log = log.select(names)
+    span = 1e-9 * float(np.ptp(log.stamp_ns)) if len(log.stamp_ns) else 0.0
+    if span < SHORTEST_S or len(log.command_ns) < 2:
+        raise RecordingRefused(
+            RecordingFault.DATA,
+            f"{log.path}: {span:.2g} s with {len(log.command_ns)} commands; record at least "
+            f"{SHORTEST_S:g} s of motion, better 20 s, with its position commands.",
+        )
+    track = Track.of(log)
+    if not moving_joints(track.smooth[0], track.smooth[1], track.step_s):
+        raise RecordingRefused(
+            RecordingFault.MOTION,
+            f"{log.path}: too little motion to tell anything of the servos; move every joint by "
+            "0.3 rad with at least 0.3 rad/s, for some 20 s.",
+        )
+    return track
+
+
+def _noise(track: Track) -> Array:
+    """(n,) rad, standard deviation of an encoder's reading, by its third differences."""
+    return np.asarray(np.std(np.diff(track.q, 3, axis=0), axis=0) / np.sqrt(20.0))
+
+
+def _everything() -> NDArray[np.bool_]:
+    return np.ones(PARAMETERS, dtype=bool)
+
+
+def _rough(arm: _Arm) -> list[JointFit]:
+    """All numbers of all joints, the load being that of the motion as it was measured."""
+    free = Freedom(_everything(), np.zeros(PARAMETERS))
+    tasks = arm.tasks([track.smooth for track in arm.tracks])
+    return [fit_joint(task, free, first_guess(task)) for task in tasks]
+
+
+def _motions(arm: _Arm, fits: Sequence[JointFit]) -> list[Array]:
+    """The motion by the fitted servos on each recording, free of the encoders' noise."""
+    servos = _servos(arm, fits)
+    return [track.simulated(servos.follow(track, arm.rigid)) for track in arm.tracks]
+
+
+def _named(arm: _Arm, fits: list[JointFit], progress: Callable[[str], None]) -> list[JointFit]:
+    """Fits in which nothing is free but what is not as documented."""
+    for _ in range(ROUNDS):
+        tasks = arm.tasks(_motions(arm, fits))
+        fits = [fit_joint(t, f.freedom, f.x) for t, f in zip(tasks, fits, strict=True)]
+    fits = _with_lead(arm, fits)
+    fits = _with_one_delay(arm, fits)
+    tasks = arm.tasks(_motions(arm, fits))
+    fits = [
+        replace(fit_joint(t, f.freedom, f.x), delay_std=f.delay_std)
+        for t, f in zip(tasks, fits, strict=True)
+    ]
+    progress("weighing what is not as documented")
+    drawn = arm.drawn_loads(_motions(arm, fits))
+    return [_weighed(arm, fit, drawn) for fit in fits]
+
+
+def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
+    """Whether the servos know the command's speed is one question for the whole arm."""
+    told = bool(arm.documented.feeds_speed.any())
+    start = [np.where(np.arange(PARAMETERS) == LEAD, 0.0, fit.x) for fit in fits]
+    without = []
+    for fit, x in zip(fits, start, strict=True):
+        x[DAMPING] = max(fit.x[DAMPING] - fit.x[LEAD], 0.0)
+        freedom = Freedom(_everything(), np.zeros(PARAMETERS)).without(LEAD)
+        without.append(fit_joint(fit.task, freedom, x))
+    pays = sum(_paid(fit, other) for fit, other in zip(fits, without, strict=True))
+    return list(fits) if told or pays > TIE_CHI2 * len(fits) else without
+
+
+def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
+    """One bus brings all commands: the delay that all joints together show, or the documented."""
+    delays = np.array([fit.x[DELAY] for fit in fits])
+    at = [int(fit.freedom.free[:DELAY].sum()) for fit in fits]
+    stds = np.array(
+        [
+            fit.scale[k] * np.sqrt(fit.noise_covariance[k, k])
+            for fit, k in zip(fits, at, strict=True)
+        ]
+    )
+    weight = 1.0 / np.maximum(stds, 1e-5) ** 2
+    delay = float(weight @ delays / weight.sum())
+    spread = float(weight @ (delays - delay) ** 2 / max(len(fits) - 1, 1))
+    std = float(np.sqrt(max(spread, 1.0) / weight.sum()))
+    if abs(delay - arm.documented.delay_s) < SURE * np.hypot(std, DOCUMENTED_DELAY_S):
+        delay, std = arm.documented.delay_s, 0.0
+    found = []
+    for fit in fits:
+        documented = fit.freedom.documented.copy()
+        documented[DELAY] = delay
+        freedom = replace(fit.freedom, documented=documented).without(DELAY)
+        found.append(replace(fit_joint(fit.task, freedom, fit.x), delay_std=std))
+    return found
+
+
+def _blocks(task: JointTask, part: int) -> list[NDArray[np.bool_]]:
+    """Every second block of time."""
+    found = []
+    for track, rows in zip(task.tracks, task.rows, strict=True):
+        found.append(rows & ((track.stamp_s // BLOCK_S).astype(int) % 2 == part))
+    return found
+
+
+def _paid(fit: JointFit, without: JointFit) -> float:
+    """By how much a fit foretells blocks it has not seen better than another, in chi squared."""
+    gain = 0.0
+    for part in (0, 1):
+        seen, unseen = (
+            fit.task.on(_blocks(fit.task, part)),
+            fit.task.on(_blocks(fit.task, 1 - part)),
+        )
+        errors = [
+            JointFit(unseen, f.freedom, fit_joint(seen, f.freedom, f.x).x).error()
+            for f in (without, fit)
+        ]
+        gain += errors[0] - errors[1]
+    return gain / fit.unit
+
+
+def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]) -> JointFit:
+    """One joint's fit without what is as documented, the surest to be so first.
+
+    Where nobody documented the servo, all stays that foretells what the fit has not seen.
+    """
+    j, fixed = fit.task.joint, arm.fixed(fit.task.joint)
+    others = [[own[j] for own in each] for each in drawn]
+    fixed[DELAY] = fit.x[DELAY]
+    known = np.isfinite(arm.documented.position_gain[j])
+    if not fit.freedom.free[LEAD] and not arm.documented.feeds_speed[j]:
+        fixed[LEAD] = 0.0
+    while True:
+        values, covariance = physical(fit, others)
+        doubt = np.sqrt(np.diagonal(covariance))
+        goal = fixed[:DELAY].copy()
+        goal[A] = 1.0 / goal[A] if known else np.nan
+        with np.errstate(invalid="ignore", divide="ignore"):
+            far = np.abs(values - goal) / np.hypot(doubt, DOCUMENTED_SHARE * goal)
+        far[~fit.freedom.free[:DELAY]] = np.inf
+        if not known:
+            far[A] = np.inf
+        k = int(np.nanargmin(far))
+        freedom = Freedom(fit.freedom.free, fixed).without(k)
+        without = fit_joint(fit.task, freedom, _started(fit, freedom))
+        apart = not known or far[k] > SURE
+        if not np.isfinite(far[k]) or (apart and _paid(fit, without) > TIE_CHI2):
+            return replace(fit, values=values, doubt=covariance)
+        fit = replace(without, delay_std=fit.delay_std)
+
+
+def _started(fit: JointFit, freedom: Freedom) -> Array:
+    return freedom.full(fit.x[freedom.free])
+
+
+def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Array, Array]:
+    """kp, gain of the command's speed, damping, armature, Coulomb (5,), SI, and covariance (5, 5).
+
+    Args:
+        others: loads of arms whose inertias are as wrong as they may be.
+    """
+    x, a = fit.x, fit.x[A]
+    covariance = np.zeros((PARAMETERS, PARAMETERS))
+    free = np.flatnonzero(fit.freedom.free)
+    if free.size:
+        own = fit.noise_covariance
+        if others:
+            moved = fit.moved(others)
+            own = own + moved.T @ moved / len(moved)
+        covariance[np.ix_(free, free)] = own * np.outer(fit.scale, fit.scale)
+    values = np.array([1.0, *x[LEAD:DELAY]]) / a
+    turn = np.zeros((DELAY, PARAMETERS))
+    turn[:, A] = -values / a
+    for k in (LEAD, DAMPING, INERTIA, RUBS):
+        turn[k, k] = 1.0 / a if fit.freedom.free[k] else 0.0
+        turn[k, A] *= fit.freedom.free[k]
+    return values, turn @ covariance @ turn.T
+
+
+def _servos(arm: _Arm, fits: Sequence[JointFit]) -> ServoModel:
+    """The servos that the fits found."""
+    x = np.array([fit.x for fit in fits])
+    kp = 1.0 / x[:, A]
+    lead, damping = x[:, LEAD], x[:, DAMPING]
+    fed = lead > 0.0
+    documented = arm.documented
+    gain = np.where(fed, lead * kp, np.minimum(documented.velocity_gain, damping * kp))
+    gain = np.where(~fed & (documented.velocity_gain == 0.0), damping * kp, gain)
+    # A lead beyond all damping would be friction that drives: the damping is then all gain.
+    return ServoModel(
+        documented.joint_names,
+        kp,
+        gain,
+        x[:, RUBS] * kp,
+        np.maximum(damping * kp - gain, 0.0),
+        x[:, INERTIA] * kp,
+        np.asarray(fed),
+        float(np.median(x[:, DELAY])),
+    )
+
+
+def _scored(
+    arm: _Arm, fits: Sequence[JointFit], servos: ServoModel, unseen: Sequence[Track]
+) -> tuple[Array, Array, str]:
+    """Tracking errors (n,) before and after, on what the fit has not seen; and what that is."""
+    if unseen:
+        scored = f"{len(unseen)} recordings held out" if len(unseen) > 1 else "held out recording"
+        before, after = (
+            np.sqrt(np.mean([s.tracking_error(t, arm.rigid) ** 2 for t in unseen], axis=0))
+            for s in (arm.documented, servos)
+        )
+        return before, after, scored
+    fitted = []
+    for fit in fits:
+        pairs = zip(fit.task.tracks, fit.task.rows, strict=True)
+        rows = [take & (t.stamp_s < FITTED_SHARE * t.stamp_s[-1]) for t, take in pairs]
+        fitted.append(fit_joint(fit.task.on(rows), fit.freedom, fit.x))
+    part = _servos(arm, fitted) if fitted else servos
+    errors = []
+    for s in (arm.documented, part):
+        squares = []
+        for track in arm.tracks:
+            left = track.left(s.follow(track, arm.rigid))
+            last = track.stamp_s >= FITTED_SHARE * track.stamp_s[-1]
+            squares.append(np.mean(left[last] ** 2, axis=0))
+        errors.append(np.sqrt(np.mean(squares, axis=0)))
+    return errors[0], errors[1], "last third, servos fitted before it"
+
+
+class _Table:
+    """Findings as they come, joint by joint."""
+
+    def __init__(self, arm: _Arm) -> None:
+        self.docs = arm.documented
+        self.rows: dict[str, list[tuple[int, float, float, float | None]]] = {e: [] for e in UNITS}
+        self.together = False
+        self.scale_open: list[int] = []
+        self.notes: list[str] = []
+
+    def add(self, effect: str, j: int, value: float, std: float, documented: float) -> None:
+        """A value of joint j (from 0), where it is another one than documented."""
+        told = bool(np.isfinite(self.docs.position_gain[j]))
+        far = abs(value - documented) if told else value
+        meant = DOCUMENTED_SHARE * max(documented, self.docs.velocity_gain[j] * (effect in DAMPS))
+        if far > (SURE * np.hypot(std, meant) if told else SHOWN * std):
+            row = j + 1, float(value), float(std), float(documented) if told else None
+            self.rows[effect].append(row)
+        else:
+            self.notes.append(
+                f"joint {j + 1}: {TITLES[effect]} of {value:.3g} {UNITS[effect][1]} is in the "
+                "model and not named: inertias as wrong as they may be explain as much"
+            )
+
+    def add_joint(self, j: int, fit: JointFit) -> None:
+        """What a joint's fit found."""
+        docs, free = self.docs, fit.freedom.free
+        values, std = fit.values, np.sqrt(np.diagonal(fit.doubt))
+        gain = float(docs.velocity_gain[j])
+        if free[A]:
+            self.add("servo_position_gain", j, values[0], std[0], float(docs.position_gain[j]))
+            if std[0] > OPEN_SHARE * values[0]:
+                self.scale_open.append(j + 1)
+        if free[LEAD]:
+            self.add("servo_velocity_gain", j, values[1], std[1], gain)
+        if fit.x[LEAD] > 0.0 and (free[LEAD] or free[DAMPING]):
+            apart = np.array([0.0, -1.0, 1.0, 0.0, 0.0])
+            doubt = float(np.sqrt(apart @ fit.doubt @ apart))
+            self.add("viscous_friction", j, float(apart @ values), doubt, float(docs.viscous[j]))
+        elif free[DAMPING] and gain > 0.0:
+            self.add("viscous_friction", j, values[2] - gain, std[2], float(docs.viscous[j]))
+        elif free[DAMPING]:
+            self.together = True
+            self.add("servo_velocity_gain", j, values[2], std[2], gain)
+        if free[INERTIA]:
+            self.add("motor_inertia", j, values[3], std[3], float(docs.armature[j]))
+        if free[RUBS]:
+            self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
+
+    def add_delay(self, fits: Sequence[JointFit]) -> None:
+        """The delay that all joints share."""
+        for j, fit in enumerate(fits):
+            if fit.x[DELAY] != self.docs.delay_s:
+                self.add("servo_delay", j, fit.x[DELAY], fit.delay_std, self.docs.delay_s)
+
+    def findings(self) -> tuple[ServoFinding, ...]:
+        """By effect."""
+        found = []
+        for effect, entries in self.rows.items():
+            if entries:
+                joints, values, stds, documented = zip(*entries, strict=True)
+                both = self.together and effect == "servo_velocity_gain"
+                said = WITH_FRICTION if both else ""
+                found.append(ServoFinding(effect, joints, values, stds, documented, said))
+        return tuple(found)
+
+
+def _found(arm: _Arm, fits: Sequence[JointFit]) -> _Table:
+    table = _Table(arm)
+    for j, fit in enumerate(fits):
+        table.add_joint(j, fit)
+    table.add_delay(fits)
+    return table

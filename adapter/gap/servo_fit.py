@@ -1,0 +1,242 @@
+"""Servos from commanded and measured positions: by equation error first, then by output error.
+
+Each joint is simulated alone, under its commands and the load that the others' motion puts on it;
+then all joints together, whose motion, free of noise, gives the load for a second round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, nnls
+
+from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Load, follow_alone
+from adapter.gap.servo_signals import Track, smoothed
+from adapter.model.spatial import Array
+
+DELAY = 5  # column after those of the servo
+PARAMETERS = 6
+LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
+MEMORY_S = 0.5  # beyond which what is left of a fit does not know itself
+LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3])  # scale of a parameter that is zero
+NUDGE = 1e-3  # of its scale, for derivatives
+ROUNDS, MILLI = 40, 1e3  # of a fit, at most; it goes by mrad
+
+
+@dataclass(frozen=True, eq=False)
+class JointTask:
+    """One joint on some recordings.
+
+    Attributes:
+        joint: from 0; tracks: the recordings; loads: of the joint on each.
+        rows: for each track the (k,) readings that are fitted.
+    """
+
+    joint: int
+    tracks: Sequence[Track]
+    loads: Sequence[Load]
+    rows: Sequence[NDArray[np.bool_]]
+
+    def left(self, x: Array) -> list[Array]:
+        """What (6,) parameters leave of each recording's readings (k,), rad."""
+        found = []
+        for track, load in zip(self.tracks, self.loads, strict=True):
+            one = track.only(self.joint)
+            goal, q = one.goal(x[LEAD : LEAD + 1], x[DELAY])[:, 0], np.empty(len(one.t))
+            follow_alone(x[:DELAY], goal, load, one.start[:, 0], track.step_s, q)
+            found.append(one.left(q[:, None])[:, 0])
+        return found
+
+    def fitted(self, x: Array) -> Array:
+        """What they leave of the readings that are fitted, rad."""
+        rows = zip(self.left(x), self.rows, strict=True)
+        return np.concatenate([left[take] for left, take in rows])
+
+    def on(self, rows: Sequence[NDArray[np.bool_]]) -> JointTask:
+        """The same on other readings."""
+        return replace(self, rows=rows)
+
+    def under(self, loads: Sequence[Load]) -> JointTask:
+        """The same under other loads."""
+        return replace(self, loads=loads)
+
+
+@dataclass(frozen=True, eq=False)
+class Freedom:
+    """Which parameters are free, and what the others are.
+
+    Attributes:
+        free: (6,) bool.
+        documented: (6,) of the fixed ones; those between `LEAD` and `RUBS` times the position
+            gain, in SI, so that they stay what they are while the gain is sought.
+    """
+
+    free: NDArray[np.bool_]
+    documented: Array
+
+    def full(self, part: Array) -> Array:
+        """(6,) from the free ones."""
+        x = self.documented.copy()
+        x[self.free] = part
+        scaled = ~self.free
+        scaled[[A, DELAY]] = False
+        x[scaled] *= x[A]
+        return x
+
+    def without(self, k: int) -> Freedom:
+        """With one parameter as documented."""
+        free = self.free.copy()
+        free[k] = False
+        return replace(self, free=free)
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A joint's servo, fitted.
+
+    Attributes:
+        task, freedom: of what, and how; x: (6,).
+        delay_std: s, of the delay that all joints share.
+        values, doubt: (5,) in SI and (5, 5) their covariance, once they were weighed.
+    """
+
+    task: JointTask
+    freedom: Freedom
+    x: Array
+    delay_std: float = 0.0
+    values: Array = field(default_factory=lambda: np.zeros(DELAY))
+    doubt: Array = field(default_factory=lambda: np.zeros((DELAY, DELAY)))
+
+    @cached_property
+    def scale(self) -> Array:
+        """(f,) of the free parameters."""
+        return np.maximum(np.abs(self.x), LEAST)[self.freedom.free]
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(r, f) of what is left by the free parameters, each in its scale."""
+        return _slopes(self.task, self.freedom, self.x[self.freedom.free], self.scale)
+
+    @cached_property
+    def noise_covariance(self) -> Array:
+        """(f, f) of the free parameters over their scales, by what is left unexplained."""
+        J = self.jacobian
+        return np.asarray(np.linalg.pinv(J.T @ J, rcond=1e-14) * self.unit)
+
+    @cached_property
+    def unit(self) -> float:
+        """Squares (rad²) that one unit of chi squared is worth, neighbours knowing each other."""
+        left = self.task.fitted(self.x)
+        return float(np.mean(left**2)) * _memory(self.task, self.x)
+
+    def moved(self, others: Sequence[Sequence[Load]]) -> Array:
+        """(s, f) by how much the parameters over their scales would move under other loads."""
+        J, here = self.jacobian, self.task.fitted(self.x)
+        gain = -np.linalg.pinv(J, rcond=1e-7)
+        return np.array([gain @ (self.task.under(o).fitted(self.x) - here) for o in others])
+
+    def error(self) -> float:
+        """Sum of squares over the readings that its task fits, rad²."""
+        left = self.task.fitted(self.x)
+        return float(left @ left)
+
+
+def fit_joint(task: JointTask, freedom: Freedom, start: Array) -> JointFit:
+    """Fit by output error from (6,) parameters on."""
+    x = start.copy()
+    scale = np.maximum(np.abs(x), LEAST)[freedom.free]
+    if not freedom.free.any():
+        return JointFit(task, freedom, freedom.full(x[freedom.free]))
+
+    def left(z: Array) -> Array:
+        return task.fitted(freedom.full(z * scale)) * MILLI
+
+    def slopes(z: Array) -> Array:
+        return _slopes(task, freedom, z * scale, scale) * MILLI
+
+    begin, ends = x[freedom.free] / scale, (0.0, np.inf)
+    found = least_squares(
+        left, begin, jac=slopes, bounds=ends, xtol=1e-5, ftol=1e-7, max_nfev=ROUNDS
+    )
+    return JointFit(task, freedom, freedom.full(found.x * scale))
+
+
+def _slopes(task: JointTask, freedom: Freedom, part: Array, scale: Array) -> Array:
+    found = []
+    for k in range(len(part)):
+        step = np.zeros(len(part))
+        step[k] = NUDGE * scale[k]
+        low = part - step if part[k] > step[k] else part
+        above, below = task.fitted(freedom.full(part + step)), task.fitted(freedom.full(low))
+        found.append((above - below) / (part[k] + step[k] - low[k]) * scale[k])
+    return np.column_stack(found)
+
+
+def _memory(task: JointTask, x: Array) -> float:
+    """How many neighbouring readings tell as much as one that knows nothing of its neighbours."""
+    most = 1.0
+    for left, track, take in zip(task.left(x), task.tracks, task.rows, strict=True):
+        own = np.where(take, left, 0.0)
+        lags = max(int(MEMORY_S / np.median(np.diff(track.stamp_s))), 1)
+        size = 1 << int(np.ceil(np.log2(2 * len(own))))
+        power = np.fft.irfft(np.abs(np.fft.rfft(own, size)) ** 2)[:lags]
+        share = power / max(power[0], 1e-30)
+        below = np.flatnonzero(share < 0.05)
+        most = max(most, 1.0 + 2.0 * float(share[1 : below[0] if below.size else lags].sum()))
+    return most
+
+
+def first_guess(task: JointTask) -> Array:
+    """(6,) by equation error on smooth signals, the delay by trying."""
+    best, least = np.zeros(PARAMETERS), np.inf
+    sides = [_sides(track, load, task.joint) for track, load in _each(task)]
+    for delay in np.arange(0.0, LATEST_S, EVERY_S):
+        rows = [side.at(delay) for side in sides]
+        matrix, wanted = (np.concatenate(part) for part in zip(*rows, strict=True))
+        size = np.maximum(np.sqrt(np.mean(matrix**2, axis=0)), 1e-12)
+        x, left = nnls(matrix / size, wanted)
+        if left < least:
+            least, best = left, np.array([*(x / size), delay])
+    return best
+
+
+def _each(task: JointTask) -> list[tuple[Track, Load]]:
+    return list(zip(task.tracks, task.loads, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """Both sides of a servo's equation, every 5 ms, but for the delay."""
+
+    t: Array
+    goal: Array
+    rate: Array
+    grid: Array
+    q: Array
+    matrix: Array
+
+    def at(self, delay: float) -> tuple[Array, Array]:
+        """Columns (m, 5) and what they are to add up to (m,)."""
+        command = np.interp(self.t - delay, self.grid, self.goal)
+        lead = -np.interp(self.t - delay, self.grid, self.rate)
+        matrix = self.matrix.copy()
+        matrix[:, LEAD] = lead
+        return matrix, command - self.q
+
+
+def _sides(track: Track, load: Load, joint: int) -> _Sides:
+    period = float(np.median(np.diff(track.stamp_s)))
+    one = track.only(joint)
+    command = smoothed(one.goal(np.zeros(1), 0.0), track.step_s, period)[:2, :, 0]
+    q, dq, ddq = 0.5 * (track.smooth[:, 1:, joint] + track.smooth[:, :-1, joint])
+    matrix = np.zeros((len(q), 5))
+    matrix[:, A] = load.mass * ddq + load.other
+    matrix[:, DAMPING], matrix[:, INERTIA], matrix[:, RUBS] = dq, ddq, np.tanh(dq / 0.01)
+    middle = track.t - 0.5 * track.step_s
+    edge = (middle > 0.5) & (middle < middle[-1] - 0.3)
+    take = np.flatnonzero(edge)[:: max(round(5e-3 / track.step_s), 1)]
+    return _Sides(middle[take], command[0], command[1], middle, q[take], matrix[take])

@@ -1,0 +1,139 @@
+"""What the servos of a position-controlled arm are, their file, and the motion they make."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.errors import ModelError
+from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Body, follow_together
+from adapter.gap.servo_signals import Track
+from adapter.model.spatial import Array
+from adapter.physics.kernels import base_at_rest
+from adapter.physics.rigid_arm import RigidArm
+
+KEYS = ("position_gain", "velocity_gain", "coulomb", "viscous", "armature")
+
+
+@dataclass(frozen=True, eq=False)
+class ServoModel:
+    """Servos of an arm, (n,) each.
+
+    Attributes:
+        joint_names: of the arm.
+        position_gain, velocity_gain: N m/rad, N m s/rad. An ideal servo, which is where a command
+            is, has an infinite position gain.
+        coulomb, viscous: friction, N m and N m s/rad; armature: kg m².
+        delay_s: from a command's stamp until it acts.
+        feeds_speed: (n,) whether the velocity gain acts on the command's speed less the joint's.
+            Where it does not, velocity gain and viscous friction do the same: their sum counts.
+    """
+
+    joint_names: tuple[str, ...]
+    position_gain: Array
+    velocity_gain: Array
+    coulomb: Array
+    viscous: Array
+    armature: Array
+    feeds_speed: NDArray[np.bool_]
+    delay_s: float = 0.0
+
+    @classmethod
+    def ideal(cls, joint_names: tuple[str, ...]) -> ServoModel:
+        """Servos that are where their commands are."""
+        nothing = np.zeros(len(joint_names))
+        never, endless = np.zeros(len(joint_names), dtype=bool), np.full(len(joint_names), np.inf)
+        return cls(joint_names, endless, nothing, nothing, nothing, nothing, never)
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether any joint simply is where it is told to be."""
+        return bool(np.isinf(self.position_gain).any())
+
+    def table(self) -> Array:
+        """(n, 5) as the compiled simulation takes it."""
+        x = np.zeros((len(self.joint_names), 5))
+        x[:, A] = 1.0 / self.position_gain
+        x[:, LEAD] = x[:, A] * self.velocity_gain * self.feeds_speed
+        x[:, DAMPING] = x[:, A] * (self.velocity_gain + self.viscous)
+        x[:, INERTIA] = x[:, A] * self.armature
+        x[:, RUBS] = x[:, A] * self.coulomb
+        return x
+
+    def follow(self, track: Track, arm: RigidArm) -> Array:
+        """(m, n) rad where the arm is, one row for each step of the track, by commands alone."""
+        if self.is_ideal:
+            return track.commanded(self.delay_s)
+        x = self.table()
+        goal = track.goal(x[:, LEAD], self.delay_s)
+        q = np.empty_like(goal)
+        body = Body(arm.frames, arm.theta, base_at_rest(arm.gravity))
+        follow_together(x, goal, body, track.start, track.step_s, q)
+        return q
+
+    def tracking_error(self, track: Track, arm: RigidArm) -> Array:
+        """(n,) rad, rms of the measured positions less the simulated ones."""
+        left = track.left(self.follow(track, arm))
+        return np.asarray(np.sqrt(np.mean(left[track.judged] ** 2, axis=0)))
+
+    def save(self, path: Path) -> None:
+        """As TOML, read by `read_servos`."""
+        lines = [
+            "# Servos of a position-controlled arm: N m/rad, N m s/rad, N m, N m s/rad, kg m2.",
+            f"delay_s = {self.delay_s:.6g}",
+        ]
+        for j, name in enumerate(self.joint_names):
+            lines += ["", "[[joint]]", f"name = {_quoted(name)}"]
+            lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
+            lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
+        path.write_text("\n".join(lines) + "\n", "utf-8")
+
+
+def _quoted(name: str) -> str:
+    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
+def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:
+    """Servos from a file, in the arm's order of joints. Raises ModelError with what is wrong."""
+    try:
+        facts = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: is not TOML: {error}") from error
+    joints = facts.get("joint")
+    if not isinstance(joints, list) or not all(isinstance(j, dict) for j in joints):
+        raise ModelError(f"{path}: needs a [[joint]] for each joint, with name and {KEYS[0]}")
+    strange = [key for key in facts if key not in ("delay_s", "joint")]
+    strange += [k for j in joints for k in j if k not in (*KEYS, "name", "feeds_speed")]
+    if strange:
+        choices = ", ".join(("delay_s", "name", *KEYS, "feeds_speed"))
+        raise ModelError(f"{path}: does not know {', '.join(strange)}; have: {choices}")
+    told = {j.get("name"): j for j in joints}
+    missing = [name for name in joint_names if name not in told]
+    if missing:
+        have = ", ".join(map(str, told))
+        raise ModelError(f"{path}: lacks the joints {', '.join(missing)}; it has {have}")
+    servos = ServoModel.ideal(joint_names)
+    rows = [told[name] for name in joint_names]
+    found: dict[str, Any] = {
+        key: np.array([_number(path, row, key, key == KEYS[0]) for row in rows]) for key in KEYS
+    }
+    found["feeds_speed"] = np.array([bool(row.get("feeds_speed", False)) for row in rows])
+    return replace(servos, delay_s=_number(path, facts, "delay_s", False), **found)
+
+
+def _number(path: Path, row: Mapping[str, Any], key: str, needed: bool) -> float:
+    value = row.get(key, None if needed else 0.0)
+    if not isinstance(value, int | float) or not np.isfinite(value) or value < 0.0:
+        raise ModelError(f"{path}: {key} must be a number, 0 or more, got {value!r}")
+    if needed and value == 0.0:
+        raise ModelError(f"{path}: {key} must be more than 0")
+    return float(value)

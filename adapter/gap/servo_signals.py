@@ -1,0 +1,154 @@
+"""Commanded and measured positions as the servos' fit takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+from adapter.gap.servo_kernels import Load
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import PositionLog
+
+LONGEST_STEP_S = 1e-3  # of the simulation
+CUT_HZ, CUT_SHARE = 20.0, 0.2  # of the smoothing; of the sample rate at most
+EDGE_S = 0.5  # at the start, where what winds the joints up is unknown: not judged
+BEYOND_S = 10.0  # before and after the commands, in which the first and last one hold
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One recording on the simulation's steps.
+
+    Attributes:
+        t: (m,) s, the end of each step; step_s: their length.
+        stamp_s: (k,) of the readings; q: (k, n) rad.
+        at_s: (c,) s of the commands; held: (c, n) integral of the held command up to there,
+            rad s; gained: (c, n) integral of its rate, rad.
+        smooth: (3, m + 1, n) q, dq, ddq at the ends of all steps, zero-phase, rad.
+    """
+
+    name: str
+    t: Array
+    step_s: float
+    stamp_s: Array
+    q: Array
+    at_s: Array
+    held: Array
+    gained: Array
+    smooth: Array
+
+    @classmethod
+    def of(cls, log: PositionLog) -> Track:
+        """Prepare a recording."""
+        first = log.stamp_ns[0]
+        stamp_s = 1e-9 * (log.stamp_ns - first).astype(float)
+        period = float(np.median(np.diff(stamp_s)))
+        step = period / np.ceil(period / LONGEST_STEP_S - 1e-6)
+        count = round(stamp_s[-1] / step)
+        grid = step * np.arange(count + 1)
+        at, held, gained = _integrals(1e-9 * (log.command_ns - first), log.q_command)
+        smooth = smoothed(columns(grid, stamp_s, log.q), step, period)
+        return cls(log.path.name, grid[1:], step, stamp_s, log.q, at, held, gained, smooth)
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return int(self.q.shape[1])
+
+    def only(self, joint: int) -> Track:
+        """The same of one joint (from 0)."""
+        if joint not in self._alone:
+            at = slice(joint, joint + 1)
+            self._alone[joint] = replace(
+                self,
+                q=self.q[:, at],
+                held=self.held[:, at],
+                gained=self.gained[:, at],
+                smooth=self.smooth[:, :, at],
+            )
+        return self._alone[joint]
+
+    @cached_property
+    def _alone(self) -> dict[int, Track]:
+        return {}
+
+    @property
+    def start(self) -> Array:
+        """(2, n) q, dq before the first step."""
+        return np.ascontiguousarray(self.smooth[:2, 0])
+
+    @cached_property
+    def judged(self) -> NDArray[np.bool_]:
+        """(k,) readings that are judged."""
+        return self.stamp_s >= EDGE_S
+
+    def goal(self, lead: Array, delay_s: float) -> Array:
+        """(m, n) rad: what the servos steer to over each step, the lead's (n,) s part included."""
+        both = self.held + lead * self.gained
+        ends = np.concatenate([[0.0], self.t]) - delay_s
+        return np.ascontiguousarray(np.diff(columns(ends, self.at_s, both), axis=0) / self.step_s)
+
+    def commanded(self, delay_s: float) -> Array:
+        """(m, n) rad: commands at the ends of the steps, between two of them by a line."""
+        each = np.diff(self.held, axis=0) / np.diff(self.at_s)[:, None]
+        return columns(self.t - delay_s, self.at_s, np.concatenate([each, each[-1:]]))
+
+    def left(self, q: Array) -> Array:
+        """(k, n) rad: readings less simulated positions (m, n) at the ends of the steps."""
+        whole = np.concatenate([self.start[:1], q])
+        grid = np.concatenate([[0.0], self.t])
+        return np.asarray(self.q - columns(self.stamp_s, grid, whole))
+
+    def simulated(self, q: Array) -> Array:
+        """(3, m + 1, n) as `smooth`, of simulated positions (m, n)."""
+        whole = np.concatenate([self.start[:1], q])
+        dq = np.gradient(whole, self.step_s, axis=0)
+        return np.array([whole, dq, np.gradient(dq, self.step_s, axis=0)])
+
+
+def columns(at: Array, t: Array, table: Array) -> Array:
+    """(m, n) of a table (k, n) over t (k,), between its rows by a line."""
+    return np.column_stack([np.interp(at, t, column) for column in table.T])
+
+
+def _integrals(at: Array, q: Array) -> tuple[Array, Array, Array]:
+    """Times, and the integrals of held commands (k, n) and of their rates, linear in between."""
+    at = np.concatenate([[at[0] - BEYOND_S], at, [at[-1] + BEYOND_S]])
+    q = np.concatenate([q[:1], q])
+    rate = np.zeros_like(q)
+    usual = float(np.median(np.diff(at)))
+    rate[2:] = np.diff(q[1:], axis=0) / np.maximum(np.diff(at[1:-1]), 0.5 * usual)[:, None]
+    width = np.diff(at)[:, None]
+    nothing = np.zeros((1, q.shape[1]))
+    held = np.concatenate([nothing, np.cumsum(q * width, axis=0)])
+    return at, held, np.concatenate([nothing, np.cumsum(rate * width, axis=0)])
+
+
+def smoothed(q: Array, step_s: float, period_s: float) -> Array:
+    """(3, m, n) q, dq, ddq through a zero-phase low-pass."""
+    cut = min(CUT_HZ, CUT_SHARE / period_s)
+    clean = sosfiltfilt(butter(4, cut, fs=1.0 / step_s, output="sos"), q, axis=0)
+    dq = np.gradient(clean, step_s, axis=0)
+    return np.array([clean, dq, np.gradient(dq, step_s, axis=0)])
+
+
+def loads(arm: RigidArm, motion: Array) -> list[Load]:
+    """What the arm makes of each joint's motion, at the steps' middles.
+
+    Args:
+        motion: (3, m + 1, n) q, dq, ddq at the ends of the steps.
+    """
+    q, dq, ddq = 0.5 * (motion[:, 1:] + motion[:, :-1])
+    tau = arm.torque(q, dq, ddq)
+    weightless, still, found = arm.changed(gravity=np.zeros(3)), np.zeros_like(q), []
+    for j in range(arm.n):
+        unit = still.copy()
+        unit[:, j] = 1.0
+        mass = np.ascontiguousarray(weightless.torque(q, still, unit)[:, j])
+        found.append(Load(mass, np.ascontiguousarray(tau[:, j] - mass * ddq[:, j])))
+    return found

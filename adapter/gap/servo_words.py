@@ -1,0 +1,104 @@
+"""What was found of an arm's servos, in sentences and in the JSON file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.markup import escape
+
+from adapter.gap.phrases import listed, numbered, plain, plus_minus, shown_unit
+from adapter.gap.servo import TITLES, UNITS, ServoFinding, ServoGap
+from adapter.model.spatial import Array
+
+WORSE = 0.05  # share by which an error of a joint may grow, and unsaid
+LABEL = 30  # columns of a figure's name
+
+
+def headline(gap: ServoGap) -> str:
+    """The outcome in one sentence."""
+    before, after = _errors(gap.before), _errors(gap.after)
+    if not gap.findings:
+        return f"the arm does what its servos' documentation says: tracking as foretold to {before}"
+    parts = [_short(finding) for finding in gap.findings]
+    said = f"tracking error of the worst joint {before} -> {after} ({gap.scored})"
+    return "; ".join([*parts, said, *_worse(gap)])
+
+
+def _errors(error: Array) -> str:
+    return f"{plain(1e3 * float(np.max(error)), 2)} mrad"
+
+
+def _worse(gap: ServoGap) -> list[str]:
+    worse = np.flatnonzero(gap.after > (1.0 + WORSE) * gap.before) + 1
+    return [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
+
+
+def _short(finding: ServoFinding) -> str:
+    joints = f"joint{'s' if len(finding.joints) > 1 else ''} {numbered(finding.joints)}"
+    if finding.effect == "servo_delay":
+        return f"commands act {1e3 * finding.values[0]:.2f} ms late"
+    factor, unit = shown_unit(finding.values[0], UNITS[finding.effect][1])
+    values = listed([plain(factor * value, 3) for value in finding.values])
+    known = any(value is not None for value in finding.documented)
+    than = " is not as documented" if known else ""
+    return f"{TITLES[finding.effect]} of {joints}{than}: {values} {unit}"
+
+
+def lines(gap: ServoGap) -> list[str]:
+    """Headline, a table of findings, figures by joint; for `rich.console.Console.print`."""
+    found = [f"[bold]{escape(headline(gap))}[/bold]"]
+    for finding in gap.findings:
+        found.append(f"[green]•[/green] {escape(TITLES[finding.effect])}")
+        rows = zip(finding.joints, finding.values, finding.std, finding.documented, strict=True)
+        factor, unit = shown_unit(finding.values[0], UNITS[finding.effect][1])
+        for j, value, std, documented in rows:
+            known = "" if documented is None else f", documented {plain(factor * documented, 4)}"
+            said = f"{plus_minus(factor * value, factor * std)} {unit}{known}"
+            found.append(f"  joint {j}: {escape(said)}")
+        if finding.open:
+            found.append(f"  [dim]{escape(finding.open)}[/dim]")
+    if gap.scale_open:
+        which = numbered(gap.scale_open)
+        found.append(
+            f"[yellow]?[/yellow] joint {which}: the documented masses hardly load it, so that its "
+            "gains, friction and inertia are known but for a common factor"
+        )
+    found += [
+        f"{name:<{LABEL}} " + " ".join(f"{plain(1e3 * x, 3):>7}" for x in error)
+        for name, error in (
+            ("tracking error before, mrad", gap.before),
+            ("               after, mrad", gap.after),
+        )
+    ]
+    return found + [f"[dim]note[/dim] {escape(text)}" for text in gap.notes]
+
+
+def as_json(gap: ServoGap) -> dict[str, Any]:
+    """What the JSON file holds."""
+    findings = []
+    for f in gap.findings:
+        key, unit = UNITS[f.effect]
+        findings.append(
+            {
+                "effect": f.effect,
+                "joints": f.joints,
+                "parameters": {key: f.values},
+                "std": {key: f.std},
+                "units": {key: unit},
+                "documented": {key: f.documented},
+                "not_told_apart": f.open or None,
+            }
+        )
+    return {
+        "headline": headline(gap),
+        "joint_names": gap.joint_names,
+        "model": gap.model_name,
+        "recordings": gap.recordings,
+        "findings": findings,
+        "before": {"tracking_rmse_rad": gap.before},
+        "after": {"tracking_rmse_rad": gap.after},
+        "scored_on": gap.scored,
+        "scale_open": gap.scale_open,
+        "notes": gap.notes,
+    }

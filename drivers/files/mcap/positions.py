@@ -1,0 +1,89 @@
+"""Recordings of position-controlled arms: commanded and measured positions, no torque."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.files.mcap.bags import open_scan
+from drivers.files.mcap.joints import assemble_joints, fits, stamps
+from drivers.files.mcap.series import Series, collect
+from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES
+from drivers.interface import Array, DriverError
+
+
+@dataclass(frozen=True, eq=False)
+class PositionLog:
+    """Commanded and measured positions.
+
+    Attributes:
+        path: where they came from; joint_names: order of the columns.
+        stamp_ns: (m,) of the encoders' readings, strictly increasing; q: (m, n) rad.
+        command_ns: (k,) of the commands, strictly increasing; q_command: (k, n) rad.
+        warnings: what was left out or looks wrong, one sentence each.
+    """
+
+    path: Path
+    joint_names: tuple[str, ...]
+    stamp_ns: NDArray[np.int64]
+    q: Array
+    command_ns: NDArray[np.int64]
+    q_command: Array
+    warnings: tuple[str, ...] = ()
+
+    def select(self, joint_names: Sequence[str]) -> PositionLog:
+        """The same with these joints in this order. Raises DriverError where it lacks one."""
+        missing = [name for name in joint_names if name not in self.joint_names]
+        if missing:
+            raise DriverError(
+                f"{self.path}: has no joint {', '.join(missing)}; have: "
+                f"{', '.join(self.joint_names)}"
+            )
+        at = [self.joint_names.index(name) for name in joint_names]
+        q, q_command = self.q[:, at], self.q_command[:, at]
+        return replace(self, joint_names=tuple(joint_names), q=q, q_command=q_command)
+
+
+def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog | None:
+    """The positions of a recording whose `/joint_commands` hold positions, without any efforts.
+
+    Args:
+        path: as `read_log` takes it; topic: of the joint states, `/joint_states` where None.
+
+    Returns:
+        None for every other recording: those whose joint states have efforts, or whose commands
+        are not positions.
+
+    Raises:
+        DriverError: the file is unreadable, or positions and commands are of other joints.
+    """
+    scan, states = open_scan(Path(path)), topic or JOINT_STATES
+    topics = collect(scan, lambda series: series.topic in (states, JOINT_COMMANDS))
+    read, commanded = topics.get(states), topics.get(JOINT_COMMANDS)
+    if read is None or commanded is None or not fits(commanded, effort=False):
+        return None
+    if not fits(read, effort=False) or _has_effort(read):
+        return None
+    joints = assemble_joints(read, scan.path, None, effort=False)
+    asked = assemble_joints(commanded, scan.path, joints.names, effort=False)
+    order = [asked.names.index(name) for name in joints.names]
+    warnings = list(scan.warnings)
+    at, rows = _increasing(stamps(read, f"{path}: {states}", warnings), joints.q)
+    when, commands = _increasing(asked.stamp_ns, asked.q[:, order])
+    return PositionLog(scan.path, joints.names, at, rows, when, commands, tuple(warnings))
+
+
+def _has_effort(series: Series) -> bool:
+    """Whether any message tells an effort that is a number and not zero."""
+    return any(np.any(np.nan_to_num(block.values[2])) for block in series.blocks)
+
+
+def _increasing(stamp_ns: NDArray[np.int64], q: Array) -> tuple[NDArray[np.int64], Array]:
+    """Finite rows in the order of time, the first of those with one stamp."""
+    finite = np.isfinite(q).all(axis=1)
+    found, first = np.unique(stamp_ns[finite], return_index=True)
+    return found, np.ascontiguousarray(q[finite][first])

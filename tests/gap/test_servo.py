@@ -1,0 +1,197 @@
+"""Arms without torque: servos named and fitted, unseen motion foretold, nothing named in vain."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.cli import main
+from adapter.effects.robots import read_robot
+from adapter.errors import ModelError
+from adapter.gap.screen import RecordingRefused
+from adapter.gap.servo import explain
+from adapter.gap.servo_kernels import Load, follow_alone
+from adapter.gap.servo_model import ServoModel, read_servos
+from drivers.files.mcap import McapWriter, read_position_log
+from tests.helpers.position_arm import (
+    Drawn,
+    PositionArm,
+    as_log,
+    errors,
+    named,
+    position_arm,
+)
+
+PANDA = read_robot("panda")
+
+
+@pytest.mark.parametrize(
+    ("seed", "drawn"),
+    [
+        (11, Drawn()),
+        (12, Drawn(feeds_speed=False, period_s=4e-3)),
+        (13, Drawn(noise_rad=1e-4)),
+    ],
+)
+def test_each_is_named_and_an_unseen_motion_foretold(seed: int, drawn: Drawn) -> None:
+    arm = position_arm(seed, drawn)
+    seen, unseen = arm.moved("sines", seed), arm.moved("points", seed + 50)
+    gap = explain([as_log(seen)], PANDA, None, [as_log(unseen)])
+    assert named(gap) == arm.expected
+    for effect, error in errors(gap, arm).items():
+        assert np.abs(error).max() < 0.1, (effect, error)
+    assert gap.after.max() < 1e-3 < gap.before.max()
+    assert np.median(gap.after) < 1.2 * drawn.noise_rad
+    together = next(f for f in gap.findings if f.effect == "servo_velocity_gain").open
+    assert bool(together) != drawn.feeds_speed
+
+
+@pytest.mark.parametrize("feeds_speed", [True, False])
+def test_an_arm_as_documented_has_nothing_named(feeds_speed: bool) -> None:
+    """Also where its bodies are other than documented, which its tracking shows."""
+    arm = position_arm(21, Drawn(8.0, feeds_speed=feeds_speed, masses_off=0.02))
+    recording = as_log(arm.moved("sines", 21))
+    gap = explain([recording], PANDA, arm.documentation)
+    assert not gap.findings
+    assert gap.before.max() < 1e-3
+
+
+def test_only_what_is_otherwise_than_documented_is_named() -> None:
+    arm = position_arm(22, Drawn(8.0))
+    right = arm.documentation
+    coulomb = right.coulomb.copy()
+    coulomb[2] *= 0.5
+    told = replace(right, coulomb=coulomb, delay_s=right.delay_s + 2e-3)
+    gap = explain([as_log(arm.moved("sines", 22))], PANDA, told)
+    every = {("servo_delay", j) for j in range(1, 8)}
+    assert named(gap) == {("coulomb_friction", 3), *every}
+    for effect, error in errors(gap, arm).items():
+        assert np.abs(error).max() < 0.1, (effect, error)
+    assert gap.after.max() < 0.1 * gap.before.max()
+
+
+def test_an_arm_that_is_where_its_commands_are_has_nothing_named() -> None:
+    recording = position_arm(23, Drawn(6.0)).moved("sines", 23)
+    noise = 5e-5 * np.random.default_rng(23).standard_normal(recording.q.shape)
+    gap = explain([as_log(replace(recording, q=recording.q_command + noise))], PANDA)
+    assert not gap.findings
+    assert gap.servos.is_ideal
+
+
+def test_one_joint_steps_as_a_linear_servo_does() -> None:
+    """Without friction it is an oscillator of the second order, whose step is known."""
+    step, x = 1e-4, np.array([2e-3, 0.0, 0.02, 1e-4, 0.0])
+    m = 10000
+    load = Load(np.full(m, 0.15), np.zeros(m))
+    inertia = x[0] * 0.15 + x[3]
+    omega, q = inertia**-0.5, np.empty(m)
+    zeta = 0.5 * x[2] * omega
+    follow_alone(x, np.ones(m), load, np.zeros(2), step, q)
+    t, fast = step * np.arange(1, m + 1), omega * np.sqrt(1.0 - zeta**2)
+    swing = np.cos(fast * t) + zeta * omega / fast * np.sin(fast * t)
+    assert np.abs(q - (1.0 - np.exp(-zeta * omega * t) * swing)).max() < 1e-4
+
+
+def test_friction_holds_a_joint() -> None:
+    """A step smaller than what friction holds moves nothing; a larger one stops short of it."""
+    x, m, q = np.array([0.0, 0.0, 0.05, 1e-4, 0.01]), 5000, np.empty(5000)
+    load = Load(np.zeros(m), np.zeros(m))
+    follow_alone(x, np.full(m, 0.009), load, np.zeros(2), 1e-3, q)
+    assert not q.any()
+    follow_alone(x, np.full(m, 0.05), load, np.zeros(2), 1e-3, q)
+    assert 0.04 - 1e-4 <= q[-1] <= 0.06
+    assert np.ptp(q[-100:]) == 0.0
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[PositionArm, Path, Path]:
+    folder = tmp_path_factory.mktemp("servo")
+    arm = position_arm(31, Drawn(8.0))
+    paths = folder / "seen.mcap", folder / "unseen.mcap"
+    for path, kind in zip(paths, ("sines", "points"), strict=True):
+        arm.moved(kind, 31).write(path)
+    return arm, *paths
+
+
+def test_the_command_finds_and_its_servos_foretell(recorded, tmp_path, capsys) -> None:
+    arm, seen, unseen = recorded
+    words = ["gap", str(seen), "--model", "panda", "--quiet"]
+    asked = [*words, "--hold-out", str(unseen), "--out", str(tmp_path / "one")]
+    assert main(asked) == 0
+    said = capsys.readouterr().out
+    for part in ("position gain", "velocity gain", "ms late", "Coulomb", "viscous", "inertia"):
+        assert part in said
+    figures = json.loads((tmp_path / "one" / "gap.json").read_text())
+    assert max(figures["after"]["tracking_rmse_rad"]) < 1e-4
+    assert {f["effect"] for f in figures["findings"]} == {e for e, _ in arm.expected}
+    servos = str(tmp_path / "one" / "servo.toml")
+    assert figures["servos_out"] == servos
+    again = ["gap", str(unseen), "--model", "panda", "--quiet", "--servo", servos]
+    assert main([*again, "--out", str(tmp_path / "two")]) == 0
+    assert "does what its servos' documentation says" in capsys.readouterr().out
+    assert not json.loads((tmp_path / "two" / "gap.json").read_text())["findings"]
+
+
+def test_what_does_not_belong_to_such_a_recording_is_refused(recorded, tmp_path, capsys) -> None:
+    _, seen, _ = recorded
+    words = ["gap", str(seen), "--model", "panda", "--out", str(tmp_path / "out")]
+    assert main([*words, "--tau-gain", "2"]) == 2
+    assert "--tau-gain: for recordings with torques" in capsys.readouterr().err
+    torque = tmp_path / "torque.mcap"
+    with McapWriter(torque, PANDA.tree.joint_names) as writer:
+        for k in range(20):
+            writer.write_joint_state(10**6 * k, *np.full((3, 7), 0.1 + 0.01 * k))
+    assert read_position_log(torque) is None
+    assert main([*words, "--hold-out", str(torque)]) == 2
+    assert "give recordings of one kind" in capsys.readouterr().err
+    asked = ["gap", str(torque), "--model", "panda", "--servo", str(tmp_path / "none.toml")]
+    assert main(asked) == 2
+    assert "holds no position commands" in capsys.readouterr().err
+
+
+def test_a_recording_too_short_or_at_rest_is_refused() -> None:
+    recording = position_arm(24, Drawn(6.0)).moved("sines", 24)
+    short = replace(
+        recording,
+        stamp_ns=recording.stamp_ns[:500],
+        q=recording.q[:500],
+        q_command=recording.q_command[:500],
+    )
+    with pytest.raises(RecordingRefused, match="better 20 s"):
+        explain([as_log(short)], PANDA)
+    rests = replace(recording, q=np.tile(recording.q[:1], (len(recording.q), 1)))
+    with pytest.raises(RecordingRefused, match="too little motion"):
+        explain([as_log(rests)], PANDA)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x", "is not TOML"),
+        ("delay_s = 0.1", r"needs a \[\[joint\]\]"),
+        ("delay = 0.1\n[[joint]]\nname = 'a'\nposition_gain = 1", "does not know delay; have"),
+        ("[[joint]]\nname = 'b'\nposition_gain = 1", "lacks the joints a; it has b"),
+        ("[[joint]]\nname = 'a'\nposition_gain = -1", "position_gain must be a number"),
+        ("[[joint]]\nname = 'a'", "position_gain must be a number"),
+        ("[[joint]]\nname = 'a'\nposition_gain = 0", "must be more than 0"),
+    ],
+)
+def test_a_servo_file_is_checked(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "servo.toml"
+    path.write_text(text)
+    with pytest.raises(ModelError, match=said):
+        read_servos(path, ("a",))
+
+
+def test_a_servo_file_comes_back(tmp_path: Path) -> None:
+    servos = position_arm(25).documentation
+    servos.save(tmp_path / "servo.toml")
+    back = read_servos(tmp_path / "servo.toml", servos.joint_names)
+    for key in ("position_gain", "velocity_gain", "coulomb", "viscous", "armature", "feeds_speed"):
+        assert np.allclose(getattr(back, key), getattr(servos, key), rtol=1e-5), key
+    assert back.delay_s == servos.delay_s
+    assert not ServoModel.ideal(("a",)).table().any()
