@@ -9,12 +9,16 @@ from adapter.effects.base import (
     Motion,
     MotionEffect,
     Parameter,
+    Template,
     Values,
     late_jit,
 )
 from adapter.effects.by_joint import EffectSums, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import FLANK
+
+MOVES = 0.9  # of the smoothed direction, from which a joint is on its way
+SIZES_RAD = (1.5e-3, 5e-3, 15e-3)  # to look for: when a play is crossed hangs on its width
 
 
 @late_jit
@@ -31,6 +35,12 @@ def play(q, half, start, link):
         link[i] = q[i] + sign * (last - q[i])
 
 
+def _pushed(dq: Array) -> float:
+    """Which way a joint with velocities dq (m,) moves first, from -1 to 1; 0 where it rests."""
+    way = smooth_sign(dq)
+    return float(way[np.argmax(np.abs(way) > MOVES)])
+
+
 class Backlash(MotionEffect):
     """Play in the gear, crossed at each reversal."""
 
@@ -44,18 +54,28 @@ class Backlash(MotionEffect):
     phrase = Phrase("{who} {has} {b} of backlash")
     shows = ((FLANK, "is gone under that load"),)
 
+    def templates(self) -> tuple[Template, ...]:
+        """Plays of several widths."""
+        return tuple(
+            Template((b,), self.decode, f"b = {1e3 * b:g} mrad", chord=True) for b in SIZES_RAD
+        )
+
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """The play operator driven by q: the link is pushed by one flank, then by the other.
 
-        Before the first instant the motor pushed the way it moves there.
+        Before the first instant the motor pushed the way it moves first. The motor runs through
+        the play at once and the link does not: what a crossing makes of the motor's measured
+        acceleration is no torque. A reversal that was smoothed looks as if it came earlier.
         """
         half = 0.5 * float(values["b"])
-        q = np.ascontiguousarray(motion.q[:, joint])
+        angles = motion.q if motion.sharp_q is None else motion.sharp_q
+        q = np.ascontiguousarray(angles[:, joint])
         link = np.empty_like(q)
         if len(q):
-            play(q, half, q[0] - half * smooth_sign(motion.dq[:1, joint])[0], link)
-        still = np.zeros_like(q)
-        return motion.moved(joint, link - q, still, still)
+            play(q, half, q[0] - half * _pushed(motion.dq[:, joint]), link)
+        behind = motion.as_smooth(link - q)
+        rate = motion.rate(behind)
+        return motion.moved(joint, behind, rate, motion.rate(rate))
 
     def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """Half the play."""

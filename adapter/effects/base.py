@@ -33,6 +33,7 @@ Values = Mapping[str, Any]
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 FEWEST_TO_FILTER = 100  # instants
+SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
 RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
@@ -93,6 +94,10 @@ class Motion:
         arm: the rigid body that moves.
         bands_hz: (n,) above which what the joints' torques hold is noise of the motion; None where
             nobody asked.
+        smooth_hz: of the zero-phase low-pass that it has been through; None where what comes of it
+            is filtered.
+        sharp_q: (m, n) rad, angles in which a reversal is not smoothed; None where q is all there
+            is.
     """
 
     t: Array
@@ -101,6 +106,8 @@ class Motion:
     ddq: Array
     arm: ArmDynamics
     bands_hz: Array | None = None
+    smooth_hz: float | None = None
+    sharp_q: Array | None = None
 
     @property
     def direction(self) -> Array:
@@ -118,15 +125,23 @@ class Motion:
 
     def inside_band(self, x: Array, joint: int) -> Array:
         """Torque x (m,) of a joint without what lies above its band: further rates are noise."""
-        if self.bands_hz is None or len(self.t) < FEWEST_TO_FILTER:
+        if self.bands_hz is None:
+            return x
+        band_hz = float(self.bands_hz[joint])
+        if band_hz == 0.0:  # nothing of it stands out of the noise
+            return np.full_like(x, x.mean())
+        return self._below(band_hz, x)
+
+    def as_smooth(self, x: Array) -> Array:
+        """An angle x (m,) that jumps, through the low-pass that the motion has been through."""
+        return x if self.smooth_hz is None else self._below(self.smooth_hz, x)
+
+    def _below(self, band_hz: float, x: Array) -> Array:
+        fs = 1.0 / (self.t[1] - self.t[0]) if len(self.t) >= FEWEST_TO_FILTER else 0.0
+        if not band_hz < 0.5 * fs:
             return x
         from scipy.signal import sosfiltfilt  # long to load; no loop needs it
 
-        fs, band_hz = 1.0 / (self.t[1] - self.t[0]), float(self.bands_hz[joint])
-        if band_hz == 0.0:  # nothing of it stands out of the noise
-            return np.full_like(x, x.mean())
-        if not band_hz < 0.5 * fs:
-            return x
         return np.asarray(sosfiltfilt(_low_pass(band_hz, round(fs, RATE_DIGITS)), x, axis=0))
 
     def rate(self, x: Array) -> Array:
@@ -157,12 +172,15 @@ class Template:
         label: what is fixed, for people ("n = 3"); empty where nothing is.
         theta: (k, 10) inertial parameters of its link per unit of each coefficient, of an effect
             `is_theta`; None where its coefficients are these parameters themselves.
+        chord: whether its signature is that of effects as large as `prior_std`, not of the least
+            ones: for what is not linear near zero.
     """
 
     prior_std: tuple[float, ...]
     decode: Callable[[Array], dict[str, Any]]
     label: str = ""
     theta: Array | None = field(default=None, compare=False)
+    chord: bool = False
 
 
 class Effect(ABC):

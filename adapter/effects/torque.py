@@ -10,6 +10,7 @@ import numpy as np
 
 from adapter.effects.active import Active, active_effects, lasting_effects
 from adapter.effects.base import (
+    SMOOTH_HZ,
     ArmDynamics,
     BodyEffect,
     Flags,
@@ -124,13 +125,22 @@ class ModelTorque:
         self._effects = active_effects(model.effects, model.tree.n)
         self._lasting = lasting_effects(model.effects, model.tree.n)
 
-    def __call__(self, q: Array, dq: Array, ddq: Array, t: Array | None = None) -> Array:
+    def __call__(
+        self,
+        q: Array,
+        dq: Array,
+        ddq: Array,
+        t: Array | None = None,
+        sharp_q: Array | None = None,
+    ) -> Array:
         """tau (m, n), N m, for q, dq, ddq (m, n) rad, rad/s, rad/s².
 
         `t` (m,), s since the recording began, decides which effects act. Without it those act
-        that have no end, and rows are taken 1 ms apart where an effect needs rates.
+        that have no end, and rows are taken 1 ms apart where an effect needs rates. Where a joint
+        jumps, the motion is taken as smooth as the recipe of `signals.validation` makes it;
+        `sharp_q` (m, n), rad, are angles that were smoothed less, if at all.
         """
-        if t is None:
-            stamps = 1e-3 * np.arange(len(q), dtype=np.float64)
-            return sensed_torque(Motion(stamps, q, dq, ddq, self._arm), self._lasting)
-        return sensed_torque(Motion(t, q, dq, ddq, self._arm), self._effects)
+        effects = self._lasting if t is None else self._effects
+        stamps = 1e-3 * np.arange(len(q), dtype=np.float64) if t is None else t
+        motion = Motion(stamps, q, dq, ddq, self._arm, smooth_hz=SMOOTH_HZ, sharp_q=sharp_q)
+        return sensed_torque(motion, effects)

@@ -125,6 +125,8 @@ def stages_of(
     """Evaluate an arm (that of the recording's motion where None is given) with effects."""
     motion = signals.motion if arm is None else replace(signals.motion, arm=arm)
     links = moved_links(motion, effects)
+    if links is not motion:
+        links = signals.banded(links)
     rigid = bodies(links, effects)
     bare = rigid
     if any(isinstance(active.effect, BodyEffect) for active in effects):
@@ -197,21 +199,21 @@ def _signatures(at: Stages, effect: Effect, template: Template, joint: int) -> A
 
 
 def _differences(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
-    """(c, k, n) change of the torque per unit of each coefficient, at zero."""
+    """(c, k, n) change of the torque per unit of each coefficient, from zero on."""
     if isinstance(effect, Pattern):
         return at.signals.low_basis(effect.basis(at.links, at.rigid, joint), joint)
     own = joint if isinstance(effect, TorqueEffect | SensorEffect) else -1
     out = []
     for i, std in enumerate(template.prior_std):
         x = np.zeros(len(template.prior_std))
-        x[i] = STEP * std
+        x[i] = std if template.chord else STEP * std
         change = _change(at, effect, joint, template.decode(x)) / x[i]
         out.append(at.signals.low_on(change, own))
     return np.array(out)
 
 
 def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
-    """(m, n) by how much a small effect changes the torque."""
+    """(m, n) by how much an effect changes the torque."""
     links = at.links
     if isinstance(effect, TorqueEffect):
         return effect.torque(links, at.rigid, joint, values)

@@ -77,11 +77,13 @@ class Signals:
 
     Attributes:
         motion: smooth motion at 250 Hz; its `t` is that of the recording.
+        noise: (n,) of its velocities, rad²/s²/Hz.
         tau: (k, n) measured torque in the band, N m.
         t: (k,) s, its instants.
     """
 
     motion: Motion
+    noise: Array
     tau: Array
     t: Array
     _kept: dict[Hashable, Array] = field(default_factory=dict, init=False, repr=False)
@@ -91,6 +93,13 @@ class Signals:
         if key not in self._kept:
             self._kept[key] = compute()
         return self._kept[key]
+
+    def banded(self, links: Motion) -> Motion:
+        """The links' motion with the bands in which its own torques stand out of the noise.
+
+        Where a joint jumped and its link did not, it is the link's torques that count.
+        """
+        return replace(links, bands_hz=_bands_of(links, self.noise))
 
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
@@ -155,7 +164,7 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     motion = Motion(grid, q, dq, ddq, arm)
     motion = replace(motion, bands_hz=_bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
-    return Signals(motion, low(_at(grid, t, recording.tau)), band_t)
+    return Signals(motion, noise, low(_at(grid, t, recording.tau)), band_t)
 
 
 def _bands_of(motion: Motion, noise: Array) -> Array:

@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
+from adapter.effects.base import SMOOTH_HZ
 from adapter.model.spatial import Array
 
 GRID_S = 1e-3
-CUT_HZ = 10.0
 EDGE_S = 0.3  # left out at either end, where the filter has no neighbours
 
 # (q, dq, ddq), each (m, n), to torque (m, n)
@@ -50,6 +50,6 @@ def smooth(stamp_s: Array, q: Array, dq: Array, tau: Array) -> tuple[Array, Arra
     if len(grid) * GRID_S < 1.0:
         raise ValueError(f"validation needs a second of data, got {len(grid) * GRID_S:.2f} s")
     columns = [np.interp(grid, stamp_s, column) for column in table.T]
-    sos = butter(4, CUT_HZ, fs=1.0 / GRID_S, output="sos")
+    sos = butter(4, SMOOTH_HZ, fs=1.0 / GRID_S, output="sos")
     q, dq, tau = np.split(sosfiltfilt(sos, np.column_stack(columns), axis=0), 3, axis=1)
     return q, dq, np.gradient(dq, GRID_S, axis=0), tau
