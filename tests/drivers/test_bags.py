@@ -10,7 +10,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from drivers.files.mcap import read_log
 from drivers.interface import DriverError
-from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros2
+from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros1_mcap, write_ros2
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 KINDS = (
@@ -83,9 +83,44 @@ def test_several_topics_are_named_and_one_is_chosen(tmp_path):
         read_log(path, topic="/middle")
 
 
-def test_the_usual_topic_comes_first_where_it_tells_efforts(tmp_path):
+def test_the_usual_topic_comes_first_where_it_tells_efforts_and_the_others_are_named(tmp_path):
     both = {"/joint_states": (JOINT_STATE, Motion.of()), "/other": (JOINT_STATE, Motion.of(seed=4))}
-    equal(read_log(write_ros2(tmp_path / "a", both)), both["/joint_states"][1])
+    path = write_ros2(tmp_path / "a", both)
+    log = read_log(path)
+    equal(log, both["/joint_states"][1])
+    assert [x for x in log.warnings if "also told by /other (--topic NAME)" in x]
+    assert not read_log(path, topic="/joint_states").warnings
+    one = {"/joint_states": both["/joint_states"]}
+    assert not read_log(write_ros2(tmp_path / "b", one)).warnings
+
+
+@pytest.mark.parametrize("kind", [JOINT_STATE, "franka_msgs/msg/FrankaState"])
+def test_ros1_messages_in_mcap(tmp_path, kind):
+    motion, other = Motion.of(7), Motion.of(7, seed=5)
+    topics = {"/states": (kind, motion), "/more": (JOINT_STATE, other)}
+    path = write_ros1_mcap(tmp_path / "a.mcap", topics, SEVEN)
+    log = read_log(path, topic="/states")
+    equal(log, motion)
+    assert log.joint_names[0] == ("arm_joint1" if kind == JOINT_STATE else "joint1")
+    equal(read_log(path, topic="/more"), other)
+
+
+def test_a_cut_mcap_of_ros1_gives_what_it_has(tmp_path):
+    motion = Motion.of()
+    path = write_ros1_mcap(tmp_path / "a.mcap", {"/joint_states": (JOINT_STATE, motion)})
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    log = read_log(path)
+    assert log.truncated
+    assert 0 < len(log) < 60
+    assert np.array_equal(log.tau, motion.tau[: len(log)])
+
+
+@pytest.mark.parametrize("definition", ["no!at64[] effort", "other_msgs/Unknown x", "\x00"])
+def test_ros1_messages_whose_definition_is_none_are_refused(tmp_path, definition):
+    topics = {"/arm": ("franka_msgs/msg/FrankaState", Motion.of(7))}
+    path = write_ros1_mcap(tmp_path / "a.mcap", topics, SEVEN, definition)
+    with pytest.raises(DriverError, match=r"a\.mcap: .*/arm"):
+        read_log(path)
 
 
 def test_others_of_ros1_reach_the_reader_too(tmp_path):

@@ -1,9 +1,9 @@
 """Bags of ROS 1 and rosbag2, by the library `rosbags`, told like the records of an MCAP file.
 
 A file is known by its first bytes, not by its name. What lies in a compressed file is unpacked
-into a temporary folder, at most `GROWTH_LIMIT` times its size. Messages of ROS 1
-become CDR; a FrankaState of ROS 1, whose fields differ between versions, becomes a JointState by
-the definition that its bag carries.
+into a temporary folder, at most `GROWTH_LIMIT` times its size. Messages of ROS 1, in a bag or in
+an MCAP file, become CDR; a FrankaState of ROS 1, whose fields differ between versions, becomes a
+JointState by the definition that its bag or file carries.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mcap.records import Channel, Schema
 
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import McapScan, Region, Scan
-from drivers.files.mcap.series import PARSERS
+from drivers.files.mcap.series import PARSERS, schema_name
 from drivers.files.ros import FRANKA_STATE, JOINT_STATE, JointStateEncoder
 from drivers.interface import DriverError
 
@@ -34,6 +34,7 @@ _PACKED: dict[bytes, Callable[[Any], Any]] = {
     b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),
 }
 _HEAD = struct.Struct("<HIQQ")  # of a message as MCAP has it: channel, sequence, two times
+_OWN_SCHEMAS = 2**16  # beyond the numbers that a file can give its schemas
 _TOGETHER = 4096  # messages of one region
 _STEP = 2**20
 METADATA = "metadata.yaml"  # beside the files of a rosbag2
@@ -60,7 +61,7 @@ def open_scan(path: Path) -> Scan:
         return BagScan(path, ".bag")
     if any(head.startswith(magic) for magic in _PACKED):
         return _unpacked(path, head)
-    return McapScan(path)
+    return McapOfAnyRos(path)
 
 
 def is_rosbag2(path: Path) -> bool:
@@ -157,7 +158,9 @@ class BagScan(Scan):
                 if c not in chosen:
                     self.passed[c.topic] = self.passed.get(c.topic, 0) + c.msgcount
             if chosen:
-                convert = _to_cdr(chosen) if self._one else None
+                convert = None
+                if self._one:
+                    convert = _to_cdr({c.msgtype: c.msgdef.data for c in chosen})
                 yield from self._packed(bag.messages(chosen), convert)
 
     def _note(self, connections: list[Any]) -> None:
@@ -185,16 +188,80 @@ class BagScan(Scan):
             yield _region(data, starts, stops)
 
 
+class McapOfAnyRos(McapScan):
+    """One pass over an MCAP file; what ROS 1 serialized is told as CDR."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises DriverError where it cannot be an MCAP file."""
+        super().__init__(path)
+        self._from_ros1: dict[int, Callable[[bytes], bytes]] = {}  # by channel
+
+    def regions(self) -> Iterator[Region]:
+        """All complete messages, in the order of the file; damaged chunks are passed over."""
+        for region in super().regions():
+            numbers = np.unique(region.channel).tolist()
+            # A file repeats its channels in each chunk, so their telling is put right each time.
+            for number in numbers:
+                self._tell_as_cdr(number)
+            if any(number in self._from_ros1 for number in numbers):
+                yield self._converted(region)
+            else:
+                yield region
+
+    def _tell_as_cdr(self, number: int) -> None:
+        channel = self.channels.get(number)
+        schema = None if channel is None else self.schemas.get(channel.schema_id)
+        if channel is None or schema is None or channel.message_encoding != "ros1":
+            return
+        kind = schema_name(self, channel)
+        if kind not in PARSERS or schema.encoding != "ros1msg":
+            return
+        if number not in self._from_ros1:
+            convert = self._converter(kind, schema)
+            if convert is None:
+                return
+            self._from_ros1[number] = convert
+        told = JOINT_STATE if kind == FRANKA_STATE else kind
+        own = _OWN_SCHEMAS + number
+        self.schemas[own] = Schema(own, b"", "ros2msg", told)
+        self.channels[number] = Channel(number, channel.topic, "cdr", channel.metadata, own)
+
+    def _converter(self, kind: str, schema: Schema) -> Callable[[bytes], bytes] | None:
+        try:
+            convert = _to_cdr({kind: schema.data.decode()})
+        except Exception as error:  # of whatever kind rosbags' parser raises
+            said = " ".join(str(error).split())[:200] or type(error).__name__
+            self._warn(f"the definition of {schema.name} cannot be read: {said}")
+            return None
+        return lambda raw: convert(kind, raw)
+
+    def _converted(self, region: Region) -> Region:
+        data, starts, stops = bytearray(), [], []
+        places = zip(region.start.tolist(), region.stop.tolist(), strict=True)
+        for (start, stop), number in zip(places, region.channel.tolist(), strict=True):
+            data += region.data[start - _HEAD.size : start].tobytes()
+            starts.append(len(data))
+            raw = region.data[start:stop].tobytes()
+            convert = self._from_ros1.get(number)
+            data += raw if convert is None else convert(raw)
+            stops.append(len(data))
+        return _region(data, starts, stops)
+
+
 def _region(data: bytearray, starts: list[int], stops: list[int]) -> Region:
     return Region(np.frombuffer(data, np.uint8), np.array(starts), np.array(stops))
 
 
-def _to_cdr(connections: list[Any]) -> Callable[[str, bytes], bytes]:
-    """What turns a message of ROS 1 into CDR; one that cannot be read becomes empty."""
+def _to_cdr(definitions: dict[str, str]) -> Callable[[str, bytes], bytes]:
+    """What turns a message of ROS 1 into CDR; one that cannot be read becomes empty.
+
+    Args:
+        definitions: of each type, as a bag of ROS 1 has them.
+    """
     typesys = importlib.import_module("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)  # whose headers have no `seq`
-    for c in connections:
-        found = typesys.get_types_from_msg(c.msgdef.data, c.msgtype)
+    for kind, text in definitions.items():
+        found = typesys.get_types_from_msg(text, kind)
         store.register({k: v for k, v in found.items() if k not in store.fielddefs})
     encoders: dict[int, JointStateEncoder] = {}
 

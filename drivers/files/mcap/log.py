@@ -240,11 +240,19 @@ def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[st
 def _chosen(scan: Scan, topics: Mapping[str, Series], topic: str | None, effort: bool) -> Series:
     """The topic that was named, or `/joint_states`, or the only one of use."""
     series = topics.get(topic or JOINT_STATES)
-    if topic is not None or (series is not None and fits(series, effort)):
+    if topic is not None:
         if series is None or not series.count:
-            raise DriverError(_nothing_found(scan, topics, topic or JOINT_STATES))
+            raise DriverError(_nothing_found(scan, topics, topic))
         return series
     fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, effort))
+    if series is not None and fits(series, effort):
+        others = [name for name in fitting if name != JOINT_STATES]
+        if others:
+            scan.warnings.append(
+                f"{scan.path}: joint states are those of {JOINT_STATES}; also told by "
+                f"{', '.join(others)} (--topic NAME)"
+            )
+        return series
     if len(fitting) > 1:
         raise DriverError(
             f"{scan.path}: {len(fitting)} topics tell joint states: {', '.join(fitting)}; choose "
