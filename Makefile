@@ -62,6 +62,7 @@ trials: $(STAMP)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/twin_trials.py --json runs/twin_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/contact_trials.py --json runs/contact_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/rate_trials.py --json runs/rate_trials.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/rate_trials.py --unchanged --trials 20 --first 300 --seconds 17 --json runs/rate_trials_unchanged.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/excite_trials.py --json runs/excite_trials.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/client_trials.py --json runs/client_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/mutated_inputs.py --json runs/mutated_inputs.json

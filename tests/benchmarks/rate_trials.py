@@ -1,7 +1,9 @@
 """One simulated log at many rates: what is learned from it, beside batch least squares.
 
-Each trial moves a PyBullet Panda with a real arm's friction and noise, measures its links, rests
-in between, and keeps every k-th sample. `make trials`.
+Each trial moves a PyBullet Panda with a real arm's friction and noise, rests in between, and keeps
+every k-th sample. With `--unchanged` the arm stops and starts often, every other log is of a motion
+three times slower, where friction sticks for longer, and what is said to have changed, all of it
+false, is all that is asked. `make trials`.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,7 +29,7 @@ from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.library import regressor
 from adapter.runs.outcome import completed_lambda, frame_errors, learned_model
-from adapter.runs.pipeline import make_front_end
+from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
 from adapter.signals.validation import EDGE_S, GRID_S, smooth, validation_torque_rmse
 from drivers.files.mcap import Log
@@ -37,13 +39,34 @@ from sim.scenarios import build
 from tests.helpers.arm_data import panda_model
 
 RATES = (1000, 500, 250, 125, 60, 30)
+REST_S = 1.5  # of each rest
 ROW_EVERY = 5  # ms between two rows of the least squares
 
 
-def recorded(seed: int, seconds_long: float, slower: float, links: bool) -> tuple[Log, SelfModel]:
+SLOWER_UNCHANGED = 3.0  # every other log of `--unchanged`, where friction sticks for longer
+
+
+class Recipe(NamedTuple):
+    """How an arm is recorded.
+
+    Attributes:
+        seconds: the log's length.
+        slower: than the usual motion, this many times.
+        links: whether links are measured.
+        rest_every: seconds from a rest's begin to the next one's; the first after as many.
+    """
+
+    seconds: float
+    slower: float = 1.0
+    links: bool = False
+    rest_every: float = 9.0
+
+
+def recorded(seed: int, recipe: Recipe) -> tuple[Log, SelfModel]:
     """A motion with rests of an arm with friction that sticks, and what the model should become."""
+    seconds_long, slower, links, rest_every = recipe
     arm, robot = build("real_drives", seed, links=links), panda_model()
-    rests = tuple((at, at + 1.5) for at in np.arange(8.0, seconds_long - 3.0, 9.0))
+    rests = tuple((at, at + REST_S) for at in np.arange(rest_every, seconds_long, rest_every))
     low, high = 0.1 / slower, 1.0 / slower
     motion = ExcitationSettings(seed=seed, low_hz=low, high_hz=high, rests=rests, share=0.7)
     forward = ModelFeedforward.of(robot)
@@ -98,12 +121,30 @@ def least_squares(log: Log, until_s: float, robot: SelfModel) -> Array:
     return np.asarray(np.sqrt(np.mean((held @ found - other) ** 2, axis=0)))
 
 
+def thinned(log: Log, rate: int) -> tuple[Log, PipelineSettings]:
+    """Every k-th sample, and how a log of that rate is learned from."""
+    thin = log.take(np.arange(len(log)) % max(round(1000 / rate), 1) == 0)
+    own, _ = fitted_to(thin, PipelineSettings().filter)
+    learner = LearnerSettings(effects=REAL_ARM_EFFECTS)
+    return thin, PipelineSettings(filter=own, learner=learner)
+
+
+def announced_at_rate(log: Log, rate: int, robot: SelfModel) -> dict[str, Any]:
+    """When, in s, a change was announced in a log in which nothing changed."""
+    thin, settings = thinned(log, rate)
+    pipeline = Pipeline(robot, settings)
+    signals = thin.stamp_ns, thin.q, thin.dq, thin.tau
+    for state in pipeline.front_end.step_table(*signals):
+        pipeline.learner.step(state)
+    learner, begin_ns = pipeline.learner, thin.stamp_ns[0]
+    changes = [round(1e-9 * (x.stamp_ns - begin_ns), 3) for x in learner.changes]
+    return {"rate": rate, "changes": changes, "looked_at": learner.change.samples}
+
+
 def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]:
     """What is learned from every k-th sample."""
-    thin = log.take(np.arange(len(log)) % max(round(1000 / rate), 1) == 0)
+    thin, settings = thinned(log, rate)
     until_s = 0.75 * float(seconds(log)[-1])
-    own, _ = fitted_to(thin, PipelineSettings().filter)
-    settings = PipelineSettings(filter=own, learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
     done = replay(thin, robot, settings, ReplayOptions(every, until_s))
     outcome, learner = done.outcome, done.pipeline.learner
     model = learned_model(outcome, robot)
@@ -140,18 +181,29 @@ def main() -> None:
     add("--slower", type=float, default=1.0, help="than usual")
     add("--links", action="store_true", help="links are measured")
     add("--every", type=int, default=1)
+    add("--unchanged", action="store_true", help="count changes announced in logs without any")
     add("--json", type=Path)
     asked = parser.parse_args()
     rows = []
     for seed in range(asked.first, asked.first + asked.trials):
-        log, robot = recorded(seed, asked.seconds, asked.slower, asked.links)
+        log, robot = recorded(seed, _recipe(asked, seed))
         for rate in asked.rates:
-            row = {"seed": seed, **at_rate(log, rate, robot, asked.every)}
-            rows.append(row)
-            shown = {k: v for k, v in row.items() if k not in ("theta", "effects")}
+            if asked.unchanged:
+                found = announced_at_rate(log, rate, robot)
+            else:
+                found = at_rate(log, rate, robot, asked.every)
+            rows.append({"seed": seed, **found})
+            shown = {k: v for k, v in rows[-1].items() if k not in ("theta", "effects")}
             print(json.dumps(shown), flush=True)
     if asked.json is not None:
         asked.json.write_text(json.dumps(rows) + "\n")
+
+
+def _recipe(asked: argparse.Namespace, seed: int) -> Recipe:
+    if not asked.unchanged:
+        return Recipe(asked.seconds, asked.slower, asked.links)
+    slower = asked.slower * (SLOWER_UNCHANGED if seed % 2 else 1.0)
+    return Recipe(asked.seconds, slower, asked.links, rest_every=4.0)
 
 
 if __name__ == "__main__":
