@@ -221,8 +221,8 @@ def controller_of(
         draw = free = plan.free_motion(args.duration)
         free.arm.meanwhile = reading(driver)
     controller = ExcitationController(limits, config.excitation, control, forward, draw, expected)
-    if plan.maybe_real and not args.trust_model:
-        controller.weight = CarriedWeight(robot)
+    if plan.maybe_real and not (args.trust_model and driver.adds_gravity):
+        controller.weight = CarriedWeight(robot, args.trust_model)
     return controller
 
 

@@ -55,17 +55,19 @@ class CarriedWeight:
 
     Args:
         model: with gravity and tool.
+        trusted: whatever the arm holds before the start is its weight, also beyond the band.
 
     Attributes:
         refusal: why the arm may not be moved; None where it holds what it may.
     """
 
-    def __init__(self, model: SelfModel) -> None:
+    def __init__(self, model: SelfModel, trusted: bool = False) -> None:
         effort = np.where(np.isfinite(model.limits.effort), model.limits.effort, 0.0)
         self._model, self._plain = model, ModelFeedforward.of(model)
         self._band = np.maximum(BAND_SHARE * effort, LEAST_BAND)
         self._heaviest = LOAD_SHARE * float(model.theta[:, 0].sum())
-        self._loaded = self._plain
+        self._loaded, self._trusted = self._plain, trusted
+        self._more = np.zeros(len(effort))
         self.refusal: str | None = None
 
     def begin(self, q: Array, tau: Array) -> None:
@@ -77,12 +79,15 @@ class CarriedWeight:
         theta[hands, :4] += load.reshape(-1, 4)
         self._loaded = ModelFeedforward.of(replace(self._model, theta=theta))
         left = tau - said - columns @ load
+        if self._trusted:
+            self._more = left - np.clip(left, -self._band, self._band)
+            return
         off = np.flatnonzero(np.abs(left) > (1.0 + 1e-6) * self._band)  # a load ends on it exactly
         self.refusal = self._said(off, tau, said, left) if len(off) else None
 
     def within(self, q: Array, wanted: Array) -> Array:
         """What is nearest to `wanted` (n,) N m that may carry the arm at q (n,) rad."""
-        weight = self._loaded.unbent(q)
+        weight = self._loaded.unbent(q) + self._more
         carried: Array = np.clip(wanted, weight - self._band, weight + self._band)
         return carried
 

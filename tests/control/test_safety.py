@@ -11,6 +11,7 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.observer import ContactObserver
+from adapter.control.resting import CarriedWeight
 from adapter.control.safety import CALM, ArmWatch, Now
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
@@ -23,7 +24,7 @@ from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.fci_lockstep import FciLockstep
-from tests.helpers.lockstep_drivers import BEGINS_S, opened
+from tests.helpers.lockstep_drivers import BEGINS_S, LET_GO, left_at_most, opened
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
@@ -93,12 +94,26 @@ ON_DRIVERS = [
     ("can", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "joint 2 (panda_joint2) is "),
     ("can", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
     ("can", {"held": [2, 4]}, {**FAR, "external_share": 0.5}, "is pushed"),
+    (
+        "can",
+        {"wall": 0.01, "t_s": BEGINS_S["can"] + 1.5},
+        {**FAR, "external_share": 0.2},
+        "is pushed",
+    ),
+    (
+        "can",
+        {"wall": 0.01, "t_s": BEGINS_S["can"] + 1.5},
+        {**FAR, "tracking_share": 0.2},
+        "from where it should be",
+    ),
+    ("can", {"load": 4.0}, {**FAR, "power_share": 0.1}, "would move with"),
+    ("can", {"load": 4.0}, {**FAR, "external_share": 0.3}, "is pushed"),
 ]
 
 
 @pytest.mark.parametrize(("name", "trouble", "safety", "said"), ON_DRIVERS)
 def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
-    """By joint and cause, without a jump; next to nothing is pushed 50 ms later."""
+    """By joint and cause, without a jump; next to nothing is pushed 50 ms later, nor for good."""
     world = build("nominal", 1, trouble={"t_s": BEGINS_S[name] + T_S, **trouble})
     commands, pushes = [], []
     with opened(name, world) as (arm, obstacles):
@@ -111,6 +126,7 @@ def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
             ControlSettings(safety=SafetySettings(**safety)),
             expected=ModelFeedforward.of(PANDA),
         )
+        controller.weight = CarriedWeight(PANDA, trusted=True)
 
         def note(sample: JointSample, tau) -> None:
             pushes.append(np.abs(obstacles.torque).max())
@@ -121,10 +137,29 @@ def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
         for _ in range(0 if name == "can" else 50):  # there the stop itself takes its time
             arm.read()
         left = float(np.abs(obstacles.torque).max())
+        for _ in range(LET_GO):
+            arm.read()
+        for_good = np.abs(obstacles.torque)
     assert result.fault is not None
     assert result.fault.startswith("joint ") and said in result.fault
     assert (np.abs(np.diff(commands, axis=0)) <= 1e-3 * LIMITS.torque_rate + 1e-9).all()
     assert left <= max(0.2 * max(pushes), 1.0)
+    assert (for_good <= left_at_most(LIMITS.effort)).all(), for_good
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_a_braked_arm_is_not_carried_with_a_push(trusted) -> None:
+    """Whatever it held at rest is carried where the model is trusted; a push later on never is."""
+    weight, q = CarriedWeight(PANDA, trusted), 0.5 * (LIMITS.lower + LIMITS.upper)
+    own = ModelFeedforward.of(PANDA).unbent(q)
+    strange = np.where(np.arange(N) == 0, 30.0, 0.0)  # about an axis along gravity: no load does
+    weight.begin(q, own + strange)
+    assert (weight.refusal is None) == trusted
+    push = np.full(N, 0.5) * LIMITS.effort
+    carried = weight.within(q, own + strange + push)
+    assert (np.abs(carried - own - strange) <= left_at_most(LIMITS.effort)).all() == trusted
+    if trusted:
+        np.testing.assert_allclose(weight.within(q, own + strange), own + strange, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", BEGINS_S)
