@@ -35,7 +35,7 @@ from drivers.faults.driver import with_faults
 from drivers.interface import JointSample
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario, build
-from tests.helpers.lockstep_drivers import BEGINS_S, LET_GO, left_at_most, opened
+from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, left_at_most, opened
 
 PANDA = documented("panda")
 N, LIMITS = PANDA.tree.n, MotionLimits.of(PANDA)
@@ -47,14 +47,15 @@ NAMED = r"joint ?\d|usable joint reading|newer joint reading|reflex|without"
 KINDS = ("position", "speed", "acceleration", "jerk", "torque", "rate", "contact", "unnamed")
 
 
-def world_of(rng: np.random.Generator, seed: int, begins_s: float) -> tuple[Scenario, str]:
+def world_of(rng: np.random.Generator, seed: int, name: str) -> tuple[Scenario, str]:
     """A scenario with at most one blockage in the motion's first second, and what it is.
 
-    `begins_s`: of the plant's time, when the motion does.
+    `name`: of the driver; it says when the motion begins.
     """
-    t_s = begins_s + float(rng.uniform(0.0, 1.0))
+    after_s = float(rng.uniform(0.0, 1.0))
     kind = str(rng.choice(["none", "held", "wall", "load"]))
-    trouble: dict = {"t_s": t_s}
+    begins_s = (BEGINS_LOADED_S if kind == "load" else BEGINS_S)[name]
+    trouble: dict = {"t_s": begins_s + after_s}
     if kind == "held":
         count = int(rng.integers(1, N + 1))
         trouble["held"] = sorted(int(j) + 1 for j in rng.choice(N, count, replace=False))
@@ -122,7 +123,7 @@ def forward_of(
 def trial(name: str, seed: int) -> tuple[Counter[str], str]:
     """What one trial broke, and how it ended."""
     rng = np.random.default_rng([seed, 14])
-    world, trouble = world_of(rng, seed, BEGINS_S[name])
+    world, trouble = world_of(rng, seed, name)
     fault = str(rng.choice(("", *FAULTS))) if trouble == "none" else ""
     fault = fault.format(j=int(rng.integers(1, N + 1)), t=round(float(rng.uniform(0.2, 1.2)), 3))
     forward, board = forward_of(rng)

@@ -24,7 +24,7 @@ from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.fci_lockstep import FciLockstep
-from tests.helpers.lockstep_drivers import BEGINS_S, LET_GO, left_at_most, opened
+from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, left_at_most, opened
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
@@ -85,6 +85,7 @@ def test_it_stops_by_joint_and_cause_and_lets_go(trouble, safety, said) -> None:
     assert max(pushes) <= 1.2 * LIMITS.effort.max()
 
 
+WALL_S, DROP_S = BEGINS_S["can"] + 1.5, BEGINS_LOADED_S["can"] + T_S
 ON_DRIVERS = [
     ("fci", {"held": [2]}, {}, "joint 2 (panda_joint2)"),
     ("fci", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "from where it should be"),
@@ -94,20 +95,9 @@ ON_DRIVERS = [
     ("can", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "joint 2 (panda_joint2) is "),
     ("can", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
     ("can", {"held": [2, 4]}, {**FAR, "external_share": 0.5}, "is pushed"),
-    (
-        "can",
-        {"wall": 0.01, "t_s": BEGINS_S["can"] + 1.5},
-        {**FAR, "external_share": 0.2},
-        "is pushed",
-    ),
-    (
-        "can",
-        {"wall": 0.01, "t_s": BEGINS_S["can"] + 1.5},
-        {**FAR, "tracking_share": 0.2},
-        "from where it should be",
-    ),
-    ("can", {"load": 4.0}, {**FAR, "power_share": 0.1}, "would move with"),
-    ("can", {"load": 4.0}, {**FAR, "external_share": 0.3}, "is pushed"),
+    ("can", {"wall": 0.01, "t_s": WALL_S}, {**FAR, "external_share": 0.1}, "is pushed"),
+    ("can", {"wall": 0.01, "t_s": WALL_S}, {**FAR, "tracking_share": 0.2}, "from where it"),
+    ("can", {"load": 6.0, "t_s": DROP_S}, {**FAR, "external_share": 0.2}, "is pushed"),
 ]
 
 
