@@ -262,6 +262,10 @@ class Effect(ABC):
         """Whether physics allows these parameters; a fit may ask for others."""
         return all(float(values[key]) > 0.0 for key in self.positive)
 
+    def log_odds_of(self, values: Values) -> float:
+        """ln of how much rarer these parameters are met than others of the effect."""
+        return 0.0
+
     def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """Add what one instant shows of the effect to sums; False where it shows nothing.
 

@@ -1,7 +1,8 @@
 """Torque sensor's low-pass: measured = tau - d dtau/dt + c d2tau/dt2.
 
 The start of the series of any low-pass that is fast against the motion: d is its mean delay, 2 c
-the mean square of its delays. A pure delay has c = d^2 / 2; one without phase has d = 0.
+the mean square of its delays. A pure delay has c = d^2 / 2, one pole c = d^2, and no sensor has more;
+one without phase, by which a log was filtered after it was recorded, has d = 0.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
 
 MOST_AHEAD_S, MOST_S = 3e-3, 0.06  # velocities that come late make torque look early
+AFTERWARDS = -40.0  # ln of the odds that only the torques of a log were filtered without phase
+LEAST_C_S2 = 5e-5  # that noise of the motion does not look like
 
 
 class TorqueFilter(LearnedEffect, SensorEffect):
@@ -51,6 +54,11 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     def possible(self, values: Values) -> bool:
         """Smoother, and not much earlier."""
         return -MOST_AHEAD_S < float(values["d"]) < MOST_S and super().possible(values)
+
+    def log_odds_of(self, values: Values) -> float:
+        """Smoother than any sensor that is no later makes it, noise of the motion looks like it."""
+        most = max(float(values["d"]) + MOST_AHEAD_S, 0.0) ** 2 + LEAST_C_S2
+        return AFTERWARDS if float(values["c"]) > most else 0.0
 
     def low_pass(self, values: Values) -> tuple[float, float]:
         """The one whose series begins so; without phase there is none, and the nearest is taken."""

@@ -281,7 +281,7 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
     values, folds = {}, Folds.of(fit, carried)
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
-        value = found.log_evidence + price(e)
+        value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
         rare = not (_is_common(e.candidate.effect) or e.candidate.columns_are_theta)
         if (
             value < BELIEF + rare * fit.caution

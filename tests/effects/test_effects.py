@@ -288,6 +288,18 @@ def test_signal_delay_makes_the_torque_late() -> None:
         assert np.abs(ours - theirs)[inner].max() < 0.05 * gap
 
 
+def test_no_sensor_is_smoother_than_it_is_late() -> None:
+    """One pole has c = d^2, several have less; without phase only what was filtered afterwards."""
+    effect = CATALOGUE["torque_filter"]
+    for poles in (1, 2, 5):
+        T1 = 0.02 / poles  # a delay of 20 ms in all; delays' variances add
+        d, c = 0.02, 0.5 * (poles * T1**2 + 0.02**2)
+        assert effect.log_odds_of({"d": d, "c": c}) == 0.0
+    assert effect.log_odds_of({"d": 0.02, "c": 0.02**2 / 2}) == 0.0  # a pure delay
+    assert effect.log_odds_of({"d": 0.0, "c": 2e-4}) < -20.0
+    assert effect.log_odds_of({"d": -0.002, "c": 1e-4}) < -20.0
+
+
 LOAD = {"m": 1.3, "cx": 0.02, "cy": -0.03, "cz": 0.09}
 SIX = [4e-3, 1e-4, -2e-4, 5e-3, 3e-4, 6e-3]
 TENSOR = np.array([[4e-3, 1e-4, -2e-4], [1e-4, 5e-3, 3e-4], [-2e-4, 3e-4, 6e-3]])
