@@ -1,8 +1,8 @@
 """Torque sensor's low-pass: measured = tau - d dtau/dt + c d2tau/dt2.
 
 The start of the series of any low-pass that is fast against the motion: d is its mean delay, 2 c
-the mean square of its delays. A pure delay has c = d^2 / 2, one pole c = d^2, and no sensor has more;
-one without phase, by which a log was filtered after it was recorded, has d = 0.
+the mean square of its delays. A pure delay has c = d^2 / 2, one pole c = d^2, and no sensor has
+more; one without phase, by which a log was filtered after it was recorded, has d = 0.
 """
 
 from __future__ import annotations
