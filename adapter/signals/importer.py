@@ -362,7 +362,11 @@ def _shape(reader: _Reader, signal: str, values: Array, samples: int) -> Array:
 def _doubts(
     spec: ImportSpec, where: str, stamp_ns: NDArray[np.int64], signals: dict[str, Array]
 ) -> list[str]:
-    """Sentences on what looks wrong but can be recorded."""
+    """Sentences on what looks wrong but can be recorded.
+
+    Raises:
+        DriverError: the unit of time or of q was not named, and another is likely.
+    """
     found = []
     steps = np.diff(stamp_ns)
     if np.any(steps < 0):
@@ -370,13 +374,15 @@ def _doubts(
         found.append(
             f"{where}: time runs backwards {int((steps < 0).sum())} times, first at sample {first}"
         )
-    step_s = float(np.median(steps)) * 1e-9 if steps.size else _STEP_S[0]
+    step_s = float(np.median(np.abs(steps))) * 1e-9 if steps.size else _STEP_S[0]
     if not _STEP_S[0] <= step_s <= _STEP_S[1]:
-        unit = spec.units.get("time", "s")
-        found.append(
-            f"{where}: samples are {step_s:.3g} s apart; is the time in {unit}? "
-            f"(units: {', '.join(UNITS['time'])})"
-        )
+        said = f"{where}: samples are {step_s:.3g} s apart; is the time in"
+        told = spec.units.get("time")
+        if told is None and spec.period_s is None:
+            raise DriverError(
+                f"{said} s? Say --units time=UNIT ({', '.join(UNITS['time'])}; s takes it as it is)"
+            )
+        found.append(f"{said} {told or 's'}? (units: {', '.join(UNITS['time'])})")
     for name, values in signals.items():
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
         if bad.size:
@@ -384,10 +390,12 @@ def _doubts(
                 f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
             )
     if looks_like_degrees(signals["q"]):
-        found.append(
-            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they "
-            "degrees? Say q=deg"
+        said = (
+            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they degrees?"
         )
+        if "q" not in spec.units:
+            raise DriverError(f"{said} Say --units q=deg (q=rad takes them as they are)")
+        found.append(f"{said} Say q=deg")
     return found
 
 

@@ -75,7 +75,11 @@ TEXTS = {  # name: (content, expected words, options)
     ),
     "bad pattern.csv": (text(), "no column 'x_\\*' for q; named t, q_1", "--columns", "q=x_*"),
     "milliseconds.csv": (scaled([0], 1e3), READ, "--units", "time=ms"),
-    "milliseconds untold.csv": (scaled([0], 1e3), "is the time in s\\?"),
+    "milliseconds untold.csv": (
+        scaled([0], 1e3),
+        "10 s apart; is the time in s\\? Say --units time=",
+    ),
+    "ten seconds apart.csv": (scaled([0], 1e3), READ, "--units", "time=s"),
     "nanoseconds untold.csv": (scaled([0], 1e9), "is the time in s\\?|is no time"),
     "stamps.csv": (text(STAMPS), READ),
     "stamps in ns untold.csv": (
@@ -83,7 +87,8 @@ TEXTS = {  # name: (content, expected words, options)
         "line 2: .* is no time",
     ),
     "degrees.csv": (scaled([1, 2, 3, 4], 180 / np.pi), READ, "--units", "q=deg"),
-    "degrees untold.csv": (scaled([1, 2, 3, 4], 57.3), "look like degrees"),
+    "degrees untold.csv": (scaled([1, 2, 3, 4], 57.3), "are they degrees\\? Say --units q=deg"),
+    "far turned.csv": (scaled([1, 2, 3, 4], 57.3), "look like degrees", "--units", "q=rad"),
     "velocity in degrees.csv": (scaled([3, 4], 57.3), "velocities 57.* times the slope"),
     "millinewton.csv": (scaled([5, 6], 1e3), READ, "--units", "tau=mNm"),
     "word.csv": (spoilt(7, 2, "abc"), "line 8, column 2 \\(q_2\\): 'abc' is not a number"),

@@ -161,8 +161,8 @@ def test_doubts_are_said(tmp_path):
     spoiled[5, 6] = np.nan
     spoiled[10, 0] -= 0.1
     table = write(tmp_path / "t.csv", spoiled * np.array([1e3, 2000, 2000, 100, 100, 1, 1]))
-    _, report = run(tmp_path, [table], COLUMNS)
-    said = "\n".join(report.warnings)
+    spec = ImportSpec.from_options([str(table)], COLUMNS, "time=s,q=rad")
+    said = "\n".join(import_table(spec, tmp_path / "out.mcap").warnings)
     for doubt in (
         "time runs backwards 1 times, first at sample 10",
         "samples are 1 s apart; is the time in s?",
@@ -171,6 +171,22 @@ def test_doubts_are_said(tmp_path):
         "times the slope of the positions",
     ):
         assert doubt in said, doubt
+
+
+@pytest.mark.parametrize(
+    ("column", "scale", "said"),
+    [
+        (0, 1e3, "1 s apart; is the time in s.*--units time=UNIT"),
+        (1, 2000, "are they degrees.*--units q=deg"),
+    ],
+)
+def test_a_likely_other_unit_is_refused_until_it_is_named(tmp_path, column, scale, said):
+    table = TABLE.copy()
+    table[:, column : column + 1 + (column > 0)] *= scale
+    path = write(tmp_path / "t.csv", table)
+    with pytest.raises(DriverError, match=rf"t\.csv: .*{said}"):
+        run(tmp_path, [path], COLUMNS)
+    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_an_existing_recording_stays(tmp_path):
