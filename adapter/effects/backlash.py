@@ -19,6 +19,7 @@ from adapter.effects.splits import FLANK
 
 MOVES = 0.9  # of the smoothed direction, from which a joint is on its way
 SIZES_RAD = (1.5e-3, 5e-3, 15e-3)  # to look for: when a play is crossed hangs on its width
+NARROW = -40.0  # ln of the odds that a play narrower than these shows
 
 
 @late_jit
@@ -76,6 +77,10 @@ class Backlash(MotionEffect):
         behind = motion.as_smooth(link - q)
         rate = motion.rate(behind)
         return motion.moved(joint, behind, rate, motion.rate(rate))
+
+    def log_odds_of(self, values: Values) -> float:
+        """What starts and stops leave of the noise in accelerations looks like a narrow play."""
+        return NARROW if abs(float(values["b"])) < SIZES_RAD[0] else 0.0
 
     def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
         """Half the play."""
