@@ -183,7 +183,7 @@ def signatures(
             tables.append(_signatures(at, effect, template, joint))
             columns = tuple(range(size, size + len(template.prior_std)))
             size += len(columns)
-        odds = _log_odds(effect, joint, n, len(templates(effect, hand)))
+        odds = prior_log_odds(effect, joint, n, len(templates(effect, hand)))
         candidates.append(Candidate(effect, template, joint, columns, odds))
     return np.concatenate(tables), candidates
 
@@ -380,7 +380,7 @@ def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     return float(odds)
 
 
-def _log_odds(effect: Effect, joint: int, n: int, ways: int) -> float:
+def prior_log_odds(effect: Effect, joint: int, n: int, ways: int) -> float:
     """Of one effect of all, at one joint of n, in one of so many ways to look for it."""
     odds = effect.log_odds - np.log(len(CATALOGUE)) - np.log(ways)
     if joint >= 0:

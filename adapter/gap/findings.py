@@ -13,7 +13,7 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
 from adapter.effects.splits import experiments
-from adapter.gap.candidates import Pattern
+from adapter.gap.candidates import Pattern, prior_log_odds
 from adapter.gap.evidence import Carried, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
@@ -132,6 +132,7 @@ def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, trusted: Array) 
     gain -= score(known.G, known.g, std).log_evidence
     covariance = honest_covariance(fit, known)[np.ix_(own, own)]
     gain /= float(np.max(np.diagonal(covariance) / np.diagonal(known.covariance())[own]))
+    gain += prior_log_odds(WRONG_LINK, k, len(fit.dtheta), 1)  # what the search asks of the name
     torque = np.tensordot(fit.dtheta[k], fit.recordings[0].low_regressor[own], 1)
     key = WRONG_LINK.parameters[0].key
     return Finding(
