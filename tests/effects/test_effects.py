@@ -300,6 +300,12 @@ def test_no_sensor_is_smoother_than_it_is_late() -> None:
     assert effect.log_odds_of({"d": -0.002, "c": 1e-4}) < -20.0
 
 
+def test_a_play_narrower_than_any_that_is_looked_for_is_rare() -> None:
+    effect = CATALOGUE["backlash"]
+    assert effect.log_odds_of({"b": 2e-3}) == 0.0
+    assert effect.log_odds_of({"b": 5e-4}) < -20.0
+
+
 LOAD = {"m": 1.3, "cx": 0.02, "cy": -0.03, "cz": 0.09}
 SIX = [4e-3, 1e-4, -2e-4, 5e-3, 3e-4, 6e-3]
 TENSOR = np.array([[4e-3, 1e-4, -2e-4], [1e-4, 5e-3, 3e-4], [-2e-4, 3e-4, 6e-3]])
