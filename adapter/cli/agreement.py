@@ -13,6 +13,7 @@ from pathlib import Path
 from adapter.control.controller import ExcitationController
 from adapter.control.excitation import plan_lines
 from adapter.control.free_path import FreeMotion
+from adapter.control.push_bound import push_bound
 from adapter.errors import SettingsError, UsageError
 from adapter.report.plan_page import write_plan
 from adapter.runs.terminal import say
@@ -72,7 +73,10 @@ def agree(
     if controller.weight is not None and controller.weight.refusal is not None:
         raise SettingsError(controller.weight.refusal)
     lines = plan_lines(motion, limits, model.tree.joint_names, duration_s)
-    lines.insert(-1, f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).")
+    lines[-1:-1] = [
+        f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).",
+        *push_bound(model, motion, limits, controller.safety).lines(),
+    ]
     say("\n".join(lines))
 
     def write() -> Path:

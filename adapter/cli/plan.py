@@ -11,6 +11,7 @@ from adapter.cli.exit_codes import ExitCode
 from adapter.cli.run import run_plan
 from adapter.control.excitation import plan_lines
 from adapter.control.limits import MotionLimits, need_same_robot
+from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
 from adapter.report.plan_page import write_plan
 from adapter.runs.terminal import results_folder, say, show
@@ -38,7 +39,10 @@ def run(args: argparse.Namespace) -> int:
     assert draw.least is not None
     duration_s = args.duration + plan.config.excitation.slow_s
     lines = plan_lines(motion, limits, robot.tree.joint_names, duration_s)
-    lines.insert(-1, f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).")
+    lines[-1:-1] = [
+        f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).",
+        *push_bound(robot, motion, limits, plan.config.safety).lines(),
+    ]
     page = results_folder(args.out, "plan") / PLAN_PAGE
     write_plan(page, draw.arm, motion, limits, draw.least, lines)
     for line in lines:

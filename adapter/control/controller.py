@@ -174,7 +174,7 @@ class ExcitationController:
         self.feedforward, self.draw = feedforward, draw
         self.observer: ContactObserver | None = None
         self.weight: CarriedWeight | None = None
-        self._expected, self._safety = expected, control.safety
+        self._expected, self.safety = expected, control.safety
         self._K, self._full_D = control.gains(limits)
         self._D = self._full_D
         self._effort = limits.effort * control.effort_share
@@ -236,7 +236,7 @@ class ExcitationController:
         if self.weight is not None:
             self.weight.begin(sample.q, sample.tau)
         self._gate = ReadingGate(self._new_judge(), self._period_ns)
-        self._watch = ArmWatch(self.limits, self._safety, self._K, self._effort)
+        self._watch = ArmWatch(self.limits, self.safety, self._K, self._effort)
         self._started = False
         ref.advance(0.0)  # compiles, as do the next lines, before the clock runs
         self._new_judge().judge(ref.q, ref.dq, ref.q, (0.0, 0.0))

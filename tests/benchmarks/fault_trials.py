@@ -23,6 +23,7 @@ import numpy as np
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
+from adapter.control.push_bound import left_at_most
 from adapter.control.resting import CarriedWeight
 from adapter.control.settings import ExcitationSettings
 from adapter.errors import SettingsError
@@ -35,7 +36,7 @@ from drivers.faults.driver import with_faults
 from drivers.interface import JointSample
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario, build
-from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, left_at_most, opened
+from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, opened
 
 PANDA = documented("panda")
 N, LIMITS = PANDA.tree.n, MotionLimits.of(PANDA)

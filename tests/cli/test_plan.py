@@ -29,6 +29,7 @@ def test_plan_writes_lines_and_a_page_and_moves_nothing(tmp_path, capsys):
     assert main([*command, "--config", str(tmp_path / "cell.toml"), "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "This moves 2 joints" in said and "Nearest on the way: 0." in said
+    assert "N m on a joint that the model does not expect" in said and "Once stopped" in said
     assert "then 0.000 rad/s (0% of" in said or "up to 0.000 rad/s (0% of" in said
     page = (tmp_path / "plan.html").read_text()
     assert page.count("<svg") == 5 and "margin 0.05 m" in page and "NaN" not in page

@@ -11,6 +11,7 @@ from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.observer import ContactObserver
+from adapter.control.push_bound import left_at_most
 from adapter.control.resting import CarriedWeight
 from adapter.control.safety import CALM, ArmWatch, Now
 from adapter.control.settings import ExcitationSettings, SafetySettings
@@ -24,7 +25,7 @@ from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.fci_lockstep import FciLockstep
-from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, left_at_most, opened
+from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, opened
 
 PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)

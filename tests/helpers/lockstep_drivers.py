@@ -7,8 +7,6 @@ from contextlib import ExitStack, contextmanager
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
 from drivers.fci import torque_control
@@ -26,15 +24,7 @@ from tests.helpers.fci_lockstep import FciLockstep
 BEGINS_S = {"sim": 0.0, "fci": 0.0, "can": 1.6}
 # The same with 4 to 8 kg at the hand: a CAN arm uses up all of the 5 s that it may settle in.
 BEGINS_LOADED_S = {**BEGINS_S, "can": 6.4}
-# Of the effort limit, and N m: what a stopped arm may still push on each joint, and what a brake of
-# motors may hold: the band that it is carried with, and half of it for what the arm sags by.
-LEFT_SHARE, LEFT_LEAST = 0.15, 1.0
 LET_GO = 150  # readings after a stop in which it comes to that; ms
-
-
-def left_at_most(effort: np.ndarray) -> np.ndarray:
-    """Torque (n,) N m that a stopped arm may still push with, for effort limits (n,) N m."""
-    return np.maximum(LEFT_SHARE * effort, LEFT_LEAST)
 
 
 @contextmanager
