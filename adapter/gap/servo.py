@@ -34,6 +34,7 @@ from drivers.files.mcap import PositionLog
 ROUNDS = 2  # in which the load follows from the arm's simulated motion
 SURE = 4.0  # standard deviations from the documented value, from which on it is another one
 DOCUMENTED_SHARE = 0.01  # of a documented value, to which it is meant; one standard deviation
+LEAST_DELAY_S = 1e-5  # standard deviation of one joint's, at least
 DOCUMENTED_DELAY_S = 5e-5  # the same of a delay
 SHOWN = 2.0  # from zero, where nobody documented a value: every servo has some of it
 TIE_CHI2 = 4.0  # by which an effect must foretell blocks that its fit has not seen better
@@ -268,18 +269,21 @@ def _with_lead(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
 
 
 def _with_one_delay(arm: _Arm, fits: Sequence[JointFit]) -> list[JointFit]:
-    """One bus brings all commands: the delay that all joints together show, or the documented."""
+    """One bus brings all commands: the delay that all joints together show, or the documented.
+
+    Inertias that are off move it in all joints at once.
+    """
     delays = np.array([fit.x[DELAY] for fit in fits])
-    at = [int(fit.freedom.free[:DELAY].sum()) for fit in fits]
-    stds = np.array(
-        [
-            fit.scale[k] * np.sqrt(fit.noise_covariance[k, k])
-            for fit, k in zip(fits, at, strict=True)
-        ]
-    )
-    weight = 1.0 / np.maximum(stds, 1e-5) ** 2
+    drawn, noise, moved = arm.drawn_loads(_motions(arm, fits)), [], []
+    for fit in fits:
+        at, j = int(fit.freedom.free[:DELAY].sum()), fit.task.joint
+        noise.append(fit.scale[at] ** 2 * fit.noise_covariance[at, at])
+        moved.append(fit.scale[at] * fit.moved([[own[j] for own in each] for each in drawn])[:, at])
+    together = np.diag(np.maximum(noise, LEAST_DELAY_S**2)) + np.cov(moved, bias=True)
+    weight = np.linalg.solve(together, np.ones(len(fits)))
     delay = float(weight @ delays / weight.sum())
-    spread = float(weight @ (delays - delay) ** 2 / max(len(fits) - 1, 1))
+    left = delays - delay
+    spread = float(left @ np.linalg.solve(together, left)) / max(len(fits) - 1, 1)
     std = float(np.sqrt(max(spread, 1.0) / weight.sum()))
     if abs(delay - arm.documented.delay_s) < SURE * np.hypot(std, DOCUMENTED_DELAY_S):
         delay, std = arm.documented.delay_s, 0.0

@@ -24,6 +24,7 @@ LATEST_S, EVERY_S = 0.05, 1e-3  # of the delays that are tried
 MEMORY_S = 0.5  # beyond which what is left of a fit does not know itself
 LEAST = np.array([1e-6, 2e-3, 2e-3, 2e-5, 1e-4, 1e-3])  # scale of a parameter that is zero
 NUDGE = 1e-3  # of its scale, for derivatives
+UNTOLD = 10.0  # scales, one standard deviation of what readings do not tell
 ROUNDS, MILLI = 40, 1e3  # of a fit, at most; it goes by mrad
 
 
@@ -123,9 +124,13 @@ class JointFit:
 
     @cached_property
     def noise_covariance(self) -> Array:
-        """(f, f) of the free parameters over their scales, by what is left unexplained."""
+        """(f, f) of the free parameters over their scales, by what is left unexplained.
+
+        What the readings do not tell is known to some times its size: a direction that is left
+        out would count as known for sure.
+        """
         J = self.jacobian
-        return np.asarray(np.linalg.pinv(J.T @ J, rcond=1e-14) * self.unit)
+        return np.linalg.inv(J.T @ J / self.unit + np.eye(J.shape[1]) / UNTOLD**2)
 
     @cached_property
     def unit(self) -> float:
@@ -135,8 +140,8 @@ class JointFit:
 
     def moved(self, others: Sequence[Sequence[Load]]) -> Array:
         """(s, f) by how much the parameters over their scales would move under other loads."""
-        J, here = self.jacobian, self.task.fitted(self.x)
-        gain = -np.linalg.pinv(J, rcond=1e-7)
+        here = self.task.fitted(self.x)
+        gain = -self.noise_covariance @ self.jacobian.T / self.unit
         return np.array([gain @ (self.task.under(o).fitted(self.x) - here) for o in others])
 
     def error(self) -> float:

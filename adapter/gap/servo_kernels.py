@@ -65,13 +65,23 @@ def follow_alone(x, goal, load, start, step, q):
     damping, rubs = x[DAMPING], x[RUBS]
     for k in range(goal.shape[0]):
         mass = x[A] * load.mass[k] + x[INERTIA]
-        pull = 2.0 * mass / step * speed + goal[k] - at - x[A] * load.other[k]
-        if abs(pull) <= rubs:
-            speed = 0.0
-        else:
-            pull -= rubs if pull > 0.0 else -rubs
-            middle = pull / (2.0 * mass / step + 0.5 * step + damping)
-            speed, at = 2.0 * middle - speed, at + step * middle
+        steers = goal[k] - x[A] * load.other[k]
+        left = step
+        if speed != 0.0:
+            way = 1.0 if speed > 0.0 else -1.0
+            pull = 2.0 * mass / step * speed + steers - at - way * rubs
+            after = 2.0 * pull / (2.0 * mass / step + 0.5 * step + damping) - speed
+            # It stops within the step: only up to there does friction act this way. What follows
+            # from the numbers then has no jumps, which a fit would be caught by.
+            share = speed / (speed - after) if after * way < 0.0 else 1.0
+            at += 0.5 * share * step * (speed + (after if share == 1.0 else 0.0))
+            speed = after if share == 1.0 else 0.0
+            left = (1.0 - share) * step
+        force = steers - at
+        if left > 0.0 and abs(force) > rubs:
+            force -= rubs if force > 0.0 else -rubs
+            middle = force / (2.0 * mass / left + 0.5 * left + damping)
+            speed, at = 2.0 * middle, at + left * middle
         q[k] = at
 
 

@@ -107,6 +107,20 @@ def test_friction_holds_a_joint() -> None:
     assert np.ptp(q[-100:]) == 0.0
 
 
+def test_a_stop_within_a_step_makes_no_jump() -> None:
+    """A joint that rings and sticks ends hardly elsewhere under 0.1 microrad more of friction."""
+    step, m = 1e-3, 3000
+    t = step * np.arange(1, m + 1)
+    load, goal = Load(np.full(m, 0.15), np.zeros(m)), 0.1 * np.sign(np.sin(2.0 * np.pi * t))
+    moved = []
+    for rubs in 4e-3 + 1e-7 * np.arange(300):
+        q = np.empty(m)
+        follow_alone(np.array([2e-3, 0.0, 5e-3, 1e-4, rubs]), goal, load, np.zeros(2), step, q)
+        moved.append(q)
+    assert (np.diff(moved[0])[m // 2 :] == 0.0).any()
+    assert np.abs(np.diff(moved, axis=0)).max() < 2e-6
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[PositionArm, Path, Path]:
     folder = tmp_path_factory.mktemp("servo")
