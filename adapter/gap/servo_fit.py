@@ -130,7 +130,7 @@ class JointFit:
         out would count as known for sure.
         """
         J = self.jacobian
-        return np.linalg.inv(J.T @ J / self.unit + np.eye(J.shape[1]) / UNTOLD**2)
+        return np.asarray(np.linalg.inv(J.T @ J / self.unit + np.eye(J.shape[1]) / UNTOLD**2))
 
     @cached_property
     def unit(self) -> float:
