@@ -120,19 +120,30 @@ def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]
     odd = np.abs(fit.dtheta / trusted).max(axis=1) > ODD
     odd[-1] &= not any(e.candidate.effect is HELD for e in fit.named)
     odd[[e.candidate.joint for e in fit.named if e.candidate.effect is WRONG_LINK]] = False
-    told = [_wrong_link(fit, known, int(k), end_s, trusted) for k in np.flatnonzero(odd)]
+    gains = {int(k): _gain_of_link(fit, known, int(k), trusted) for k in np.flatnonzero(odd)}
+    odds = prior_log_odds(WRONG_LINK, 0, len(odd), 1)  # what the search asks of the name
+    wrong = sum(e.candidate.effect is WRONG_LINK for e in fit.named)
+    wrong += sum(gain + odds > 0.0 for gain in gains.values())
+    if wrong > 1:  # one wrong link says nothing of the others, several: the whole model is poor
+        odds = max(odds, float(np.log((wrong - 1) / len(odd))))
+    told = [_wrong_link(fit, known, k, end_s, gain + odds) for k, gain in gains.items()]
     return [f for f in told if f.evidence > SINGLED_OUT]
 
 
-def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, trusted: Array) -> Finding:
-    """The correction of the k-th link as a finding."""
+def _gain_of_link(fit: Fit, known: Carried, k: int, trusted: Array) -> float:
+    """nats by which the data want the k-th link's correction, before the odds of its name."""
     own, std = np.arange(10 * k, 10 * k + 10), known.prior_std.copy()
     std[own] = trusted[k]
     gain = score(known.G, known.g, known.prior_std).log_evidence
     gain -= score(known.G, known.g, std).log_evidence
+    covariance = np.diagonal(honest_covariance(fit, known))[own]
+    return float(gain / np.max(covariance / np.diagonal(known.covariance())[own]))
+
+
+def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, log_odds: float) -> Finding:
+    """The correction of the k-th link as a finding."""
+    own, size = np.arange(10 * k, 10 * k + 10), len(known.prior_std)
     covariance = honest_covariance(fit, known)[np.ix_(own, own)]
-    gain /= float(np.max(np.diagonal(covariance) / np.diagonal(known.covariance())[own]))
-    gain += prior_log_odds(WRONG_LINK, k, len(fit.dtheta), 1)  # what the search asks of the name
     torque = np.tensordot(fit.dtheta[k], fit.recordings[0].low_regressor[own], 1)
     key = WRONG_LINK.parameters[0].key
     return Finding(
@@ -144,10 +155,10 @@ def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, trusted: Array) 
         parameters={key: [float(x) for x in fit.dtheta[k]]},
         std={key: [float(x) for x in np.sqrt(np.diagonal(covariance))]},
         units=WRONG_LINK.units(),
-        evidence=float(1.0 / (1.0 + np.exp(-np.clip(gain, -700.0, 700.0)))),
+        evidence=float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -700.0, 700.0)))),
         overlaps={},
         split_by="; ".join(experiments(WRONG_LINK, [])),
-        detectability=float(np.sqrt(known.worth(own, np.delete(np.arange(len(std)), own)).chi2)),
+        detectability=float(np.sqrt(known.worth(own, np.delete(np.arange(size), own)).chi2)),
         torque_rms_nm=np.sqrt(np.mean(torque**2, axis=0)),
     )
 
