@@ -13,6 +13,7 @@ from adapter.model.model_file import load_model
 from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table, table_log
 from adapter.signals.recording import describe, summary
+from adapter.signals.recording_import import import_recording, of_recording, recording_log
 from drivers.files.mcap import Log, recover
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
@@ -32,8 +33,9 @@ def run_import(args: argparse.Namespace) -> int:
         period_s=args.period,
         overwrite=args.overwrite,
         episode=args.episode,
+        topic=args.topic,
     )
-    report = import_table(spec, args.to)
+    report = (import_recording if of_recording(spec) else import_table)(spec, args.to)
     warn(list(report.warnings))
     facts = report.as_dict()
     write_json(args.json, facts)
@@ -79,13 +81,16 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def opened(args: argparse.Namespace) -> Log | None:
-    """A table as a recording; None of what is no table. Raises DriverError."""
+    """A table, or a recording in other units; None of a recording as it is. Raises DriverError."""
     path = args.file
     table = path.with_suffix("") if path.suffix == ".gz" else path
-    if table.suffix not in TABLES and not (path / "meta" / "info.json").is_file():
-        return None
     more = {"period_s": args.period, "episode": args.episode}
-    return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
+    if table.suffix in TABLES or (path / "meta" / "info.json").is_file():
+        return table_log(ImportSpec.from_options([str(path)], args.columns, args.units, **more))
+    if not (args.units or args.columns or any(x is not None for x in more.values())):
+        return None
+    spec = ImportSpec.from_options([str(path)], args.columns, args.units, topic=args.topic, **more)
+    return recording_log(spec)
 
 
 def _model_facts(path: Path) -> dict[str, Any]:

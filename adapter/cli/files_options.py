@@ -19,13 +19,14 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     """Declare them, and what checks them."""
     parser.description = (
         "Turn tables (CSV, white space, either packed by gzip, .npz, .parquet, or the folder of a "
-        "LeRobot data set) into an MCAP recording. Sources are one FILE, or SIGNAL=FILE for each "
-        "of time, q, dq, tau."
+        "LeRobot data set) or a bag (rosbag2, ROS 1, MCAP) into an MCAP recording of our own. "
+        "Sources are one FILE, or of tables SIGNAL=FILE for each of time, q, dq, tau."
     )
     add = parser.add_argument
     add("sources", nargs="+", metavar="[SIGNAL=]FILE")
     add("--to", type=Path, required=True, metavar="FILE", help="recording to write")
     _add_tables(parser)
+    add_topic(parser)
     add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
     add("--joints", default="", metavar="LIST", help="joint names, commas between")
     add("--flat", action="store_true", help="one value per line")

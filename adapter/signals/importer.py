@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.model_file import whole_file
+from adapter.signals.plausible import refuse_wild, value_doubts, velocity_doubts
 from adapter.signals.source_table import (
     SourceTable,
     lerobot_joints,
@@ -25,7 +26,7 @@ from adapter.signals.source_table import (
     read_parquet,
     read_table,
 )
-from drivers.files.mcap import Log, McapWriter, derive_velocity, looks_like_degrees
+from drivers.files.mcap import Log, McapWriter, derive_velocity
 from drivers.interface import Array, DriverError
 
 SIGNALS = ("time", "q", "dq", "tau")
@@ -48,11 +49,7 @@ _USUAL = {  # what signals are called where the user doesn't say
         *("observation.effort", "observation.torque"),
     ),
 }
-_MOST = {"time": 9e9, "q": 1e4, "dq": 1e6, "tau": 1e6}  # SI; beyond, it is another quantity
-_WHAT = {"time": "time", "q": "angle", "dq": "velocity", "tau": "torque"}
 _STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
-_MOVING = 1e-2  # rad/s, a median slope below it says nothing
-_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 
 
 @dataclass(frozen=True)
@@ -71,6 +68,7 @@ class ImportSpec:
         period_s: of the samples, where there is no time.
         overwrite: replace an existing recording.
         episode: of a data set with several.
+        topic: of the joint states, where the source is a recording (`signals.recording_import`).
     """
 
     sources: Mapping[str, Path]
@@ -81,6 +79,7 @@ class ImportSpec:
     period_s: float | None = None
     overwrite: bool = False
     episode: int | None = None
+    topic: str | None = None
 
     @classmethod
     def from_options(
@@ -100,7 +99,11 @@ class ImportSpec:
         files: dict[str, Path] = {}
         for source in sources:
             match = re.fullmatch(rf"({'|'.join((*SIGNALS, 't'))})=(.+)", source)
-            files[_signal(match[1]) if match else ALL] = Path(match[2] if match else source)
+            signal, path = (_signal(match[1]), match[2]) if match else (ALL, source)
+            if signal in files:
+                what = signal or "all signals"
+                raise DriverError(f"{files[signal]} and {path}: are both for {what}; give one file")
+            files[signal] = Path(path)
         chosen = {signal: words[0] for signal, words in _assignments(units, "unit").items()}
         return cls(files, _assignments(columns, "column"), chosen, **other)
 
@@ -127,6 +130,15 @@ def _assignments(text: str, what: str) -> dict[str, tuple[str, ...]]:
     return {name: tuple(words) for name, words in found.items()}
 
 
+def unit_factor(units: Mapping[str, str], signal: str) -> float:
+    """From a signal's unit to SI. Raises DriverError where there is no such unit."""
+    usual = units.get("q", "rad") if signal == "dq" else next(iter(UNITS[signal]))
+    unit = units.get(signal, usual)
+    if unit not in UNITS[signal]:
+        raise DriverError(f"no unit '{unit}' for {signal}; have: {', '.join(UNITS[signal])}")
+    return UNITS[signal][unit]
+
+
 @dataclass(frozen=True)
 class ImportReport:
     """What was written."""
@@ -137,6 +149,15 @@ class ImportReport:
     duration_s: float
     rate_hz: float
     warnings: list[str]
+
+    @classmethod
+    def of(
+        cls, out: Path, names: tuple[str, ...], stamp_ns: NDArray[np.int64], warnings: list[str]
+    ) -> ImportReport:
+        """From the stamps (m,) of what was written."""
+        duration_s = float(np.ptp(stamp_ns)) * 1e-9 if len(stamp_ns) else 0.0
+        rate_hz = (len(stamp_ns) - 1) / duration_s if duration_s > 0 else 0.0
+        return cls(out, len(stamp_ns), names, duration_s, rate_hz, warnings)
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -154,9 +175,7 @@ def import_table(spec: ImportSpec, out: Path) -> ImportReport:
     if out.exists() and not spec.overwrite:
         raise DriverError(f"{out}: exists; choose another name or delete it")
     _write(spec, out, log.joint_names, (log.stamp_ns, log.q, log.dq, log.tau))
-    duration_s = float(np.ptp(log.stamp_ns)) * 1e-9
-    rate_hz = (len(log) - 1) / duration_s if duration_s > 0 else 0.0
-    return ImportReport(out, len(log), log.joint_names, duration_s, rate_hz, log.warnings)
+    return ImportReport.of(out, log.joint_names, log.stamp_ns, log.warnings)
 
 
 def table_log(spec: ImportSpec) -> Log:
@@ -175,7 +194,7 @@ def table_log(spec: ImportSpec) -> Log:
         dq = derive_velocity(stamp_ns, q)
         warnings.append(f"{where}: no velocities; derived from the positions")
     else:
-        warnings += _velocity_doubts(where, stamp_ns, q, dq)
+        warnings += velocity_doubts(where, stamp_ns, q, dq)
     warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
     columns = reader.taken
     return Log(Path(where), names, stamp_ns, q, dq, tau, warnings=warnings, topic=columns)
@@ -187,6 +206,17 @@ def _write(
     names: tuple[str, ...],
     signals: tuple[NDArray[np.int64], Array, Array, Array],
 ) -> None:
+    metadata = imported_by(spec)
+    with (
+        whole_file(out) as part,
+        McapWriter(part, names, metadata=metadata, overwrite=True) as writer,
+    ):
+        for stamp_ns, q, dq, tau in zip(*signals, strict=True):
+            writer.write_joint_state(int(stamp_ns), q, dq, tau)
+
+
+def imported_by(spec: ImportSpec) -> dict[str, Any]:
+    """What a recording says of where it came from."""
     try:
         version = importlib.metadata.version("panda-adapter")
     except importlib.metadata.PackageNotFoundError:
@@ -195,14 +225,9 @@ def _write(
         "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},
         "columns": spec.columns,
         "units": spec.units,
+        "topic": spec.topic,
     }
-    metadata = {"version": version, "imported": source}
-    with (
-        whole_file(out) as part,
-        McapWriter(part, names, metadata=metadata, overwrite=True) as writer,
-    ):
-        for stamp_ns, q, dq, tau in zip(*signals, strict=True):
-            writer.write_joint_state(int(stamp_ns), q, dq, tau)
+    return {"version": version, "imported": source}
 
 
 class _Reader:
@@ -225,7 +250,7 @@ class _Reader:
     def read(self, signal: str) -> Array | None:
         """(m, k) values in SI units; None where the signal isn't there and wasn't asked for."""
         path = self.source(signal)
-        factor = self._factor(signal)
+        factor = unit_factor(self._spec.units, signal)
         if path is None:
             return None
         values = self._npz(path, signal) if path.suffix == ".npz" else self._text(path, signal)
@@ -233,15 +258,9 @@ class _Reader:
             return None
         with np.errstate(over="ignore"):
             values = values * factor
-        wild = np.argwhere(np.abs(values) > _MOST[signal])
-        if len(wild):
-            row, column = wild[0].tolist()
-            table = self._tables.get(path)
-            place = f"row {row}" if table is None else table.place(row)
-            raise DriverError(
-                f"{path}: {place}: {values[row, column]:.4g} is no {_WHAT[signal]} (at most "
-                f"{_MOST[signal]:g} in SI units); are column and unit of {signal} right?"
-            )
+        table = self._tables.get(path)
+        place = table.place if table is not None else (lambda row: f"row {row}")
+        refuse_wild(str(path), place, signal, values)
         return values
 
     @property
@@ -266,14 +285,6 @@ class _Reader:
             table = self._tables[path]
             having = f"its columns: {', '.join(table.names) or f'0 to {len(table) - 1}'}"
         raise DriverError(f"{path}: which column is {signal}? Name it, {signal}=...; {having}")
-
-    def _factor(self, signal: str) -> float:
-        units = self._spec.units
-        usual = units.get("q", "rad") if signal == "dq" else next(iter(UNITS[signal]))
-        unit = units.get(signal, usual)
-        if unit not in UNITS[signal]:
-            raise DriverError(f"no unit '{unit}' for {signal}; have: {', '.join(UNITS[signal])}")
-        return UNITS[signal][unit]
 
     def _text(self, path: Path, signal: str) -> Array | None:
         if path not in self._tables:
@@ -383,31 +394,4 @@ def _doubts(
                 f"{said} s? Say --units time=UNIT ({', '.join(UNITS['time'])}; s takes it as it is)"
             )
         found.append(f"{said} {told or 's'}? (units: {', '.join(UNITS['time'])})")
-    for name, values in signals.items():
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if bad.size:
-            found.append(
-                f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
-            )
-    if looks_like_degrees(signals["q"]):
-        said = (
-            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they degrees?"
-        )
-        if "q" not in spec.units:
-            raise DriverError(f"{said} Say --units q=deg (q=rad takes them as they are)")
-        found.append(f"{said} Say q=deg")
-    return found
-
-
-def _velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array) -> list[str]:
-    """Whether the velocities are the positions' slope in the same unit."""
-    with np.errstate(invalid="ignore"):
-        slope = np.nanmedian(np.abs(derive_velocity(stamp_ns, q)))
-        said = np.nanmedian(np.abs(dq))
-    ratio = said / slope if slope > _MOVING and said > 0 else 1.0
-    if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
-        return []
-    return [
-        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
-        "of q, dq and time right?"
-    ]
+    return found + value_doubts(where, signals, spec.units)

@@ -72,14 +72,14 @@ def matching(log: Log, documented: SelfModel) -> Log:
         DriverError: a joint of the robot is not in the recording; names both lists.
     """
     tree = documented.tree
-    joints, warnings = _corresponding(tree.joint_names, log.joint_names, "joint")
+    joints, warnings = corresponding(tree.joint_names, log.joint_names, "joint")
     missing = [name for name, found in zip(tree.joint_names, joints, strict=True) if found is None]
     if missing:
         raise DriverError(
             f"{log.path}: has no joint {', '.join(missing)}; it has {', '.join(log.joint_names)}; "
             f"{documented.name} has {', '.join(tree.joint_names)}"
         )
-    links, more = _corresponding(tree.link_names, log.link_names, "link")
+    links, more = corresponding(tree.link_names, log.link_names, "link")
     heard = all(links) and log.twists is not None and log.accels is not None
     if tree.floating:  # see `twist`
         if heard:
@@ -98,7 +98,7 @@ def matching(log: Log, documented: SelfModel) -> Log:
     return log
 
 
-def _corresponding(
+def corresponding(
     want: tuple[str, ...], have: tuple[str, ...], what: str
 ) -> tuple[list[str | None], list[str]]:
     """For each wanted name the one in `have` (None: not there), and warnings."""

@@ -7,6 +7,7 @@ metadata record with configuration and version. Read only: sensor_msgs/msg/Imu o
 floating base also nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any topic.
 """
 
+from drivers.files.mcap.bags import is_recording
 from drivers.files.mcap.imus import READERS, FrameMotion
 from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
@@ -27,6 +28,7 @@ __all__ = [
     "Recovery",
     "Topic",
     "derive_velocity",
+    "is_recording",
     "looks_like_degrees",
     "read_estimates",
     "read_log",

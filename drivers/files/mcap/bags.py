@@ -14,6 +14,7 @@ import re
 import struct
 import tempfile
 import weakref
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import zstandard
 from mcap.records import Channel, Schema
 
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
-from drivers.files.mcap.records import McapScan, Region, Scan
+from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
 from drivers.files.mcap.series import PARSERS, schema_name
 from drivers.files.ros import FRANKA_STATE, JOINT_STATE, JointStateEncoder
 from drivers.interface import DriverError
@@ -67,6 +68,26 @@ def open_scan(path: Path) -> Scan:
 def is_rosbag2(path: Path) -> bool:
     """Whether a folder is one recording of rosbag2."""
     return (path / METADATA).is_file()
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is one by its first bytes, packed or not, or by its name, or a folder has one.
+
+    A damaged recording is one, too. False of what cannot be opened.
+    """
+    if path.is_dir():
+        return is_rosbag2(path) or any(p.suffix in _OF_BAGS for p in path.iterdir())
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_SQLITE))
+            unpack = next((f for magic, f in _PACKED.items() if head.startswith(magic)), None)
+            if unpack is not None:
+                file.seek(0)
+                head = unpack(file).read(len(_SQLITE))
+    except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError):
+        head = b""
+    named = path.with_suffix("") if path.suffix in (".gz", ".zst", ".zstd") else path
+    return head.startswith((_SQLITE, _ROS1, MAGIC)) or named.suffix in _OF_BAGS
 
 
 def _open_folder(path: Path) -> Scan:

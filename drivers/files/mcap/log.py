@@ -124,11 +124,17 @@ class Log:
         log = replace(self, stamp_ns=self.stamp_ns[rows], q=self.q[rows], dq=self.dq[rows])
         return replace(log, tau=self.tau[rows], twists=twists, accels=accels, base=base)
 
+    @property
+    def pairs_links(self) -> bool:
+        """Whether the recording says which joint moves which link."""
+        joints, links = self.metadata.get("joint_names"), self.metadata.get("link_names")
+        return isinstance(joints, list) and isinstance(links, list) and len(joints) == len(links)
+
     def _links_moved_by(self, joint_names: Sequence[str]) -> list[str] | None:
         """The links that these joints move, where the recording says so and has them all."""
-        joints, links = self.metadata.get("joint_names"), self.metadata.get("link_names")
-        if not (isinstance(joints, list) and isinstance(links, list) and len(joints) == len(links)):
+        if not self.pairs_links:
             return None
+        joints, links = self.metadata["joint_names"], self.metadata["link_names"]
         pairs = dict(zip(joints, links, strict=True))
         moved = [pairs.get(name) for name in joint_names]
         return [n for n in moved if n] if all(n in self.link_names for n in moved) else None
