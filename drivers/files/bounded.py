@@ -24,12 +24,17 @@ INTEGER_DIGITS = 19  # what 64 bits hold
 _PLAIN = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
-def read_text(path: str | Path) -> str:
-    """A text in UTF-8, its line ends as they are. Raises OSError, ValueError."""
+def read_text(path: str | Path, limit: int | None = None) -> str:
+    """A text in UTF-8 of at most `limit` bytes (`TEXT_LIMIT`), its line ends as they are.
+
+    Raises:
+        OSError, ValueError: it cannot be opened; it is too long, or no such text.
+    """
+    limit = TEXT_LIMIT if limit is None else limit
     with Path(path).open("rb") as file:
-        content = file.read(TEXT_LIMIT + 1)
-    if len(content) > TEXT_LIMIT:
-        raise ValueError(f"more than {TEXT_LIMIT >> 20} MiB of text")
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise ValueError(f"more than {limit >> 20} MiB of text")
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:

@@ -1,27 +1,33 @@
 """Bags of ROS 1 and rosbag2, by the library `rosbags`, told like the records of an MCAP file.
 
 A file is known by its first bytes, not by its name. What lies in a compressed file is unpacked
-into a temporary folder, at most `GROWTH_LIMIT` times its size. Messages of ROS 1, in a bag or in
+into a temporary folder; files, chunks and messages are unpacked here, in steps, because `rosbags`
+takes what a few bytes make of whatever size. A bag makes at most `GROWTH_LIMIT` times its size, a
+chunk or message of it at most `CHUNK_LIMIT`. Messages of ROS 1, in a bag or in
 an MCAP file, become CDR; a FrankaState of ROS 1, whose fields differ between versions, becomes a
 JointState by the definition that its bag or file carries.
 """
 
 from __future__ import annotations
 
+import bz2
 import gzip
 import importlib
-import re
+import sqlite3
 import struct
 import tempfile
 import weakref
 import zlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from contextlib import closing, contextmanager
+from io import BytesIO
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 import zstandard
 from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
@@ -29,17 +35,24 @@ from drivers.files.mcap.series import PARSERS, schema_name
 from drivers.files.ros import FRANKA_STATE, JOINT_STATE, JointStateEncoder
 from drivers.interface import DriverError
 
-_SQLITE, _ROS1 = b"SQLite format 3\0", b"#ROSBAG"
+_SQLITE, _ROS1, _ZSTD = b"SQLite format 3\0", b"#ROSBAG", b"\x28\xb5\x2f\xfd"
+_LZ4 = b"\x04\x22\x4d\x18"
 _PACKED: dict[bytes, Callable[[Any], Any]] = {
-    b"\x28\xb5\x2f\xfd": lambda file: zstandard.ZstdDecompressor().stream_reader(file),
+    _ZSTD: lambda file: zstandard.ZstdDecompressor().stream_reader(file),
     b"\x1f\x8b": lambda file: gzip.GzipFile(fileobj=file),
 }
 _HEAD = struct.Struct("<HIQQ")  # of a message as MCAP has it: channel, sequence, two times
 _OWN_SCHEMAS = 2**16  # beyond the numbers that a file can give its schemas
 _TOGETHER = 4096  # messages of one region
 _STEP = 2**20
+_REGION_BYTES = 2**24  # beyond them a region ends
 METADATA = "metadata.yaml"  # beside the files of a rosbag2
-_BY_MESSAGE = re.compile(r"compression_mode:\W*message", re.IGNORECASE)
+_COMPUTED = """
+SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%'
+UNION ALL SELECT t.name || '.' || x.name FROM sqlite_master t, pragma_table_xinfo(t.name) x
+WHERE t.type = 'table' AND x.hidden <> 0"""
+_FILES = "relative_file_paths"
+_METADATA_LIMIT = 2**20  # bytes; a topic has some hundred
 _OF_BAGS = (".db3", ".bag", ".mcap")
 
 
@@ -91,21 +104,77 @@ def is_recording(path: Path) -> bool:
 
 
 def _open_folder(path: Path) -> Scan:
-    mcap = sorted(path.glob("*.mcap"))
-    if is_rosbag2(path) and (len(mcap) != 1 or _BY_MESSAGE.search(_described(path))):
-        return BagScan(path, "")
-    files = mcap or sorted(p for p in path.iterdir() if p.suffix in _OF_BAGS)
+    if is_rosbag2(path):
+        return FolderScan(path)
+    files = sorted(p for p in path.iterdir() if p.suffix in _OF_BAGS)
     if len(files) == 1:
         return open_scan(files[0])
     inside = ", ".join(p.name for p in files) or "no recording"
     raise DriverError(f"{path}: is a folder; name the file in it (has: {inside})")
 
 
-def _described(path: Path) -> str:
+def _files_of(folder: Path) -> list[Path]:
+    """The files of a rosbag2, in their order. Raises DriverError where one is not there."""
+    about = folder / METADATA
     try:
-        return read_text(path / METADATA)
-    except (OSError, ValueError) as error:
-        raise DriverError(f"{path / METADATA}: cannot be read: {error}") from error
+        text = read_text(about, _METADATA_LIMIT)
+        # Composed and not constructed: a few merged mappings would fill the memory.
+        root = importlib.import_module("ruamel.yaml").YAML(typ="safe").compose(text)
+    except Exception as error:  # of whatever kind the parser raises
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DriverError(f"{about}: cannot be read: {said}") from error
+    try:
+        told = {k.value: v for k, v in root.value}["rosbag2_bagfile_information"]
+        listed = {k.value: v for k, v in told.value}[_FILES]
+        names = [PurePath(x.value).name for x in listed.value]
+    except (AttributeError, TypeError, ValueError, KeyError) as error:
+        raise DriverError(f"{about}: has no list of files ({_FILES})") from error
+    files = [folder / name for name in dict.fromkeys(names)]
+    for file in files:
+        if not file.is_file():
+            raise DriverError(f"{about}: names the file {file.name}, which is not there")
+    if not files:
+        raise DriverError(f"{about}: names no file")
+    return files
+
+
+class _TooLarge(ValueError):
+    """A bag makes more of its bytes than any recording does."""
+
+
+class _Growth:
+    """What a file may still make of its bytes."""
+
+    def __init__(self, stored: int) -> None:
+        """Args: stored: its bytes, as they came."""
+        self._left = GROWTH_LIMIT * stored + CHUNK_LIMIT
+
+    def spend(self, size: int) -> None:
+        """Count bytes that were made. Raises _TooLarge."""
+        self._left -= size
+        if self._left < 0:
+            raise _TooLarge(f"would grow more than {GROWTH_LIMIT} times; not read")
+
+    def message(self, raw: bytes) -> bytes:
+        """A message, unpacked where it is packed: CDR never begins like zstd. Raises _TooLarge."""
+        if raw[: len(_ZSTD)] == _ZSTD:
+            try:
+                raw = _bounded(zstandard.ZstdDecompressor().stream_reader(raw))
+            except zstandard.ZstdError:
+                raw = b""  # counted as unreadable
+        self.spend(len(raw))
+        return raw
+
+
+def _bounded(stream: Any) -> bytes:
+    """All that a chunk or message makes. Raises _TooLarge."""
+    parts, size = [], 0
+    while part := stream.read(_STEP):
+        parts.append(part)
+        size += len(part)
+        if size > CHUNK_LIMIT:
+            raise _TooLarge(f"a chunk or message makes more than {CHUNK_LIMIT} bytes; not read")
+    return b"".join(parts)
 
 
 def _unpacked(path: Path, head: bytes) -> Scan:
@@ -122,34 +191,80 @@ def _unpacked(path: Path, head: bytes) -> Scan:
 
 def _scan_unpacked(path: Path, head: bytes, whole: Path) -> Scan:
     unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
-    left = GROWTH_LIMIT * path.stat().st_size + CHUNK_LIMIT
+    growth = _Growth(path.stat().st_size)
     with path.open("rb") as packed, whole.open("wb") as out:
         try:
             with unpack(packed) as stream:
-                while left > 0 and (part := stream.read(_STEP)):
+                while part := stream.read(_STEP):
+                    growth.spend(len(part))
                     out.write(part)
-                    left -= len(part)
-        except (OSError, EOFError, ValueError, zstandard.ZstdError) as error:
+        except _TooLarge as error:
+            raise DriverError(f"{path}: {error}") from error
+        except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError) as error:
             raise DriverError(f"{path}: cannot be unpacked: {error}") from error
-    if left <= 0:
-        raise DriverError(f"{path}: would grow more than {GROWTH_LIMIT} times; not read")
+    with whole.open("rb") as file:
+        if file.read(len(_ZSTD)).startswith(tuple(_PACKED)):
+            raise DriverError(f"{path}: is packed twice; unpack it once")
     try:
         scan = open_scan(whole)
     except DriverError as error:
         raise DriverError(str(error).replace(str(whole), str(path))) from error
-    scan.path = path
+    scan.path, scan.stored = path, path.stat().st_size
     return scan
 
 
+class FolderScan(Scan):
+    """One pass over a rosbag2: the files of a folder, one after the other."""
+
+    def __init__(self, path: Path) -> None:
+        """Read which files it has. Raises DriverError."""
+        super().__init__(path)
+        try:
+            self._files = _files_of(path)
+        except DriverError as error:
+            self._files = sorted(p for p in path.iterdir() if p.suffix in _OF_BAGS)
+            if len(self._files) != 1:
+                raise
+            self.warnings.append(f"{error}; the only file there is read, {self._files[0].name}")
+
+    def regions(self) -> Iterator[Region]:
+        """The messages of its files. Raises DriverError where one of them cannot be read."""
+        channels: dict[tuple[str, str, str], None] = {}
+        growth = _Growth(sum(file.stat().st_size for file in self._files))
+        for file in self._files:
+            part = open_scan(file)
+            for region in part.regions():
+                try:
+                    growth.spend(int((region.stop - region.start).sum()))
+                except _TooLarge as error:
+                    raise DriverError(f"{self.path}: {error}") from error
+                # Each file numbers its channels in its own way.
+                self.channels, self.schemas = part.channels, part.schemas
+                yield region
+            for channel in part.channels.values():
+                kind = schema_name(part, channel)
+                channels[channel.topic, channel.message_encoding, kind] = None
+            for topic, count in part.passed.items():
+                self.passed[topic] = self.passed.get(topic, 0) + count
+            self.header, self.truncated = part.header, self.truncated or part.truncated
+            self.metadata += part.metadata
+            self.attachments += part.attachments
+            self.warnings += part.warnings
+        self.channels, self.schemas = {}, {}
+        for number, (topic, encoding, kind) in enumerate(channels):
+            self.schemas[number] = Schema(number, b"", "ros2msg", kind)
+            self.channels[number] = Channel(number, topic, encoding, {}, number)
+
+
 class BagScan(Scan):
-    """One pass over a bag of ROS 1, or a folder or SQLite file of rosbag2."""
+    """One pass over a bag of ROS 1, or an SQLite file of rosbag2."""
 
     def __init__(self, path: Path, kind: str) -> None:
-        """Args: path: of the bag; kind: ".db3", ".bag", or "" for a folder of rosbag2."""
+        """Args: path: of the bag; kind: ".db3" or ".bag"."""
         super().__init__(path)
         self._whole, self._kind = path.resolve(), kind
         self._one = kind == ".bag"
-        if kind and path.with_name(f"{path.name}-wal").exists():
+        if path.with_name(f"{path.name}-wal").exists():
             self.warnings.append(
                 f"{path}: what lies in {path.name}-wal is not read (sqlite3 opens "
                 "the file and writes it in)"
@@ -157,12 +272,15 @@ class BagScan(Scan):
 
     def regions(self) -> Iterator[Region]:
         """The messages of known types; others are counted in `passed`. Raises DriverError."""
+        self._growth = _Growth(self.stored)
         with tempfile.TemporaryDirectory() as folder:
             # Under a plain name: in the user's `?` and `#` would be read as parts of an address.
             link = Path(folder) / f"bag{self._kind}"
             link.symlink_to(self._whole)
             try:
                 yield from self._messages(link)
+            except _TooLarge as error:
+                raise DriverError(f"{self.path}: {error}") from error
             except Exception as error:  # rosbags' own, SQLite's, and those of damaged bytes
                 said = " ".join(str(error).replace(str(link), "it").split())[:200]
                 raise DriverError(
@@ -171,8 +289,8 @@ class BagScan(Scan):
                 ) from error
 
     def _messages(self, link: Path) -> Iterator[Region]:
-        name = "rosbags.rosbag1" if self._one else "rosbags.rosbag2"
-        with importlib.import_module(name).Reader(link) as bag:
+        chunks = _Growth(self.stored)
+        with _open_ros1(link, chunks) if self._one else _open_sqlite(link) as bag:
             self._note(bag.connections)
             chosen = [c for c in bag.connections if c.msgtype in PARSERS]
             for c in bag.connections:
@@ -182,7 +300,7 @@ class BagScan(Scan):
                 convert = None
                 if self._one:
                     convert = _to_cdr({c.msgtype: c.msgdef.data for c in chosen})
-                yield from self._packed(bag.messages(chosen), convert)
+                yield from _regions(self._told(bag.messages(chosen), convert))
 
     def _note(self, connections: list[Any]) -> None:
         for c in connections:
@@ -191,26 +309,67 @@ class BagScan(Scan):
             encoding = "cdr" if self._one else c.ext.serialization_format
             self.channels[c.id] = Channel(c.id, c.topic, encoding, {}, c.id)
 
-    def _packed(
+    def _told(
         self, messages: Iterator[Any], convert: Callable[[str, bytes], bytes] | None
-    ) -> Iterator[Region]:
-        data, starts, stops = bytearray(), [], []
+    ) -> Iterator[tuple[bytes, bytes]]:
+        """Head and content of each message."""
         for number, (connection, time_ns, raw) in enumerate(messages):
+            raw = self._growth.message(raw)
             if convert is not None:
                 raw = convert(connection.msgtype, raw)
-            data += _HEAD.pack(connection.id, number % 2**32, time_ns, time_ns)
-            starts.append(len(data))
-            data += raw
-            stops.append(len(data))
-            if len(starts) == _TOGETHER:
-                yield _region(data, starts, stops)
-                data, starts, stops = bytearray(), [], []
-        if starts:
-            yield _region(data, starts, stops)
+            yield _HEAD.pack(connection.id, number % 2**32, time_ns, time_ns), raw
+
+
+def _open_sqlite(path: Path) -> Any:
+    """A reader of an SQLite file, whose messages are what it stores and nothing more.
+
+    A database may compute what a table holds, and point to the same bytes again and again, so
+    that a few bytes fill the memory while they are sorted. Raises _TooLarge.
+    """
+    with closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as base:
+        made = base.execute(_COMPUTED).fetchone()
+        if made is not None:
+            raise _TooLarge(f"computes '{made[0]}' instead of storing it; not read")
+        (size,) = base.execute("SELECT total(length(data)) FROM messages").fetchone()
+    if size > path.stat().st_size:
+        raise _TooLarge(f"would tell {size:.0f} bytes of messages, more than it has; not read")
+    return importlib.import_module("rosbags.rosbag2").Reader(path)
+
+
+@contextmanager
+def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
+    """A reader whose chunks make no more than `growth` allows; each of them counts once."""
+    reader = importlib.import_module("rosbags.rosbag1").Reader(path)
+    read_chunk, known = reader.read_chunk, set()
+
+    def read_bounded() -> Any:
+        chunk = read_chunk()
+
+        def unpack(data: bytes) -> bytes:
+            content = _chunk_of_ros1(data)
+            if chunk.datapos not in known:
+                known.add(chunk.datapos)
+                growth.spend(len(content))
+            return content
+
+        return chunk._replace(decompressor=unpack)
+
+    reader.read_chunk = read_bounded
+    with reader:
+        yield reader
+
+
+def _chunk_of_ros1(data: bytes) -> bytes:
+    """The records of a chunk, which never begin like what packs them. Raises _TooLarge."""
+    if data.startswith(b"BZh"):
+        return _bounded(bz2.BZ2File(BytesIO(data)))
+    if data.startswith(_LZ4):
+        return _bounded(importlib.import_module("lz4.frame").LZ4FrameFile(BytesIO(data)))
+    return data
 
 
 class McapOfAnyRos(McapScan):
-    """One pass over an MCAP file; what ROS 1 serialized is told as CDR."""
+    """One pass over an MCAP file; what ROS 1 serialized is told as CDR, what is packed unpacked."""
 
     def __init__(self, path: Path) -> None:
         """Open the file. Raises DriverError where it cannot be an MCAP file."""
@@ -219,15 +378,31 @@ class McapOfAnyRos(McapScan):
 
     def regions(self) -> Iterator[Region]:
         """All complete messages, in the order of the file; damaged chunks are passed over."""
+        self._growth = _Growth(self.stored)
         for region in super().regions():
             numbers = np.unique(region.channel).tolist()
             # A file repeats its channels in each chunk, so their telling is put right each time.
             for number in numbers:
                 self._tell_as_cdr(number)
-            if any(number in self._from_ros1 for number in numbers):
-                yield self._converted(region)
+            packed = self._packed(region)
+            if packed.any() or any(number in self._from_ros1 for number in numbers):
+                try:
+                    yield from _regions(self._told(region, packed))
+                except _TooLarge as error:
+                    raise DriverError(f"{self.path}: {error}") from error
             else:
                 yield region
+
+    def _packed(self, region: Region) -> NDArray[np.bool_]:
+        """(k,) which messages of known types are packed one by one, as rosbag2 can."""
+        packed = np.zeros(len(region.start), bool)
+        long = np.flatnonzero(region.stop - region.start > len(_ZSTD))
+        begin = region.rows(region.start[long], len(_ZSTD))
+        packed[long] = (begin == np.frombuffer(_ZSTD, np.uint8)).all(axis=1)
+        if packed.any():
+            known = [n for n, c in self.channels.items() if schema_name(self, c) in PARSERS]
+            packed &= np.isin(region.channel, known)
+        return packed
 
     def _tell_as_cdr(self, number: int) -> None:
         channel = self.channels.get(number)
@@ -256,17 +431,31 @@ class McapOfAnyRos(McapScan):
             return None
         return lambda raw: convert(kind, raw)
 
-    def _converted(self, region: Region) -> Region:
-        data, starts, stops = bytearray(), [], []
-        places = zip(region.start.tolist(), region.stop.tolist(), strict=True)
-        for (start, stop), number in zip(places, region.channel.tolist(), strict=True):
-            data += region.data[start - _HEAD.size : start].tobytes()
-            starts.append(len(data))
+    def _told(self, region: Region, packed: NDArray[np.bool_]) -> Iterator[tuple[bytes, bytes]]:
+        """Head and content of each message."""
+        places = zip(region.start.tolist(), region.stop.tolist(), packed.tolist(), strict=True)
+        for (start, stop, pack), number in zip(places, region.channel.tolist(), strict=True):
             raw = region.data[start:stop].tobytes()
+            if pack:
+                raw = self._growth.message(raw)
             convert = self._from_ros1.get(number)
-            data += raw if convert is None else convert(raw)
-            stops.append(len(data))
-        return _region(data, starts, stops)
+            head = region.data[start - _HEAD.size : start].tobytes()
+            yield head, raw if convert is None else convert(raw)
+
+
+def _regions(messages: Iterator[tuple[bytes, bytes]]) -> Iterator[Region]:
+    """Heads and contents, some thousand together."""
+    data, starts, stops = bytearray(), [], []
+    for head, content in messages:
+        data += head
+        starts.append(len(data))
+        data += content
+        stops.append(len(data))
+        if len(starts) == _TOGETHER or len(data) > _REGION_BYTES:
+            yield _region(data, starts, stops)
+            data, starts, stops = bytearray(), [], []
+    if starts:
+        yield _region(data, starts, stops)
 
 
 def _region(data: bytearray, starts: list[int], stops: list[int]) -> Region:

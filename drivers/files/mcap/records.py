@@ -180,6 +180,7 @@ class Scan:
 
     Attributes:
         path: the file or folder.
+        stored: its bytes, as they came; what it may make of them is judged by these.
         header: profile and library.
         schemas, channels: by number.
         metadata, attachments: in the order of the file.
@@ -190,6 +191,7 @@ class Scan:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.stored = path.stat().st_size if path.is_file() else 0
         self.header = Header("", "")
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -331,7 +333,7 @@ class McapScan(Scan):
         """Count what chunks make. Raises DamagedChunk where no recording makes so much."""
         if size > CHUNK_LIMIT:
             raise DamagedChunk(f"it claims {size} bytes, at most {CHUNK_LIMIT} are read")
-        if self._made + size > GROWTH_LIMIT * self.size + CHUNK_LIMIT:
+        if self._made + size > GROWTH_LIMIT * self.stored + CHUNK_LIMIT:
             raise DamagedChunk(f"the file would grow more than {GROWTH_LIMIT} times")
         self._made += size
 
