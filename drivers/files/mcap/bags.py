@@ -51,6 +51,7 @@ _COMPUTED = """
 SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%'
 UNION ALL SELECT t.name || '.' || x.name FROM sqlite_master t, pragma_table_xinfo(t.name) x
 WHERE t.type = 'table' AND x.hidden <> 0"""
+_QOS = "offered_qos_profiles"
 _FILES = "relative_file_paths"
 _METADATA_LIMIT = 2**20  # bytes; a topic has some hundred
 _OF_BAGS = (".db3", ".bag", ".mcap")
@@ -155,13 +156,15 @@ class _Growth:
         if self._left < 0:
             raise _TooLarge(f"would grow more than {GROWTH_LIMIT} times; not read")
 
-    def message(self, raw: bytes) -> bytes:
+    def message(self, raw: object) -> bytes:
         """A message, unpacked where it is packed: CDR never begins like zstd. Raises _TooLarge."""
+        if not isinstance(raw, bytes):  # a database holds anything anywhere
+            raw = b""  # counted as unreadable
         if raw[: len(_ZSTD)] == _ZSTD:
             try:
                 raw = _bounded(zstandard.ZstdDecompressor().stream_reader(raw))
             except zstandard.ZstdError:
-                raw = b""  # counted as unreadable
+                raw = b""
         self.spend(len(raw))
         return raw
 
@@ -304,6 +307,8 @@ class BagScan(Scan):
 
     def _note(self, connections: list[Any]) -> None:
         for c in connections:
+            if not (isinstance(c.topic, str) and isinstance(c.msgtype, str)):
+                raise ValueError("the name or type of a topic is no text")
             kind = JOINT_STATE if self._one and c.msgtype == FRANKA_STATE else c.msgtype
             self.schemas[c.id] = Schema(c.id, b"", "ros2msg", kind)
             encoding = "cdr" if self._one else c.ext.serialization_format
@@ -330,6 +335,12 @@ def _open_sqlite(path: Path) -> Any:
         made = base.execute(_COMPUTED).fetchone()
         if made is not None:
             raise _TooLarge(f"computes '{made[0]}' instead of storing it; not read")
+        topics = base.execute("SELECT * FROM topics")
+        columns = [column[0] for column in topics.description]
+        told = [dict(zip(columns, row, strict=True)).get(_QOS) or "" for row in topics]
+        # rosbags reads these as YAML, in which anchors are what grows.
+        if sum(len(str(x)) for x in told) > _METADATA_LIMIT or any("&" in str(x) for x in told):
+            raise _TooLarge(f"has {_QOS} that no recorder writes; not read")
         (size,) = base.execute("SELECT total(length(data)) FROM messages").fetchone()
     if size > path.stat().st_size:
         raise _TooLarge(f"would tell {size:.0f} bytes of messages, more than it has; not read")
@@ -338,23 +349,31 @@ def _open_sqlite(path: Path) -> Any:
 
 @contextmanager
 def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
-    """A reader whose chunks make no more than `growth` allows; each of them counts once."""
+    """A reader whose chunks make no more than `growth` allows, and whose index is read once.
+
+    Each unpacking counts: an index that goes to and fro between chunks would never come to an end.
+    """
     reader = importlib.import_module("rosbags.rosbag1").Reader(path)
-    read_chunk, known = reader.read_chunk, set()
+    read_chunk, read_index = reader.read_chunk, reader.read_index_data
+    left = path.stat().st_size  # of the index, which lies in the file
 
     def read_bounded() -> Any:
-        chunk = read_chunk()
-
         def unpack(data: bytes) -> bytes:
             content = _chunk_of_ros1(data)
-            if chunk.datapos not in known:
-                known.add(chunk.datapos)
-                growth.spend(len(content))
+            growth.spend(len(content) if content is not data else 0)
             return content
 
-        return chunk._replace(decompressor=unpack)
+        return read_chunk()._replace(decompressor=unpack)
 
-    reader.read_chunk = read_bounded
+    def read_index_once(place: int, indexes: Any) -> None:
+        nonlocal left
+        begin = reader.bio.tell()
+        read_index(place, indexes)
+        left -= reader.bio.tell() - begin
+        if left < 0:
+            raise _TooLarge("has chunks that share their index; not read")
+
+    reader.read_chunk, reader.read_index_data = read_bounded, read_index_once
     with reader:
         yield reader
 
