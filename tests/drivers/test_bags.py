@@ -123,6 +123,17 @@ def test_ros1_messages_whose_definition_is_none_are_refused(tmp_path, definition
         read_log(path)
 
 
+@pytest.mark.parametrize("array", ["Nothing[100000000]", "Nothing[]", "Nothing[2]"])
+def test_ros1_messages_of_no_bytes_are_refused(tmp_path, array):
+    """Any number of them would fit into one message, and be walked over."""
+    rule = "=" * 80
+    definition = f"{array} many\n{rule}\nMSG: franka_msgs/Nothing\nfloat64[0] none\n"
+    topics = {"/arm": ("franka_msgs/msg/FrankaState", Motion.of(7))}
+    path = write_ros1_mcap(tmp_path / "a.mcap", topics, SEVEN, definition)
+    with pytest.raises(DriverError, match=r"a\.mcap: .*/arm"):
+        read_log(path)
+
+
 def test_others_of_ros1_reach_the_reader_too(tmp_path):
     motion = Motion.of()
     path = write_ros1(tmp_path / "a.bag", {"/joint_states": (JOINT_STATE, motion)})

@@ -18,7 +18,7 @@ import struct
 import tempfile
 import weakref
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from io import BytesIO
 from pathlib import Path, PurePath
@@ -481,6 +481,22 @@ def _region(data: bytearray, starts: list[int], stops: list[int]) -> Region:
     return Region(np.frombuffer(data, np.uint8), np.array(starts), np.array(stops))
 
 
+def _empty(types: Mapping[str, Any]) -> set[str]:
+    """The messages that take no byte, of types and their fields as `rosbags` tells them."""
+    empty, before = set(types), len(types) + 1
+    while len(empty) < before:
+        before = len(empty)
+        empty = {name for name in empty if all(_no_bytes(f, empty) for _, f in types[name][1])}
+    return empty
+
+
+def _no_bytes(field: Any, empty: set[str]) -> bool:
+    node, of = field
+    if node.name == "ARRAY":
+        return of[1] == 0 or _no_bytes(of[0], empty)
+    return node.name == "NAME" and of in empty
+
+
 def _to_cdr(definitions: dict[str, str]) -> Callable[[str, bytes], bytes]:
     """What turns a message of ROS 1 into CDR; one that cannot be read becomes empty.
 
@@ -491,6 +507,9 @@ def _to_cdr(definitions: dict[str, str]) -> Callable[[str, bytes], bytes]:
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)  # whose headers have no `seq`
     for kind, text in definitions.items():
         found = typesys.get_types_from_msg(text, kind)
+        empty = _empty({**store.fielddefs, **found}) & set(found)
+        if empty:  # any number of them fits into a message, and would be walked over
+            raise ValueError(f"{sorted(empty)[0]} has no bytes")
         store.register({k: v for k, v in found.items() if k not in store.fielddefs})
     encoders: dict[int, JointStateEncoder] = {}
 
