@@ -198,6 +198,8 @@ class Effect(ABC):
         shows: what it shows in the experiments of `splits` that touch it.
         positive: keys of parameters that physics keeps above zero.
         inexact: share of its torque that may be otherwise in truth: an idealised equation.
+        band: share of its largest torque that may be otherwise where the joint is slow or rests:
+            static friction is a band, and rises as the joint slows down.
         form: of what has finer forms, see `LEVEL`; empty for all else.
         simpler: forms of which it is a finer one, each with the share of the evidence that the
             finer form must add: no gear is exactly as an equation says.
@@ -224,6 +226,7 @@ class Effect(ABC):
     positive: ClassVar[tuple[str, ...]] = ()
     log_odds: ClassVar[float] = 0.0
     inexact: ClassVar[float] = 0.0
+    band: ClassVar[float] = 0.0
     simpler: ClassVar[tuple[tuple[str, float], ...]] = ()
     form: ClassVar[str] = ""
     sudden: ClassVar[bool] = False

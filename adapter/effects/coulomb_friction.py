@@ -18,6 +18,7 @@ class CoulombFriction(LinearEffect):
     place = FRICTION
     positive = ("Fc",)
     inexact = 0.02
+    band = 0.3  # static friction is 1 to 1.6 times Coulomb's in what is published
     phrase = Phrase.lacks("Fc", "Coulomb friction")
     form = LEVEL
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over at once"))

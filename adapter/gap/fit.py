@@ -401,8 +401,7 @@ class Fit:
             if e.recording not in (None, recording):
                 continue
             if e.candidate.effect.inexact:
-                off = unsure(e, self.model.contribution(recording, k))
-                weight /= np.sqrt(1.0 + (off / level) ** 2)
+                weight /= np.sqrt(1.0 + (unsure(self.model, recording, k) / level) ** 2)
             for edge in e.interval_s:
                 after = EDGE_S + ORDER / BAND_HZ
                 weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
@@ -436,9 +435,12 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
     return refitted(fit.with_noise())
 
 
-def unsure(e: Named, torque: Array) -> Array:
-    """(k, n) by how much an effect's torque (k, n) may be otherwise in truth, N m."""
-    return np.asarray(np.hypot(e.candidate.effect.inexact * torque, EDGE * _jumps(torque)))
+def unsure(model: Model, recording: int, place: int) -> Array:
+    """(k, n) by how much a named effect's torque may be otherwise in truth, N m."""
+    effect, own = model.named[place].candidate.effect, model.recordings[recording]
+    torque = model.contribution(recording, place)
+    band = effect.band * np.abs(torque).max(axis=0) * own.slowness
+    return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, EDGE * _jumps(torque))))
 
 
 def _jumps(torque: Array) -> Array:

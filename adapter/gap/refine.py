@@ -128,7 +128,7 @@ def _doubt(fit: Fit, recording: int, counted: Array) -> Array:
     square = np.where(counted > 0.0, 0.0, NOT_COUNTED_NM**2)
     for k, e in enumerate(fit.named):
         if e.candidate.effect.inexact and e.recording in (None, recording):
-            square += unsure(e, fit.model.contribution(recording, k)) ** 2
+            square += unsure(fit.model, recording, k) ** 2
             square += _by_speed(fit, e, recording) ** 2
     return np.asarray(np.sqrt(square).reshape(own.tau.shape))
 

@@ -59,6 +59,7 @@ UNLIKE = 0.3  # of the measured torque's size: commands further off mean somethi
 FAR_S = 0.05  # a command older than that does not drive any more
 HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
+STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1
 
 
 def low(x: Array) -> Array:
@@ -131,6 +132,23 @@ class Signals:
         A joint that rests holds what static friction lets it, and forgets it as it slides.
         """
         return self.once("start", self._low_start)
+
+    @property
+    def slowness(self) -> Array:
+        """(k, n) 1 where a joint rests, near 0 where it slides; times the root of a rest's rows.
+
+        What static friction holds at a rest is one unknown value, however long the rest lasts.
+        """
+        return self.once("slowness", self._slowness)
+
+    def _slowness(self) -> Array:
+        slow = np.exp(-np.square(low(self.motion.dq) / STRIBECK_SPEED))
+        out = np.empty_like(slow)
+        for j, own in enumerate(slow.T):
+            begins = np.flatnonzero(np.diff(own > 0.5, prepend=not own[0] > 0.5))
+            rows = np.diff(begins, append=len(own))
+            out[:, j] = own * np.sqrt(np.repeat(np.where(own[begins] > 0.5, rows, 1), rows))
+        return out
 
     def _low_start(self) -> Array:
         q = self.motion.q

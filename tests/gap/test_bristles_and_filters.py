@@ -13,7 +13,7 @@ import pytest
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect
-from sim.hidden import write
+from sim.hidden import draw, write
 from tests.helpers.gap_tools import believed, pinocchio_recording
 
 
@@ -24,6 +24,7 @@ def named(effect: Effect, seed: int, folder: Path, seconds: float) -> tuple[Find
     return tuple(find_gap([log], model).findings)
 
 
+RUBBING = {"bristle_friction", "coulomb_friction", "viscous_friction", "stribeck_friction"}
 BRISTLES = [
     (5, 0.3, 1e-3, 10.0),
     pytest.param(2, 0.8, 1e-3, 20.0, marks=pytest.mark.slow),
@@ -50,3 +51,11 @@ def test_a_sensors_low_pass_is_named(joint: int, d: float, share: float, tmp_pat
     (found,) = named(hidden, 300 + joint, tmp_path, 20.0)
     assert (found.effect, found.joints) == (hidden.name, hidden.joints)
     assert found.parameters["d"] == pytest.approx(d, rel=0.1)
+
+
+@pytest.mark.slow
+def test_what_rests_hold_is_no_effect(tmp_path: Path) -> None:
+    """Static friction above Coulomb's in every joint, many rests, a tilted base."""
+    trial = draw(9826, "single", "base_tilt", rubs=True)
+    log, model, _ = write(trial, tmp_path, pinocchio_recording(trial))
+    assert {found.effect for found in find_gap([log], model).findings} <= {*RUBBING, "base_tilt"}

@@ -626,6 +626,20 @@ def test_rows_in_which_a_joint_sticks_do_not_pull_at_its_friction():
     assert last < 0.03 and last < 0.7 * searched
 
 
+def test_a_rest_is_one_unknown_value_however_long_it_lasts():
+    """A joint that swings, rests for five seconds, and swings on."""
+    t = np.arange(0.0, 15.0, 1e-3)
+    q, dq = (np.zeros((len(t), len(ARM.theta))) for _ in range(2))
+    moves = (t < 5.0) | (t > 10.0)
+    q[:, RUBS] = np.where(moves, 0.5 * (1.0 - np.cos(0.4 * np.pi * t)), 0.0)
+    dq[:, RUBS] = np.where(moves, 0.2 * np.pi * np.sin(0.4 * np.pi * t), 0.0)
+    own = prepare(recorded(noisy(np.zeros_like(q), TAU_NOISE, 1), t, q, dq), ARM)
+    slowness = own.slowness[:, RUBS]
+    assert slowness[(own.t > 6.0) & (own.t < 9.0)] == pytest.approx(np.sqrt(5.0 * 25.0), rel=0.1)
+    sliding = np.abs(own.low(own.motion.dq)[:, RUBS]) > 0.2
+    assert sliding.sum() > 50 and slowness[sliding].max() < 1e-3
+
+
 def test_nothing_is_refined_where_nothing_is_in_doubt():
     fit = fit_of(SHORT)
     fit, carried = under_own_noise(fit.with_named([named(fit, "base_tilt")]))
