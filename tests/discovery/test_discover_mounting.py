@@ -152,7 +152,7 @@ def test_mountings_and_lambda_are_true(name: str) -> None:
     [
         (8, 2.0, 1.0, (1, 2, 5, 6), ()),
         pytest.param(9, 4.0, 1.0, (), ((3, 5),), marks=pytest.mark.slow),
-        (10, 2.0, 50.0, (), ()),
+        pytest.param(10, 2.0, 50.0, (), (), marks=pytest.mark.slow),
     ],
 )
 def test_no_wrong_edge_is_trusted(

@@ -79,6 +79,7 @@ def test_what_is_left_is_noise_or_is_said(published: GapResult) -> None:
     assert {int(j) + 1 for j in np.flatnonzero(over > NEAR_NOISE)} <= said, over
 
 
+@pytest.mark.slow
 def test_dummy_inertias_are_said_to_be_wrong_and_no_load_is(log: Path) -> None:
     urdf = Path(pybullet_data.getDataPath()) / "franka_panda" / "panda.urdf"
     result = told(log, urdf)

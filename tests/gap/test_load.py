@@ -63,7 +63,10 @@ def off(found: HandLoad, load: Effect) -> np.ndarray:
     ]
 
 
-@pytest.mark.parametrize("with_empty", [False, True], ids=["documented arm", "log without load"])
+BESIDE_EMPTY = pytest.param(True, id="log without load", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("with_empty", [pytest.param(False, id="documented arm"), BESIDE_EMPTY])
 def test_standard_deviations_are_honest(with_empty: bool) -> None:
     share, z = 0.1 if with_empty else 0.03, []
     for seed in SEEDS:

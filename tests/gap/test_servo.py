@@ -32,8 +32,8 @@ PANDA = read_robot("panda")
 @pytest.mark.parametrize(
     ("seed", "drawn"),
     [
-        (11, Drawn()),
-        (12, Drawn(feeds_speed=False, period_s=4e-3)),
+        pytest.param(11, Drawn(), marks=pytest.mark.slow),
+        pytest.param(12, Drawn(feeds_speed=False, period_s=4e-3), marks=pytest.mark.slow),
         (13, Drawn(noise_rad=1e-4)),
     ],
 )

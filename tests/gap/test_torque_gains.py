@@ -106,6 +106,7 @@ def test_a_real_arm_in_amperes() -> None:
     assert np.abs(found.gain / UR10_GAINS - 1.0)[found.shown].max() < 0.1
 
 
+@pytest.mark.slow
 def test_one_known_mass_makes_gains_known() -> None:
     hidden = driven_arm(1)  # all masses 13.6 % heavier than documented
     bare, loaded = currents(hidden, 1), currents(hidden, 101, load_kg=LOAD_KG)

@@ -65,6 +65,7 @@ def test_panda_in_batches(panda_log: Path, tmp_path: Path) -> None:
     assert (error <= 0.92 * TOOL).all(), error / TOOL
 
 
+@pytest.mark.slow
 def test_kuka(tmp_path: Path) -> None:
     folder = SHARED / "data" / "lwr4"
     urdf, path = folder / "kuka_lwr4.urdf", tmp_path / "kuka.mcap"

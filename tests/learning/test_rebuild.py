@@ -51,6 +51,7 @@ def test_moments_are_rebuilt_when_lambda_moves() -> None:
     assert np.allclose(a, b, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_theta_then_is_that_learned_with_the_right_lambda() -> None:
     off, right = learned(truth=False), learned(truth=True)
     table = states()[::50]

@@ -40,7 +40,11 @@ def states_of(data: TreeData, number: int = 0) -> np.ndarray:
     return data.states(first_ns=number * PAUSE_NS)
 
 
-@pytest.mark.parametrize("seed,kind", [(1, "all"), (2, "bare"), (3, "carried")])
+SLOW = pytest.mark.slow
+FALLEN = [(1, "all"), *(pytest.param(*x, marks=SLOW) for x in [(2, "bare"), (3, "carried")])]
+
+
+@pytest.mark.parametrize("seed,kind", FALLEN)
 def test_a_falling_tree_is_learned(seed: int, kind: str) -> None:
     model, parts, test = falling(seed)
     schema = SchemaSettings(judge_every=20, spin_measured=kind != "carried")
