@@ -49,6 +49,7 @@ class Named:
         interval_s: when; recording: in which one, None in all.
         assumed: whether any arm has it: it stays in the model, and is told by name where it is
             worth it.
+        tried: keys of the effects that stood in its place and gave way to a better name.
     """
 
     candidate: Candidate
@@ -56,6 +57,7 @@ class Named:
     interval_s: tuple[float, float] = WHOLE
     recording: int | None = None
     assumed: bool = False
+    tried: frozenset[tuple[str, int]] = frozenset()
 
     @property
     def is_pattern(self) -> bool:

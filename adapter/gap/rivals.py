@@ -48,6 +48,7 @@ class Standing:
         log_evidence: nats over nothing, its odds included; chi2: fall of the squared distance.
         rivals: the most credible first.
         assumed: whether any arm has it: then nothing is better for being simpler.
+        tried: keys of effects that gave way to it: none of them is better for being simpler.
     """
 
     candidate: Candidate
@@ -55,6 +56,7 @@ class Standing:
     chi2: float
     rivals: tuple[Rival, ...]
     assumed: bool = False
+    tried: frozenset[tuple[str, int]] = frozenset()
 
     @property
     def probability(self) -> float:
@@ -67,7 +69,8 @@ class Standing:
         mine, other = (self.candidate, self.chi2), (rival.candidate, rival.chi2)
         if simpler_wins(mine, other):
             return -np.inf
-        if not self.assumed and simpler_wins(other, mine):
+        judged = self.assumed or rival.candidate.key in self.tried
+        if not judged and simpler_wins(other, mine):
             return np.inf
         return rival.log_evidence - self.log_evidence
 
@@ -121,7 +124,7 @@ def _standing(
     taken = {e.candidate.key for e in fit.named}
     rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
     value = mine.log_evidence + price(named)
-    return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.assumed)
+    return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.assumed, named.tried)
 
 
 class _Reduced(NamedTuple):

@@ -42,7 +42,7 @@ from adapter.model.spatial import Array
 TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
-MOST_SWAPS, SWAP_NATS = 4, 0.0  # names that are exchanged for better ones, and by how much
+MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 SAME_SHARE = 0.5  # of a signature that another name for it explains
 CLEAR = 3.0  # standard deviations of a force
@@ -351,6 +351,8 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
     together = [joint for joint in best if joint >= 0] if first >= 0 else [first]
     for joint in together:
         _, k, rival = best[joint]
-        other = replace(fit.named[k], candidate=rival.candidate, x=rival.x, assumed=False)
+        named = fit.named[k]
+        tried = named.tried | {named.candidate.key}
+        other = replace(named, candidate=rival.candidate, x=rival.x, assumed=False, tried=tried)
         fit = fit.instead(k, other)
     return fit
