@@ -95,7 +95,8 @@ def test_at_rest_the_mass_shows_and_the_inertia_does_not() -> None:
     told = as_json(alone)
     assert told["inertia_kg_m2"] is None and "inertia about it: not shown" in told["sentence"]
     against = find_load(log, panda_model(), empty)
-    assert against.mass_std < 0.1 * alone.mass_std and abs(off(against, load)[0]) < 4.0
+    # what static friction holds is not the same in two rests
+    assert against.mass_std < 0.2 * alone.mass_std and abs(off(against, load)[0]) < 4.0
 
 
 def test_an_empty_hand_carries_nothing() -> None:
