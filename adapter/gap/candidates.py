@@ -370,6 +370,12 @@ def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]
     return share is not None and a.joint == b.joint and theirs < (1.0 + share) * mine
 
 
+def is_finer(fine: Candidate, simple: Candidate) -> bool:
+    """Whether a candidate is a finer form of another on the same joint."""
+    alike = fine.joint == simple.joint and not isinstance(fine.effect, Pattern)
+    return alike and simple.effect.form in dict(fine.effect.simpler)
+
+
 def log_odds(c: Candidate, timed: bool = False, passing: bool = False) -> float:
     """ln of what a candidate is worth before the data, the ways to look for it included."""
     odds = c.log_odds

@@ -49,7 +49,7 @@ class Named:
         interval_s: when; recording: in which one, None in all.
         assumed: whether any arm has it: it stays in the model, and is told by name where it is
             worth it.
-        tried: keys of the effects that stood in its place and gave way to a better name.
+        tried: keys of the effects that were tried in its place, and gave way to it.
     """
 
     candidate: Candidate

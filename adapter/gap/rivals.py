@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.gap.candidates import Candidate, log_odds, simpler_wins
+from adapter.gap.candidates import Candidate, is_finer, log_odds, simpler_wins
 from adapter.gap.evidence import Carried, scores
 from adapter.gap.fit import Fit, Named, beside
 from adapter.gap.scan import SignatureTable
@@ -48,7 +48,7 @@ class Standing:
         log_evidence: nats over nothing, its odds included; chi2: fall of the squared distance.
         rivals: the most credible first.
         assumed: whether any arm has it: then nothing is better for being simpler.
-        tried: keys of effects that gave way to it: none of them is better for being simpler.
+        tried: keys of effects that gave way to it: no simpler one of them is a rival any more.
     """
 
     candidate: Candidate
@@ -69,8 +69,9 @@ class Standing:
         mine, other = (self.candidate, self.chi2), (rival.candidate, rival.chi2)
         if simpler_wins(mine, other):
             return -np.inf
-        judged = self.assumed or rival.candidate.key in self.tried
-        if not judged and simpler_wins(other, mine):
+        if rival.candidate.key in self.tried and is_finer(self.candidate, rival.candidate):
+            return -np.inf
+        if not self.assumed and simpler_wins(other, mine):
             return np.inf
         return rival.log_evidence - self.log_evidence
 

@@ -43,6 +43,7 @@ TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
+LOST = 2.0  # times the residual that another name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
 SAME_SHARE = 0.5  # of a signature that another name for it explains
 CLEAR = 3.0  # standard deviations of a force
@@ -251,9 +252,12 @@ def _with(
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
-    swaps = 0
+    swaps, before = 0, fit
     while True:
         fit, carried = under_own_noise(fit)
+        if _lost(before, fit):
+            fit = before = _refused(before, fit)
+            continue
         values = weak(fit, carried)
         bad = worst(fit, values)
         if bad is not None:
@@ -264,7 +268,26 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
-        fit, swaps = dated_anew(swapped), swaps + 1
+        before, fit, swaps = fit, dated_anew(swapped), swaps + 1
+
+
+def _lost(before: Fit, fit: Fit) -> bool:
+    """Whether other names leave far more of a joint's torque."""
+    a, b = (
+        np.sqrt(np.mean(np.concatenate(own.model.residuals()) ** 2, axis=0))
+        for own in (before, fit)
+    )
+    return len(before.named) == len(fit.named) and bool((b > LOST * a).any())
+
+
+def _refused(before: Fit, fit: Fit) -> Fit:
+    """A fit before names were exchanged; those that it got instead have been tried."""
+    return before.with_named(
+        [
+            replace(a, tried=a.tried | {b.candidate.key}) if a.candidate is not b.candidate else a
+            for a, b in zip(before.named, fit.named, strict=True)
+        ]
+    )
 
 
 def worst(fit: Fit, values: Mapping[int, float]) -> int | None:

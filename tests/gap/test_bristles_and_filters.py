@@ -59,3 +59,13 @@ def test_what_rests_hold_is_no_effect(tmp_path: Path) -> None:
     trial = draw(9826, "single", "base_tilt", rubs=True)
     log, model, _ = write(trial, tmp_path, pinocchio_recording(trial))
     assert {found.effect for found in find_gap([log], model).findings} <= {*RUBBING, "base_tilt"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "effect"), [(9932, "bristle"), (9902, "stribeck")])
+def test_a_finer_friction_is_not_given_up_for_coulombs(seed, effect, tmp_path: Path) -> None:
+    """Under its own weights Coulomb friction explains as much, under Coulomb's it does not."""
+    trial = draw(seed, "single", f"{effect}_friction")
+    log, model, _ = write(trial, tmp_path, pinocchio_recording(trial))
+    (found,) = find_gap([log], model).findings
+    assert (found.effect, found.joints) == (f"{effect}_friction", trial.effects[0].joints)

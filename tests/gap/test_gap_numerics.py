@@ -43,7 +43,7 @@ from adapter.gap.folds import Folds, fold_rows, pays_held_out
 from adapter.gap.hand import MASSES_KG, Hand
 from adapter.gap.possible import possible
 from adapter.gap.refine import DoubtedNoise, refined
-from adapter.gap.rivals import standings
+from adapter.gap.rivals import Rival, Standing, standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
 from adapter.gap.search import Found
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
@@ -750,6 +750,19 @@ def test_noise_gives_no_move():
     fit = fit_of(recording(21, friction=0.0))
     fit, _ = refitted(fit)
     assert honest_moves(SignatureTable(fit, EVERYWHERE), set()) == []
+
+
+def test_a_simpler_name_is_no_rival_where_it_was_tried_and_gave_way():
+    candidates = {
+        name: Candidate(CATALOGUE[name], CATALOGUE[name].templates()[0], RUBS, (0,), 0.0)
+        for name in ("coulomb_friction", "stribeck_friction", "viscous_friction")
+    }
+    plain, fine, other = candidates.values()
+    rivals = [Rival(c, 99.0, 199.0, 1.0, np.ones(1), True) for c in (plain, other)]
+    own = Standing(fine, 100.0, 200.0, tuple(rivals))
+    assert own.gain(rivals[0]) == np.inf and own.probability == pytest.approx(0.0, abs=1e-9)
+    own = replace(own, tried=frozenset({plain.key, other.key}))
+    assert own.gain(rivals[0]) == -np.inf and own.gain(rivals[1]) == pytest.approx(-1.0)
 
 
 def test_rivals_explain_a_share_between_nothing_and_all():
