@@ -22,6 +22,7 @@ from scipy.sparse import diags
 
 from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
+from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
@@ -135,19 +136,19 @@ class Signals:
 
     @property
     def slowness(self) -> Array:
-        """(k, n) 1 where a joint rests, near 0 where it slides; times the root of a rest's rows.
+        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
 
         What static friction holds at a rest is one unknown value, however long the rest lasts.
         """
         return self.once("slowness", self._slowness)
 
     def _slowness(self) -> Array:
-        slow = np.exp(-np.square(low(self.motion.dq) / STRIBECK_SPEED))
-        out = np.empty_like(slow)
-        for j, own in enumerate(slow.T):
-            begins = np.flatnonzero(np.diff(own > 0.5, prepend=not own[0] > 0.5))
-            rows = np.diff(begins, append=len(own))
-            out[:, j] = own * np.sqrt(np.repeat(np.where(own[begins] > 0.5, rows, 1), rows))
+        dq = np.abs(low(self.motion.dq))
+        out = np.exp(-np.square(dq / STRIBECK_SPEED))
+        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
+            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
+            rows = np.diff(begins, append=len(rests))
+            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
         return out
 
     def _low_start(self) -> Array:
