@@ -9,6 +9,7 @@ import can
 import numpy as np
 
 from drivers.damiao import codec
+from drivers.damiao.answered import AnsweredCommands
 from drivers.damiao.bus import MulticastWire, Wire, open_bus, wire_of
 from drivers.damiao.codec import MIT_MODE, TIMEOUT_UNIT_S, Scales
 from drivers.damiao.connect import Dialogue
@@ -20,7 +21,7 @@ from drivers.damiao.settings import VIRTUAL, BusSettings
 from drivers.damiao.speed_check import SpeedCheck
 from drivers.damiao.stream import MotorStream, ReplyIntake
 from drivers.damiao.tables import type_of
-from drivers.interface import Array, DriverError, Intake, JointSample
+from drivers.interface import Array, CommandCount, DriverError, Intake, JointSample
 
 WATCHDOG_S = 0.5  # without a command for so long a motor lets go: a last resort, own choice
 FIRST_ROUNDS, ROUND_TIMEOUT_S = 2, 0.1  # replies that the first sample lies between
@@ -105,6 +106,9 @@ class DamiaoArm:
         self._last_ns = 0
         self._commanded = self._driving = False
         self._told: list[float] | None = None
+        if self.can_move:
+            self.intake.commands = CommandCount()
+            self._answered = AnsweredCommands(self.intake.commands, self.period_ns)
         self._wire.waiting()  # what others sent before
         talk = Dialogue(self._wire, self.settings)
         self.limits = talk.limits()
@@ -216,6 +220,8 @@ class DamiaoArm:
         self._need_open()
         stream = self._stream
         stream.receive()
+        if self._driving:
+            self._answered.look(self._replies.latest)
         stamp_ns = stream.asked_ns if stream.fresh else self._now_ns() - self.period_ns
         if stamp_ns <= self._last_ns:
             stamp_ns = self._last_ns + 1
@@ -254,7 +260,8 @@ class DamiaoArm:
             self._start_driving()
         self._beat()
         self._commanded = True
-        self._stream.command(frames)
+        whole = self._stream.command(frames)
+        self._answered.sent(self._stream.asked_ns, whole, cut)
 
     def carry(self, tau: Array) -> None:
         """What carries the arm here, (n,) N m; a braked arm is carried so, by the guardian too.
@@ -328,6 +335,7 @@ class DamiaoArm:
             self._replies.discard()
             self._beat()
             self._guardian.memory.mode = GuardianMode.DRIVE
+        self._answered.pause()
         self._driving, self._replies.others_ask = True, False
 
     def _report(self, values: list[float]) -> None:

@@ -379,14 +379,15 @@ class MotorStream:
         """Ask all motors for their states. Raises DriverError as `command`."""
         self._send(self._requests)
 
-    def command(self, frames: Sequence[bytes]) -> None:
-        """Send each motor its command.
+    def command(self, frames: Sequence[bytes]) -> bool:
+        """Send each motor its command; whether the bus took them all.
 
         Raises DriverError where frames could not be sent in `SEND_FAILURES` ticks in a row.
         """
         for message, data in zip(self._commands, frames, strict=True):
             message.data = data  # type: ignore[assignment]  # bytes are copied faster
         self._send(self._commands)
+        return not self._failed_ticks
 
     def rounds(self, count: int, timeout_s: float) -> None:
         """Ask for states and wait for them, several times over. Raises DriverError."""

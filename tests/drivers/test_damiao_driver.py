@@ -187,6 +187,42 @@ def test_a_longer_hole_is_nan_and_then_an_error_that_names_the_motor(moving):
     assert all(np.isfinite(sample.q[[0, 1, 3, 4, 5, 6]]).all() for sample in seen)
 
 
+def test_commands_are_accounted_for_by_their_replies(driven):
+    """Each seventh reply that is missing is a seventh of a command; windows are of 100."""
+    arm, bus = driven
+    load = np.full(N, 2.0)
+    for _ in range(200):
+        tick(arm, bus, load)
+    count = arm.intake.commands
+    assert (count.sent, count.cut, count.holes) == (200, 0, 0)
+    assert (count.success_min, count.success_mean) == (1.0, 1.0)
+    every_other = itertools.count()
+    bus.keep = lambda can_id, data: can_id != 0x13 or next(every_other) % 2 == 0
+    for _ in range(100):
+        tick(arm, bus, load)
+    bus.keep = lambda can_id, data: True
+    for _ in range(100):
+        tick(arm, bus, load)
+    assert count.success_min == pytest.approx(1 - 50 / (100 * N))
+    assert count.success_mean == pytest.approx(1 - 50 / (399 * N))  # the last one's is to come
+    assert count.holes == 0  # the motors had them all
+    tick(arm, bus, load, period_ns=6_000_000)
+    tick(arm, bus, np.full(N, 1e3))
+    assert (count.sent, count.cut, count.holes) == (402, 1, 1)
+    assert count.longest_hole_ms == pytest.approx(6.0, abs=0.2)
+    bus.refusing = 1  # the bus takes six of seven: no command, and a hole of two periods
+    tick(arm, bus, load)
+    tick(arm, bus, load)
+    assert (count.sent, count.holes) == (403, 2)
+    told = arm.intake.as_dict()["commands"]
+    assert told["success_min"] == count.success_min and told["sent"] == 403
+    assert "at worst 93 %" in count.line()
+
+
+def test_a_listener_has_no_commands_to_count(moving):
+    assert moving[0].intake.commands is None
+
+
 def test_late_replies_cost_one_sample_and_are_not_lost(moving):
     arm, bus = moving
     for _ in range(20):
