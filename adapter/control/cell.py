@@ -11,7 +11,8 @@ xyz = [0.6, 0.0, 0.4]
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 from adapter.errors import SettingsError
 
@@ -72,6 +73,24 @@ class Plane:
 
 
 @dataclass(frozen=True)
+class Mesh:
+    """The triangles of an STL or OBJ file, a surface: what is closed is not filled.
+
+    `scale` is metres per unit of the file; xyz and rpy place the file's origin.
+    """
+
+    name: str
+    file: str
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rpy: tuple[float, ...] = (0.0, 0.0, 0.0)
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        _need(0.0 < self.scale < math.inf, self.name, "scale must be above zero")
+        _need(_finite((*self.xyz, *self.rpy), 6), self.name, "xyz and rpy need 3 numbers each")
+
+
+@dataclass(frozen=True)
 class Hand:
     """What is on the hand, from the last link's frame along its z."""
 
@@ -91,7 +110,7 @@ class Cell:
         margin: kept from everything and between links.
         table: whether the arm stands on a plane: z = 0 of its base (on a wall, that wall).
         reach: furthest from the base's origin that any part may get; no limit where None.
-        box, cylinder, plane: what stands there.
+        box, cylinder, plane, mesh: what stands there.
         hand: what the robot's file does not say of its hand.
         allowed: pairs of links, or of a link and a thing, that may touch.
     """
@@ -102,6 +121,7 @@ class Cell:
     box: tuple[Box, ...] = ()
     cylinder: tuple[Cylinder, ...] = ()
     plane: tuple[Plane, ...] = ()
+    mesh: tuple[Mesh, ...] = ()
     hand: Hand | None = None
     allowed: tuple[tuple[str, ...], ...] = ()
 
@@ -113,6 +133,12 @@ class Cell:
         if any(len(pair) != 2 for pair in self.allowed):
             raise SettingsError("cell.allowed needs pairs of names")
         names = [each.name for each in self.box] + [each.name for each in self.cylinder]
-        names += [each.name for each in self.plane]
+        names += [each.name for each in self.plane] + [each.name for each in self.mesh]
         if len({*names, "table"}) <= len(names):
-            raise SettingsError("cell: every box, cylinder and plane needs a name of its own")
+            raise SettingsError("cell: every box, cylinder, plane and mesh needs a name of its own")
+
+    def beside(self, folder: Path) -> Cell:
+        """The same cell, with files of meshes that are named from this folder."""
+        return replace(
+            self, mesh=tuple(replace(each, file=str(folder / each.file)) for each in self.mesh)
+        )

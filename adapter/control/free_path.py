@@ -20,9 +20,10 @@ import numpy as np
 from adapter.control.cell import Cell
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
+from adapter.control.meshes import Mesh, read_mesh
 from adapter.control.path_motion import PathMotion
 from adapter.control.settings import ExcitationSettings
-from adapter.control.shapes import Capsule, capsules_of
+from adapter.control.shapes import Body, Capsule, bodies_of
 from adapter.errors import MeansError, SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_rpy, z_to_axis
@@ -56,7 +57,7 @@ class Clearance:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two bodies: a capsule, and another or a thing in the cell (None: the limit of reach).
+    """Two bodies: one of the arm, and another or a thing in the cell (None: the limit of reach).
 
     Attributes:
         arms: (n,) m: how far away from both each joint may turn one against the other.
@@ -81,19 +82,23 @@ def _coal() -> Any:
 
 
 class ArmInCell:
-    """An arm's capsules and what they must not touch.
+    """An arm's bodies and what they must not touch.
+
+    Links are capsules, or the convex hulls of their meshes; a mesh in the cell keeps its hollows
+    (a tree of bounding volumes over its triangles).
 
     Args:
         model: of the arm, its base fixed.
         cell: around it.
 
     Attributes:
-        capsules: on the links.
+        bodies: on the links.
         meanwhile: called every few milliseconds of a search, so that an arm's samples can be read.
         ignored: pairs that are near in nearly every pose, so that they count as joined.
 
     Raises:
-        SettingsError: `cell.allowed` has a name that does not exist; with the choices.
+        SettingsError: `cell.allowed` has a name that does not exist, with the choices; a mesh of
+            the cell cannot be read.
         MeansError: coal is not installed.
     """
 
@@ -101,11 +106,11 @@ class ArmInCell:
         self._coal = _coal()
         self.model, self.cell = model, cell
         self.meanwhile: Callable[[], None] = lambda: None
-        self.capsules = capsules_of(model, cell.hand)
+        self.bodies = bodies_of(model, cell.hand)
         self._frames = frames_of(model.tree.parent, model.lam)
         n = model.tree.n
         self._R, self._o = np.zeros((n, 3, 3)), np.zeros((n, 3))
-        self._bodies = [self._body(capsule) for capsule in self.capsules]
+        self._shapes = [self._shape(body) for body in self.bodies]
         self._request = self._coal.DistanceRequest()
         self._pairs = [*self._own_pairs(), *self._cell_pairs()]
         self._check_allowed()
@@ -170,11 +175,11 @@ class ArmInCell:
         return total, slope
 
     def placed(self, q: Array) -> list[tuple[Array, float]]:
-        """Ends (2, 3) in base axes and radius of every capsule in one pose (n,)."""
+        """Corners (k, 3) in base axes and radius of every body in one pose (n,); 2 of a capsule."""
         place_frames(self._frames, q, self._R, self._o)
         return [
             (c.ends if c.link == BASE else self._o[c.link] + c.ends @ self._R[c.link].T, c.radius)
-            for c in self.capsules
+            for c in self.bodies
         ]
 
     def skeleton(self, q: Array) -> list[Array]:
@@ -183,16 +188,38 @@ class ArmInCell:
         before = [np.zeros(3) if k == BASE else self._o[k] for k in self.model.tree.parent]
         return [np.array(ends) for ends in zip(before, self._o.copy(), strict=True)]
 
-    def _body(self, capsule: Capsule) -> tuple[Any, Array, Array]:
+    def _shape(self, body: Body) -> tuple[Any, Array, Array]:
         """Shape, and its turn and place in the link's frame."""
-        line = capsule.ends[1] - capsule.ends[0]
+        if not isinstance(body, Capsule):
+            points, triangles = self._listed(Mesh(body.ends, body.triangles))
+            return self._coal.Convex(points, triangles), np.eye(3), np.zeros(3)
+        line = body.ends[1] - body.ends[0]
         length = float(np.linalg.norm(line))
         turn = z_to_axis(line / length) if length > 0.0 else np.eye(3)
-        return self._coal.Capsule(capsule.radius, length), turn, capsule.ends.mean(axis=0)
+        return self._coal.Capsule(body.radius, length), turn, body.ends.mean(axis=0)
+
+    def _listed(self, mesh: Mesh) -> tuple[Any, Any]:
+        """Corners and triangles as coal takes them."""
+        points, triangles = self._coal.StdVec_Vec3s(), self._coal.StdVec_Triangle()
+        points.extend(list(mesh.corners))
+        triangles.extend([self._coal.Triangle(*row) for row in mesh.triangles.tolist()])
+        return points, triangles
+
+    def _surface(self, file: str, scale: float) -> Any:
+        """A tree of bounding volumes over the triangles of a file."""
+        try:
+            mesh = read_mesh(file, (scale,))
+        except ValueError as error:
+            raise SettingsError(f"cell.mesh: {error}") from None
+        tree = self._coal.BVHModelOBBRSS()
+        tree.beginModel(len(mesh.triangles), len(mesh.corners))
+        tree.addSubModel(*self._listed(mesh))
+        tree.endModel()
+        return tree
 
     def _placed(self, k: int) -> Any:
-        _, turn, place = self._bodies[k]
-        link = self.capsules[k].link
+        _, turn, place = self._shapes[k]
+        link = self.bodies[k].link
         if link == BASE:
             return self._coal.Transform3s(turn, place)
         R = self._R[link]
@@ -200,25 +227,25 @@ class ArmInCell:
 
     def _distance(self, pair: Pair) -> float:
         if pair.other is None and pair.thing is None:
-            capsule = self.capsules[pair.one]
-            ends = self._o[capsule.link] + capsule.ends @ self._R[capsule.link].T
-            furthest = np.linalg.norm(ends, axis=1).max() + capsule.radius
+            body = self.bodies[pair.one]
+            ends = self._o[body.link] + body.ends @ self._R[body.link].T
+            furthest = np.linalg.norm(ends, axis=1).max() + body.radius
             return float((self.cell.reach or np.inf) - furthest)
         if pair.other is None:
             assert pair.thing is not None
             shape, place = pair.thing
         else:
-            shape, place = self._bodies[pair.other][0], self._placed(pair.other)
-        own, result = self._bodies[pair.one][0], self._coal.DistanceResult()
+            shape, place = self._shapes[pair.other][0], self._placed(pair.other)
+        own, result = self._shapes[pair.one][0], self._coal.DistanceResult()
         return float(
             self._coal.distance(own, self._placed(pair.one), shape, place, self._request, result)
         )
 
     def _own_pairs(self) -> list[Pair]:
-        """Every two capsules whose links are not joined to each other."""
+        """Every two bodies whose links are not joined to each other."""
         parent, found = self.model.tree.parent, []
-        for k, one in enumerate(self.capsules):
-            for m, other in enumerate(self.capsules[:k]):
+        for k, one in enumerate(self.bodies):
+            for m, other in enumerate(self.bodies[:k]):
                 joined = one.link == other.link or other.link in (
                     parent[one.link] if one.link != BASE else None,
                 )
@@ -234,15 +261,15 @@ class ArmInCell:
         return found
 
     def _cell_pairs(self) -> list[Pair]:
-        """Every capsule that moves against every thing. What the base carries first stands on the
+        """Every body that moves against every thing. What the base carries first stands on the
         table, by its mounting."""
-        found = []
-        for k, capsule in enumerate(self.capsules):
-            if capsule.link == BASE:
+        found, things = [], self._things()
+        for k, body in enumerate(self.bodies):
+            if body.link == BASE:
                 continue
-            name, arms = self._name(capsule), self._lever(capsule)
-            first = self.model.tree.parent[capsule.link] == BASE
-            for thing, shape, place in self._things():
+            name, arms = self._name(body), self._lever(body)
+            first = self.model.tree.parent[body.link] == BASE
+            for thing, shape, place in things:
                 if not (first and thing == TABLE):
                     found.append(Pair((name, thing), k, None, (shape, place), arms))
             if self.cell.reach is not None:
@@ -261,15 +288,18 @@ class ArmInCell:
         for pillar in cell.cylinder:
             place = coal.Transform3s(matrix_from_rpy(pillar.rpy), np.array(pillar.xyz))
             things.append((pillar.name, coal.Cylinder(pillar.radius, pillar.length), place))
+        for mesh in cell.mesh:
+            place = coal.Transform3s(matrix_from_rpy(mesh.rpy), np.array(mesh.xyz))
+            things.append((mesh.name, self._surface(mesh.file, mesh.scale), place))
         for wall in cell.plane:
             length = float(np.linalg.norm(wall.normal))
             normal = np.array(wall.normal) / length
             things.append((wall.name, coal.Halfspace(normal, wall.offset), coal.Transform3s()))
         return things
 
-    def _name(self, capsule: Capsule) -> str:
+    def _name(self, body: Body) -> str:
         tree = self.model.tree
-        return tree.base_name if capsule.link == BASE else tree.link_names[capsule.link]
+        return tree.base_name if body.link == BASE else tree.link_names[body.link]
 
     def _turned_by(self, link: int) -> Array:
         """Whether each joint (n,) turns a link."""
@@ -279,16 +309,16 @@ class ArmInCell:
             link = self.model.tree.parent[link]
         return turns
 
-    def _lever(self, capsule: Capsule) -> Array:
-        """How far from each joint's axis (n,) the capsule's line may be, 0 where it is not turned.
+    def _lever(self, body: Body) -> Array:
+        """How far from each joint's axis (n,) a capsule's line or a hull may be, 0 if not turned.
 
         From its own joint's, exactly; from those before it at most the lengths between.
         """
-        levers, link = np.zeros(self.model.tree.n), capsule.link
+        levers, link = np.zeros(self.model.tree.n), body.link
         if link == BASE:
             return levers
-        levers[link] = np.linalg.norm(capsule.ends[:, :2], axis=1).max()
-        far = np.linalg.norm(capsule.ends, axis=1).max()
+        levers[link] = np.linalg.norm(body.ends[:, :2], axis=1).max()
+        far = np.linalg.norm(body.ends, axis=1).max()
         while self.model.tree.parent[link] != BASE:
             far += np.linalg.norm(self.model.lam[link, 3:])
             link = self.model.tree.parent[link]

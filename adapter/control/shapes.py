@@ -1,8 +1,8 @@
-"""The room that an arm takes: capsules on its links, as small as what is known of them allows.
+"""The room that an arm takes: bodies on its links, as small as what is known of them allows.
 
-In this order: those of an arm that is known by name; the boxes, cylinders and spheres of a URDF's
-collision elements; from a joint to the next with a radius that the inertia says. Meshes are not
-read: their files are rarely where a URDF is.
+In this order: capsules of an arm that is known by name; capsules around the boxes, cylinders and
+spheres of a URDF's collision elements, and the convex hulls of its meshes; capsules from a joint to
+the next with a radius that the inertia says, also where the file of a mesh is not to be had.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.control.cell import Hand
+from adapter.control.meshes import Mesh, file_of, hull_of, read_mesh
 from adapter.errors import ModelWarning
 from adapter.model.inertia import body_from_theta
 from adapter.model.locking import LOCKED
 from adapter.model.robot_file import Merged
 from adapter.model.robots.known import facts_of
-from adapter.model.self_model import URDF, SelfModel
+from adapter.model.self_model import URDF, SelfModel, Source
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.model.tree import BASE
 from adapter.model.urdf import parse_urdf
@@ -44,9 +46,33 @@ class Capsule:
     radius: float
 
 
-def capsules_of(model: SelfModel, hand: Hand | None = None) -> list[Capsule]:
-    """Capsules on the links of an arm with a fixed base."""
+@dataclass(frozen=True)
+class Hull:
+    """The convex hull of a mesh, which fills hollows: on the safe side.
+
+    Attributes:
+        link: as a capsule's.
+        ends: (k, 3) its corners in the link's frame, m.
+        triangles: (m, 3) numbers of three corners each.
+        radius: around it.
+    """
+
+    link: int
+    ends: Array
+    triangles: NDArray[np.int64]
+    radius: float = 0.0
+
+
+Body = Capsule | Hull
+
+
+def bodies_of(model: SelfModel, hand: Hand | None = None) -> list[Body]:
+    """What the links of an arm with a fixed base are taken for.
+
+    Warns (ModelWarning) of each mesh that cannot be used, and why.
+    """
     known = facts_of(model)
+    found: list[Body]
     if known is not None:
         found = [
             Capsule(number - 1, row[:6].reshape(2, 3), float(row[6]))
@@ -55,8 +81,8 @@ def capsules_of(model: SelfModel, hand: Hand | None = None) -> list[Capsule]:
         ]
         found += _on_the_hand(model, found)
     else:
-        found = list(_of_collisions(model))
-        bare = set(range(BASE, model.tree.n)) - {capsule.link for capsule in found}
+        found, lacking = _of_collisions(model)
+        bare = set(range(BASE, model.tree.n)) - {body.link for body in found} | lacking
         found += [capsule for link in sorted(bare) for capsule in _of_inertia(model, link)]
     if hand is not None:
         ends = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, hand.length]])
@@ -69,7 +95,7 @@ def leaves(model: SelfModel) -> list[int]:
     return [link for link in range(model.tree.n) if link not in model.tree.parent]
 
 
-def _on_the_hand(model: SelfModel, known: list[Capsule]) -> Iterator[Capsule]:
+def _on_the_hand(model: SelfModel, known: list[Body]) -> Iterator[Capsule]:
     """Room for what a file hangs on the flange of an arm whose own shapes are known."""
     for link in leaves(model):
         reach = max(np.abs(c.ends).max() + c.radius for c in known if c.link == link)
@@ -79,11 +105,13 @@ def _on_the_hand(model: SelfModel, known: list[Capsule]) -> Iterator[Capsule]:
                 yield Capsule(link, np.array([np.zeros(3), frame.position]), HAND_RADIUS_M)
 
 
-def _of_collisions(model: SelfModel) -> Iterator[Capsule]:
-    """Capsules around the simple shapes of a URDF's collision elements."""
+def _of_collisions(model: SelfModel) -> tuple[list[Body], set[int]]:
+    """Bodies of a URDF's collision elements, and the links that lack one of theirs."""
     source = model.source
+    found: list[Body] = []
+    lacking: set[int] = set()
     if source is None or source.format != URDF or source.text is None:
-        return
+        return found, lacking
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelWarning)  # they were said when the model was read
         locked = model.provenance.get(LOCKED) or {}
@@ -96,13 +124,38 @@ def _of_collisions(model: SelfModel) -> Iterator[Capsule]:
         for collision in link.findall("collision"):
             shape = collision.find("geometry/*")
             origin = collision.find("origin")
-            line = None if shape is None else _line_of(shape)
-            if line is None:
-                continue
             place = np.zeros(6) if origin is None else _six(origin)
-            half, radius = line
-            centre, along = p_link + R_link @ place[:3], R_link @ matrix_from_rpy(place[3:]) @ half
-            yield Capsule(body, np.array([centre - along, centre + along]), radius)
+            R, p = R_link @ matrix_from_rpy(place[3:]), p_link + R_link @ place[:3]
+            line = None if shape is None else _line_of(shape)
+            if line is not None:
+                ends = np.array([p - R @ line[0], p + R @ line[0]])
+                found.append(Capsule(body, ends, line[1]))
+            elif shape is not None and shape.tag == "mesh":
+                mesh = _mesh_of(shape, source, link.get("name", ""))
+                if mesh is None:
+                    lacking.add(body)
+                else:
+                    found.append(Hull(body, p + mesh.corners @ R.T, mesh.triangles))
+    return found, lacking
+
+
+def _mesh_of(shape: ET.Element, source: Source, link: str) -> Mesh | None:
+    """The hull of a mesh element; None, with a warning, where its file cannot be used."""
+    name = shape.get("filename", "")
+    try:
+        if source.folder is None:
+            raise ValueError(f"{name}: the folder of {source.file} is not known")
+        scale = tuple(float(part) for part in shape.get("scale", "1 1 1").split())
+        if len(scale) != 3 or not np.isfinite(scale).all() or not all(scale):
+            raise ValueError(f"{name}: scale needs 3 numbers that are not zero")
+        return hull_of(read_mesh(file_of(name, source.folder), scale))
+    except ValueError as error:
+        warnings.warn(
+            f"link '{link}': its mesh is not used ({error}); a capsule by its inertia is",
+            ModelWarning,
+            stacklevel=2,
+        )
+        return None
 
 
 def _six(origin: ET.Element) -> Array:

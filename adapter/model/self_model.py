@@ -75,6 +75,7 @@ class Source:
         format: `URDF` or `MJCF`.
         file: its name; of an MJCF, which may take in other files, the whole path.
         text: of a URDF; an MJCF is read from its file again.
+        folder: that a URDF was read from, for its meshes; None where it came otherwise.
         lam: (n, 6) λ as documented there, row by row as in the model.
     """
 
@@ -82,6 +83,7 @@ class Source:
     file: str
     text: str | None = None
     lam: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    folder: str | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import math
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,10 @@ def read_urdf(
         ModelError: one sentence naming the file, the element and the choices.
     """
     text = file_text(path)
-    return model_from_urdf(text, str(path), joints, floating, gravity, lock)
+    model = model_from_urdf(text, str(path), joints, floating, gravity, lock)
+    assert model.source is not None
+    source = replace(model.source, folder=str(Path(path).resolve().parent))
+    return replace(model, source=source)
 
 
 def model_from_urdf(

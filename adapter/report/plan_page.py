@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from adapter.control.cell import Cell
 from adapter.control.free_path import ArmInCell, Clearance
 from adapter.control.limits import MotionLimits
+from adapter.control.meshes import read_mesh
 from adapter.control.path_motion import PathMotion
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.report.html import fill, write_whole
@@ -74,9 +76,8 @@ def _view(
         for ends in arm.skeleton(q) if alpha == 1.0 else ():
             ax.plot(*project(ends).T, color=color, linewidth=0.7)
         for ends, _ in arm.placed(q):
-            ax.plot(
-                *project(ends).T, color=color, linewidth=width, alpha=alpha, solid_capstyle="round"
-            )
+            line = _rim(project(ends))
+            ax.plot(*line.T, color=color, linewidth=width, alpha=alpha, solid_capstyle="round")
     _scale(ax, arm.cell.table, project)
     return drawing.panel(title, "", note)
 
@@ -90,14 +91,33 @@ def _scale(ax: Axes, table: bool, project: Callable[[Array], Array]) -> None:
     ax.text(left + 0.23, foot, "0.2 m", color=MUTED, va="center", fontsize=7.6)
 
 
+def _rim(points: Array) -> Array:
+    """Points (k, 2) of a body as a line: a capsule's as they are, the outline of more."""
+    if len(points) <= 2:
+        return points
+    try:
+        around = ConvexHull(points).vertices
+    except QhullError:
+        return points
+    return points[[*around, around[0]]]
+
+
 def _outlines(cell: Cell) -> list[Array]:
-    """Lines (k, 3) that show the boxes and cylinders of a cell, and a piece of each plane."""
+    """Lines (k, 3) that show a cell's boxes and cylinders, boxes around its meshes, and a piece of
+    each plane."""
     loop = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]], dtype=float)
     found = []
     for box in cell.box:
         R, half = matrix_from_rpy(box.rpy), 0.5 * np.array(box.size)
         corners = np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
         found.append(np.array(box.xyz) + (corners * half) @ R.T)
+    for mesh in cell.mesh:
+        low, high = (
+            f(read_mesh(mesh.file, (mesh.scale,)).corners, axis=0) for f in (np.min, np.max)
+        )
+        corners = np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
+        inside = 0.5 * (low + high) + corners * 0.5 * (high - low)
+        found.append(np.array(mesh.xyz) + inside @ matrix_from_rpy(mesh.rpy).T)
     angle = np.linspace(0.0, 2.0 * np.pi, RIM)
     for each in cell.cylinder:
         ring = each.radius * np.c_[np.cos(angle), np.sin(angle)]

@@ -103,7 +103,8 @@ def read_config(path: str | Path | None) -> Config:
         raise SettingsError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise SettingsError(f"{path}: not TOML: {error}") from error
-    return config_from(table, str(path))
+    config = config_from(table, str(path))
+    return dataclasses.replace(config, cell=config.cell.beside(Path(path).resolve().parent))
 
 
 def config_from(table: dict[str, Any], where: str = "configuration") -> Config:

@@ -30,15 +30,25 @@ def read_text(path: str | Path, limit: int | None = None) -> str:
     Raises:
         OSError, ValueError: it cannot be opened; it is too long, or no such text.
     """
-    limit = TEXT_LIMIT if limit is None else limit
-    with Path(path).open("rb") as file:
-        content = file.read(limit + 1)
-    if len(content) > limit:
-        raise ValueError(f"more than {limit >> 20} MiB of text")
+    content = read_bytes(path, limit, " of text")
     try:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ValueError(f"not text in UTF-8 ({error}); save it as UTF-8") from None
+
+
+def read_bytes(path: str | Path, limit: int | None = None, what: str = "") -> bytes:
+    """A file's bytes, at most `limit` (`TEXT_LIMIT`).
+
+    Raises:
+        OSError, ValueError: it cannot be opened; it is too long.
+    """
+    limit = TEXT_LIMIT if limit is None else limit
+    with Path(path).open("rb") as file:
+        content = file.read(limit + 1)
+    if len(content) > limit:
+        raise ValueError(f"more than {limit >> 20} MiB{what}")
+    return content
 
 
 def parse_json(text: str | bytes) -> Any:

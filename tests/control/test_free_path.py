@@ -16,8 +16,8 @@ from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.information import Information
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings, gentle
-from adapter.control.shapes import capsules_of
-from adapter.errors import SettingsError
+from adapter.control.shapes import bodies_of
+from adapter.errors import ModelWarning, SettingsError
 from adapter.model.robots import documented
 from adapter.model.urdf import model_from_urdf
 from adapter.runs.config import config_from, config_table
@@ -53,7 +53,7 @@ def test_nothing_lies_between_two_looks(seed):
     motion = RandomMotion(LIMITS, READY, ExcitationSettings(seed=seed))
     dense = np.inf
     for q in _poses(motion, 0.01):
-        for capsule, (ends, radius) in zip(arm.capsules, arm.placed(q), strict=True):
+        for capsule, (ends, radius) in zip(arm.bodies, arm.placed(q), strict=True):
             if capsule.link > 0:
                 points = _along(ends)
                 beside = np.linalg.norm(np.maximum(np.abs(points - centre) - half, 0.0), axis=1)
@@ -142,14 +142,17 @@ SHAPE = """<collision><origin xyz="0 0 0.15" rpy="0 0 0"/><geometry><box size="0
 
 
 def test_an_arm_of_ones_own_gets_its_shapes_from_its_file():
-    bare = {c.link: c for c in capsules_of(model_from_urdf(ARM.replace("SHAPE", "")))}
+    bare = {c.link: c for c in bodies_of(model_from_urdf(ARM.replace("SHAPE", "")))}
     assert np.linalg.norm(bare[0].ends[1] - bare[0].ends[0]) == pytest.approx(0.4)
     assert bare[0].radius == pytest.approx(0.05)  # of a cylinder of 2 kg with 0.0025 kg m²
     assert np.linalg.norm(bare[1].ends[1]) == pytest.approx(0.2)  # twice to its centre
-    shaped = {c.link: c for c in capsules_of(model_from_urdf(ARM.replace("SHAPE", SHAPE)))}
-    assert shaped[1].radius == pytest.approx(0.05)  # half the diagonal of 0.06 by 0.08
     model = model_from_urdf(ARM.replace("SHAPE", SHAPE))
-    straight = ArmInCell(model, Cell()).placed(np.zeros(2))
+    with pytest.warns(ModelWarning, match=r"link 'fore': its mesh is not used \(x.stl: the folder"):
+        box, inertia = (body for body in bodies_of(model) if body.link == 1)
+    assert box.radius == pytest.approx(0.05)  # half the diagonal of 0.06 by 0.08
+    assert inertia.radius == pytest.approx(0.03)  # the mesh may be larger than the box
+    with pytest.warns(ModelWarning, match="by its inertia"):
+        straight = ArmInCell(model, Cell()).placed(np.zeros(2))
     high = max(ends[:, 2].max() for ends, _ in straight)
     assert high == pytest.approx(0.8)  # 0.1 + 0.4 + 0.3, whatever axes the joints turn about
 
@@ -159,7 +162,7 @@ def test_a_panda_with_a_hand_in_its_file_needs_room_for_it():
     hand = '<link name="hand"/><joint name="h" type="fixed"><parent link="panda_link8"/>'
     hand += '<child link="hand"/><origin xyz="0 0 0.1"/></joint></robot>'
     model = model_from_urdf((folder / "panda.urdf").read_text().replace("</robot>", hand))
-    assert len(capsules_of(model)) == len(capsules_of(PANDA)) + 1
+    assert len(bodies_of(model)) == len(bodies_of(PANDA)) + 1
 
 
 def test_what_comes_too_near_says_which_way_out():
