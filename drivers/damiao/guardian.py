@@ -11,6 +11,8 @@ driven and then fall. So this process, with its own handle on the bus, takes ove
 It also looks whether the loop pushes an arm that stands still (`PushWatch`), and then forbids its
 commands: the loop's driver refuses them, naming the joint, and brakes. A loop that goes on driving
 all the same is ended (SIGKILL: two that send commands would only take turns), and the arm braked.
+Both go by what the loop did, never by how long it took: a loop that a busy machine keeps waiting
+has neither pushed nor gone on meanwhile.
 
 It sends the commands of `drivers.damiao.holding` at 200 Hz, until
 
@@ -52,7 +54,7 @@ ROWS = 5  # held angle, angle, speed, torque that carries the arm, torque measur
 BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
-OBEY_S, OBEY_PERIODS = 0.03, 2  # in which a loop has to heed what was forbidden; the longer one
+GO_ON_BEATS = 2  # commands seen after driving was forbidden; one may have been under way
 MILLI = 1000  # the block's whole numbers are mN m
 GONE_S = 10.0
 READY = "ready"
@@ -177,14 +179,16 @@ class Guardian:
         parent: int,
         names: Sequence[str],
     ) -> None:
-        self._names, self._forbidden_s = names, 0.0
+        self._names = names
         self._settings, self._limits, self._memory, self._parent = settings, limits, memory, parent
         self._bus = open_bus(settings)
         self._wire = wire_of(self._bus)
         self._messages = [message_for(settings, can_id, codec.ENABLE) for can_id in settings.ids]
         self._index = {can_id: j for j, can_id in enumerate(settings.reply_ids)}
         self._braker: Braker | None = None
-        self._pushes, self._looked_s = PushWatch(limits), 0.0
+        self._pushes = PushWatch(limits)
+        self._longest_ns = max(round(1e9 * HOLD_S), 1_000_000_000 // settings.rate_hz)
+        self._beat_ns = self._gone_on = 0
         self._mode = GuardianMode.IDLE
         self._q: list[float] = []
         self._dq: list[float] = []
@@ -205,8 +209,7 @@ class Guardian:
                 driven and time.monotonic_ns() - memory.beat_ns < SILENCE_NS
             ):
                 self._braker = None
-                self._look(driven)
-                self._end_who_goes_on(mode)
+                self._look(mode)
                 time.sleep(WATCH_S)
                 continue
             if self._braker is None or mode != self._mode:
@@ -227,28 +230,27 @@ class Guardian:
         self._wire.close()
         self._bus.shutdown()
 
-    def _look(self, driven: bool) -> None:
-        """Forbid to drive an arm on that is pushed although it stands still."""
-        now_s = time.monotonic()
-        dt_s, self._looked_s = min(now_s - self._looked_s, HOLD_S), now_s
-        if not driven:
+    def _look(self, mode: GuardianMode) -> None:
+        """At each command of a driven arm: forbid to drive on where it is pushed although it
+        stands still, and end a loop that drives on all the same."""
+        memory = self._memory
+        beat_ns, before_ns = memory.beat_ns, self._beat_ns
+        if mode != GuardianMode.DRIVE:
             self._pushes.reset()
-            return
-        _, dq, carried, tau = self._memory.motion()
-        push = self._pushes.step(dt_s, dq, carried, tau)
-        if push is not None and self._memory.forbidden is None:
-            self._memory.forbid(push)
-            self._forbidden_s = now_s
-            self._say(f"{push.said(self._names[push.joint])}; the arm is stopped")
-
-    def _end_who_goes_on(self, mode: GuardianMode) -> None:
-        """End a loop that drives on although it was forbidden; the arm is then braked from here."""
-        if mode != GuardianMode.DRIVE or self._memory.forbidden is None:
-            return
-        patience_s = max(OBEY_S, OBEY_PERIODS / self._settings.rate_hz)
-        if time.monotonic() - self._forbidden_s > patience_s and os.getppid() == self._parent:
-            self._say(f"process {self._parent} goes on driving; it is ended")
-            os.kill(self._parent, signal.SIGKILL)
+            self._gone_on = 0
+        elif beat_ns != before_ns and memory.forbidden is not None:
+            self._gone_on += 1
+            if self._gone_on >= GO_ON_BEATS and os.getppid() == self._parent:
+                self._say(f"process {self._parent} goes on driving; it is ended")
+                os.kill(self._parent, signal.SIGKILL)
+        elif beat_ns != before_ns:
+            _, dq, carried, tau = memory.motion()
+            dt_s = 1e-9 * min(beat_ns - before_ns, self._longest_ns)
+            push = self._pushes.step(dt_s, dq, carried, tau)
+            if push is not None:
+                memory.forbid(push)
+                self._say(f"{push.said(self._names[push.joint])}; the arm is stopped")
+        self._beat_ns = beat_ns
 
     def _begin(self, mode: GuardianMode, alive: bool) -> None:
         self._wire.waiting()  # old replies

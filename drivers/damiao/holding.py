@@ -32,8 +32,10 @@ STOP_AT_MOST_S, HELD_S = 1.5, 0.5
 # TMAX in the spring the held angle comes after it, slowly enough for a load that was put on.
 YIELD_SHARE, YIELD_SPEED = 0.15, 0.2  # , rad/s
 # A driven arm that stands still and is pushed nevertheless: shares of TMAX, s, rad/s. Further away
-# than the limits of the loop itself, for which this is the second look.
-PUSH_SHARE, PUSH_S = 0.75, 0.1
+# than the limits of the loop itself, for which this is the second look. An arm that is free leaves
+# the band of speed in 15 ms under such a torque unless its inertia is above 0.11 kg m² for each N m
+# of TMAX, more than a motor could move well; three reports, so that no single one does it.
+PUSH_SHARE, PUSH_S, PUSH_REPORTS = 0.75, 0.015, 3
 FULL_SHARE, FULL_S = 0.8, 0.3
 STANDING = 0.05
 
@@ -73,7 +75,7 @@ class Braker:
         """The next MIT commands.
 
         Args:
-            dt_s: since the last call.
+            dt_s: since the last call, each one with a report of its own.
             q, dq: (n) measured last, rad, rad/s; NaN for a joint that does not answer.
         """
         if self.hold is not None:
@@ -148,6 +150,7 @@ class PushWatch:
     def reset(self) -> None:
         """The arm is driven anew."""
         self._pushed_s = [0.0] * len(self._most)
+        self._pushed = [0] * len(self._most)
         self._full_s = [0.0] * len(self._most)
 
     def step(
@@ -156,7 +159,7 @@ class PushWatch:
         """What is pushed for too long; None for nothing.
 
         Args:
-            dt_s: since the last call.
+            dt_s: since the last call, each one with a report of its own.
             dq: (n) rad/s; carried, tau: (n) N m that carry the arm, and that were measured.
         """
         for j, most in enumerate(self._most):
@@ -164,8 +167,9 @@ class PushWatch:
             pushed = stands and abs(tau[j] - carried[j]) > PUSH_SHARE * most
             full = stands and abs(tau[j]) > FULL_SHARE * most
             self._pushed_s[j] = self._pushed_s[j] + dt_s if pushed else 0.0
+            self._pushed[j] = self._pushed[j] + 1 if pushed else 0
             self._full_s[j] = self._full_s[j] + dt_s if full else 0.0
-            if self._pushed_s[j] > PUSH_S:
+            if self._pushed_s[j] > PUSH_S and self._pushed[j] >= PUSH_REPORTS:
                 return Push(j, tau[j] - carried[j], PUSH_SHARE * most)
             if self._full_s[j] > FULL_S:
                 return Push(j, tau[j], FULL_SHARE * most)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+import os
 import tempfile
 
 import numpy as np
@@ -18,8 +20,9 @@ from adapter.signals.front_end import FrontEnd
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.codec import Scales
-from drivers.damiao.guardian import BLOCK_BYTES, GuardianMemory
+from drivers.damiao.guardian import BLOCK_BYTES, Guardian, GuardianMemory, GuardianMode
 from drivers.damiao.holding import Braker, Push, PushWatch
+from drivers.damiao.settings import BusSettings
 from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
@@ -95,6 +98,76 @@ def test_the_guardian_finds_an_arm_that_is_pushed_although_it_stands(
     push = next((push for push in found if push is not None), None)
     assert (None if push is None else push.joint) == joint
     assert found[0] is None
+
+
+def test_a_free_arm_never_looks_pushed(monkeypatch) -> None:
+    """Turning points of 2 s of motion: standing joints, none pushed for a fifth of the time."""
+    scenario = build("nominal")
+    line = Line()
+    boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+    line.attach(boards)
+    monkeypatch.setattr(
+        holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
+    )
+    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+    names = scenario.truth.joint_names
+    arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
+    driver = Lockstep(arm, line)
+    controller = ExcitationController(
+        MotionLimits.of(PANDA), ExcitationSettings(seed=3), expected=ModelFeedforward.of(PANDA)
+    )
+    watch, longest_s, still = None, 0.0, 0
+
+    def look(sample, tau):
+        nonlocal watch, longest_s, still
+        watch = watch or PushWatch(arm.limits)
+        carried = arm._told or arm._carried
+        assert watch.step(0.001, sample.dq.tolist(), carried, sample.tau.tolist()) is None
+        longest_s = max(longest_s, *watch._pushed_s)
+        still += int((np.abs(sample.dq) < holding.STANDING).sum())
+
+    result = run_lockstep(driver, FrontEnd(PANDA), None, controller, 2.0, each=look)
+    driver.close()
+    boards.close()
+    assert result.fault is None and still > 300
+    assert longest_s < 0.2 * holding.PUSH_S
+
+
+def test_a_loop_that_a_busy_machine_stops_in_a_push_is_not_held_to_have_pushed_meanwhile() -> None:
+    """One report of a push, then 40 ms without any; three reports of 5 ms are a push."""
+    settings = BusSettings.of("can://239.74.163.2:46991?interface=udp_multicast&rate=200", None)
+    limits = [Scales(12.5, 25.0, 100.0)] * settings.joints
+    names = [f"joint{j + 1}" for j in range(settings.joints)]
+    n = settings.joints
+    with tempfile.TemporaryFile() as block:
+        block.truncate(BLOCK_BYTES)
+        memory = GuardianMemory(block, n)
+        guardian = Guardian(settings, limits, memory, os.getpid(), names)
+        guardian._say = lambda sentence: None
+        try:
+            memory.put([0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n)
+            beats = itertools.count(10**9, 5_000_000)
+            for _ in range(10):
+                memory.beat_ns = next(beats)
+                guardian._look(GuardianMode.DRIVE)
+            memory.put([0.0] * n, [0.0] * n, [0.0] * n, [90.0] * n)
+            memory.beat_ns = next(beats)
+            for _ in range(20):
+                guardian._look(GuardianMode.DRIVE)
+            assert memory.forbidden is None
+            memory.beat_ns = next(beats) + 40_000_000
+            guardian._look(GuardianMode.DRIVE)
+            assert memory.forbidden is None
+            for _ in range(2):
+                memory.beat_ns = next(beats) + 40_000_000
+                guardian._look(GuardianMode.DRIVE)
+            assert memory.forbidden is not None and memory.forbidden.joint == 0
+            for _ in range(20):  # it heeds that: no command, however long it takes
+                guardian._look(GuardianMode.DRIVE)
+            assert guardian._gone_on == 0
+        finally:
+            guardian.close()
+            memory.close()
 
 
 def test_a_forbidden_joint_is_read_by_the_loop() -> None:

@@ -151,7 +151,7 @@ while True:
 
 @needs_multicast
 def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(served, capfd):
-    """The push is the whole of what joint 2 can; 0.1 s of it are a push, 50 ms more its end."""
+    """The push is the whole of what joint 2 can: some 50 ms of it in a loop of 200 Hz."""
     address, bank = served
     bank.held[1] = True
     pushed_s, take = [], bank._take
@@ -183,7 +183,7 @@ def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(serve
     assert "joint 2 (joint2) is pushed with +48.0 N m (limit 40.5 N m)" in said
     assert "goes on driving; it is ended" in said and "braked and held" in said
     print(f"pushed for {pushed_s[-1] - pushed_s[0]:.3f} s")
-    assert pushed_s[-1] - pushed_s[0] < 0.5  # on a busy machine, too
+    assert pushed_s[-1] - pushed_s[0] < 0.3  # on a busy machine, too
 
 
 @needs_multicast
