@@ -146,9 +146,43 @@ class Motion:
 
     def rate(self, x: Array) -> Array:
         """Time derivative of x (m, ...); zero where there is but one instant."""
-        if len(self.t) < 2:
-            return np.zeros_like(x)
-        return np.asarray(np.gradient(x, self.t, axis=0))
+        rate = _rate(np.ascontiguousarray(x, dtype=np.float64).reshape(len(x), -1), self.t)
+        return np.asarray(rate.reshape(np.shape(x)))
+
+
+def late_jit(function: Kernel) -> Kernel:
+    """Compile a function when it is first called: the catalogue is read by who needs no numba."""
+
+    @cache
+    def compiled() -> Any:
+        from numba import njit
+
+        return njit(cache=True, error_model="numpy")(function)
+
+    @wraps(function)
+    def call(*args: Any) -> Any:
+        return compiled()(*args)
+
+    return cast(Kernel, call)
+
+
+@late_jit
+def _rate(x: Array, t: Array) -> Array:
+    """Slope of x (m, c) at each instant t (m,) of the parabola through it and its neighbours.
+
+    That of a line at both ends; zero where there is but one instant.
+    """
+    rows, columns = x.shape
+    out = np.zeros((rows, columns))
+    for i in range(rows if rows > 1 else 0):
+        back, ahead = max(i - 1, 0), min(i + 1, rows - 1)
+        before, after = t[i] - t[back], t[ahead] - t[i]
+        share = 1.0 if before == 0.0 else 0.0 if after == 0.0 else before / (before + after)
+        up = 0.0 if after == 0.0 else share / after
+        down = 0.0 if before == 0.0 else (1.0 - share) / before
+        for j in range(columns):
+            out[i, j] = up * (x[ahead, j] - x[i, j]) + down * (x[i, j] - x[back, j])
+    return out
 
 
 @lru_cache
@@ -367,22 +401,6 @@ def on_joint(motion: Motion, joint: int, torque: Array) -> Array:
     out = np.zeros_like(motion.q)
     out[:, joint] = torque
     return out
-
-
-def late_jit(function: Kernel) -> Kernel:
-    """Compile a function when it is first called: the catalogue is read by who needs no numba."""
-
-    @cache
-    def compiled() -> Any:
-        from numba import njit
-
-        return njit(cache=True, error_model="numpy")(function)
-
-    @wraps(function)
-    def call(*args: Any) -> Any:
-        return compiled()(*args)
-
-    return cast(Kernel, call)
 
 
 class JointTorque(TorqueEffect):

@@ -71,10 +71,11 @@ class TorqueFilter(LearnedEffect, SensorEffect):
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
         measured torque look smoother than the one that the motion asks for.
         """
+        own = list(range(tau.shape[1]) if joint < 0 else (joint,))
+        inside = np.stack([motion.inside_band(tau[:, j], j) for j in own], axis=1)
+        bend = motion.rate(motion.rate(inside))
         out = tau.copy()
-        for j in range(tau.shape[1]) if joint < 0 else (joint,):
-            bend = motion.rate(motion.rate(motion.inside_band(tau[:, j], j)))
-            out[:, j] += values["c"] * bend - values["d"] * motion.rate(tau[:, j])
+        out[:, own] += values["c"] * bend - values["d"] * motion.rate(tau[:, own])
         return np.asarray(out)
 
     def basis(self, at: JointSignals) -> tuple[Array, ...]:

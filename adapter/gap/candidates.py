@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -94,7 +95,7 @@ class Stages:
         links: motion of the links, with the model's arm.
         rigid: (m, n) torque of the bodies; total: with what acts at the joints; sensed: as the
             sensors read it.
-        bare: (m, n) torque of the arm alone, without effects on its bodies.
+        has_bodies: whether some effects are on bodies.
     """
 
     signals: Signals
@@ -102,7 +103,13 @@ class Stages:
     rigid: Array
     total: Array
     sensed: Array
-    bare: Array
+    has_bodies: bool
+
+    @cached_property
+    def bare(self) -> Array:
+        """(m, n) torque of the arm alone, without effects on its bodies."""
+        links = self.links
+        return links.arm.torque(links.q, links.dq, links.ddq) if self.has_bodies else self.rigid
 
     @property
     def unmoved(self) -> bool:
@@ -128,11 +135,9 @@ def stages_of(
     if links is not motion:
         links = signals.banded(links)
     rigid = bodies(links, effects)
-    bare = rigid
-    if any(isinstance(active.effect, BodyEffect) for active in effects):
-        bare = links.arm.torque(links.q, links.dq, links.ddq)
     total = added(links, rigid, effects)
-    return Stages(signals, links, rigid, total, sensors(links, total, effects), bare)
+    has_bodies = any(isinstance(active.effect, BodyEffect) for active in effects)
+    return Stages(signals, links, rigid, total, sensors(links, total, effects), has_bodies)
 
 
 def places(effect: Effect, n: int) -> tuple[int, ...]:

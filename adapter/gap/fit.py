@@ -539,7 +539,7 @@ def shaped(fit: Fit, place: int) -> Fit:
     effect = fit.named[place].candidate.effect
     if effect.reshaped(fit.named[place].values, 1.0) is None:
         return fit
-    if fit.links_stay and isinstance(effect, TorqueEffect) and not effect.by_load:
+    if isinstance(effect, TorqueEffect) and not effect.by_load:
         return _reshaped(fit, place)
     for step in SHAPE_STEPS:
         named = fit.named[place]
@@ -562,7 +562,7 @@ def _other_shapes(named: Named, step: float) -> list[Named]:
 
 
 def _reshaped(fit: Fit, place: int) -> Fit:
-    """The same where all is linear but the setting: its own columns are all that changes."""
+    """The same where its own columns are all that changes; others stay as linear as they are."""
     carried, own = fit.carried(), place_of(fit, place)
     best, named = carried, fit.named[place]
     for step in SHAPE_STEPS:
