@@ -252,13 +252,13 @@ def _with(
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
-    swaps, before = 0, fit
+    swaps, before = 0, None  # the fit before names were exchanged, until that is judged
     while True:
         fit, carried = under_own_noise(fit)
-        if _lost(before, fit):
-            fit = before = _refused(before, fit)
+        if before is not None and _lost(before, fit):
+            fit, before = _refused(before, fit), None
             continue
-        values = weak(fit, carried)
+        before, values = None, weak(fit, carried)
         bad = worst(fit, values)
         if bad is not None:
             fit = fit.without(bad)

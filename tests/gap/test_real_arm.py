@@ -142,3 +142,11 @@ def test_friction_held_at_the_first_sample_is_forgotten_as_a_joint_slides() -> N
         assert np.abs(held[j, -1]).max() < 1e-3
         assert np.abs(np.delete(held[j], j, axis=1)).max() == 0.0
     assert len(place_of(arm.fit, 0)) == 10
+
+
+@pytest.mark.timeout(300)
+def test_names_that_were_exchanged_in_vain_are_given_up() -> None:
+    """The search of this log went to and fro between two fits with the same names, without end."""
+    twin = draw_twin(5097)
+    found = find_gap([by_mujoco(twin).log()], documented())
+    assert not any(f.effect in ("payload", "external_wrench") for f in found.findings)
