@@ -75,7 +75,7 @@ class Braker:
         """The next MIT commands.
 
         Args:
-            dt_s: since the last call, each one with a report of its own.
+            dt_s: since the last call.
             q, dq: (n) measured last, rad, rad/s; NaN for a joint that does not answer.
         """
         if self.hold is not None:
