@@ -8,8 +8,8 @@ from scipy.linalg import cholesky, solve_triangular
 from adapter.errors import ModelError
 from adapter.gap.evidence import Normal
 from adapter.gap.fit import Fit, place_of
+from adapter.learning.batch.conic import solve_conic
 from adapter.learning.batch.theta_filling import KEPT, UNSOLVED, Measure
-from adapter.learning.batch.theta_solvers import solve_conic
 from adapter.model.inertia import is_consistent
 from adapter.model.spatial import Array
 

@@ -204,7 +204,7 @@ def test_a_solver_that_stops_early_is_flagged(monkeypatch: pytest.MonkeyPatch) -
     rng = np.random.default_rng(6)
     r, b = rng.normal(size=(30, 10)), rng.normal(size=30)
     assert consistent_theta(r, b).converged
-    monkeypatch.setattr("adapter.learning.batch.theta_solvers.SOLVED", ())
+    monkeypatch.setattr("adapter.learning.batch.conic.SOLVED", ())
     found = consistent_theta(r, b)
     assert not found.converged and is_consistent(found.theta)
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.learning.batch.theta_factors import qr_factor
-from adapter.learning.batch.theta_solvers import (
+from adapter.learning.batch.conic import (
     LENGTH,
     cones,
     entries,
@@ -163,7 +162,8 @@ def _nearest_by_torque(measure: Measure, start: Array, regressor: Array) -> Fill
     """Possible bodies whose torques are nearest to those of what was learned."""
     back = np.array([measure.theta(x).ravel() for x in np.eye(len(start))])  # θ of each unit
     table = regressor @ back.T
-    table = qr_factor(table) / max(float(np.linalg.norm(table @ start)), 1e-300)
+    root = np.asarray(np.linalg.qr(table, mode="r"))
+    table = root / max(float(np.linalg.norm(root @ start)), 1e-300)
     quadratic = table.T @ table + NEARNESS * np.eye(len(start))
     share, _, _ = solve_conic(
         quadratic,

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import clarabel
 import numpy as np
 import scipy.linalg
 import torch
-from scipy import sparse
 
 from adapter.errors import ModelError
+from adapter.learning.batch.conic import LENGTH, cones, entries, nonnegative, solve_conic
 from adapter.model.inertia import min_eigenvalue, pseudo_inertia
 from adapter.model.spatial import Array
 from adapter.physics.identifiability import RANK_TOLERANCE
@@ -32,13 +31,10 @@ START_MASS, START_REACH, START_RADIUS, START_SPREAD = (0.5, 10.0), 0.1, 0.1, 0.3
 GAP, NEGLIGIBLE = 1e-7, 1e-14
 RATE, LAST_RATE, BETAS = 1e-2, 1e-4, (0.97, 0.99)  # of ADAM
 
-LENGTH = 0.1  # m, in units of which the entries of a link's pseudo-inertia (kg) are of like size
 EDGE = 1e-6  # kg, least eigenvalue in those units of a body that noise pushes to the edge
 ROOM = 1e-2  # kg, such an eigenvalue from which on more room is worth nothing
 LIGHT = 1e-6  # kg of room that 1 kg of mass (and of its size) is worth: what is unseen stays light
 HELD = 1e-9  # weight of a body of 1 kg and radius `LENGTH`, to the mean weight of the data
-PRECISION = 1e-10  # of the solver, relative and absolute
-SOLVED = ("Solved", "AlmostSolved")
 
 
 @dataclass(frozen=True)
@@ -110,24 +106,6 @@ def _svd(matrix: Array) -> tuple[Array, Array, Array]:
     except np.linalg.LinAlgError:
         u, values, vt = scipy.linalg.svd(matrix, full_matrices=True, lapack_driver="gesvd")
     return u, values, vt
-
-
-_UPPER = [(row, column) for column in range(4) for row in range(column + 1)]
-
-
-def entries(matrix: Array) -> Array:
-    """(..., 10) of symmetric matrices (..., 4, 4): as Clarabel wants a triangle."""
-    twice = np.sqrt(2.0)
-    parts = [matrix[..., i, j] * (1.0 if i == j else twice) for i, j in _UPPER]
-    return np.stack(parts, axis=-1)
-
-
-def matrices(entry: Array) -> Array:
-    """Symmetric matrices (..., 4, 4) of their entries (..., 10)."""
-    out = np.empty((*entry.shape[:-1], 4, 4))
-    for k, (i, j) in enumerate(_UPPER):
-        out[..., i, j] = out[..., j, i] = entry[..., k] / (1.0 if i == j else np.sqrt(2.0))
-    return out
 
 
 _UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
@@ -220,33 +198,6 @@ def _closest(r: Array, b: Array) -> Possible:
     # where the solver stopped short of the edge's right side
     lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
     return Possible(theta + lifted, steps, solved)
-
-
-def cones(bodies: int) -> list[object]:
-    """Where the entries of so many bodies' matrices are those of possible bodies."""
-    return [clarabel.PSDTriangleConeT(4)] * bodies
-
-
-def nonnegative(count: int) -> object:
-    """Where so many numbers are not below zero."""
-    return clarabel.NonnegativeConeT(count)
-
-
-def solve_conic(
-    quadratic: Array, linear: Array, left: Array, right: Array, in_cones: list[object]
-) -> tuple[Array, int, bool]:
-    """Minimise x·Q x / 2 + linear·x where right - left x lies in cones: x, steps, solved."""
-    settings = clarabel.DefaultSettings()
-    settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = PRECISION
-    # Its scaling of rows would turn the cones; the units above scale better.
-    settings.equilibrate_enable = False
-    upper = sparse.triu(sparse.csc_matrix(quadratic), format="csc")
-    solver = clarabel.DefaultSolver(
-        upper, linear, sparse.csc_matrix(left), right, in_cones, settings
-    )
-    answer = solver.solve()
-    return np.array(answer.x), int(answer.iterations), str(answer.status) in SOLVED
 
 
 def adam_theta(r: Array, b: Array, start: Array, steps: int = 5000) -> Solution:
