@@ -24,7 +24,9 @@ SERVE_CAN = (
     "p = argparse.ArgumentParser(); add_arguments(p); sys.exit(run(p.parse_args()))"
 )
 
-PATIENCE_S = "5"  # of a simulated robot with a process that this machine holds up
+# Of a simulated robot with a process that this machine holds up; less than the second after which
+# a driver gives up that waits for a state, as one does that lost the state it owes an answer to.
+PATIENCE_S = "0.5"
 
 
 class OnTime:
