@@ -10,7 +10,8 @@ QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/re
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 PAIRS := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 SHARED := $(PAIRS) -m "not alone and not slow"
-REAL_TIME := -m "alone and not slow"
+WITH_ALONE := $(sort $(shell grep --recursive --files-with-matches --include '*.py' mark.alone tests))
+REAL_TIME := -m "alone and not slow" $(WITH_ALONE)
 
 .PHONY: run test quick experiment setup lint shared quick-tests trials soak bench clean
 
@@ -21,8 +22,9 @@ experiment: $(STAMP)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
 # The lint beside the tests that judge no time: mypy alone would leave a processor idle.
-# A test in real time that fails is run once more, with the machine to itself: a shared machine
-# stands still now and then. One that fails twice fails.
+# Of tests in real time only their files are collected, for which all that others import is idle
+# work. One that fails is run once more, with the machine to itself: a shared machine stands still now
+# and then. One that fails twice fails.
 test: $(STAMP)
 	$(MAKE) --jobs 2 lint shared
 	$(PYTEST) $(PAIRS) $(REAL_TIME) || $(PYTEST) --last-failed --last-failed-no-failures none $(REAL_TIME)
@@ -44,10 +46,11 @@ lint: $(STAMP)
 
 setup: $(STAMP)
 
+# Python translates what is imported when it is; pip would translate all of torch, for a minute
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version.split()[0])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[test]'
+	$(BIN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[test]'
 	$(BIN)/python -m adapter.cli.warm_up > /dev/null 2>&1
 	touch $@
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from functools import partial
 from pathlib import Path
 
@@ -16,18 +17,20 @@ from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import LearnerScores
 from adapter.experiments.split import SETS, split
+from tests.helpers.readme import HUMANOID, README
 
 CHANNELS = {"w", "v", "a", "dw"}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a small experiment left its results."""
+    """Where the README's small experiment left its results; in three trials of `discover`."""
     place = tmp_path_factory.mktemp("experiment")
-    small = ["--trajectories", "5", "--seconds", "2", "--no-baselines"]
+    line = next(line for line in README.splitlines() if line.startswith(f"{HUMANOID} --"))
+    small = shlex.split(line)[1:]
     small += ["--seed", "4", "--seeds", "3"]
     where = ["--cache", str(place / "cache"), "--out", str(place), "--json", str(place / "e.json")]
-    assert main(["experiment", "atlas", *small, *where]) == 0
+    assert main([*small, *where]) == 0
     return place
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 PATIENCE_S = 1500.0  # with a command, on a machine with other work
+HUMANOID = "adapter experiment atlas"  # given by tests/experiments/test_experiment.py
 ROOT = Path(__file__).parents[2]
 SHELL = r"```sh\n(.*?)```"
 README = (ROOT / "README.md").read_text()

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.fci.arm import FciArm
+from drivers.files.mcap import read_log
 from drivers.interface import DriverError
 from tests.helpers import hardware_rigs as rigs
 from tests.helpers.live_tools import wait_for
@@ -22,6 +23,8 @@ from tests.helpers.live_tools import wait_for
 pytestmark = pytest.mark.alone
 
 ATTEMPTS = 3
+SECOND = 1000  # samples
+MOVING = 0.1  # rad/s, of the fastest joint
 
 
 def test_a_robot_whose_loop_is_killed_brakes_by_itself(tmp_path):
@@ -37,7 +40,7 @@ def _killed_in_motion(folder: Path) -> str:
     """Kill the loop of a moving robot, which has to come to rest; why it ended before, or ""."""
     folder.mkdir()
     figures = folder / "run.json"
-    with rigs.process("-m", "sim.fci", "--port", "0") as line:
+    with rigs.process("-m", "sim.fci", "--port", "0", "--patience", rigs.PATIENCE_S) as line:
         address = f"fci://{line.split()[2]}"
         command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
         command += [
@@ -53,16 +56,17 @@ def _killed_in_motion(folder: Path) -> str:
         recording = folder / "recording.mcap"
         loop = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:
-            # A second of samples is some 0.25 MB; after twelve seconds it moves at full speed.
-            full_speed = lambda: recording.exists() and recording.stat().st_size > 3e6  # noqa: E731
-            wait_for(lambda: full_speed() or loop.poll() is not None, 120)
+            # A second of samples is some 0.25 MB.
+            under_way = lambda: recording.exists() and recording.stat().st_size > 2e6  # noqa: E731
+            wait_for(lambda: under_way() or loop.poll() is not None, 120)
             if loop.poll() is not None:
                 return _rightly_ended(loop.returncode, json.loads(figures.read_text()))
-            assert full_speed()
+            assert under_way()
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(loop.pid, signal.SIGKILL)
             loop.wait()
+        assert np.abs(read_log(recording).dq[-SECOND:]).max(axis=1).min() > MOVING
         q = _at_rest(address)
         time.sleep(0.5)
         assert np.abs(_at_rest(address) - q).max() < 1e-3
