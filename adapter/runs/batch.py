@@ -3,6 +3,7 @@
 λ takes all states first, then θ takes them all with the λ they led to; live, θ has to do
 without the states before λ had converged. Moments need no steps to be complete, so as many steps
 as live are taken until λ and θ have converged, and few from there on, for many states at once.
+What θ needs of the states waits in a temporary file while λ takes them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.signals.records import stamp_of
+from drivers.files.rows import RowsFile
 
 SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
 SCHEMA_POLISH = 300  # more of them, to the optimum
@@ -42,7 +44,7 @@ def learn_batch(
     learner.learn_schema(_NO_STATES, SCHEMA_POLISH)
     if not len(torque):
         return
-    learner.start_theta(stamp_of(torque[0]))
+    learner.start_theta(stamp_of(torque.rows(0, 1)[0]))
     _learn_theta(learner, torque, every, waiting, progress)
     for steps, share in THETA_POLISH:
         learner.set_rate(share * learner.settings.theta.rate)
@@ -51,16 +53,18 @@ def learn_batch(
     learner.follow_convergence()
 
 
-def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -> tuple[Array, int]:
+def _learn_schema(
+    learner: OnlineLearner, tables: Iterable[Array], every: int
+) -> tuple[RowsFile, int]:
     """Let λ take all states.
 
     Returns:
         What θ needs of them (m, columns `before_links`), and how many came before λ had converged.
     """
-    kept, waiting, before = [], 0, 0
+    kept, waiting, before = RowsFile(learner.layout.before_links.stop), 0, 0
     for table in tables:
         states = learner.without_known(table)
-        kept.append(states[:, learner.layout.before_links].copy())
+        kept.append(states[:, learner.layout.before_links])
         done = 0
         while done < len(states):
             settled = learner.schema.converged
@@ -74,20 +78,24 @@ def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -
         if learner.schema.converged:
             break
         learner.learn_schema(_NO_STATES)
-    return np.concatenate(kept) if kept else _NO_STATES, waiting
+    return kept, waiting
 
 
 def _learn_theta(
-    learner: OnlineLearner, torque: Array, every: int, waiting: int, progress: Callable[[int], None]
+    learner: OnlineLearner,
+    torque: RowsFile,
+    every: int,
+    waiting: int,
+    progress: Callable[[int], None],
 ) -> None:
     """Let θ take all states; it begins to step behind the first `waiting` of them, as live."""
     theta, usual = learner.theta, learner.settings.theta.rate
     for start in range(0, waiting, SETTLED):
-        learner.learn_theta(torque[start : min(start + SETTLED, waiting)], 0)
+        learner.learn_theta(torque.rows(start, min(start + SETTLED, waiting)), 0)
     moving, start, number = True, waiting, 0
     while start < len(torque):
         progress(start)
-        batch = torque[start : start + (every if moving else SETTLED)]
+        batch = torque.rows(start, start + (every if moving else SETTLED))
         learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
         before = theta.th.copy()
         learner.learn_theta(batch, every if moving else FEW_STEPS)
