@@ -6,24 +6,33 @@ Numba keeps what it compiled on disk; `make` runs this at the end of set-up.
 from __future__ import annotations
 
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 from adapter.cli.main import main
 
+LOG = str(Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap")
+
 
 def warm_up() -> int:
-    """Short runs on the simulated arm, a replay and a search for the gap; nothing is kept.
+    """A short run on the simulated arm; beside it a search for the gap and a replay.
 
-    While the first run compiles, the arm's log gets holes; the search needs one without.
+    Nothing is kept. What one of the two processes has compiled the other one loads.
     """
     with tempfile.TemporaryDirectory() as name:
-        compiling, recording = (str(Path(name) / f"{n}.mcap") for n in ("compiling", "warm"))
-        common = ["--quiet", "--no-report", "--out", name]
-        live = ["run", "--scenario", "friction", *common]
-        code = main([*live, "--duration", "3", "--record", compiling])
-        code = code or main(["replay", compiling, "--every", "10", *common])
-        code = code or main([*live, "--duration", "6", "--record", recording])
-        return code or main(["gap", recording, "--model", "panda", *common])
+        common = ["--quiet", "--no-report", "--out"]
+        live = ["run", "--scenario", "friction", "--duration", "3", "--no-record"]
+        search = ["gap", LOG, "--model", "panda", *common, f"{name}/gap"]
+        again = ["replay", LOG, *common, f"{name}/again"]
+        lanes = [[*live, *common, f"{name}/run"]], [search, again]
+        with ProcessPoolExecutor(len(lanes), get_context("spawn")) as processes:
+            return max(processes.map(_give, lanes))
+
+
+def _give(lines: list[list[str]]) -> int:
+    """Give command lines one after the other; the worst exit code."""
+    return max(main(line) for line in lines)
 
 
 if __name__ == "__main__":
