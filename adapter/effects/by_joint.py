@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from adapter.model.spatial import Array
 
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
+STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1; static friction acts below it
 WAYS_RAD = (3e-4, 1e-3, 3e-3, 1e-2)  # over which bristles wind up that somebody remembers
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
 from adapter.gap.monitor_signatures import LearnedFrames
@@ -22,7 +23,8 @@ from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.signals.records import StateLayout, stamp_of
 
-BLOCK_NS = 40_000_000  # states averaged to one row: 25 rows a second
+BLOCK_NS = 40_000_000  # states averaged to one row
+ROWS_PER_S = 1e9 / BLOCK_NS
 HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
 ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
@@ -167,15 +169,33 @@ class Monitor:
         for k, column in enumerate(learner.theta.torque_per_unit(at)):
             Z[:, joints, links + k * self._n + joints] = column
         model = Z @ self._belief.mean()[: self._size] + tool
-        return RowGroup(t, Z, frames.signatures(q, dq, ddq, model, Y), tau - tool)
+        signatures = frames.signatures(q, dq, ddq, model, Y)
+        return RowGroup(t, Z, signatures, tau - tool, _static_friction(learner, dq))
 
     def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""
         Z = self._found.columns(group)
-        weight = self._found.weights(group.t, self._level.weight)
+        own = self._level.weight(group.unsure)
+        weight = self._found.weights(group.t, own)
         residual = group.tau - Z @ self._belief.mean()
-        if (weight == self._level.weight).all():
-            self._level.look(residual)
+        if (weight == own).all():
+            self._level.look(residual, group.unsure)
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
         self._found.forget_before(float(group.t[0]), self._belief)
+
+
+def _static_friction(learner: OnlineLearner, dq: Array) -> Array:
+    """(r, n) variance of what friction holds where a joint is slow, (N m)².
+
+    Static friction is a band (`Effect.band`). At a rest it is one unknown value however many rows
+    the rest lasts; those of a second tell then as much as one.
+
+    Args:
+        dq: (r, n) rad/s.
+    """
+    held = np.zeros(dq.shape[1])
+    for effect, value in zip(learner.theta.effects, learner.theta.effect_values, strict=True):
+        held = np.hypot(held, effect.band * value)
+    rows = np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0)
+    return np.asarray(rows * np.square(held * np.exp(-np.square(dq / STRIBECK_SPEED))))

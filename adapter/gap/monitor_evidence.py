@@ -85,17 +85,19 @@ class RowGroup:
         t: (r,) s.
         Z: (r, n, D) regressor and columns of the learned effects.
         S: (r, n, K) signatures; tau: (r, n) N m.
+        unsure: (r, n) variance that no model of these rows can do without, (N m)².
     """
 
     t: Array
     Z: Array
     S: Array
     tau: Array
+    unsure: Array
 
     @classmethod
     def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:
         """One group of all rows of several."""
-        keys = ("t", "Z", "S", "tau")
+        keys = ("t", "Z", "S", "tau", "unsure")
         return cls(*(np.concatenate([getattr(group, key) for group in groups]) for key in keys))
 
 
@@ -179,23 +181,28 @@ class Level:
         self.row = variance.copy()
         self.long = inflation * variance
         self._rows, self._sums = START_SUMS * 2 * ROWS_PER_GROUP, START_SUMS
-        self._half: Array | None = None
+        self._half: tuple[Array, Array] | None = None
 
-    def look(self, residual: Array) -> None:
-        """Take the residual (r, n) of one group."""
-        for r in residual**2:
+    def look(self, residual: Array, unsure: Array) -> None:
+        """Take the residual (r, n) of one group; the more `unsure` a row is, the less it counts."""
+        share = self.share(unsure)
+        for r, counts in zip(residual**2, share, strict=True):
             self._rows = min(self._rows + 1.0, LEVEL_ROWS)
-            self.row += (np.minimum(r, CLIP * self.row) - self.row) / self._rows
+            self.row += counts * (np.minimum(r, CLIP * self.row) - self.row) / self._rows
+        half = residual.sum(axis=0), share.min(axis=0)
         if self._half is None:
-            self._half = residual.sum(axis=0)
+            self._half = half
             return
-        count = 2 * len(residual)
-        power = (self._half + residual.sum(axis=0)) ** 2 / count
+        power = (self._half[0] + half[0]) ** 2 / (2 * len(residual))
+        counts = np.minimum(self._half[1], half[1])
         self._half = None
         self._sums = min(self._sums + 1.0, LEVEL_SUMS)
-        self.long += (np.minimum(power, CLIP * self.long) - self.long) / self._sums
+        self.long += counts * (np.minimum(power, CLIP * self.long) - self.long) / self._sums
 
-    @property
-    def weight(self) -> Array:
-        """(n,) information that one row has, 1/(N m)²."""
-        return np.asarray(1.0 / np.maximum(self.long, LEAST_INFLATION * self.row))
+    def share(self, unsure: Array) -> Array:
+        """(r, n) of a row's residual squared that noise may be, the rest being `unsure`."""
+        return np.asarray(self.row / (self.row + unsure))
+
+    def weight(self, unsure: Array) -> Array:
+        """(r, n) information that each row has, 1/(N m)²."""
+        return np.asarray(1.0 / (np.maximum(self.long, LEAST_INFLATION * self.row) + unsure))

@@ -61,6 +61,7 @@ class DisagreementDetector:
             [c.evidence(_block(G, c.columns), b[:, c.columns]) for c in self._candidates]
         )
         left = evidence.residual - evidence.rows.Z @ evidence.shift
+        left *= np.sqrt(self._level.share(evidence.rows.unsure))
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
         ended = self._end_something(evidence, scores, power)
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
@@ -80,7 +81,7 @@ class DisagreementDetector:
     def _evidence(self, weight: Array | None = None) -> Evidence:
         rows = RowGroup.joined(self._groups)
         if weight is None:
-            weight = self._found.weights(rows.t, self._level.weight)
+            weight = self._found.weights(rows.t, self._level.weight(rows.unsure))
         return Evidence(replace(rows, Z=self._found.columns(rows)), weight, self._belief)
 
     def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
@@ -169,10 +170,11 @@ class DisagreementDetector:
     def _left(self, evidence: Evidence, candidate: Signature, a: Array, first: int) -> list[int]:
         """Joints (from 0) where much of the residual stays when the candidate is in."""
         late = slice(first + EDGE_ROWS, None)
-        left = evidence.leftover(candidate, a, first)[late] ** 2
+        share = self._level.share(evidence.rows.unsure)[late]
+        left = share * evidence.leftover(candidate, a, first)[late] ** 2
         if len(left) < ROWS_PER_GROUP:
             return []
-        whole = np.sum(evidence.residual[late] ** 2, axis=0)
+        whole = np.sum(share * evidence.residual[late] ** 2, axis=0)
         much = np.mean(left, axis=0) > LEFT_RATIO * self._level.row
         much &= left.sum(axis=0) > LEFT_SHARE * whole
         return [int(j) for j in np.flatnonzero(much & (evidence.weight[-1] > 0.0))]
@@ -308,9 +310,9 @@ class DisagreementList:
                 parts.append(rows.S[:, :, found.candidate.columns] * on)
         return np.concatenate(parts, axis=2) if len(parts) > 1 else rows.Z
 
-    def weights(self, t: Array, level: Array) -> Array:
+    def weights(self, t: Array, weight: Array) -> Array:
         """(m, n); next to nothing for joints that nothing explains, nothing around the edges."""
-        weight = np.tile(level, (len(t), 1))
+        weight = weight.copy()
         for found in self.active:
             if found.candidate is None:
                 weight[:, found.joints] *= MUTED

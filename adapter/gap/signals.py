@@ -22,7 +22,7 @@ from scipy.sparse import diags
 
 from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
-from adapter.effects.by_joint import SMOOTHING_DQ
+from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
@@ -60,7 +60,6 @@ UNLIKE = 0.3  # of the measured torque's size: commands further off mean somethi
 FAR_S = 0.05  # a command older than that does not drive any more
 HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
-STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1
 
 
 def low(x: Array) -> Array:

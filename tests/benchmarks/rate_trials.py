@@ -1,7 +1,8 @@
 """One simulated log at many rates: what is learned from it, beside batch least squares.
 
 Each trial moves a PyBullet Panda with a real arm's friction and noise, rests in between, and keeps
-every k-th sample. With `--unchanged` the arm stops and starts often, every other log is of a motion
+every k-th sample; at the end stands how far friction and inertia are from those that the fastest
+rate finds. With `--unchanged` the arm stops and starts often, every other log is of a motion
 three times slower, where friction sticks for longer, and what is said to have changed, all of it
 false, is all that is asked. `make trials`.
 """
@@ -23,6 +24,7 @@ from adapter.control.settings import ExcitationSettings
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.torque import ModelTorque
 from adapter.learning.settings import LearnerSettings
+from adapter.learning.theta import Theta
 from adapter.model.self_model import SelfModel
 from adapter.physics.freedom import Freedom
 from adapter.realtime.session import run_lockstep
@@ -40,6 +42,7 @@ from tests.helpers.arm_data import panda_model
 
 RATES = (1000, 500, 250, 125, 60, 30)
 REST_S = 1.5  # of each rest
+SPEED = 0.5  # rad/s, at which friction is compared between rates
 ROW_EVERY = 5  # ms between two rows of the least squares
 
 
@@ -141,6 +144,37 @@ def announced_at_rate(log: Log, rate: int, robot: SelfModel) -> dict[str, Any]:
     return {"rate": rate, "changes": changes, "looked_at": learner.change.samples}
 
 
+def friction(theta: Theta) -> Array:
+    """Friction (n,) N m of each joint at SPEED, by the effects learned."""
+    viscous, coulomb = (
+        theta.effect_values[REAL_ARM_EFFECTS.index(name)]
+        for name in ("viscous_friction", "bristle_friction")
+    )
+    return np.asarray(SPEED * viscous + coulomb)
+
+
+def inertia(theta: Theta, robot: SelfModel, poses: Array) -> Array:
+    """Inertia (n,) kg m² about each joint's axis with its motor's, mean over poses (m, n)."""
+    own = np.empty(poses.shape[1])
+    still = np.zeros_like(poses)
+    weight = regressor(robot, poses, still, still)
+    for j, turning in enumerate(np.eye(len(own))):
+        more = regressor(robot, poses, still, still + turning) - weight
+        own[j] = np.mean(more[:, j] @ theta.theta.ravel())
+    return np.asarray(own + theta.effect_values[REAL_ARM_EFFECTS.index("motor_inertia")])
+
+
+def bias(rows: list[dict[str, Any]], what: str) -> dict[int, tuple[float, float]]:
+    """By rate: median and worst share by which `what` is off from the fastest rate's."""
+    off: dict[int, list[float]] = {}
+    for row in rows:
+        fastest = max((x for x in rows if x["seed"] == row["seed"]), key=lambda x: int(x["rate"]))
+        off.setdefault(row["rate"], []).extend(
+            np.abs(np.array(row[what]) / np.array(fastest[what]) - 1.0)
+        )
+    return {rate: (float(np.median(x)), float(np.max(x))) for rate, x in off.items()}
+
+
 def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]:
     """What is learned from every k-th sample."""
     thin, settings = thinned(log, rate)
@@ -165,8 +199,8 @@ def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]
         "changes": len(learner.changes),
         "lam_rad": float(turn.max()),
         "lam_m": float(shift.max()),
-        "theta": theta.theta.tolist(),
-        "effects": theta.effect_values.tolist(),
+        "friction_nm": friction(theta).round(4).tolist(),
+        "inertia_kgm2": inertia(theta, robot, thin.q[:: len(thin) // 100]).round(5).tolist(),
         "refused": dict(done.pipeline.front_end.refused),
     }
 
@@ -193,8 +227,10 @@ def main() -> None:
             else:
                 found = at_rate(log, rate, robot, asked.every)
             rows.append({"seed": seed, **found})
-            shown = {k: v for k, v in rows[-1].items() if k not in ("theta", "effects")}
-            print(json.dumps(shown), flush=True)
+            print(json.dumps(rows[-1]), flush=True)
+    for what in () if asked.unchanged else ("friction_nm", "inertia_kgm2"):
+        for rate, (median, worst) in bias(rows, what).items():
+            print(f"{what} at {rate} Hz: off by {median:.1%} (median), {worst:.1%} (worst joint)")
     if asked.json is not None:
         asked.json.write_text(json.dumps(rows) + "\n")
 
