@@ -205,9 +205,11 @@ def convincing(comparison: TorqueComparison, best: TorqueReading, as_is: TorqueR
         return True
     if best.cost > as_is.cost - GAIN_OF_EVIDENCE:
         return False
+    before, after = (comparison.misfit(r.tau, best.joints) for r in (as_is, best))
+    if best.kind != "scale" and after >= before:  # offsets and gains alone make it the cheaper one
+        return False
     if best.kind == "scale" or best.cost < CLEAR_SHARE_OF_COST * as_is.cost:
         return True
-    before, after = (comparison.misfit(r.tau, best.joints) for r in (as_is, best))
     if best.cost > min(SHARE_OF_COST * as_is.cost, MUCH):  # much is left, which no reading explains
         return after < FAR_SHARE_OF_MISFIT * before
     return after < SHARE_OF_MISFIT * before

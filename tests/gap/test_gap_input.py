@@ -12,9 +12,12 @@ from adapter.gap.screen import RecordingRefused, Screened, moving_joints, refuse
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from drivers.files.mcap import Log
+from drivers.files.mcap import Log, read_log
 from sim.effects import payload
+from sim.hidden import draw
+from sim.hidden.record import write
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, pin_model, record, rnea
+from tests.helpers.gap_tools import pinocchio_recording
 
 SHARED = Path(__file__).parents[2].parent / "shared"
 NAMES = panda_model().tree.joint_names
@@ -195,3 +198,10 @@ def test_nothing_to_read() -> None:
     refused(recording(0, 1.0).log(), "data")
     refused(replace(log, q=np.full_like(log.q, np.nan)), "data")
     refused(replace(log, tau=np.zeros_like(log.tau)), "torque")
+
+
+def test_a_few_poses_are_no_other_order(tmp_path: Path) -> None:
+    """Offsets, gains and a load fit any order of torques there: 11 N m off in place of 0.7."""
+    trial = draw(10098)
+    log, model, _ = write(trial, tmp_path, pinocchio_recording(trial), "pinocchio")
+    taken(read_log(log), documented(model))
