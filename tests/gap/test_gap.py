@@ -58,7 +58,7 @@ def clear_beside_friction(trial: Trial) -> bool:
 
 SINGLES = {
     "coulomb_friction": Rule(20, mujoco_recording, on_a_heavy_joint),
-    "payload": Rule(72, holds=in_mid_recording),
+    "payload": Rule(40, holds=in_mid_recording),
     "motor_inertia": Rule(100),
     "viscous_friction": Rule(30),
     "base_tilt": Rule(50),
