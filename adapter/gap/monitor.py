@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
+from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
 from adapter.gap.monitor_signatures import LearnedFrames
@@ -170,7 +170,11 @@ class Monitor:
             Z[:, joints, links + k * self._n + joints] = column
         model = Z @ self._belief.mean()[: self._size] + tool
         signatures = frames.signatures(q, dq, ddq, model, Y)
-        return RowGroup(t, Z, signatures, tau - tool, _static_friction(learner, dq))
+        # at a rest static friction is one unknown value however many rows the rest lasts; those
+        # of a second tell then as much as one
+        rows = np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0)
+        unsure = rows * np.square(learner.theta.static_friction(dq))
+        return RowGroup(t, Z, signatures, tau - tool, unsure)
 
     def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""
@@ -183,19 +187,3 @@ class Monitor:
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
         self._found.forget_before(float(group.t[0]), self._belief)
-
-
-def _static_friction(learner: OnlineLearner, dq: Array) -> Array:
-    """(r, n) variance of what friction holds where a joint is slow, (N m)².
-
-    Static friction is a band (`Effect.band`). At a rest it is one unknown value however many rows
-    the rest lasts; those of a second tell then as much as one.
-
-    Args:
-        dq: (r, n) rad/s.
-    """
-    held = np.zeros(dq.shape[1])
-    for effect, value in zip(learner.theta.effects, learner.theta.effect_values, strict=True):
-        held = np.hypot(held, effect.band * value)
-    rows = np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0)
-    return np.asarray(rows * np.square(held * np.exp(-np.square(dq / STRIBECK_SPEED))))

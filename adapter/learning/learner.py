@@ -417,7 +417,10 @@ class OnlineLearner:
             self._doubted.clear()
 
     def _a_load_explains(self) -> bool:
-        """Whether the newest errors are what a body at the hand makes, and not friction's, say."""
+        """Whether the newest errors are what a body at the hand makes, and not friction's, say.
+
+        A slow joint holds what its static friction lets it, which no model foretells.
+        """
         if self.tree.floating:
             return True
         tables, errors = zip(*self._doubted, strict=True)
@@ -427,9 +430,11 @@ class OnlineLearner:
         motion = JointMotion(*(np.ascontiguousarray(table[:, x]) for x in (at.q, at.dq, at.ddq)))
         Y = np.zeros((m, n, 10 * n))
         regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
-        size = np.sqrt(self.change.level)
+        size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
+        if not self.change.stands_out(error / size):
+            return False
         begin = self.theta.hand.start
-        load = Y[:, :, begin : begin + 4] / size[:, None]  # mass and its moments
+        load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
         return explained_share(load, error / size) > LOAD_SHARE
 
     def _start_change(self, stamp_ns: int) -> None:

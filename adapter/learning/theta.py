@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import JointSignals
+from adapter.effects.by_joint import STRIBECK_SPEED, JointSignals
 from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
@@ -605,6 +605,17 @@ class Theta:
     def effect_values(self) -> Array:
         """(e, n) parameters of the effects."""
         return self.th[self._effects_from :].reshape(len(self.effects), self.tree.n)
+
+    def static_friction(self, dq: Array) -> Array:
+        """(m, n) N m that friction may hold otherwise where a joint is slow (`Effect.band`).
+
+        Args:
+            dq: (m, n) rad/s.
+        """
+        held = np.zeros(self.tree.n)
+        for effect, value in zip(self.effects, self.effect_values, strict=True):
+            held = np.hypot(held, effect.band * value)
+        return np.asarray(held * np.exp(-0.5 * np.square(dq / STRIBECK_SPEED)))
 
     def start_change(self) -> None:
         """Something at the hand changed: keep what is known, open the spare body for the rest."""
