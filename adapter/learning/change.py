@@ -96,11 +96,6 @@ class ChangeDetector:
             peaks[:] = np.maximum(fade * peaks, block)
             block[:], self._block_samples = 0.0, 0
 
-    def stands_out(self, ratio: Array) -> bool:
-        """Whether errors (m, n), each in units of its own size, say that something changed."""
-        power = np.mean(np.square(ratio), axis=0)
-        return self._alarming(float(np.sqrt(power.max())), float(np.sqrt(power.mean())))
-
     def _alarming(self, most: float, mean: float) -> bool:
         s = self.settings
         return bool(

@@ -431,8 +431,6 @@ class OnlineLearner:
         Y = np.zeros((m, n, 10 * n))
         regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
-        if not self.change.stands_out(error / size):
-            return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
         return explained_share(load, error / size) > LOAD_SHARE

@@ -287,7 +287,8 @@ def test_bodies_are_in_the_model_the_learner_compares_with() -> None:
     np.testing.assert_allclose(learner.schema.R0[0], model.joint_rotation()[0], atol=0.02)
     for ours, theirs in zip(held_out(learner, tilt), held_out(level), strict=True):
         assert ours < 1.5 * theirs + 0.01
-    assert held_out(learner).max() < 0.03  # the same θ on a level base
+    # the same θ on a level base, where a tilt that nobody told leaves 1 N m
+    assert held_out(learner).max() < 1.5 * held_out(level).max() + 0.01
     outcome = learned_model(collect(learner), model)
     assert outcome.effects == ()
     np.testing.assert_allclose(outcome.gravity, turned)

@@ -6,9 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.learning.change import ChangeDetector
+from adapter.learning.change import ChangeDetector, explained_share
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import ChangeSettings, ThetaSettings
+from adapter.runs.library import regressor
 from adapter.runs.outcome import changes, collect, learned_model
 from adapter.signals.records import stamps_of
 from sim.scenarios import build
@@ -141,6 +142,21 @@ def test_what_no_hand_carries_is_no_change(joint: int) -> None:
         learner.step(state)
         doubted += learner.change.waiting
     assert doubted and not learner.changes
+
+
+def test_what_static_friction_may_hold_is_no_load() -> None:
+    """A torque on joint 7 alone: a load's, by the noise; where that joint creeps, friction's."""
+    theta = learner_for(effects=("coulomb_friction",)).theta
+    theta.effect_values[0] = 0.5
+    held = theta.static_friction(np.full((50, 7), 0.01))
+    q = np.tile([-0.2, 0.4, -0.4, -1.4, -1.6, 1.4, -1.0], (50, 1))
+    load = regressor(panda_model(), q, 0.0 * q, 0.0 * q)[:, :, -10:-6]
+    level = np.array([0.06, 0.1, 0.09, 0.5, 0.03, 0.05, 0.02])  # of a motion, N m
+    error = np.random.default_rng(1).normal(0.0, 0.4 * level, (50, 7))
+    error[:, 6] += 0.25
+    sizes = (0.0 * held + level)[..., None], np.hypot(level, held)[..., None]
+    share = [explained_share(load / x, error / x[..., 0]) for x in sizes]
+    assert share[0] > 0.95 and share[1] < 0.9, share
 
 
 def test_no_false_alarm() -> None:

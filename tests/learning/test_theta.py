@@ -9,7 +9,6 @@ import pytest
 from adapter.effects import effects_by_name
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.torque import ModelTorque
-from adapter.learning.change import ChangeDetector
 from adapter.learning.learner import OnlineLearner
 from adapter.model.inertia import min_eigenvalue
 from adapter.model.self_model import SelfModel, Tool
@@ -262,15 +261,3 @@ def test_static_friction_is_a_band_of_slow_joints() -> None:
     np.testing.assert_allclose(at_rest, 0.3 * np.arange(N))
     np.testing.assert_allclose(slow, np.exp(-0.5) * at_rest)
     np.testing.assert_allclose(fast, 0.0, atol=1e-12)
-
-
-def test_what_static_friction_may_hold_is_no_change() -> None:
-    """The same error on joint 7, many times its noise: of a joint that creeps, and of one that
-    friction knows nothing of."""
-    knows = learner_for(effects=FRICTION).theta
-    knows.effect_values[FRICTION.index("coulomb_friction")] = 0.5
-    detector, error = ChangeDetector(N), np.zeros((50, N))
-    detector.level[:], error[:, 6] = 0.01**2, 0.15
-    creeping = np.hypot(0.01, knows.static_friction(np.full((50, N), 0.01)))
-    assert detector.stands_out(error / 0.01)
-    assert not detector.stands_out(error / creeping)
