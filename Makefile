@@ -84,6 +84,7 @@ bench: $(STAMP)
 	$(BIN)/adapter bench
 	$(BIN)/python tests/benchmarks/wires.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/tree_rate.py --json runs/tree_rate.json
+	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/fleet.py --json runs/bench_fleet.json
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -14,6 +14,7 @@ from adapter.cli import (
     discover_options,
     excite_options,
     files_options,
+    fleet_options,
     gap_options,
     load_options,
     replay_options,
@@ -61,6 +62,12 @@ COMMANDS = {  # in the order of --help
         (ExitCode.NOTHING_LEARNED,),
     ),
     "gap": Command(gap_options.declare, "find what a model lacks", "adapter.cli.gap:run"),
+    "fleet": Command(
+        fleet_options.declare,
+        "one model per arm from many recordings",
+        "adapter.cli.fleet:run",
+        (ExitCode.NOTHING_LEARNED,),
+    ),
     "load": Command(
         load_options.declare,
         "what the hand carries, to type into the robot",

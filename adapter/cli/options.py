@@ -13,11 +13,10 @@ from pathlib import Path
 
 from adapter.errors import UsageError
 from adapter.model.robots import names as robot_names
+from drivers.files.names import RECORDINGS, is_recording
 
 MODES = ("moments", "sample")  # of `adapter.learning.learner`
 NAMES = "adapter.cli.names"  # brings NumPy; loaded by name where there is a name to look up
-RECORDINGS = (".mcap", ".db3", ".bag")
-PACKED = (".gz", ".zst", ".zstd")
 MODEL_FILES = (".urdf", ".xml", ".json")
 
 
@@ -203,7 +202,7 @@ def check_logs(*paths: Path | None) -> list[Path]:
     found: list[Path] = []
     for path in (path for path in paths if path is not None):
         if path.is_dir() and not (path / "metadata.yaml").is_file():
-            inside = sorted(p for p in path.iterdir() if _is_recording(p))
+            inside = sorted(p for p in path.iterdir() if is_recording(p))
             if not inside:
                 raise UsageError(f"{path}: no recording in this folder ({', '.join(RECORDINGS)})")
             found += inside
@@ -211,14 +210,6 @@ def check_logs(*paths: Path | None) -> list[Path]:
             found.append(path)
     check_files(*(path for path in found if not path.is_dir()))
     return found
-
-
-def _is_recording(path: Path) -> bool:
-    """Whether the name of a file, packed or not, or a folder's content is a recording's."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    plain = path.with_suffix("") if path.suffix in PACKED else path
-    return plain.suffix in RECORDINGS
 
 
 def check_files(*paths: Path | None) -> None:

@@ -348,12 +348,16 @@ class Theta:
         own = (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
         return np.asarray(own + self.model_variance)
 
-    def joint_moments(self, j: int) -> Array:
-        """(S + 1, S + 1) moments of joint j's row [y, tau]; `rows.place[j, :S]` are its columns."""
+    def joint_moments(self, j: int, A: Array | None = None) -> Array:
+        """(S + 1, S + 1) moments of joint j's row [y, tau]; `rows.place[j, :S]` are its columns.
+
+        Args:
+            A: of other moments than the present ones, see `Moments`.
+        """
         width = int(self.rows.sizes[j]) + 1
         out, start = np.zeros((width, width)), self.rows.starts[j]
         upper = np.triu_indices(width)
-        out[upper] = self.moments.A[start : start + len(upper[0])]
+        out[upper] = (self.moments.A if A is None else A)[start : start + len(upper[0])]
         return out + np.triu(out, 1).T
 
     def information(self) -> tuple[Array, Array]:
@@ -361,28 +365,43 @@ class Theta:
 
         That of a floating base is what its wrench tells when the links are what they are now.
         """
-        H, rhs = self.prior.copy(), self.prior_rhs.copy()
-        for j, weight in enumerate(self._weights()):
-            at, moments = self._parameter_moments(j)
-            H[np.ix_(at, at)] += weight * moments[:-1, :-1]
-            rhs[at] += weight * moments[:-1, -1]
+        H, rhs = self.data_information(self.moments.A, self.weights())
+        H, rhs = H + self.prior, rhs + self.prior_rhs
         if self.tree.floating:
             wrench = self._base_information()
             H[:10, :10] += wrench[:, :10]
             rhs[:10] += wrench[:, -1] - wrench[:, 10:-1] @ self.th[self.rows.base_place[10:]]
         return H, rhs
 
-    def _weights(self) -> Array:
+    def data_information(self, A: Array, weights: Array) -> tuple[Array, Array]:
+        """(P, P) and (P,) of what joints' torques alone tell.
+
+        Args:
+            A: see `Moments`.
+            weights: (n,) of a sample of each joint, see `weights`.
+        """
+        H, rhs = np.zeros((self.P, self.P)), np.zeros(self.P)
+        for j, weight in enumerate(weights):
+            at, moments = self._parameter_moments(j, A)
+            H[np.ix_(at, at)] += weight * moments[:-1, :-1]
+            rhs[at] += weight * moments[:-1, -1]
+        return H, rhs
+
+    def costs(self, th: Array, A: Array) -> Array:
+        """(n,) sums of squared torque errors of parameters th (P,) over the samples in A."""
+        return np.asarray(joint_costs(self._rows, th, A))
+
+    def weights(self) -> Array:
         """(n,) information of a sample of each joint's torque, 1/(N m)²."""
         return np.asarray(1.0 / (self.noise_gain * self.variance()))
 
-    def _parameter_moments(self, j: int) -> tuple[NDArray[np.intp], Array]:
+    def _parameter_moments(self, j: int, A: Array | None = None) -> tuple[NDArray[np.intp], Array]:
         """Joint j's parameters (p,), and moments (p + 1, p + 1) of them and its torque."""
         size = self.rows.sizes[j]
         at, which = np.unique(self.rows.place[j, :size], return_inverse=True)
         to = np.zeros((size + 1, len(at) + 1))
         to[np.arange(size), which], to[-1, -1] = self.rows.share[j, :size], 1.0
-        return at, to.T @ self.joint_moments(j) @ to
+        return at, to.T @ self.joint_moments(j, A) @ to
 
     def _base_information(self) -> Array:
         """(10, 10 (n + 1) + 1) information of the base's wrench: base by [base, links, wrench]."""
@@ -506,7 +525,7 @@ class Theta:
         anything there the one takes off what the other puts on, and is learned for that.
         """
         H, rhs = self.information()
-        first, weights = 0, self._weights()
+        first, weights = 0, self.weights()
         for k, effect in enumerate(self.effects):
             for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
                 S, y = self._reduced(j, k, slice(first, first + 1), H, rhs)
@@ -526,7 +545,7 @@ class Theta:
             columns: among those of the effects; H, rhs: all that is known.
         """
         P, size, count = self.P, self.rows.sizes[j], columns.stop - columns.start
-        weight, (at, folded) = self._weights()[j], self._parameter_moments(j)
+        weight, (at, folded) = self.weights()[j], self._parameter_moments(j)
         G, b = np.zeros((P + count, P + count)), np.zeros(P + count)
         G[:P, :P], b[:P] = H, rhs
         G[np.ix_(at, at)] -= weight * folded[:-1, :-1]

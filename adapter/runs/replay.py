@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from adapter.runs.contacts import ReplayObserver, contacts_of
 from adapter.runs.outcome import Outcome, collect
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
+from adapter.signals.front_end import FrontEnd
 from adapter.signals.settings import FilterSettings
 from adapter.signals.validation import validation_torque_rmse
 from drivers.files.mcap import Log
@@ -195,19 +196,21 @@ def _heard(log: Log) -> NDArray[np.bool_] | None:
 def _batch(
     log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
 ) -> NDArray[np.int64]:
-    def states(start: int, end: int) -> Array:
-        part = slice(start, min(end, stop))
+    learn_batch(pipeline.learner, filtered_tables(log, stop, pipeline.front_end), every, progress)
+    return np.zeros(0, dtype=np.int64)
+
+
+def filtered_tables(log: Log, stop: int, front_end: FrontEnd) -> Iterator[Array]:
+    """Filtered states (m, size) of the first `stop` samples of a recording, a table at a time."""
+    at_once = max(AT_ONCE // front_end.filter.settings.states_per_sample, 1)
+    for start in range(0, stop, at_once):
+        part = slice(start, min(start + at_once, stop))
         links = None
         if log.twists is not None and log.accels is not None:
             links = log.twists[part], log.accels[part]
         joints = log.stamp_ns[part], log.q[part], log.dq[part], log.tau[part]
         base = None if log.base is None else log.base[part]
-        return pipeline.front_end.step_table(*joints, links, base)
-
-    at_once = max(AT_ONCE // pipeline.front_end.filter.settings.states_per_sample, 1)
-    tables = (states(start, start + at_once) for start in range(0, stop, at_once))
-    learn_batch(pipeline.learner, tables, every, progress)
-    return np.zeros(0, dtype=np.int64)
+        yield front_end.step_table(*joints, links, base)
 
 
 def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:

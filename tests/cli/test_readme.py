@@ -108,6 +108,13 @@ def test_your_own_log(toured: Path) -> None:
         give(brief(line), toured)
 
 
+def test_many_logs(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
+    (line,) = next(commands(block) for block in blocks("sh") if "adapter fleet" in block)
+    give(line, tmp_path)
+    assert (tmp_path / "runs" / "fleet" / "fleet.html").exists()
+
+
 def test_settings(tmp_path: Path) -> None:
     path = tmp_path / "my.toml"
     path.write_text(blocks("toml")[0])

@@ -1,0 +1,101 @@
+"""`adapter fleet`: one model per arm from many recordings."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+from rich.progress import Progress
+from rich.table import Table
+
+from adapter.cli.common import robot_of
+from adapter.cli.exit_codes import ExitCode
+from adapter.effects.export import robot_urdf
+from adapter.errors import MeansError, ModelError
+from adapter.model.model_file import save_model
+from adapter.report.fleet_page import write_fleet_page
+from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary
+from adapter.runs.fleet.arm import FleetArm
+from adapter.runs.fleet.fleet import (
+    Fleet,
+    Manifest,
+    Settings,
+    forget,
+    found_logs,
+    learn_fleet,
+    read_manifest,
+)
+from adapter.runs.fleet.table import write_table
+from adapter.runs.terminal import (
+    console,
+    output,
+    results_folder,
+    say,
+    show,
+    warn,
+    write_json,
+)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    robot = robot_of(args, args.model)
+    given = found_logs(args.logs)
+    folder = results_folder(args.out, "fleet")
+    manifest = Manifest({}, {}) if args.manifest is None else read_manifest(args.manifest)
+    settings = Settings(folder, args.workers, args.cluster, args.by, manifest, args.topic)
+    if args.forget:
+        forget(found_logs(args.forget), robot, settings)
+    say(f"{len(given)} recordings; moments are kept in {folder}")
+    with Progress(console=console, transient=True, disable=args.quiet) as bar:
+        task = bar.add_task("reading", total=len(given))
+
+        def progress(done: int, whole: int) -> None:
+            bar.update(task, completed=done, total=whole)
+
+        found = learn_fleet(given, robot, settings._replace(progress=progress))
+    warn([f"{x.path}: left out: {x.why}" for x in found.broken])
+    warn([f"{path}: the same recording as {other}; it counts once" for path, other in found.alike])
+    figures = as_json(found)
+    for arm, names in zip(found.arms, figures["arms"], strict=True):
+        names["model"] = str(_write_model(arm, folder))
+        if not args.quiet:
+            _print(arm)
+    for line in summary(found):
+        show(line)
+    figures["table"] = str(_table(found, folder))
+    if not args.no_report:
+        figures["report"] = str(write_fleet_page(found, folder / "fleet.html"))
+        show(figures["report"])
+    write_json(args.json, figures)
+    return ExitCode.DONE if found.arms else ExitCode.NOTHING_LEARNED
+
+
+def _write_model(arm: FleetArm, folder: Path) -> Path:
+    """Model file and URDF under the arm's name."""
+    name = re.sub(r"[^\w.-]+", "_", arm.name).strip("._") or "arm"
+    path = save_model(arm.model, folder / f"{name}.json")
+    try:
+        path.with_suffix(".urdf").write_bytes(robot_urdf(arm.model).text.encode())
+    except ModelError as error:
+        warn([f"{arm.name}: no URDF: {error}"])
+    return path
+
+
+def _table(found: Fleet, folder: Path) -> Path:
+    """Parquet, or CSV where that cannot be written."""
+    try:
+        return write_table(found, folder / "fleet.parquet")
+    except MeansError as error:
+        warn([f"{error}; a CSV table is written instead"])
+        return write_table(found, folder / "fleet.csv")
+
+
+def _print(arm: FleetArm) -> None:
+    table = Table(*HEADS, box=None, pad_edge=False, title=arm.name, title_justify="left")
+    for log in arm.logs:
+        table.add_row(*log_cells(log))
+    output.print(table)
+    for line in sentences(arm):
+        show(line)

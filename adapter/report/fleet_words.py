@@ -1,0 +1,129 @@
+"""What a fleet found, in words and as figures."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.catalogue import CATALOGUE
+from adapter.runs.fleet.arm import TIME, Drift, FleetArm, OfLog
+from adapter.runs.fleet.fleet import Fleet
+
+HEADS = ("recording", "begins", "s", "hand carries, kg", "worst fit, N m", "teaches", "disagrees")
+EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
+
+
+def log_cells(log: OfLog) -> tuple[str, ...]:
+    """A recording's row under `HEADS`."""
+    worst = int(np.argmax(log.rmse))
+    return (
+        Path(log.moments.path).name,
+        begin_words(log.moments.begin_s),
+        f"{log.moments.span_s:.0f}",
+        "as usual" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
+        f"{log.rmse[worst]:.3f} (joint {worst + 1})",
+        f"{log.worth:.3f}",
+        _joints(log.disagrees) if log.disagrees else "",
+    )
+
+
+def begin_words(begin_s: float) -> str:
+    """A date, or s where a clock counts from something else."""
+    if begin_s < EPOCH_S:
+        return f"{begin_s:.1f} s"
+    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M:%S}"
+
+
+def _joints(numbers: tuple[int, ...]) -> str:
+    return f"joint {', '.join(map(str, numbers))}"
+
+
+def drift_words(drift: Drift) -> str:
+    """A sentence."""
+    effect = CATALOGUE[drift.effect]
+    unit = effect.parameters[0].unit
+    per = "a day" if drift.follows == TIME else f"per unit of {drift.follows}"
+    return (
+        f"{effect.title.lower()} of joint {drift.joint} follows {drift.follows}: "
+        f"{drift.slope:+.3g} ± {drift.std:.2g} {unit} {per}, {drift.span:.3g} {unit} over all"
+    )
+
+
+def sentences(arm: FleetArm) -> list[str]:
+    """What stands out of an arm's recordings."""
+    found = [drift_words(x) for x in arm.drifts]
+    for log in arm.logs:
+        if log.disagrees:
+            worst = int(np.argmax(log.rmse / log.own_rmse))
+            found.append(
+                f"{Path(log.moments.path).name} disagrees with the others on "
+                f"{_joints(log.disagrees)}: {log.rmse[worst]:.2g} N m on joint {worst + 1} where "
+                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change "
+                "(--forget leaves it out)"
+            )
+    if len(arm.logs) > 1:
+        best = max(arm.logs, key=lambda x: x.worth)
+        found.append(
+            f"the motion of {Path(best.moments.path).name} would teach most if repeated "
+            f"({best.worth:.2f} nats a parameter)"
+        )
+    return found
+
+
+def summary(found: Fleet) -> list[str]:
+    """What was done, in one line."""
+    arms = len(found.arms)
+    parts = ["1 arm" if arms == 1 else f"{arms} arms"]
+    parts += [f"{found.read} recordings read", f"{found.known} known"]
+    for number, word in ((len(found.broken), "broken"), (len(found.forgotten), "forgotten")):
+        parts += [f"{number} {word}"] if number else []
+    return [", ".join(parts)]
+
+
+def as_json(found: Fleet) -> dict[str, Any]:
+    """As figures."""
+    return {
+        "read": found.read,
+        "known": found.known,
+        "broken": [x._asdict() for x in found.broken],
+        "forgotten": list(found.forgotten),
+        "alike": [list(pair) for pair in found.alike],
+        "arms": [_arm_json(arm) for arm in found.arms],
+    }
+
+
+def _arm_json(arm: FleetArm) -> dict[str, Any]:
+    return {
+        "name": arm.name,
+        "theta": arm.model.theta,
+        "theta_std": arm.model.theta_std,
+        "effects": {
+            name: {"value": arm.outcome.effects[k], "std": _effect_std(arm)[k]}
+            for k, name in enumerate(arm.effects)
+        },
+        "drifts": [x._asdict() for x in arm.drifts],
+        "logs": [_log_json(log) for log in arm.logs],
+        "notes": sentences(arm),
+    }
+
+
+def _effect_std(arm: FleetArm) -> Any:
+    return arm.std[len(arm.std) - arm.outcome.effects.size :].reshape(arm.outcome.effects.shape)
+
+
+def _log_json(log: OfLog) -> dict[str, Any]:
+    return {
+        "path": log.moments.path,
+        "content": log.moments.content,
+        "begin_s": log.moments.begin_s,
+        "span_s": log.moments.span_s,
+        "samples": log.moments.samples,
+        "load": None if log.load is None else log.load._asdict(),
+        "rmse_nm": log.rmse,
+        "own_rmse_nm": log.own_rmse,
+        "disagrees": list(log.disagrees),
+        "worth_nats": log.worth,
+    }

@@ -1,0 +1,218 @@
+"""Moments of one recording: all that a fleet keeps of it.
+
+They are taken with the λ of the model and add up (eq. 19): of how many recordings, in which order
+and on which machine does not matter, and leaving one out of the sum forgets it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
+from adapter.errors import MeansError
+from adapter.gap.screen import check_effort_unit
+from adapter.learning.known_effects import learnable
+from adapter.learning.learner import OnlineLearner
+from adapter.learning.settings import LearnerSettings
+from adapter.model import model_file
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.runs.config import PipelineSettings
+from adapter.runs.pipeline import Pipeline, make_learner
+from adapter.runs.replay import filtered_tables, fitted_to
+from adapter.signals.matching import matching
+from drivers.files.mcap import Log, read_log
+from drivers.interface import DriverError
+
+FORMAT = 1  # of the files of moments; another one is computed anew
+READ_AT_ONCE = 1 << 20  # bytes
+ARM_KEYS = ("arm", "serial", "serial_number", "robot_serial", "arm_id")  # in a log's metadata
+
+
+class Task(NamedTuple):
+    """What a worker needs to know of a recording.
+
+    Attributes:
+        path: of the file or folder, or an address that fsspec opens.
+        model: the documented arm as the text of a model file.
+        topic: of the joint states, None for the only one.
+    """
+
+    path: str
+    model: str
+    topic: str | None = None
+
+
+class Broken(NamedTuple):
+    """A recording that could not be used, and the sentence that says why."""
+
+    path: str
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class LogMoments:
+    """What is kept of a recording.
+
+    Attributes:
+        content: SHA-256 of the recording's bytes.
+        path: where it was read.
+        arm: name or serial number that the recording tells, None if it tells none.
+        begin_s, span_s: first stamp (s, on the recording's clock), and to the last one.
+        samples: filtered states in the moments.
+        count: independent samples that these are worth.
+        A: moments of the joints' torques (see `Moments`), of samples that are independent.
+    """
+
+    content: str
+    path: str
+    arm: str | None
+    begin_s: float
+    span_s: float
+    samples: int
+    count: float
+    A: Array
+
+    def save(self, path: Path) -> None:
+        """Write them, whole or not at all."""
+        said = {key: value for key, value in asdict(self).items() if key != "A"}
+        with model_file.whole_file(path) as part, part.open("wb") as file:
+            np.savez_compressed(file, A=self.A, said=np.array(json.dumps(said)))
+
+    @classmethod
+    def load(cls, path: Path) -> LogMoments:
+        """Read them back, to the last bit."""
+        with np.load(path) as kept:
+            return cls(A=kept["A"], **json.loads(str(kept["said"])))
+
+
+def effects_for(model: SelfModel) -> tuple[str, ...]:
+    """Effects learned beside θ: those of a real arm, but for those that need θ to be seen."""
+    names = tuple(x.name for x in effects_by_name(REAL_ARM_EFFECTS) if not x.by_rates)
+    return learnable(model, names)
+
+
+def learner_of(model: SelfModel) -> OnlineLearner:
+    """A learner for moments of independent samples, none in it yet."""
+    learner = make_learner(model, PipelineSettings(learner=_learning(model)))
+    learner.theta.noise_gain = 1.0
+    return learner
+
+
+def content_of(task: Task) -> str | Broken:
+    """SHA-256 of a recording's bytes, of a folder's files in the order of their names."""
+    try:
+        with _at_hand(task.path) as path:
+            digest = hashlib.sha256()
+            files = sorted(path.rglob("*")) if path.is_dir() else [path]
+            for file in (x for x in files if x.is_file()):
+                if path.is_dir():
+                    digest.update(str(file.relative_to(path)).encode() + b"\0")
+                with file.open("rb") as opened:
+                    while block := opened.read(READ_AT_ONCE):
+                        digest.update(block)
+            return digest.hexdigest()
+    except (OSError, ValueError, MeansError) as error:
+        return Broken(task.path, _sentence(error))
+
+
+def moments_of(task: Task) -> LogMoments | Broken:
+    """Read a recording and take its moments; whatever is wrong with it becomes a sentence."""
+    content = content_of(task)
+    if isinstance(content, Broken):
+        return content
+    try:
+        with _at_hand(task.path) as path:
+            log = read_log(path, topic=task.topic)
+        return _taken(log, _model(task.model), content, task.path)
+    except MemoryError:
+        return Broken(task.path, "there is not enough memory for it")
+    except (DriverError, OSError, ValueError) as error:
+        return Broken(task.path, _sentence(error))
+
+
+def _taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
+    named = arm_named(log.metadata)
+    log = matching(log, model)
+    if not len(log):
+        raise DriverError("no samples to learn from")
+    check_effort_unit(log, model)
+    settings, _ = fitted_to(log, PipelineSettings().filter)
+    pipeline = Pipeline(model, PipelineSettings(filter=settings, learner=_learning(model)))
+    learner = pipeline.learner
+    frames = model.joint_rotation(), model.lam[:, 3:]
+    into, samples = learner.theta.empty_moments(), 0
+    for table in filtered_tables(log, len(log), pipeline.front_end):
+        states = learner.without_known(table)
+        if len(states):
+            learner.theta.absorb_again(frames, states[:, learner.layout.before_links], into)
+            samples += len(states)
+    if not samples:
+        raise DriverError("the arm never moves; nothing can be learned from it")
+    share = 1.0 / learner.theta.noise_gain
+    begin, end = int(log.stamp_ns.min()), int(log.stamp_ns.max())
+    spans = 1e-9 * begin, 1e-9 * (end - begin)
+    return LogMoments(content, path, named, *spans, samples, share * samples, share * into.A)
+
+
+def arm_named(metadata: dict[str, Any]) -> str | None:
+    """Name or serial number of the arm that a recording tells, if it does."""
+    for entry in (metadata, *(x for x in metadata.values() if isinstance(x, dict))):
+        for key in ARM_KEYS:
+            if isinstance(entry.get(key), str | int) and str(entry[key]).strip():
+                return str(entry[key]).strip()
+    return None
+
+
+def _learning(model: SelfModel) -> LearnerSettings:
+    return LearnerSettings(effects=effects_for(model))
+
+
+@lru_cache(maxsize=4)
+def _model(text: str) -> SelfModel:
+    return model_file.loads(text)
+
+
+@contextmanager
+def _at_hand(address: str) -> Iterator[Path]:
+    """The recording on this machine; one behind an address is copied for as long as it takes."""
+    if "://" not in address:
+        yield Path(address)
+        return
+    filesystem, inside = opened(address)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / Path(inside).name
+        filesystem.get(inside, str(path), recursive=filesystem.isdir(inside))
+        yield path
+
+
+def opened(address: str) -> tuple[Any, str]:
+    """What fsspec makes of an address: the file system, and the path on it.
+
+    Raises:
+        MeansError: fsspec, or what it needs for such an address, is not installed.
+        ValueError: nobody knows such addresses.
+    """
+    try:
+        core = importlib.import_module("fsspec.core")
+        filesystem, inside = core.url_to_fs(address)
+    except ImportError as error:
+        raise MeansError(f"{address}: {error}; pip install 'panda-adapter[cluster]'") from None
+    return filesystem, str(inside)
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'it'}: {error.strerror}"
+    return str(error)

@@ -1,0 +1,16 @@
+"""Which files and folders are recordings, by their names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+RECORDINGS = (".mcap", ".db3", ".bag")
+PACKED = (".gz", ".zst", ".zstd")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether the name of a file, packed or not, or a folder's content is a recording's."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    plain = path.with_suffix("") if path.suffix in PACKED else path
+    return plain.suffix in RECORDINGS

@@ -1,0 +1,269 @@
+"""Fleets: moments that add up exactly, loads, drifts, logs that disagree, stores that go on."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from adapter.errors import MeansError, SettingsError
+from adapter.model import model_file
+from adapter.runs.config import PipelineSettings
+from adapter.runs.fleet.arm import FleetArm, learn_arm
+from adapter.runs.fleet.engine import here, on_cluster
+from adapter.runs.fleet.fleet import (
+    Fleet,
+    Settings,
+    forget,
+    found_logs,
+    learn_fleet,
+    read_manifest,
+)
+from adapter.runs.fleet.moments import Broken, LogMoments, Task, learner_of, moments_of
+from adapter.runs.pipeline import make_front_end
+from drivers.files.mcap import McapWriter, read_log
+from sim.effects import per_joint
+from sim.scenarios import build
+from sim.truth import Truth
+from tests.helpers.arm_data import Motion, panda_model, record, rubbing
+
+DAY_NS = 86_400 * 10**9
+LOADED, WORN, OTHER = (
+    2,
+    3,
+    6,
+)  # the log with a load; joint (from 1) whose friction grows; another arm
+LOGS, MASS, WEAR = 6, 1.2, 0.05  # N m s/rad a day
+
+
+def truth_on(day: int) -> Truth:
+    """The arm as it is on a day: the friction of one joint grows."""
+    worn = per_joint("viscous_friction", "Fv", [WEAR * day * (j == WORN - 1) for j in range(7)])
+    truth = rubbing(0.3, 0.2)
+    truth = truth.with_changes(effects=(*truth.effects, *worn))
+    if day == LOADED:
+        (load,) = build("payload_at_20s", mass=MASS, t_s=0.0).truth.effects
+        truth = truth.with_changes(effects=(*truth.effects, replace(load, interval_s=None)))
+    return truth
+
+
+def write(path: Path, truth: Truth, day: int, arm: str | None = None, seconds: float = 8.0) -> Path:
+    data = record(truth, Motion(seconds, 50 + day))
+    metadata = {} if arm is None else {"serial": arm}
+    with McapWriter(path, panda_model().tree.joint_names, metadata=metadata) as writer:
+        for row in range(len(data.q)):
+            stamp = day * DAY_NS + int(data.stamp_ns[row]) + 1
+            writer.write_joint_state(stamp, data.q[row], data.dq[row], data.tau[row])
+    return path
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six days of one arm, one log of another, one that is broken."""
+    folder = tmp_path_factory.mktemp("logs")
+    for day in range(LOGS):
+        write(folder / f"day{day}.mcap", truth_on(day), day, "A-1")
+    (folder / "other").mkdir()
+    write(folder / "other" / "log.mcap", rubbing(0.1, 0.05), OTHER, "B-2")
+    (folder / "other" / "cut.mcap").write_bytes(b"\x89MCAP0\r\n not a recording")
+    return folder
+
+
+def taken(path: Path) -> LogMoments:
+    found = moments_of(Task(str(path), model_file.dumps(panda_model())))
+    assert isinstance(found, LogMoments)
+    return found
+
+
+@pytest.fixture(scope="module")
+def fleet(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
+    out = tmp_path_factory.mktemp("fleet")
+    return learn_fleet(found_logs([str(logs)]), panda_model(), Settings(out, workers=2))
+
+
+def the_arm(found: Fleet, name: str = "A-1") -> FleetArm:
+    return next(arm for arm in found.arms if arm.name == name)
+
+
+def off(ours: FleetArm, theirs: FleetArm) -> float:
+    """Largest difference of two solutions in standard deviations."""
+    known = theirs.std > 0.0
+    return float(np.max(np.abs(ours.solution - theirs.solution)[known] / theirs.std[known]))
+
+
+def test_logs_are_told_apart_and_broken_ones_said(fleet: Fleet) -> None:
+    assert [(arm.name, len(arm.logs)) for arm in fleet.arms] == [("A-1", LOGS), ("B-2", 1)]
+    (broken,) = fleet.broken
+    assert broken.path.endswith("cut.mcap") and broken.why
+    assert fleet.read == LOGS + 1 and fleet.known == 0
+
+
+def test_the_load_of_one_log_is_weighed(fleet: Fleet) -> None:
+    loads = [log.load for log in the_arm(fleet).logs]
+    assert [x is not None for x in loads] == [day == LOADED for day in range(LOGS)]
+    load = loads[LOADED]
+    assert load is not None
+    assert abs(load.mass - MASS) < max(4.0 * load.std, 0.05 * MASS)
+
+
+def test_friction_that_grows_is_named(fleet: Fleet) -> None:
+    (first, *more) = the_arm(fleet).drifts
+    assert (first.effect, first.joint, first.follows) == ("viscous_friction", WORN, "time")
+    assert abs(first.slope - WEAR) < max(4.0 * first.std, 0.1 * WEAR)
+    assert not more
+
+
+def test_no_log_of_this_arm_disagrees(fleet: Fleet) -> None:
+    assert all(not log.disagrees for log in the_arm(fleet).logs)
+    assert all(log.worth > 0.0 for log in the_arm(fleet).logs)
+
+
+def test_sums_are_those_of_one_pass(logs: Path) -> None:
+    """θ by moments of each log against all states in one learner, in another order.
+
+    Weak directions (a link's mass known to 3 kg) differ by what rounding of sums leaves in them.
+    """
+    model = panda_model()
+    paths = [logs / f"day{day}.mcap" for day in (0, 1, 3, 4)]
+    ours = learn_arm("A-1", [taken(path) for path in paths[:2]], model)
+    learner = learner_of(model)
+    theta, frames = learner.theta, (model.joint_rotation(), model.lam[:, 3:])
+    gain = 0.0
+    for path in reversed(paths[:2]):
+        front_end = make_front_end(model, PipelineSettings(learner=learner.settings))
+        log = read_log(path)
+        states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau)
+        theta.absorb(frames, states[:, learner.layout.before_links])
+        gain = front_end.filter.noise_gain
+    theta.moments.A[:] /= gain
+    theta.replace_moments(theta.moments, theta.count / gain)
+    for _ in range(6):
+        theta.th[:] = theta.least_squares()
+        theta.adapt_prior()
+    once = theta.least_squares()
+    known = ours.std > 0.0
+    apart = np.abs(ours.solution - once)[known] / ours.std[known]
+    assert np.median(apart) < 1e-9 and np.max(apart) < 1e-6
+
+
+def test_neither_workers_nor_order_nor_parts_matter(
+    fleet: Fleet, logs: Path, tmp_path: Path
+) -> None:
+    """One process, logs in two parts and another order: the same to the last bit."""
+    given = found_logs([str(logs / "day*.mcap")])
+    alone = Settings(tmp_path, workers=1)
+    learn_fleet(given[3:], panda_model(), alone)
+    whole = learn_fleet([*reversed(given[:3]), given[4]], panda_model(), alone)
+    assert (whole.read, whole.known) == (3, 3)
+    assert off(the_arm(whole), the_arm(fleet)) == 0.0
+
+
+def test_forgetting_is_exact_and_lasts(logs: Path, tmp_path: Path) -> None:
+    bad, *rest = found_logs([str(logs / "day*.mcap")])
+    settings = Settings(tmp_path / "all", workers=1)
+    learn_fleet([bad, *rest], panda_model(), settings)
+    forget([bad], panda_model(), settings)
+    after = learn_fleet([bad, *rest], panda_model(), settings)
+    assert after.forgotten == (bad,) and after.read == 0
+    never = learn_fleet(rest, panda_model(), Settings(tmp_path / "rest", workers=1))
+    assert off(the_arm(after), the_arm(never)) == 0.0
+
+
+def test_nothing_is_computed_twice_and_damage_is_mended(logs: Path, tmp_path: Path) -> None:
+    settings = Settings(tmp_path / "out", workers=1)
+    first = str(logs / "day0.mcap")
+    copy = shutil.copy(first, tmp_path / "copy.mcap")
+    found = learn_fleet([first, str(copy)], panda_model(), settings)
+    assert found.read == 1 and found.alike == ((str(copy), first),)
+    assert learn_fleet([first], panda_model(), settings).read == 0
+    (kept,) = (tmp_path / "out" / "moments").glob("*.npz")
+    kept.write_bytes(kept.read_bytes()[:1000])
+    assert not learn_fleet([], panda_model(), settings).arms
+    assert learn_fleet([first], panda_model(), settings).read == 1
+    heavier = replace(panda_model(), theta=1.1 * panda_model().theta)
+    assert learn_fleet([first], heavier, settings).read == 1  # another model, other moments
+
+
+def test_another_arm_among_the_logs_disagrees(logs: Path, tmp_path: Path) -> None:
+    """Whose links are another unit's: the model of five logs does not fit it."""
+    moments = [taken(logs / f"day{day}.mcap") for day in (0, 1, 3, 4, 5)]
+    heavy = truth_on(1)
+    heavy = heavy.with_changes(theta=heavy.theta * np.linspace(0.6, 1.5, 7)[:, None])
+    moments.append(taken(write(tmp_path / "x.mcap", heavy, 9, "A-1")))
+    found = learn_arm("A-1", moments, panda_model())
+    assert [bool(log.disagrees) for log in found.logs] == [False] * 5 + [True]
+
+
+def test_a_manifest_tells_arms_and_temperature(logs: Path, tmp_path: Path) -> None:
+    table = tmp_path / "logs.csv"
+    with table.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["log", "arm", "temperature", "who"])
+        for day in range(LOGS):
+            rows.writerow([logs / f"day{day}.mcap", "left", 20 + 3 * day, "Ada"])
+    manifest = read_manifest(table)
+    given = found_logs([str(logs / "day*.mcap")])
+    found = learn_fleet(given, panda_model(), Settings(tmp_path, workers=1, manifest=manifest))
+    (arm,) = found.arms
+    assert arm.name == "left"
+    assert {(x.joint, x.follows) for x in arm.drifts} == {(WORN, "time"), (WORN, "temperature")}
+    table.write_text("recording,arm\na.mcap,left\n")
+    with pytest.raises(SettingsError, match="log, path, file"):
+        read_manifest(table)
+
+
+def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="no recording there"):
+        found_logs([str(tmp_path)])
+    missing = moments_of(Task(str(tmp_path / "none.mcap"), model_file.dumps(panda_model())))
+    assert isinstance(missing, Broken) and "No such file" in missing.why
+
+
+def dies_at_first(task: Task) -> int:
+    """Ends its process once."""
+    marker = Path(task.path)
+    if not marker.exists():
+        marker.touch()
+        os._exit(9)
+    return 7
+
+
+def test_a_worker_that_dies_costs_time_only(tmp_path: Path) -> None:
+
+    tasks = [Task(str(tmp_path / name), "") for name in "ab"]
+    done = dict(here(dies_at_first, tasks, 2))
+    assert done == dict.fromkeys(tasks, 7)
+
+
+def test_a_cluster_gives_the_same_though_a_worker_is_killed(
+    fleet: Fleet, logs: Path, tmp_path: Path
+) -> None:
+    """A real Dask scheduler and two worker processes; one is killed as the first result is in."""
+    distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
+    given = found_logs([str(logs / "day*.mcap")])
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
+
+        def kill_one(done: int, whole: int) -> None:
+            if done == 1:
+                os.kill(pids[0], signal.SIGKILL)
+
+        address = cluster.scheduler_address
+        settings = Settings(tmp_path, cluster=address, progress=kill_one)
+        found = learn_fleet(given, panda_model(), settings)
+    assert not found.broken and found.read == LOGS
+    assert off(the_arm(found), the_arm(fleet)) == 0.0
+
+
+def test_nobody_answers_at_the_address(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
+    with pytest.raises(MeansError, match="no Dask scheduler there"):
+        list(on_cluster(moments_of, [Task("x", "")], "tcp://127.0.0.1:1"))
