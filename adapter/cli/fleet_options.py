@@ -58,7 +58,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=os.cpu_count() or 1,
         metavar="N",
-        help="processes on this machine (default: as many as it has processors)",
+        help="processes on this machine (default: as many as it has processors; 0: none beside "
+        "this one)",
     )
     add("--cluster", metavar="ADDRESS", help="of a Dask scheduler to send the tasks to")
     add_results(parser)
@@ -70,8 +71,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")
     if args.forget and args.out is None:
         raise UsageError("--forget needs --out, the folder of the fleet that knows the LOG")
-    if args.workers < 1:
-        raise UsageError(f"--workers takes 1 or more, got {args.workers}")
+    if args.workers < 0:
+        raise UsageError(f"--workers takes 0 or more, got {args.workers}")
     locks_of(args)
     check_robot(args.model)
     check_files(args.manifest)

@@ -18,7 +18,7 @@ RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 
 
 def fleet(*arguments: object) -> int:
-    return main(["fleet", *map(str, arguments), "--model", "panda", "--workers", "1"])
+    return main(["fleet", *map(str, arguments), "--model", "panda", "--workers", "0"])
 
 
 @pytest.fixture

@@ -157,7 +157,7 @@ def test_neither_workers_nor_order_nor_parts_matter(
 ) -> None:
     """One process, logs in two parts and another order: the same to the last bit."""
     given = found_logs([str(logs / "day*.mcap")])
-    alone = Settings(tmp_path, workers=1)
+    alone = Settings(tmp_path, workers=0)
     learn_fleet(given[3:], panda_model(), alone)
     whole = learn_fleet([*reversed(given[:3]), given[4]], panda_model(), alone)
     assert (whole.read, whole.known) == (3, 3)
@@ -166,17 +166,17 @@ def test_neither_workers_nor_order_nor_parts_matter(
 
 def test_forgetting_is_exact_and_lasts(logs: Path, tmp_path: Path) -> None:
     bad, *rest = found_logs([str(logs / "day*.mcap")])
-    settings = Settings(tmp_path / "all", workers=1)
+    settings = Settings(tmp_path / "all", workers=0)
     learn_fleet([bad, *rest], panda_model(), settings)
     forget([bad], panda_model(), settings)
     after = learn_fleet([bad, *rest], panda_model(), settings)
     assert after.forgotten == (bad,) and after.read == 0
-    never = learn_fleet(rest, panda_model(), Settings(tmp_path / "rest", workers=1))
+    never = learn_fleet(rest, panda_model(), Settings(tmp_path / "rest", workers=0))
     assert off(the_arm(after), the_arm(never)) == 0.0
 
 
 def test_nothing_is_computed_twice_and_damage_is_mended(logs: Path, tmp_path: Path) -> None:
-    settings = Settings(tmp_path / "out", workers=1)
+    settings = Settings(tmp_path / "out", workers=0)
     first = str(logs / "day0.mcap")
     copy = shutil.copy(first, tmp_path / "copy.mcap")
     found = learn_fleet([first, str(copy)], panda_model(), settings)
@@ -209,7 +209,7 @@ def test_a_manifest_tells_arms_and_temperature(logs: Path, tmp_path: Path) -> No
             rows.writerow([logs / f"day{day}.mcap", "left", 20 + 3 * day, "Ada"])
     manifest = read_manifest(table)
     given = found_logs([str(logs / "day*.mcap")])
-    found = learn_fleet(given, panda_model(), Settings(tmp_path, workers=1, manifest=manifest))
+    found = learn_fleet(given, panda_model(), Settings(tmp_path, workers=0, manifest=manifest))
     (arm,) = found.arms
     assert arm.name == "left"
     assert {(x.joint, x.follows) for x in arm.drifts} == {(WORN, "time"), (WORN, "temperature")}

@@ -6,7 +6,7 @@ import importlib
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
@@ -43,6 +43,14 @@ def here(
         left = again
     for task in left:
         yield task, Broken(task.path, DIED)
+
+
+def in_threads(
+    function: Callable[[Task], Result], tasks: Sequence[Task]
+) -> Iterator[tuple[Task, Result]]:
+    """Do tasks that wait for disks rather than compute in threads of this process, in order."""
+    with ThreadPoolExecutor() as pool:
+        yield from zip(tasks, pool.map(function, tasks), strict=True)
 
 
 def _round(

@@ -7,13 +7,13 @@ import glob
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from adapter.errors import SettingsError
 from adapter.model import model_file
 from adapter.model.self_model import SelfModel
 from adapter.runs.fleet.arm import FleetArm, learn_arm
-from adapter.runs.fleet.engine import here, on_cluster
+from adapter.runs.fleet.engine import here, in_threads, on_cluster
 from adapter.runs.fleet.moments import (
     Broken,
     LogMoments,
@@ -46,7 +46,7 @@ class Settings(NamedTuple):
 
     Attributes:
         folder: of the store; what it holds joins what is given.
-        workers: processes of this machine.
+        workers: processes of this machine; 0: this one alone.
         cluster: address of a Dask scheduler, None for this machine.
         by: "log": logs tell their arm; "folder": those of one folder are of one arm.
         manifest: goes before both.
@@ -190,7 +190,7 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
             alike.append((task.path, first[content].path))
         first.setdefault(content, task)
     left = [task for content, task in first.items() if not store.has(content)]
-    for number, (_, result) in enumerate(_done(moments_of, left, settings), start=1):
+    for number, (_, result) in enumerate(_taken(left, settings), start=1):
         if isinstance(result, LogMoments):
             store.add(result)
         else:
@@ -219,7 +219,11 @@ def _contents(
     """Content by path; only what has changed since it was seen is read."""
     found = {task.path: store.content_seen(task.path) for task in tasks}
     unseen = [task for task in tasks if found[task.path] is None]
-    for task, result in _done(content_of, unseen, settings):
+    if settings.cluster is None:
+        results = in_threads(content_of, unseen)
+    else:
+        results = on_cluster(content_of, unseen, settings.cluster)
+    for task, result in results if unseen else ():
         if isinstance(result, Broken):
             broken.append(result)
         else:
@@ -229,16 +233,14 @@ def _contents(
     return contents
 
 
-def _done(
-    function: Callable[[Task], Any], tasks: Sequence[Task], settings: Settings
-) -> Iterator[Any]:
+def _taken(tasks: Sequence[Task], settings: Settings) -> Iterator[tuple[Task, LogMoments | Broken]]:
     if not tasks:
         return iter(())
     if settings.cluster is not None:
-        return on_cluster(function, tasks, settings.cluster)
-    if settings.workers == 1 or len(tasks) == 1:
-        return ((task, function(task)) for task in tasks)
-    return here(function, tasks, settings.workers)
+        return on_cluster(moments_of, tasks, settings.cluster)
+    if not settings.workers or len(tasks) == 1:
+        return ((task, moments_of(task)) for task in tasks)
+    return here(moments_of, tasks, settings.workers)
 
 
 def _arms(

@@ -88,7 +88,7 @@ class LogMoments:
         """Write them, whole or not at all."""
         said = {key: value for key, value in asdict(self).items() if key != "A"}
         with model_file.whole_file(path) as part, part.open("wb") as file:
-            np.savez_compressed(file, A=self.A, said=np.array(json.dumps(said)))
+            np.savez(file, A=self.A, said=np.array(json.dumps(said)))
 
     @classmethod
     def load(cls, path: Path) -> LogMoments:
