@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.report.fleet_words import EPOCH_S, HEADS, log_cells, sentences, summary
+from adapter.report.fleet_words import EPOCH_S, HEADS, effect_std, log_cells, sentences, summary
 from adapter.report.html import fill, write_whole
-from adapter.report.style import Drawing, Panel, joint_color
+from adapter.report.style import MUTED, Drawing, Panel, joint_color
 from adapter.report.tables import Table
+from adapter.report.words import plus_minus
 from adapter.runs.fleet.arm import DAY_S, FleetArm
 from adapter.runs.fleet.fleet import Fleet
 
 TEMPLATE = "fleet.html"
+LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class ArmOnPage:
 
     name: str
     lines: list[str]
+    parameters: Table
     panels: list[Panel]
     logs: Table
 
@@ -43,7 +46,25 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
 def _arm(arm: FleetArm) -> ArmOnPage:
     logs = Table(HEADS, [log_cells(log) for log in arm.logs])
     panels = _courses(arm) if len(arm.logs) > 1 else []
-    return ArmOnPage(arm.name, sentences(arm), panels, logs)
+    return ArmOnPage(arm.name, sentences(arm), _parameters(arm), panels, logs)
+
+
+def _parameters(arm: FleetArm) -> Table:
+    """What is learned of each joint and of the link that it moves; θ whole is in the model file."""
+    heads = ["joint", "mass of its link", *(CATALOGUE[name].title for name in arm.effects)]
+    units = ["", "kg", *(CATALOGUE[name].parameters[0].unit for name in arm.effects)]
+    std = effect_std(arm)
+    links = len(arm.model.theta) - arm.model.tree.n  # a base that floats comes first
+    rows = []
+    for j, name in enumerate(arm.model.tree.joint_names):
+        shown = arm.model.theta_std[links + j, 0] > LEAST_STD
+        mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
+        values = [plus_minus(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
+        rows.append([name, plus_minus(*mass), *values])
+    note = (
+        "A mass without a standard deviation is the documentation's: torques show it in sums only."
+    )
+    return Table(heads, rows, units, note)
 
 
 def _courses(arm: FleetArm) -> list[Panel]:
@@ -60,7 +81,17 @@ def _courses(arm: FleetArm) -> list[Panel]:
                 np.array([getattr(log, key)[k, j] for log in arm.logs])
                 for key in ("effects", "effects_std")
             )
-            ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
+            look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)
+            look.set_label(str(j + 1))
+        ax.legend(
+            ncols=8,
+            fontsize=6,
+            frameon=False,
+            labelcolor=MUTED,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 0.98),
+        )
+        drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
         effect = CATALOGUE[name]
         unit = effect.parameters[0].unit

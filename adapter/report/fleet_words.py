@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
+from adapter.model.spatial import Array
 from adapter.runs.fleet.arm import TIME, Drift, FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
@@ -96,12 +97,13 @@ def as_json(found: Fleet) -> dict[str, Any]:
 
 
 def _arm_json(arm: FleetArm) -> dict[str, Any]:
+    std = effect_std(arm)
     return {
         "name": arm.name,
         "theta": arm.model.theta,
         "theta_std": arm.model.theta_std,
         "effects": {
-            name: {"value": arm.outcome.effects[k], "std": _effect_std(arm)[k]}
+            name: {"value": arm.outcome.effects[k], "std": std[k]}
             for k, name in enumerate(arm.effects)
         },
         "drifts": [x._asdict() for x in arm.drifts],
@@ -110,8 +112,10 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
     }
 
 
-def _effect_std(arm: FleetArm) -> Any:
-    return arm.std[len(arm.std) - arm.outcome.effects.size :].reshape(arm.outcome.effects.shape)
+def effect_std(arm: FleetArm) -> Array:
+    """(e, n) standard deviations of what is learned beside θ."""
+    effects = arm.outcome.effects
+    return np.asarray(arm.std[len(arm.std) - effects.size :].reshape(effects.shape))
 
 
 def _log_json(log: OfLog) -> dict[str, Any]:

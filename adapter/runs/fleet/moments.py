@@ -124,7 +124,7 @@ def content_of(task: Task) -> str | Broken:
                         digest.update(block)
             return digest.hexdigest()
     except (OSError, ValueError, MeansError) as error:
-        return Broken(task.path, _sentence(error))
+        return _broken(task.path, error)
 
 
 def moments_of(task: Task) -> LogMoments | Broken:
@@ -136,10 +136,8 @@ def moments_of(task: Task) -> LogMoments | Broken:
         with _at_hand(task.path) as path:
             log = read_log(path, topic=task.topic)
         return _taken(log, _model(task.model), content, task.path)
-    except MemoryError:
-        return Broken(task.path, "there is not enough memory for it")
-    except (DriverError, OSError, ValueError) as error:
-        return Broken(task.path, _sentence(error))
+    except (DriverError, OSError, ValueError, MemoryError) as error:
+        return _broken(task.path, error)
 
 
 def _taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
@@ -212,7 +210,8 @@ def opened(address: str) -> tuple[Any, str]:
     return filesystem, str(inside)
 
 
-def _sentence(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename or 'it'}: {error.strerror}"
-    return str(error)
+def _broken(path: str, error: Exception) -> Broken:
+    if isinstance(error, MemoryError):
+        return Broken(path, "there is not enough memory for it")
+    said = error.strerror if isinstance(error, OSError) else None
+    return Broken(path, said or str(error).removeprefix(f"{path}: "))
