@@ -1,7 +1,8 @@
 """Statistical trials over many seeds on the simulated arm, in lockstep: `make trials`.
 
-Prints one line a trial; the figures in the README come from here. Each trial is what `adapter run`
-runs with the same options: model, settings, effects and driver come from the command's own code.
+Prints one line a trial; the figures in docs/numbers.md come from here. Each trial is what
+`adapter run` runs with the same options: model, settings, effects and driver come from the
+command's own code.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from drivers.interface import DriverError, NotReady
-from tests.helpers.readme import README
+from tests.helpers.pages import PAGES
 
 NAMES = ("[red]shoulder[/]", "[/]", "arm[1]", "[bold", ":smile:", "\\[x]", "[link=file:x]y")
 
@@ -68,8 +68,8 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         assert process.wait(60) == 0
 
 
-def test_exit_codes_stand_in_the_readme_and_in_the_help() -> None:
-    table = dict(re.findall(r"^\| (\d+) \| (.+?) \|$", README, re.MULTILINE))
+def test_exit_codes_stand_in_the_pages_and_in_the_help() -> None:
+    table = dict(re.findall(r"^\| (\d+) \| (.+?) \|$", PAGES["docs/commands.md"], re.M))
     assert table == {str(code.value): code.words for code in ExitCode}
     parts = next(a for a in build_parser()._actions if a.dest == "command").choices
     for name, command in COMMANDS.items():

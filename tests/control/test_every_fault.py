@@ -1,4 +1,4 @@
-"""What the loop does upon each fault of single samples: one test for each row of the README.
+"""What the loop does upon each fault of single samples: one test for each row of the table in docs.
 
 Faults that cost samples alone are put into a recording, those that end a run into the simulated
 arm under its controller; `test_parameters_under_faults` has all of the first there, too.

@@ -17,16 +17,16 @@ from adapter.experiments.baselines.presets import Choice
 from adapter.experiments.panda import run_panda
 from adapter.experiments.results import LearnerScores
 from adapter.experiments.split import SETS, split
-from tests.helpers.readme import HUMANOID, README
+from tests.helpers.pages import every_command
 
 CHANNELS = {"w", "v", "a", "dw"}
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where the README's small experiment left its results; in three trials of `discover`."""
+    """Where the pages' small experiment left its results; in three trials of `discover`."""
     place = tmp_path_factory.mktemp("experiment")
-    line = next(line for line in README.splitlines() if line.startswith(f"{HUMANOID} --"))
+    line = next(x for x in every_command() if x.startswith("adapter experiment atlas --"))
     small = shlex.split(line)[1:]
     small += ["--seed", "4", "--seeds", "3"]
     where = ["--cache", str(place / "cache"), "--out", str(place), "--json", str(place / "e.json")]

@@ -1,4 +1,4 @@
-"""What the README tells people to type works, word for word."""
+"""What README and pages tell people to type works, word for word."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from adapter.model.robots import documented
 from adapter.realtime import SnapshotWriter
 from adapter.runs.config import read_config
 from drivers.files.mcap import read_log
-from tests.helpers.readme import HUMANOID, PATIENCE_S, README, ROOT, SHELL, blocks, commands, give
+from tests.helpers.pages import PATIENCE_S, ROOT, blocks, give, given
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(2 * PATIENCE_S)]
 
@@ -32,8 +32,9 @@ BRIEFLY = {
     "--validate-from 14": "--validate-from 6",
 }
 
-
-OWN_LOG = next(block for block in blocks("sh") if "adapter import" in block)
+FOLDER = re.compile(r"runs/\w+")  # that a command writes, or goes on from
+TOUR = [line for line in given() if FOLDER.search(line)]
+OWN_LOG = [line for line in given() if not FOLDER.search(line)]  # of a table, in this folder
 
 
 def brief(line: str) -> str:
@@ -47,28 +48,24 @@ def chains(lines: list[str]) -> list[list[str]]:
     """The lines in groups: those after the first of a group read the folder that it writes."""
     found: dict[str, list[str]] = {}
     for line in lines:
-        folder = re.findall(r"runs/\w+", line)[0]
-        found.setdefault(folder, []).append(line)
+        found.setdefault(FOLDER.findall(line)[0], []).append(line)
     return list(found.values())
 
 
 @pytest.fixture(scope="module")
 def toured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in which the tour and the search for a tree were made, two commands at a time."""
+    """A folder in which all commands that write results were given, two at a time."""
     folder = tmp_path_factory.mktemp("tour")
-    tour = commands(next(block for block in blocks("sh") if "runs/tour" in block))
-    section = README.split("## The paper's experiments")[1].split("\n## ")[0]
-    small = [line for block in re.findall(SHELL, section, re.DOTALL) for line in commands(block)]
-    found = [line for line in small if not line.startswith(HUMANOID)]
-    assert len(tour) >= 6 and len(found) == len(small) - 1 >= 1
-    assert all(any(said in line for line in [*tour, OWN_LOG]) for said in BRIEFLY)
+    (folder / "recordings").symlink_to(ROOT / "recordings")
+    assert len(TOUR) >= 8
+    assert all(any(said in line for line in given()) for said in BRIEFLY)
 
     def give_all(lines: list[str]) -> None:
         for line in lines:
             give(brief(line), folder)
 
-    with ThreadPoolExecutor(LANES) as lanes:  # the last group of the tour takes longest
-        for done in [lanes.submit(give_all, lines) for lines in reversed(chains(tour + found))]:
+    with ThreadPoolExecutor(LANES) as lanes:  # the last groups take longest
+        for done in [lanes.submit(give_all, lines) for lines in reversed(chains(TOUR))]:
             done.result()
     return folder
 
@@ -104,20 +101,18 @@ def test_your_own_log(toured: Path) -> None:
     table = np.hstack([seconds, np.degrees(log.q), np.degrees(log.dq), log.tau])
     np.savetxt(toured / "log.csv", table, delimiter=",")
     shutil.copy(toured / "panda_learned.urdf", toured / "my_arm.urdf")
-    for line in commands(OWN_LOG):
+    assert len(OWN_LOG) >= 3
+    for line in OWN_LOG:
         give(brief(line), toured)
 
 
-def test_many_logs(tmp_path: Path) -> None:
-    shutil.copytree(ROOT / "recordings", tmp_path / "recordings")
-    (line,) = next(commands(block) for block in blocks("sh") if "adapter fleet" in block)
-    give(line, tmp_path)
-    assert (tmp_path / "runs" / "fleet" / "fleet.html").exists()
+def test_many_logs(toured: Path) -> None:
+    assert (toured / "runs" / "fleet" / "fleet.html").exists()
 
 
 def test_settings(tmp_path: Path) -> None:
     path = tmp_path / "my.toml"
-    path.write_text(blocks("toml")[0])
+    path.write_text(blocks("toml", "docs/commands.md")[0])
     assert read_config(path).tool is not None
 
 
@@ -150,8 +145,3 @@ def test_reading_the_estimate() -> None:
         exec(code.replace('"panda_adapter"', '"panda_adapter_readme"'), {})
     finally:
         writer.close()
-
-
-def test_every_file_it_points_to_is_there() -> None:
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (ROOT / target).exists(), target

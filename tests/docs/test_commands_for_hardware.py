@@ -1,4 +1,4 @@
-"""The README's commands for hardware, word for word, with simulated hardware behind the wire."""
+"""The pages' commands for hardware, word for word, with simulated hardware behind the wire."""
 
 import json
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.readme import PATIENCE_S, README, SHELL, commands, environment, give
+from tests.helpers.pages import PATIENCE_S, environment, give, given
 from tests.helpers.stalls import Stalls
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(2 * PATIENCE_S)]
@@ -23,7 +23,7 @@ BY_THE_MACHINE = (
 
 
 def served(line: str, folder: Path) -> subprocess.Popen[str]:
-    """A simulated arm started as the README says, on a port of its own, once it is ready."""
+    """A simulated arm started as the pages say, on a port of its own, once it is ready."""
     arm = subprocess.Popen(
         [*shlex.split(line), "--port", str(PORT), "--json", "arm.json"],
         cwd=folder,
@@ -41,10 +41,8 @@ def served(line: str, folder: Path) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("kind", ["fci", "can"])
 def test_simulated_hardware(kind: str, tmp_path: Path) -> None:
     """Its accounts balance; an arm that stopped says so, and only where processors were away."""
-    section = README.split("## Simulated hardware")[1].split("\n## ")[0]
-    shell = "".join(re.findall(SHELL, section, re.DOTALL))
-    serve = next(line for line in commands(shell) if line.strip() == f"adapter sim {kind}")
-    run = next(line for line in commands(shell) if f"{kind}://" in line)
+    serve = next(line for line in given(wire=True) if line == f"adapter sim {kind}")
+    run = next(line for line in given(wire=True) if re.search(f"{kind}://(127|239)", line))
     run = run.replace("127.0.0.1", f"127.0.0.1:{PORT}").replace("163.2?", f"163.2:{PORT}?")
     arm = served(serve, tmp_path)
     with Stalls() as stalls:

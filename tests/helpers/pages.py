@@ -1,0 +1,76 @@
+"""What users read, README and pages, and its commands given as a shell would."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+PATIENCE_S = 1500.0  # with a command, on a machine with other work
+ROOT = Path(__file__).parents[2]
+SHELL, PYTHON = "sh", "python"
+
+# What `tests/docs` does not give word for word, by what stands in it, and why
+NOT_GIVEN = {
+    "172.16.0.2": "a real Franka robot; simulated ones are in simulated-hardware.md",
+    "can://can0": "a real CAN bus; a simulated one is in simulated-hardware.md",
+    "adapter sim fci --": "its options: tests/sim",
+    "adapter experiment atlas": "a small one is given by tests/experiments/test_experiment.py",
+}
+
+WIRE = ("adapter sim ", "://")  # in commands for simulated hardware
+
+
+def _pages() -> dict[str, str]:
+    """Text of each page by its path from the root: first README and the tour, then by name."""
+    first = [ROOT / "README.md", ROOT / "docs" / "five-minutes.md"]
+    rest = sorted({*(ROOT / "docs").glob("*.md")} - {*first})
+    paths = [*first, *rest, ROOT / "drivers" / "README.md"]
+    return {path.relative_to(ROOT).as_posix(): path.read_text() for path in paths}
+
+
+PAGES = _pages()
+
+
+def blocks(language: str, page: str | None = None) -> list[str]:
+    """Fenced blocks of a language in order, of one page or of all."""
+    texts = PAGES.values() if page is None else [PAGES[page]]
+    return [b for text in texts for b in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)]
+
+
+def commands(block: str) -> list[str]:
+    """The adapter's commands of a block, without comments."""
+    lines = (line.partition("#")[0].strip() for line in block.splitlines())
+    return [line for line in lines if line.startswith("adapter ")]
+
+
+def every_command() -> list[str]:
+    """The adapter's commands of all pages, each once, in the order of pages."""
+    return list(dict.fromkeys(line for block in blocks(SHELL) for line in commands(block)))
+
+
+def given(wire: bool = False) -> list[str]:
+    """Those of them that tests give word for word: for simulated hardware, or all others."""
+    ours = [line for line in every_command() if not any(part in line for part in NOT_GIVEN)]
+    return [line for line in ours if any(part in line for part in WIRE) == wire]
+
+
+def environment(folder: Path) -> dict[str, str]:
+    """As a shell has it in which the project's own was activated."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    return {**os.environ, "PATH": path, "PANDA_ADAPTER_CACHE": str(folder / "cache")}
+
+
+def give(line: str, folder: Path, codes: tuple[int, ...] = (0,)) -> tuple[int, str]:
+    """Run a command line as a shell would; its exit code, one of these, and its complaints."""
+    done = subprocess.run(
+        shlex.split(line),
+        cwd=folder,
+        env=environment(folder),
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    assert done.returncode in codes, f"{line}\n{done.stderr}"
+    return done.returncode, done.stderr
