@@ -13,7 +13,7 @@ SHARED := $(PAIRS) -m "not alone and not slow"
 WITH_ALONE := $(sort $(shell grep --recursive --files-with-matches --include '*.py' mark.alone tests))
 REAL_TIME := -m "alone and not slow" $(WITH_ALONE)
 
-.PHONY: run test quick experiment setup lint shared quick-tests trials soak bench clean
+.PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench clean
 
 run: $(STAMP)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
@@ -45,6 +45,11 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 setup: $(STAMP)
+
+# Notebooks are executed first, so that their pages have pictures
+docs: $(STAMP)
+	PYTHONPATH=. $(BIN)/python docs/site/notebooks.py
+	$(BIN)/mkdocs build --strict --config-file docs/site/mkdocs.yml
 
 # Python translates what is imported when it is; pip would translate all of torch, for a minute
 $(STAMP): pyproject.toml constraints.txt

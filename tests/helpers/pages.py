@@ -16,6 +16,7 @@ NOT_GIVEN = {
     "172.16.0.2": "a real Franka robot; simulated ones are in simulated-hardware.md",
     "can://can0": "a real CAN bus; a simulated one is in simulated-hardware.md",
     "adapter sim fci --": "its options: tests/sim",
+    "adapter excite": "minutes of search; tests/cli/test_excite.py gives it with a nearer goal",
     "adapter experiment atlas": "a small one is given by tests/experiments/test_experiment.py",
 }
 
