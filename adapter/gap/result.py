@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.model.spatial import Array
+from drivers.files.html_table import html_table, plus_minus
 
 UNEXPLAINED = "unexplained"  # the name of what no effect of the catalogue explains
 WORSE = 0.05  # share by which an error of a joint may grow on data not seen, and unsaid
@@ -80,6 +81,10 @@ class Finding:
         common = self.throughout and not self.recording
         return self.effect == "payload" and common and self.overlaps.get("link_inertia", 0) > 0.995
 
+    def _repr_html_(self) -> str:
+        """Sizes with units and doubt, for notebooks."""
+        return _findings_html(f"Finding: {self.title}", [self])
+
     def as_dict(self) -> dict[str, Any]:
         """As in the JSON file."""
         own = asdict(self)
@@ -87,6 +92,29 @@ class Finding:
         own["ambiguous_with"], own["overlap"] = list(self.overlaps), own.pop("overlaps")
         own["z"] = own.pop("detectability")
         return own
+
+
+def _findings_html(title: str, findings: Sequence[Finding]) -> str:
+    heads = ("effect", "joints", "size", "evidence", "could also be")
+    rows = [
+        (
+            finding.title,
+            ", ".join(map(str, finding.joints)),
+            "; ".join(_size(finding, key) for key in finding.parameters),
+            f"{finding.evidence:.0%}",
+            ", ".join(finding.overlaps),
+        )
+        for finding in findings
+    ]
+    return html_table(title, heads, rows)
+
+
+def _size(finding: Finding, key: str) -> str:
+    """A parameter ± its standard deviation, with its unit; of a table of numbers all of them."""
+    values, std = np.ravel(finding.parameters[key]), np.ravel(finding.std.get(key, np.nan))
+    doubts = np.resize(np.asarray(std, float), values.shape)
+    sizes = ", ".join(map(plus_minus, np.asarray(values, float), doubts))
+    return f"{key} = {sizes} {finding.units.get(key, '')}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -233,6 +261,19 @@ class GapResult:
         before, after = (np.max(part.torque_rmse_nm) for part in (self.before, self.after))
         names = ", ".join(dict.fromkeys(finding.effect for finding in self.findings)) or "nothing"
         return f"GapResult({names} found, torque error at most {before:.2g} -> {after:.2g} N m)"
+
+    def _repr_html_(self) -> str:
+        """Findings, and the torque error of each joint before and after, for notebooks."""
+        if self.problem is not None:
+            return html_table(repr(self), (), ())
+        errors = zip(
+            self.joint_names,
+            map(plus_minus, self.before.torque_rmse_nm),
+            map(plus_minus, self.after.torque_rmse_nm),
+            strict=True,
+        )
+        heads = ("joint", "torque error before, N m", "after, N m")
+        return _findings_html(repr(self), self.findings) + html_table("", heads, list(errors))
 
     @classmethod
     def untold(

@@ -12,6 +12,7 @@ from adapter.errors import ModelError
 from adapter.model.inertia import move_theta, theta_from_body
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import Tree
+from drivers.files.html_table import html_table, plus_minus
 
 STANDARD_GRAVITY = 9.81  # m/s², the value simulators and Pinocchio use
 LAMBDA_DOCUMENTATION = "documentation"
@@ -19,12 +20,43 @@ LAMBDA_REPRODUCED = "reproduces the documentation"
 LAMBDA_MEASURED = "measured"
 LAMBDA_SOURCES = (LAMBDA_DOCUMENTATION, LAMBDA_REPRODUCED, LAMBDA_MEASURED)
 URDF, MJCF = "urdf", "mjcf"
+LEAST_STD = 1e-9  # m, kg, kg m: of what data cannot show, rounding leaves less
+_PULLS = ("mass · centre x, kg m", "y", "z")
 LIMITS = ("lower", "upper", "velocity", "effort")
 
 
 def gravity_down() -> Array:
     """Gravity [0 0 -9.81] m/s² of a base that stands upright."""
     return np.array([0.0, 0.0, -STANDARD_GRAVITY])
+
+
+def _cell(value: float, std: float) -> str:
+    """A value with its doubt; without one where there is none, or data show nothing of it."""
+    return plus_minus(value, std if std > LEAST_STD else np.nan)
+
+
+def effects_html(effects: Sequence[Mapping[str, Any]]) -> str:
+    """A table of effects as a model file lists them, those of one kind together; empty of none.
+
+    Args:
+        effects: as `SelfModel.effects` has them.
+    """
+    rows: dict[tuple[str, str], list[str]] = {}
+    for entry in effects:
+        for key, value in entry["parameters"].items():
+            if np.ndim(value):
+                continue
+            std = entry.get("std", {}).get(key)
+            unit = entry.get("units", {}).get(key, "")
+            cell = plus_minus(float(value), np.nan if std is None else float(std))
+            joints = ", ".join(map(str, entry["joints"])) or "all"
+            rows.setdefault((entry["effect"], f"{key}, {unit}".rstrip(", ")), []).append(
+                f"{joints}: {cell}"
+            )
+    if not rows:
+        return ""
+    lines = [(effect, what, "; ".join(cells)) for (effect, what), cells in rows.items()]
+    return html_table("Effects", ("effect", "parameter", "joints: value ± std"), lines)
 
 
 @dataclass(frozen=True)
@@ -192,6 +224,21 @@ class SelfModel:
 
     def __repr__(self) -> str:
         return f"SelfModel({self.name}: {self.tree.n} joints, λ {self.lambda_source})"
+
+    def _repr_html_(self) -> str:
+        """Joints, links and effects, for notebooks; without ± what is documented or not shown."""
+        heads = ("joint", "place in its parent, m", "link", "mass, kg", *_PULLS)
+        first = self.tree.bodies - self.tree.n
+        rows = [
+            (
+                joint,
+                ", ".join(map(_cell, self.lam[j, 3:], self.lam_std[j, 3:])),
+                self.tree.link_names[j],
+                *map(_cell, self.theta[first + j, :4], self.theta_std[first + j, :4]),
+            )
+            for j, joint in enumerate(self.tree.joint_names)
+        ]
+        return html_table(repr(self), heads, rows) + effects_html(self.effects)
 
     def _check_arrays(self, n: int, bodies: int) -> None:
         known = {

@@ -24,7 +24,7 @@ from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
 from adapter.learning.settings import LearnerSettings
 from adapter.model.model_file import save_model
-from adapter.model.self_model import SelfModel
+from adapter.model.self_model import SelfModel, effects_html
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
@@ -33,6 +33,7 @@ from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
 from adapter.signals.matching import matching, present
 from adapter.signals.validation import validation_torque_rmse
+from drivers.files.html_table import html_table, plus_minus
 from drivers.files.mcap import Log
 from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
@@ -164,6 +165,13 @@ class LearnResult:
         lam = "converged" if self.lam_converged else "not converged"
         theta = "learned" if self.theta_learned else "not learned"
         return f"LearnResult(λ {lam}, θ {theta}, held-out torque error at most {worst:.2g} N m)"
+
+    def _repr_html_(self) -> str:
+        """Error and effects of each joint, for notebooks; `model` shows bodies and frames."""
+        names = self.model.tree.joint_names
+        rows = [(name, plus_minus(self.held_out_rmse_nm[j])) for j, name in enumerate(names)]
+        errors = html_table(repr(self), ("joint", "held-out torque error, N m rms"), rows)
+        return errors + effects_html(self.model.effects)
 
 
 def learn(

@@ -1,7 +1,7 @@
 """What mkdocs does beside its plugins: pages that stand elsewhere, figures, notebooks.
 
-`index.md` is the README, `drivers.md` the one of `drivers`, `api.md` the names of `adapter`; figures
-are drawn by `figures.py`, and pages of notebooks are made of their cells.
+`index.md` is the README, `drivers.md` the one of `drivers`, `api.md` the names of `adapter`;
+figures are drawn by `figures.py`, and pages of notebooks are made of their cells.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def _made() -> Iterator[tuple[str, str | bytes]]:
 def _reference() -> Iterator[str]:
     """The names of `adapter`, functions first, each for mkdocstrings to fill in."""
     yield "# API reference\n"
-    yield "Everything in `import adapter`; nothing is loaded before it is used. `help(adapter.learn)`"
-    yield "says the same at the prompt. Units are SI, shapes are in brackets.\n"
+    yield "Everything in `import adapter`; nothing is loaded before it is used. Units are SI,"
+    yield "shapes are in brackets. `help(adapter.learn)` says the same at the prompt.\n"
     for name in adapter._FROM:  # in the order of use
         yield f"::: {adapter._FROM[name]}.{name}\n"
 

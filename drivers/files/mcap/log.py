@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.bounded import parse_json
+from drivers.files.html_table import NOTHING, html_table
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
 from drivers.files.mcap.joints import Commands, Joints, assemble_joints, fits, read_commands
@@ -89,6 +90,16 @@ class Log:
         span_s = 1e-9 * float(np.ptp(self.stamp_ns)) if len(self) else 0.0
         count = f"{len(self)} samples of {len(self.joint_names)} joints"
         return f"Log({self.path.name}: {count}, {span_s:.1f} s)"
+
+    def _repr_html_(self) -> str:
+        """Ranges of each joint, for notebooks."""
+        tables = (self.q, self.dq, self.tau)
+        rows = [
+            (name, *(_range(table[:, j]) for table in tables))
+            for j, name in enumerate(self.joint_names)
+        ]
+        heads = ("joint", "position, rad", "velocity, rad/s", "torque, N m")
+        return html_table(repr(self), heads, rows)
 
     def select(self, joint_names: Sequence[str], link_names: Sequence[str] | None = None) -> Log:
         """The same recording with these joints (and links) in this order.
@@ -333,3 +344,9 @@ def _decoded(text: str) -> Any:
         return parse_json(text)
     except ValueError:
         return text
+
+
+def _range(values: Array) -> str:
+    """From the smallest to the largest; a dash where nothing was measured."""
+    known = values[np.isfinite(values)]
+    return f"{known.min():.3g} to {known.max():.3g}" if len(known) else NOTHING
