@@ -11,9 +11,13 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-import adapter
+from adapter.model.robots import documented
 from adapter.model.spatial import Array
-from adapter.physics.identifiability import base_parameters, frame_observability
+from adapter.physics.identifiability import (
+    base_parameters,
+    frame_observability,
+    random_regressor,
+)
 
 TURNS_AND_SHIFTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 PARAMETERS = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
@@ -24,7 +28,7 @@ WORDS = ("never shown", "shown in a sum with others", "shown by itself")
 
 def lambda_shown() -> str:
     """Which turns and shifts of the Panda's joint frames the motion of its links shows."""
-    panda = adapter.load_model("panda")
+    panda = documented("panda")
     seen = frame_observability(panda.tree, panda.lam, panda.gravity)
     share = np.diagonal(seen.projectors, axis1=1, axis2=2)
     kinds = np.where(seen.flags, ALONE, np.where(share > 1e-6, TOGETHER, NEVER))
@@ -34,7 +38,7 @@ def lambda_shown() -> str:
 
 def theta_shown() -> str:
     """Which inertial parameters of the Panda's links its joint torques show."""
-    panda = adapter.load_model("panda")
+    panda = documented("panda")
     base = base_parameters(panda.tree, panda.lam, panda.gravity)
     share = np.sum(base.basis**2, axis=1).reshape(panda.theta.shape)
     kinds = np.where(share > 1.0 - 1e-6, ALONE, np.where(share > 1e-6, TOGETHER, NEVER))
@@ -44,15 +48,13 @@ def theta_shown() -> str:
 
 def same_torque() -> str:
     """Two different sets of bodies that need the same torques: masses move along the chain."""
-    panda = adapter.load_model("panda")
+    panda = documented("panda")
     base = base_parameters(panda.tree, panda.lam, panda.gravity)
     unseen = np.zeros_like(panda.theta)
     unseen[3, 0] = 1.0  # the part of link 4's mass that no torque shows
     flat = unseen.ravel() - base.basis @ (base.basis.T @ unseen.ravel())
     other = panda.theta + (flat / np.abs(flat.reshape(-1, 10)[:, 0]).max()).reshape(-1, 10)
-    rng = np.random.default_rng(1)
-    motion = [rng.uniform(-1.0, 1.0, (1000, panda.tree.n)) for _ in range(3)]
-    Y = adapter.regressor(panda, *motion)
+    Y = random_regressor(panda.tree, panda.lam, panda.gravity, samples=1000, seed=1).matrix
     apart = float(np.abs(Y @ (other - panda.theta).ravel()).max())
     figure, (ax,) = _figure(6.2, 2.6)
     at = np.arange(panda.tree.n) + 1.0
