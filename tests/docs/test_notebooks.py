@@ -1,4 +1,4 @@
-"""The notebooks run from the first cell to the last, hold no outputs in git, and find what they say."""
+"""The notebooks run from first cell to last, find what they say, and hold no outputs in git."""
 
 import re
 import time
