@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
 
 import nbformat
-from jupyter_client.manager import AsyncKernelManager
 from nbclient import NotebookClient
+from traitlets.config import Config
 
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "docs" / "notebooks"
@@ -23,8 +24,11 @@ def execute(source: Path) -> nbformat.NotebookNode:
     """
     notebook = nbformat.read(source, as_version=4)
     resources = {"metadata": {"path": str(source.parent)}}
-    kernel = AsyncKernelManager(transport="ipc")  # no port is opened
-    NotebookClient(notebook, km=kernel, timeout=LONGEST_S, resources=resources).execute()
+    with tempfile.TemporaryDirectory() as folder:  # of sockets: no port is opened
+        kernel = {"KernelManager": {"transport": "ipc", "ip": f"{folder}/kernel"}}
+        NotebookClient(
+            notebook, timeout=LONGEST_S, resources=resources, config=Config(kernel)
+        ).execute()
     return notebook
 
 
