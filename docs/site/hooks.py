@@ -107,7 +107,7 @@ def _reference() -> Iterator[str]:
     yield "Everything in `import adapter`; nothing is loaded before it is used. Units are SI,"
     yield "shapes are in brackets. `help(adapter.learn)` says the same at the prompt.\n"
     for name in adapter._FROM:  # in the order of use
-        yield f"::: {adapter._FROM[name]}.{name}\n"
+        yield f"::: adapter.{name}\n"
 
 
 def _examples() -> Iterator[str]:
