@@ -96,8 +96,8 @@ def _made() -> Iterator[tuple[str, str | bytes]]:
     yield "site.css", (HERE / "site.css").read_text()
     for name, draw in FIGURES.items():
         yield f"figures/{name}.svg", draw()
-    for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
-        for name, content in page_of(path, ROOT / "runs" / "notebooks" / path.name):
+    for notebook in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        for name, content in page_of(notebook, ROOT / "runs" / "notebooks" / notebook.name):
             yield f"notebooks/{name}", content
 
 
