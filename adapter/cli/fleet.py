@@ -25,6 +25,7 @@ from adapter.runs.fleet.fleet import (
     found_logs,
     learn_fleet,
     read_manifest,
+    recall,
 )
 from adapter.runs.fleet.table import write_table
 from adapter.runs.terminal import (
@@ -45,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     folder = results_folder(args.out, "fleet")
     manifest = Manifest({}, {}) if args.manifest is None else read_manifest(args.manifest)
     settings = Settings(folder, args.workers, args.cluster, args.by, manifest, args.topic)
-    if args.forget:
-        forget(found_logs(args.forget), robot, settings)
+    forget(args.forget, robot, settings)
+    recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("reading", total=len(given))
