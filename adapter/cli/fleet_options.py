@@ -52,9 +52,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="a table with a column log, and arm, or numbers that friction may follow "
         "(temperature, age); goes before --by",
     )
-    several = {"nargs": "+", "action": "extend", "default": [], "metavar": "LOG"}
-    add("--forget", help="leave these out from now on, though they are gone or given", **several)
-    add("--remember", help="do not leave these out any more", **several)
+    for name, said in (
+        ("--forget", "leave these out from now on, though they are gone or given"),
+        ("--remember", "do not leave these out any more"),
+    ):
+        add(name, nargs="+", action="extend", default=[], metavar="LOG", help=said)
     add(
         "--workers",
         type=int,

@@ -16,7 +16,8 @@ from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift, StandsOut
 from adapter.runs.fleet.fleet import Fleet
 
-HEADS = ("recording", "begins", "s", "hand carries, kg", "worst fit, N m", "once more", "disagrees")
+HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
+FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 
 
@@ -27,10 +28,10 @@ def log_cells(log: OfLog) -> tuple[str, ...]:
         Path(log.moments.path).name,
         begin_words(log.moments.begin_s),
         f"{log.moments.span_s:.0f}",
-        "as usual" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
-        f"{log.rmse[worst]:.3f} (joint {worst + 1})",
+        "" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
+        f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
-        _joints(log.disagrees) if log.disagrees else "",
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
     )
 
 
@@ -38,7 +39,7 @@ def begin_words(begin_s: float) -> str:
     """A date, or s where a clock counts from something else."""
     if begin_s < EPOCH_S:
         return f"{begin_s:.1f} s"
-    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M:%S}"
+    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
 
 
 def _joints(numbers: tuple[int, ...]) -> str:
@@ -83,8 +84,8 @@ def sentences(arm: FleetArm) -> list[str]:
             found.append(
                 f"{Path(log.moments.path).name} disagrees with the others on "
                 f"{_joints(log.disagrees)}: {log.rmse[worst]:.2g} N m on joint {worst + 1} where "
-                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change "
-                "(--forget leaves it out)"
+                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change"
+                f"{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
     if len(arm.logs) > 1:
@@ -160,6 +161,7 @@ def _log_json(log: OfLog) -> dict[str, Any]:
         "load": None if log.load is None else log.load._asdict(),
         "rmse_nm": log.rmse,
         "own_rmse_nm": log.own_rmse,
+        "used": log.used,
         "disagrees": list(log.disagrees),
         "worth_nats": log.worth,
     }

@@ -1,8 +1,8 @@
 """One arm from the moments of its recordings: its model, and what each recording tells beside it.
 
-Inertias, friction and offsets are common. A recording whose hand is heavier or lighter than is
-usual on this arm (the median) carries a body of its own, which is solved for with all else and
-taken off its moments. λ is the documented one.
+Inertias, friction and offsets are common to those that agree. A recording whose hand is heavier or
+lighter than is usual on this arm (the median) carries a body of its own, which is solved for with
+all else and taken off its moments. λ is the documented one.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from adapter.runs.outcome import Outcome, collect, learned_model
 
 FITS = 6  # of weights and priors to what was found with those before
 LOAD_ROUNDS = 4  # of loads to weights
+ROUNDS = 5  # of who agrees to the model that these make
 LEAST_LOAD_KG, LOAD_STD = 0.05, 4.0  # less than this, or so many standard deviations, is no load
 TIMES_WORSE = 1.5  # than its own best fit and than other logs: one that disagrees
 BY_CHANCE = 0.01  # that one of an arm's recordings does so
@@ -49,6 +50,7 @@ class OfLog:
 
     Attributes:
         moments: of the recording, as they were taken.
+        used: whether the arm's model is learned from it, too; not where it disagrees.
         load: None where the hand is as usual.
         effects, effects_std: (e, n) of this recording alone, inertias being the arm's.
         rmse, own_rmse: (n,) N m of the arm's model, and of the best one for this recording alone.
@@ -58,6 +60,7 @@ class OfLog:
     """
 
     moments: LogMoments
+    used: bool
     load: Load | None
     effects: Array
     effects_std: Array
@@ -73,7 +76,7 @@ class FleetArm:
 
     Attributes:
         name: of the arm.
-        model: learned from all recordings.
+        model: learned from all recordings that agree, where these are the most.
         outcome: of the learner, for whatever reads those.
         solution, std: (P,) (θ, effects) and standard deviations, before bodies are made possible.
         effects: names of what was learned beside θ.
@@ -108,25 +111,38 @@ def learn_arm(
         told: numbers that a manifest tells of recordings, by content and column.
     """
     found = sorted(found, key=lambda x: x.content)
-    learner = learner_of(documented)
-    theta = learner.theta
-    _pool(theta, found, {})
-    loads: dict[str, tuple[Array, float]] = {}
-    for _ in range(LOAD_ROUNDS if len(found) >= FEWEST_TO_COMPARE else 0):
-        before, loads = loads, _loads(theta, found)
-        if not before and not loads:
+    used = list(found)
+    for number in range(ROUNDS):
+        learner, loads = _learned(documented, used)
+        logs = _of_logs(learner, found, used, loads)
+        agreeing = {x.moments.content for x in logs if not x.disagrees}
+        told_apart = agreeing != {x.content for x in used} and 2 * len(agreeing) > len(found)
+        if number == ROUNDS - 1 or not told_apart:
             break
-        _pool(theta, found, {key: phi for key, (phi, _) in loads.items()})
-    begin = min(x.begin_s for x in found)
-    learner.start_theta(round(1e9 * begin))
-    learner.learned = sum(x.samples for x in found)
-    logs = _of_logs(learner, found, loads)
-    outcome = collect(learner)
-    model = learned_model(outcome, documented, fleet=[x.path for x in found])
+        used = [x for x in found if x.content in agreeing]
+    learner.start_theta(round(1e9 * min(x.begin_s for x in used)))
+    learner.learned = sum(x.samples for x in used)
+    theta, outcome, effects = learner.theta, collect(learner), effects_for(documented)
+    model = learned_model(outcome, documented, fleet=[x.path for x in used])
     solution, std = theta.th.copy(), np.sqrt(np.diagonal(theta.covariance()))
-    effects = effects_for(documented)
     drifts, out = courses(_series(logs, effects), _columns(logs, told or {}))
     return FleetArm(name, model, outcome, solution, std, effects, logs, tuple(drifts), tuple(out))
+
+
+def _learned(
+    documented: SelfModel, used: Sequence[LogMoments]
+) -> tuple[OnlineLearner, dict[str, tuple[Array, float]]]:
+    """A learner with the sum of all moments, loads taken off, and the loads by content."""
+    learner = learner_of(documented)
+    theta = learner.theta
+    _pool(theta, used, {})
+    loads: dict[str, tuple[Array, float]] = {}
+    for _ in range(LOAD_ROUNDS if len(used) >= FEWEST_TO_COMPARE else 0):
+        before, loads = loads, _loads(theta, used)
+        if not before and not loads:
+            break
+        _pool(theta, used, {key: phi for key, (phi, _) in loads.items()})
+    return learner, loads
 
 
 def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array]) -> None:
@@ -262,9 +278,10 @@ def _gain(information: Array, hand: slice) -> Array:
 def _of_logs(
     learner: OnlineLearner,
     found: Sequence[LogMoments],
+    used: Sequence[LogMoments],
     loads: Mapping[str, tuple[Array, float]],
 ) -> tuple[OfLog, ...]:
-    theta = learner.theta
+    theta, among = learner.theta, {x.content for x in used}
     H, _ = theta.information()
     known = theta.known()
     before = np.linalg.slogdet(H[np.ix_(known, known)])[1]
@@ -283,8 +300,10 @@ def _of_logs(
         worth = 0.5 * float(np.linalg.slogdet(more)[1] - before) / len(known)
         effects, std = _own_effects(theta, information, side, rmse)
         carried = None if load is None else Load(float(load[0][0]), load[1])
-        told.append(OfLog(log, carried, effects, std, rmse, own_rmse, (), worth))
-    usual = np.median([x.rmse for x in told], axis=0)
+        told.append(
+            OfLog(log, log.content in among, carried, effects, std, rmse, own_rmse, (), worth)
+        )
+    usual = np.median([x.rmse for x in told if x.used], axis=0)
     out = [
         replace(x, disagrees=_worse(x, usual, len(told))) if len(told) >= FEWEST_TO_COMPARE else x
         for x in told
@@ -321,6 +340,7 @@ def _own_effects(theta: Theta, information: Array, side: Array, rmse: Array) -> 
 def _series(logs: Sequence[OfLog], effects: Sequence[str]) -> list[Series]:
     """Effects joint by joint over an arm's recordings."""
     values, std = (np.array([getattr(x, key) for x in logs]) for key in ("effects", "effects_std"))
+    values[[not x.used for x in logs]] = np.nan
     return [
         Series(name, j + 1, values[:, k, j], std[:, k, j])
         for k, name in enumerate(effects)

@@ -6,7 +6,7 @@ import importlib
 import multiprocessing
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     Future,
@@ -48,7 +48,7 @@ def here(function: Callable[[Task], Result], tasks: Sequence[Task], workers: int
 
 def _together(
     function: Callable[[Task], Result], left: deque[Task], workers: int
-) -> Iterator[tuple[Task, Result]]:
+) -> Generator[tuple[Task, Result], None, list[Task]]:
     """Do tasks from the left until none is left or a process dies; those that it leaves undone."""
     asked: dict[Future[Result], Task] = {}
     undone: list[Task] = []

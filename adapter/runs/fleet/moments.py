@@ -122,8 +122,8 @@ def content_of(task: Task) -> str | Broken:
 
 def _content(path: Path) -> str:
     digest = hashlib.sha256()
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    for file in (x for x in files if x.is_file()):
+    files = sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
+    for file in files:
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode() + b"\0")
         with file.open("rb") as opened:
@@ -141,12 +141,21 @@ def moments_of(task: Task) -> LogMoments | Broken:
         with at_hand(task.path) as path:
             content = _content(path)
             log = read_log(path, topic=task.topic)
-        return _taken(log, _model(task.model), content, task.path)
+        return taken(log, _model(task.model), content, task.path)
     except Exception as error:  # of thousands of files one has what no reader has thought of
         return _broken(task.path, error)
 
 
-def _taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
+def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
+    """Moments of a recording in memory.
+
+    Args:
+        log: as it was read; model: the documented arm.
+        content, path: what it is to be known by.
+
+    Raises:
+        DriverError, RecordingRefused: nothing can be learned from it.
+    """
     named = arm_named(log.metadata)
     log = matching(log, model)
     if not len(log):
@@ -165,6 +174,8 @@ def _taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
     if not samples:
         reasons = ", ".join(reason for reason, _ in front_end.refused.most_common())
         raise DriverError(f"nothing can be learned from it: {reasons or 'no states'}")
+    if not np.isfinite(into.A).all():
+        raise DriverError("its numbers are beyond what can be added up")
     share = 1.0 / learner.theta.noise_gain
     begin, end = int(log.stamp_ns.min()), int(log.stamp_ns.max())
     spans = 1e-9 * begin, 1e-9 * (end - begin)
@@ -221,6 +232,9 @@ def _broken(path: str, error: Exception) -> Broken:
     if isinstance(error, MemoryError):
         return Broken(path, "there is not enough memory for it")
     said = error.strerror if isinstance(error, OSError) else None
-    told = (said or str(error)).replace(str(Path(path)), Path(path).name)
+    told, name = said or str(error), Path(path).name
+    place, there, rest = told.partition(f"{name}: ")  # it is said where the sentence goes
+    if there and (not place or place.endswith("/")):
+        told = rest
     expected = isinstance(error, DriverError | OSError | ValueError | MeansError)
     return Broken(path, told if expected and told else f"{type(error).__name__}: {told}")

@@ -13,7 +13,7 @@ from adapter.model.model_file import whole_file
 from adapter.runs.fleet.arm import FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
-USED, BROKEN, FORGOTTEN = "used", "broken", "forgotten"
+USED, DISAGREES, BROKEN, FORGOTTEN = "used", "disagrees", "broken", "forgotten"
 
 
 def rows(found: Fleet) -> list[dict[str, Any]]:
@@ -31,7 +31,7 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
     out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
     return {
         "log": taken.path,
-        "state": USED,
+        "state": USED if log.used else DISAGREES,
         "why": None,
         "arm": arm.name,
         "content": taken.content,
