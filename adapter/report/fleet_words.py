@@ -88,8 +88,9 @@ def sentences(arm: FleetArm) -> list[str]:
                 f"{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
-    if len(arm.logs) > 1:
-        best = max(arm.logs, key=lambda x: x.worth)
+    used = [x for x in arm.logs if x.used]
+    if len(used) > 1:
+        best = max(used, key=lambda x: x.worth)
         found.append(
             f"the motion of {Path(best.moments.path).name} would teach most if repeated: standard "
             f"deviations would be {_less(best.worth)} less (geometric mean)"

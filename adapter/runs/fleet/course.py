@@ -29,7 +29,7 @@ TOLD_APART = 0.01  # that one column matters beside another one, by chance
 COLLINEAR = 1e-8  # share of a column that others leave
 MOST_OUT = 0.25  # share of the recordings that may stand out
 FARTHEST = 3.0  # standard deviations that a scatter counts for away from the usual one
-MOST_FREEDOM = 1e4  # what all parameters say of one, as so many numbers of its own
+MOST_FREEDOM = 16.0  # what all say of one, as so many numbers of its own; more, and a tail counts
 TINY = 1e-300
 Used = Sequence[NDArray[np.bool_]]
 

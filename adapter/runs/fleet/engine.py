@@ -17,6 +17,7 @@ from concurrent.futures import (
 from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from multiprocessing.context import BaseContext
+from threading import Thread
 from typing import Any, TypeVar
 
 from adapter.errors import MeansError
@@ -52,7 +53,7 @@ def _together(
     """Do tasks from the left until none is left or a process dies; those that it leaves undone."""
     asked: dict[Future[Result], Task] = {}
     undone: list[Task] = []
-    with ProcessPoolExecutor(workers, mp_context=_context()) as pool:
+    with _processes(workers) as pool:
         while (left and not undone) or asked:
             while left and not undone and len(asked) < AT_HAND * workers:
                 task = left.popleft()
@@ -74,12 +75,29 @@ def _together(
 def _alone(function: Callable[[Task], Result], task: Task) -> Result | Broken:
     """Do a task in a process of its own."""
     for _ in range(TRIES):
-        with ProcessPoolExecutor(1, mp_context=_context()) as pool:
+        with _processes(1) as pool:
             try:
                 return pool.submit(function, task).result()
             except BrokenProcessPool:
                 continue
     return Broken(task.path, DIED)
+
+
+def _processes(count: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(count, mp_context=_context(), initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Let this process end when the one that asked for it has died without a word."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
 
 
 def _context() -> BaseContext:
