@@ -25,6 +25,7 @@ from adapter.runs.fleet.fleet import (
     found_logs,
     learn_fleet,
     read_manifest,
+    recall,
 )
 from adapter.runs.fleet.table import write_table
 from adapter.runs.terminal import (
@@ -37,6 +38,8 @@ from adapter.runs.terminal import (
     write_json,
 )
 
+MOST_ROWS = 40  # on the terminal; of more recordings those that there is something to say of
+
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
@@ -45,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
     folder = results_folder(args.out, "fleet")
     manifest = Manifest({}, {}) if args.manifest is None else read_manifest(args.manifest)
     settings = Settings(folder, args.workers, args.cluster, args.by, manifest, args.topic)
-    if args.forget:
-        forget(found_logs(args.forget), robot, settings)
+    forget(args.forget, robot, settings)
+    recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("reading", total=len(given))
@@ -93,9 +96,16 @@ def _table(found: Fleet, folder: Path) -> Path:
 
 
 def _print(arm: FleetArm) -> None:
-    table = Table(*HEADS, box=None, pad_edge=False, title=arm.name, title_justify="left")
-    for log in arm.logs:
-        table.add_row(*log_cells(log))
+    worth_saying = {x.number for x in arm.standing_out}
+    worth_saying |= {k for k, x in enumerate(arm.logs) if x.load is not None or x.disagrees}
+    shown = range(len(arm.logs)) if len(arm.logs) <= MOST_ROWS else sorted(worth_saying)
+    table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
+    for number, head in enumerate(HEADS):
+        table.add_column(head, no_wrap=number > 0, overflow="fold")
+    for k in shown:
+        table.add_row(*log_cells(arm.logs[k]))
     output.print(table)
+    if len(shown) < len(arm.logs):
+        show(f"{len(arm.logs) - len(shown)} recordings of which nothing is to be said")
     for line in sentences(arm):
         show(line)

@@ -52,7 +52,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="a table with a column log, and arm, or numbers that friction may follow "
         "(temperature, age); goes before --by",
     )
-    add("--forget", nargs="+", action="extend", default=[], metavar="LOG", help="leave these out")
+    for name, said in (
+        ("--forget", "leave these out from now on, though they are gone or given"),
+        ("--remember", "do not leave these out any more"),
+    ):
+        add(name, nargs="+", action="extend", default=[], metavar="LOG", help=said)
     add(
         "--workers",
         type=int,
@@ -69,8 +73,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def _check(args: argparse.Namespace) -> None:
     if not args.logs and args.out is None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")
-    if args.forget and args.out is None:
-        raise UsageError("--forget needs --out, the folder of the fleet that knows the LOG")
+    for option in ("forget", "remember"):
+        if getattr(args, option) and args.out is None:
+            raise UsageError(f"--{option} needs --out, the folder of the fleet that knows the LOG")
     if args.workers < 0:
         raise UsageError(f"--workers takes 0 or more, got {args.workers}")
     locks_of(args)

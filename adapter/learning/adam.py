@@ -7,9 +7,12 @@ the fused operator that it ends in takes 5. That operator is private: where a to
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # loaded by the first learner: takes a second
+import numpy as np
+
+if TYPE_CHECKING:  # loaded by the first step: takes a second, and who sums moments takes none
     import torch
 
 FUSED = "_fused_adam_"
@@ -31,25 +34,32 @@ class FlatAdam:
 
     def __init__(self, size: int, rate: float, betas: tuple[float, float]) -> None:
         self.rate, self._betas = rate, betas
+        self.parameters, self.gradient, self.first, self.second = np.zeros((4, size))
+        self._count = np.zeros((), dtype=np.float32)
+
+    @cached_property
+    def _tensors(self) -> list[torch.Tensor]:
+        """Parameters, gradient and the two means, on the same memory, and the count of steps."""
         import torch
 
-        self._tensors = [torch.zeros(size, dtype=torch.float64) for _ in range(4)]
-        self._steps = torch.zeros((), dtype=torch.float32)
-        self._count = self._steps.numpy()
-        self.parameters, self.gradient, self.first, self.second = (
-            tensor.numpy() for tensor in self._tensors
-        )
-        self._fused: Any = getattr(torch, FUSED, None)
-        self._optimizer = self._plain() if self._fused is None else None
+        arrays = self.parameters, self.gradient, self.first, self.second, self._count
+        return [torch.from_numpy(x) for x in arrays]
 
-    def _plain(self) -> torch.optim.Optimizer:
+    @cached_property
+    def _fused(self) -> Any:
+        import torch
+
+        return getattr(torch, FUSED, None)
+
+    @cached_property
+    def _optimizer(self) -> torch.optim.Optimizer:
         """torch's optimizer on our memory, its state included."""
         import torch
 
-        parameters, gradient, first, second = self._tensors
+        parameters, gradient, first, second, steps = self._tensors
         parameters.grad = gradient
         optimizer = torch.optim.Adam([parameters], lr=self.rate, betas=self._betas, eps=EPS)
-        state = {"step": self._steps, "exp_avg": first, "exp_avg_sq": second}
+        state = {"step": steps, "exp_avg": first, "exp_avg_sq": second}
         optimizer.state[parameters] = state
         return optimizer
 
@@ -64,11 +74,11 @@ class FlatAdam:
 
     def step(self) -> None:
         """One ADAM step on the gradient as it stands."""
-        if self._optimizer is not None:
+        if self._fused is None:
             self._optimizer.param_groups[0]["lr"] = self.rate
             self._optimizer.step()
             return
-        parameters, gradient, first, second = self._tensors
+        parameters, gradient, first, second, steps = self._tensors
         self._count += 1.0
         self._fused(
             [parameters],
@@ -76,7 +86,7 @@ class FlatAdam:
             [first],
             [second],
             [],
-            [self._steps],
+            [steps],
             lr=self.rate,
             beta1=self._betas[0],
             beta2=self._betas[1],

@@ -219,7 +219,7 @@ class OnlineLearner:
         Raises:
             ModelError: records of another size.
         """
-        table = self.without_known(self._sound(table))
+        table = self.without_known(self.sound(table))
         if not len(table):
             return 0
         self.stamp_ns = stamp_of(table[-1])
@@ -239,7 +239,7 @@ class OnlineLearner:
             self.watch(self, self._torque_states if due else table)
         return len(table)
 
-    def _sound(self, table: Array) -> Array:
+    def sound(self, table: Array) -> Array:
         """The states of a table that can be learned from."""
         if table.shape[1] != self.layout.size:
             raise ModelError(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,12 @@ import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.model.spatial import Array
-from adapter.runs.fleet.arm import TIME, Drift, FleetArm, OfLog
+from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
+from adapter.runs.fleet.course import Drift, StandsOut
 from adapter.runs.fleet.fleet import Fleet
 
-HEADS = ("recording", "begins", "s", "hand carries, kg", "worst fit, N m", "teaches", "disagrees")
+HEADS = ("recording", "begins", "s", "load, kg", "fit, N m", "once more", "disagrees")
+FEW = 4  # joints to be named in a table
 EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 
 
@@ -24,10 +28,10 @@ def log_cells(log: OfLog) -> tuple[str, ...]:
         Path(log.moments.path).name,
         begin_words(log.moments.begin_s),
         f"{log.moments.span_s:.0f}",
-        "as usual" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
-        f"{log.rmse[worst]:.3f} (joint {worst + 1})",
-        f"{log.worth:.3f}",
-        _joints(log.disagrees) if log.disagrees else "",
+        "" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
+        f"{log.rmse[worst]:.3f} ({worst + 1})",
+        _less(log.worth),
+        " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
     )
 
 
@@ -35,7 +39,7 @@ def begin_words(begin_s: float) -> str:
     """A date, or s where a clock counts from something else."""
     if begin_s < EPOCH_S:
         return f"{begin_s:.1f} s"
-    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M:%S}"
+    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
 
 
 def _joints(numbers: tuple[int, ...]) -> str:
@@ -44,17 +48,35 @@ def _joints(numbers: tuple[int, ...]) -> str:
 
 def drift_words(drift: Drift) -> str:
     """A sentence."""
-    effect = CATALOGUE[drift.effect]
+    effect, per = CATALOGUE[drift.effect], f"per unit of {drift.follows}"
     unit = effect.parameters[0].unit
-    per = "a day" if drift.follows == TIME else f"per unit of {drift.follows}"
+    per = "a day" if drift.follows == TIME else per
+    share = f" ({100.0 * drift.span / abs(drift.usual):.0f} % of it)" if drift.usual else ""
+    or_ = "".join(f" or {x}" for x in drift.rivals)
+    doubt = "; these recordings cannot tell which" if drift.rivals else ""
     return (
-        f"{effect.title.lower()} of joint {drift.joint} follows {drift.follows}: "
+        f"{effect.title.lower()} of joint {drift.joint} follows {drift.follows}{or_}: "
         f"{drift.slope:+.3g} ± {drift.std:.2g} {unit} {per}, {drift.span:.3g} {unit} over all"
+        f"{share}{doubt}"
     )
 
 
+def standing_out_words(arm: FleetArm) -> Iterator[str]:
+    """A sentence for each recording with parameters that the others do not have."""
+    by_log: dict[int, list[StandsOut]] = {}
+    for one in arm.standing_out:
+        by_log.setdefault(one.number, []).append(one)
+    for number, several in sorted(by_log.items()):
+        told = [
+            f"{CATALOGUE[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
+            f"{CATALOGUE[x.effect].parameters[0].unit} where {x.expected:.3g} was to be expected"
+            for x in several
+        ]
+        yield f"{Path(arm.logs[number].moments.path).name} stands out: {'; '.join(told)}"
+
+
 def sentences(arm: FleetArm) -> list[str]:
-    """What stands out of an arm's recordings."""
+    """What there is to say of an arm's recordings."""
     found = [drift_words(x) for x in arm.drifts]
     for log in arm.logs:
         if log.disagrees:
@@ -62,16 +84,23 @@ def sentences(arm: FleetArm) -> list[str]:
             found.append(
                 f"{Path(log.moments.path).name} disagrees with the others on "
                 f"{_joints(log.disagrees)}: {log.rmse[worst]:.2g} N m on joint {worst + 1} where "
-                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change "
-                "(--forget leaves it out)"
+                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change"
+                f"{'' if log.used else '; the model is learned without it'}"
             )
-    if len(arm.logs) > 1:
-        best = max(arm.logs, key=lambda x: x.worth)
+    found += standing_out_words(arm)
+    used = [x for x in arm.logs if x.used]
+    if len(used) > 1:
+        best = max(used, key=lambda x: x.worth)
         found.append(
-            f"the motion of {Path(best.moments.path).name} would teach most if repeated "
-            f"({best.worth:.2f} nats a parameter)"
+            f"the motion of {Path(best.moments.path).name} would teach most if repeated: standard "
+            f"deviations would be {_less(best.worth)} less (geometric mean)"
         )
     return found
+
+
+def _less(worth: float) -> str:
+    """By how much standard deviations become less with so many nats a parameter more."""
+    return f"{-100.0 * np.expm1(-worth):.2g} %"
 
 
 def summary(found: Fleet) -> list[str]:
@@ -106,10 +135,15 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
             name: {"value": arm.outcome.effects[k], "std": std[k]}
             for k, name in enumerate(arm.effects)
         },
-        "drifts": [x._asdict() for x in arm.drifts],
+        "drifts": [asdict(x) for x in arm.drifts],
+        "standing_out": [_standing_out_json(arm, x) for x in arm.standing_out],
         "logs": [_log_json(log) for log in arm.logs],
         "notes": sentences(arm),
     }
+
+
+def _standing_out_json(arm: FleetArm, one: StandsOut) -> dict[str, Any]:
+    return {**one._asdict(), "path": arm.logs[one.number].moments.path}
 
 
 def effect_std(arm: FleetArm) -> Array:
@@ -128,6 +162,7 @@ def _log_json(log: OfLog) -> dict[str, Any]:
         "load": None if log.load is None else log.load._asdict(),
         "rmse_nm": log.rmse,
         "own_rmse_nm": log.own_rmse,
+        "used": log.used,
         "disagrees": list(log.disagrees),
         "worth_nats": log.worth,
     }

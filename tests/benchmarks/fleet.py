@@ -1,9 +1,11 @@
 """What a fleet costs: processes against each other, the same work elsewhere, and a plan from it.
 
 Recordings of `--seconds` hold the documented Panda's torques with friction and noise. The same
-normal equations are made by a plain loop over Pinocchio's regressor with numpy. The plan takes what
-a recording costs here and lets a fleet of machines do hours of them, with stragglers and processes
-that die, by a simulation of the scheduler's rule: whoever is free takes the next. `make bench`.
+normal equations are made by a plain loop over Pinocchio's regressor with numpy; `mujoco.sysid`
+(extra `mujoco[sysid]`) fits the same parameters by simulating the recording over and over. The plan
+takes what a recording costs here and lets a fleet of machines do hours of them, with stragglers and
+machines that fail, by a simulation: whoever is free takes the next, and all results go through one
+process that keeps them. `make bench`.
 """
 
 from __future__ import annotations
@@ -18,12 +20,13 @@ import shutil
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.export import robot_urdf
+from adapter.effects.export import robot_mjcf, robot_urdf
 from adapter.effects.robots import documented
 from adapter.effects.torque import ModelTorque
 from adapter.runs.fleet.engine import here
@@ -31,16 +34,19 @@ from adapter.runs.fleet.fleet import Settings, found_logs, learn_fleet
 from adapter.runs.fleet.moments import Task, content_of
 from adapter.signals.validation import smooth
 from drivers.files.mcap import McapWriter, read_log
-from tests.helpers.arm_data import Motion, trajectory
 
 SEED = 11
 NOISE = 1e-5, 1e-3, 0.05  # rad, rad/s, N m
-DIES_AN_HOUR = 0.001  # chance of a process
+FAILS_AN_HOUR, AWAY_S = 0.01, 600.0  # chance of a machine, and how long it is away then
 SLOW_SHARE, SLOW = 0.05, 4.0  # stragglers, and how many times longer they take
+SEGMENT_S = 0.1  # that mujoco.sysid simulates from a measured state; longer ones run away
+SYSID_ROUNDS = 5  # of its optimizer
 
 
 def make_logs(folder: Path, count: int, seconds: float) -> list[str]:
     """Recordings of different motions; those of before are kept."""
+    from tests.helpers.arm_data import Motion, trajectory  # brings what no worker needs
+
     folder.mkdir(parents=True, exist_ok=True)
     panda = documented("panda")
     torque, rng = ModelTorque(panda), np.random.default_rng(SEED)
@@ -60,14 +66,14 @@ def make_logs(folder: Path, count: int, seconds: float) -> list[str]:
     return found_logs([str(folder)])[:count]
 
 
-def timed(logs: list[str], folder: Path, workers: int) -> float:
-    """Wall time, s, of a fleet that knows nothing yet."""
+def timed(logs: list[str], folder: Path, workers: int) -> tuple[float, float]:
+    """Wall time and this process's processor time, s, of a fleet that knows nothing yet."""
     shutil.rmtree(folder, ignore_errors=True)
-    started = time.perf_counter()
+    started, own = time.perf_counter(), time.process_time()
     found = learn_fleet(logs, documented("panda"), Settings(folder, workers))
     if found.broken or found.read != len(logs):
         raise SystemExit(f"{len(found.broken)} broken of {len(logs)}")
-    return time.perf_counter() - started
+    return time.perf_counter() - started, time.process_time() - own
 
 
 def plain_loop(logs: list[str]) -> None:
@@ -93,12 +99,64 @@ def plain_loop(logs: list[str]) -> None:
     np.linalg.solve(A, b)
 
 
+def mujoco_sysid(logs: list[str]) -> dict[str, float]:
+    """The same parameters by `mujoco.sysid`: ten of each link, damping and dry friction."""
+    import mujoco
+    from mujoco import sysid
+
+    model = documented("panda")
+    spec = mujoco.MjSpec.from_string(robot_mjcf(model).text)
+    spec.option.timestep = 1e-3
+    for name in model.tree.joint_names:
+        spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        for kind in (mujoco.mjtSensor.mjSENS_JOINTPOS, mujoco.mjtSensor.mjSENS_JOINTVEL):
+            sensor = f"{name}_{kind.name}"
+            spec.add_sensor(name=sensor, type=kind, objname=name, objtype=mujoco.mjtObj.mjOBJ_JOINT)
+    compiled = spec.compile()
+    parameters = sysid.ParameterDict()
+    for name in model.tree.joint_names:
+        body = compiled.body(compiled.joint(name).bodyid[0]).name
+        parameters.add(sysid.body_inertia_param(spec, compiled, body, sysid.InertiaType.Pseudo))
+        for effect, most in (("damping", 5.0), ("frictionloss", 5.0)):
+            change = partial(_set_of_joint, name, effect)
+            own = sysid.Parameter(f"{name}_{effect}", 0.1, 0.0, most, modifier=change)
+            parameters.add(own)
+    states, controls, sensors, names = [], [], [], []
+    step = round(SEGMENT_S / spec.option.timestep)
+    for path in logs:
+        log = read_log(path)
+        seconds = 1e-3 * np.arange(step)
+        measured = np.stack([log.q, log.dq], axis=2).reshape(len(log), -1)
+        for start in range(0, len(log) - step, step):
+            part = slice(start, start + step)
+            states.append(sysid.create_initial_state(compiled, log.q[start], log.dq[start], None))
+            controls.append(sysid.TimeSeries(seconds, log.tau[part]))
+            sensors.append(sysid.TimeSeries.from_names(seconds, measured[part], compiled))
+            names.append(f"{path}:{start}")
+    whole = sysid.ModelSequences("panda", spec, names, states, controls, sensors)
+    residual = sysid.build_residual_fn(models_sequences=[whole], n_threads=1)
+    begin, _, _ = residual(parameters.as_vector(), parameters)
+    best, _ = sysid.optimize(parameters, residual, verbose=False, max_iters=SYSID_ROUNDS)
+    end, _, _ = residual(best.as_vector(), best)
+    first, last = (float(np.sqrt(np.mean(np.concatenate(x) ** 2))) for x in (begin, end))
+    damping = [best[f"{name}_damping"].value[0] for name in model.tree.joint_names]
+    return {"residual_before": first, "after": last, "damping": float(np.median(damping))}
+
+
+def _set_of_joint(name: str, effect: str, spec: Any, parameter: Any) -> None:
+    joint, value = spec.joint(name), float(parameter.value[0])
+    as_now = np.atleast_1d(getattr(joint, effect))  # damping is a polynomial in the speed
+    setattr(joint, effect, np.r_[value, 0.0 * as_now[1:]] if len(as_now) > 1 else value)
+
+
 def in_a_process(arguments: list[str]) -> dict[str, float]:
     """Wall and processor time, s, and most memory, MB, of this file in a process of its own."""
     started = time.perf_counter()
     command = [sys.executable, __file__, *arguments]
-    told = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    own = json.loads(told.splitlines()[-1])
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        return {"cannot": done.stderr.splitlines()[-1]}
+    own = json.loads(done.stdout.splitlines()[-1])
     return {"wall_s": time.perf_counter() - started, **own}
 
 
@@ -108,24 +166,32 @@ def of_this_process() -> dict[str, float]:
     return {"cpu_s": time.process_time(), "peak_mb": int(peak[1]) / 1024 if peak else math.nan}
 
 
-def schedule(tasks: int, task_s: float, processes: int) -> dict[str, float]:
-    """Hours until all tasks are done where some take longer and processes die with their task.
+def schedule(tasks: int, task_s: float, head_s: float, machines: int) -> dict[str, float]:
+    """Hours until all tasks are done by machines of two processes and one that keeps results.
 
-    A process that dies is gone for good; its task starts again elsewhere.
+    Args:
+        tasks: how many; task_s: of one on a process; head_s: of one where results are kept.
+        machines: some of whose tasks take longer, and which fail with both tasks and come back.
     """
     rng = np.random.default_rng(SEED)
-    free = [(0.0, k) for k in range(processes)]
-    end_s, lost, left = 0.0, 0, tasks
+    free = [(0.0, machine) for machine in range(machines) for _ in range(2)]
+    back_s, kept_s, lost, left = np.zeros(machines), 0.0, 0, tasks
     while left:
-        at, who = heapq.heappop(free)
+        at_s, machine = heapq.heappop(free)
+        at_s = max(at_s, back_s[machine])
         took = task_s * (SLOW if rng.random() < SLOW_SHARE else 1.0)
-        if len(free) > 1 and rng.random() < DIES_AN_HOUR * took / 3600.0:
-            lost += 1
+        if rng.random() < 0.5 * FAILS_AN_HOUR * took / 3600.0:
+            lost += 1  # the task goes back to the others
+            back_s[machine] = at_s + took + AWAY_S
+            heapq.heappush(free, (back_s[machine], machine))
             continue
-        left, end_s = left - 1, max(end_s, at + took)
-        heapq.heappush(free, (at + took, who))
-    ideal_s = tasks * task_s * (1.0 + SLOW_SHARE * (SLOW - 1.0)) / processes
-    return {"hours": end_s / 3600.0, "over_ideal": end_s / ideal_s, "processes_lost": lost}
+        left -= 1
+        kept_s = max(kept_s, at_s + took) + head_s
+        heapq.heappush(free, (at_s + took, machine))
+    ideal_s = tasks * task_s * (1.0 + SLOW_SHARE * (SLOW - 1.0)) / (2 * machines)
+    read_s = max(at_s for at_s, _ in free)
+    hours = {"read_hours": read_s / 3600.0, "kept_hours": kept_s / 3600.0}
+    return {**hours, "read_over_ideal": read_s / ideal_s, "failures": lost}
 
 
 def overhead_ms() -> float:
@@ -150,41 +216,56 @@ def main() -> None:
     add("--plan-hours", type=float, default=10_000.0)
     add("--machines", type=int, default=100)
     add("--compared", type=int, default=20, help="logs of the comparison with other tools")
-    add("--only", choices=("fleet", "plain"), help=argparse.SUPPRESS)
+    add("--simulated", type=int, default=1, help="logs of that with mujoco.sysid")
+    add("--only", choices=("fleet", "plain", "sysid"), help=argparse.SUPPRESS)
     add("--json", type=Path)
     args = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     logs = make_logs(args.folder / "logs", args.logs, args.seconds)
     if args.only is not None:
-        few = logs[: args.compared]
-        plain_loop(few) if args.only == "plain" else timed(few, args.folder / "only", 0)
-        print(json.dumps(of_this_process()))
+        told = only(args.only, logs[: args.compared], args)
+        print(json.dumps({**of_this_process(), **told}))
         return
     timed(logs[:2], args.folder / "first", 2)  # kernels are compiled
     found: dict[str, Any] = {"logs": len(logs), "seconds": args.seconds}
     for workers in (1, 2):
-        found[f"workers_{workers}_s"] = timed(logs, args.folder / f"out{workers}", workers)
+        found[f"workers_{workers}_s"], own_s = timed(logs, args.folder / f"out{workers}", workers)
     found["times_faster"] = found["workers_1_s"] / found["workers_2_s"]
     started = time.perf_counter()
     learn_fleet(logs, documented("panda"), Settings(args.folder / "out2", 2))
     found["again_s"] = time.perf_counter() - started
     found["overhead_ms_per_log"] = overhead_ms()
     same = ["--logs", str(args.logs), "--seconds", str(args.seconds), "--folder", str(args.folder)]
-    same += ["--compared", str(args.compared)]
-    for name in ("fleet", "plain"):
-        found[f"{args.compared}_logs_{name}"] = in_a_process([*same, "--only", name])
-    per_log_s = found["workers_1_s"] / len(logs)
+    for name, count in (("fleet", args.compared), ("plain", args.compared), ("fleet", 1)):
+        told = in_a_process([*same, "--compared", str(count), "--only", name])
+        found[f"{count}_logs_{name}"] = told
+    several = ["--compared", str(args.simulated), "--only", "sysid"]
+    found[f"{args.simulated}_logs_sysid"] = in_a_process([*same, *several])
+    per_log_s = 2.0 * found["workers_2_s"] / len(logs)
     tasks = round(args.plan_hours * 3600.0 / args.seconds)
+    head_s = own_s / len(logs)
     found["plan"] = {
         "hours_of_logs": args.plan_hours,
         "machines": args.machines,
         "s_per_log": per_log_s,
-        **schedule(tasks, per_log_s, 2 * args.machines),
+        "head_s_per_log": head_s,
+        **schedule(tasks, per_log_s, head_s, args.machines),
     }
     text = json.dumps(found, indent=1)
     print(text)
     if args.json is not None:
         args.json.write_text(text + "\n")
+
+
+def only(name: str, logs: list[str], args: argparse.Namespace) -> dict[str, float]:
+    """One way of doing the work, in this process."""
+    if name == "sysid":
+        return mujoco_sysid(logs)
+    if name == "plain":
+        plain_loop(logs)
+    else:
+        timed(logs, args.folder / "only", 0)
+    return {}
 
 
 if __name__ == "__main__":

@@ -1,38 +1,40 @@
 """One arm from the moments of its recordings: its model, and what each recording tells beside it.
 
-Inertias, friction and offsets are common. A recording whose hand is heavier or lighter than is
-usual on this arm (the median) carries a body of its own, which is solved for with all else and
-taken off its moments. λ is the documented one.
+Inertias, friction and offsets are common to those that agree. A recording whose hand is heavier or
+lighter than is usual on this arm (the median) carries a body of its own, which is solved for with
+all else and taken off its moments. λ is the documented one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.stats import chi2
 
-from adapter.effects.catalogue import effects_by_name
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.theta import PRIOR_STD, Theta
 from adapter.learning.theta_kernels import Moments
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.runs.fleet.course import Drift, Series, StandsOut, courses
+from adapter.runs.fleet.information import Information
 from adapter.runs.fleet.moments import LogMoments, effects_for, learner_of
 from adapter.runs.outcome import Outcome, collect, learned_model
 
 FITS = 6  # of weights and priors to what was found with those before
 LOAD_ROUNDS = 4  # of loads to weights
+ROUNDS = 5  # of who agrees to the model that these make
 LEAST_LOAD_KG, LOAD_STD = 0.05, 4.0  # less than this, or so many standard deviations, is no load
 TIMES_WORSE = 1.5  # than its own best fit and than other logs: one that disagrees
-FEWEST_TO_COMPARE, FEWEST_FOR_DRIFT = 3, 5  # logs
-# that a line through what does not change is as steep: by standard deviations, and by scatter alone
-CHANCE, CHANCE_BY_SCATTER = 1e-5, 0.01
+BY_CHANCE = 0.01  # that one of an arm's recordings does so
+FEWEST_TO_COMPARE = 3  # logs
 DAY_S = 86_400.0
-TIME = "time"  # the covariate that every log has
+TIME = "time"  # the column that every log has
+TINY = 1e-300
 
 
 class Load(NamedTuple):
@@ -42,30 +44,13 @@ class Load(NamedTuple):
     std: float
 
 
-class Drift(NamedTuple):
-    """A parameter that follows something.
-
-    Attributes:
-        effect, joint: of which joint (from 1).
-        follows: "time", or a column of the manifest.
-        slope, std: of the parameter per day, or per unit of the column.
-        span: how far the parameter goes over all recordings.
-    """
-
-    effect: str
-    joint: int
-    follows: str
-    slope: float
-    std: float
-    span: float
-
-
 @dataclass(frozen=True, eq=False)
 class OfLog:
     """What one recording tells beside the arm's model.
 
     Attributes:
         moments: of the recording, as they were taken.
+        used: whether the arm's model is learned from it, too; not where it disagrees.
         load: None where the hand is as usual.
         effects, effects_std: (e, n) of this recording alone, inertias being the arm's.
         rmse, own_rmse: (n,) N m of the arm's model, and of the best one for this recording alone.
@@ -75,6 +60,7 @@ class OfLog:
     """
 
     moments: LogMoments
+    used: bool
     load: Load | None
     effects: Array
     effects_std: Array
@@ -90,12 +76,13 @@ class FleetArm:
 
     Attributes:
         name: of the arm.
-        model: learned from all recordings.
+        model: learned from all recordings that agree, where these are the most.
         outcome: of the learner, for whatever reads those.
         solution, std: (P,) (θ, effects) and standard deviations, before bodies are made possible.
         effects: names of what was learned beside θ.
         logs: in the order of their begin.
-        drifts: the surest first.
+        drifts: the clearest first.
+        standing_out: friction and offsets of single recordings, by their number in `logs`.
     """
 
     name: str
@@ -106,6 +93,7 @@ class FleetArm:
     effects: tuple[str, ...]
     logs: tuple[OfLog, ...]
     drifts: tuple[Drift, ...]
+    standing_out: tuple[StandsOut, ...]
 
 
 def learn_arm(
@@ -123,36 +111,63 @@ def learn_arm(
         told: numbers that a manifest tells of recordings, by content and column.
     """
     found = sorted(found, key=lambda x: x.content)
+    used = list(found)
+    for number in range(ROUNDS):
+        learner, loads = _learned(documented, used)
+        logs = _of_logs(learner, found, used, loads)
+        agreeing = {x.moments.content for x in logs if not x.disagrees}
+        told_apart = agreeing != {x.content for x in used} and 2 * len(agreeing) > len(found)
+        if number == ROUNDS - 1 or not told_apart:
+            break
+        used = [x for x in found if x.content in agreeing]
+    learner.start_theta(round(1e9 * min(x.begin_s for x in used)))
+    learner.learned = sum(x.samples for x in used)
+    theta, outcome, effects = learner.theta, collect(learner), effects_for(documented)
+    model = learned_model(outcome, documented, fleet=[x.path for x in used])
+    solution, std = theta.th.copy(), np.sqrt(np.diagonal(theta.covariance()))
+    drifts, out = courses(_series(logs, effects), _columns(logs, told or {}))
+    return FleetArm(name, model, outcome, solution, std, effects, logs, tuple(drifts), tuple(out))
+
+
+def _learned(
+    documented: SelfModel, used: Sequence[LogMoments]
+) -> tuple[OnlineLearner, dict[str, tuple[Array, float]]]:
+    """A learner with the sum of all moments, loads taken off, and the loads by content."""
     learner = learner_of(documented)
     theta = learner.theta
-    _pool(theta, found, {})
+    _pool(theta, used, {})
     loads: dict[str, tuple[Array, float]] = {}
-    for _ in range(LOAD_ROUNDS if len(found) >= FEWEST_TO_COMPARE else 0):
-        loads = _loads(theta, found)
-        _pool(theta, found, {key: phi for key, (phi, _) in loads.items()})
-    begin = min(x.begin_s for x in found)
-    learner.start_theta(round(1e9 * begin))
-    learner.learned = sum(x.samples for x in found)
-    logs = _of_logs(learner, found, loads)
-    outcome = collect(learner)
-    model = learned_model(outcome, documented, fleet=[x.path for x in found])
-    solution, std = theta.th.copy(), np.sqrt(np.diagonal(theta.covariance()))
-    effects = effects_for(documented)
-    drifts = _drifts(logs, effects, told or {})
-    return FleetArm(name, model, outcome, solution, std, effects, logs, drifts)
+    for _ in range(LOAD_ROUNDS if len(used) >= FEWEST_TO_COMPARE else 0):
+        before, loads = loads, _loads(theta, used)
+        if not before and not loads:
+            break
+        _pool(theta, used, {key: phi for key, (phi, _) in loads.items()})
+    return learner, loads
 
 
 def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array]) -> None:
     """Put the sum of all moments in place, loads taken off, and solve for (θ, effects)."""
-    A, count = np.zeros_like(theta.moments.A), 0.0
-    for log in found:
-        A += _without(theta, log.A, loads.get(log.content))
-        count += log.count
+    A = _sum(_without(theta, log.A, loads.get(log.content)) for log in found)
+    count = sum(log.count for log in found)
     theta.replace_moments(Moments(A, theta.moments.C, *theta.moments[2:]), count)
     for _ in range(FITS):
         theta.th[:] = theta.least_squares()
         theta.adapt_prior()
-    theta.th[:] = theta.least_squares()
+    theta.th[:] = _solution(theta)
+
+
+def _solution(theta: Theta) -> Array:
+    """Least squares, refined once: what is left over is small, and counted in more digits.
+
+    Without that rounding in directions that only the prior holds reaches 1e-9 of the standard
+    deviations of those that data show.
+    """
+    th, at = theta.least_squares(), theta.known()
+    H, rhs = theta.information()
+    wide = np.longdouble
+    left = rhs.astype(wide)[at] - H.astype(wide)[np.ix_(at, at)] @ th.astype(wide)[at]
+    th[at] += np.linalg.solve(H[np.ix_(at, at)], left.astype(float))
+    return th
 
 
 def _without(theta: Theta, A: Array, load: Array | None) -> Array:
@@ -176,15 +191,14 @@ def _without(theta: Theta, A: Array, load: Array | None) -> Array:
 
 def _loads(theta: Theta, found: Sequence[LogMoments]) -> dict[str, tuple[Array, float]]:
     """Bodies (10,) beside the usual hand, and the standard deviations of their masses."""
-    weights = theta.weights()
-    own = [theta.data_information(log.A, weights) for log in found]
-    every = _solved(theta, own, range(len(found)))
+    information = Information(theta)
+    every = _solved(theta, information, found, range(len(found)))
     masses = np.array([x.body[0] for x in every])
     usual = every[np.argsort(masses)[len(masses) // 2]]
     std = np.array([_mass_std(theta, x, usual) for x in every])
     beyond = np.abs(masses - usual.body[0]) > np.maximum(LEAST_LOAD_KG, LOAD_STD * std)
     loaded = [k for k, x in enumerate(beyond) if x]
-    again = _solved(theta, own, loaded)
+    again = _solved(theta, information, found, loaded)
     return {
         found[k].content: (x.body, _mass_std(theta, x, None))
         for k, x in zip(loaded, again, strict=True)
@@ -219,32 +233,40 @@ def _mass_std(theta: Theta, ours: Body, other: Body | None) -> float:
     return float(np.sqrt(variance + follows @ ours.arm @ follows))
 
 
-def _solved(theta: Theta, own: Sequence[tuple[Array, Array]], loaded: Sequence[int]) -> list[Body]:
+def _solved(
+    theta: Theta, information: Information, found: Sequence[LogMoments], loaded: Sequence[int]
+) -> list[Body]:
     """Bodies at the hands of `loaded`, the arm's θ being common.
 
     A body acts as the hand does; it is eliminated from the information of its recording, and found
     when all others have said what the arm is (Schur complement).
     """
-    H, rhs, hand = theta.prior.copy(), theta.prior_rhs.copy(), theta.hand
-    for k, (information, side) in enumerate(own):
-        H += information
-        rhs += side
-        if k in loaded:
-            gain = _gain(information, hand)
-            H -= information[:, hand] @ gain
-            rhs -= gain.T @ side[hand]
+    hand = theta.hand
+    H, rhs = information(_sum(x.A for x in found))
+    H, rhs = H + theta.prior, rhs + theta.prior_rhs
+    for k in loaded:
+        own, side = information(found[k].A)
+        gain = _gain(own, hand)
+        H -= own[:, hand] @ gain
+        rhs -= gain.T @ side[hand]
     known = theta.known()
     inverse = np.asarray(np.linalg.inv(H[np.ix_(known, known)]), dtype=float)
     common = np.zeros(theta.P)
     common[known] = inverse @ rhs[known]
-    found = []
-    for information, side in (own[k] for k in loaded):
+    bodies = []
+    for k in loaded:
+        own, side = information(found[k].A)
         alone = np.asarray(
-            np.linalg.inv(information[hand, hand] + np.diag(1.0 / PRIOR_STD**2)), dtype=float
+            np.linalg.inv(own[hand, hand] + np.diag(1.0 / PRIOR_STD**2)), dtype=float
         )
-        body: Array = alone @ (side[hand] - information[hand] @ common)
-        found.append(Body(body, alone, _gain(information, hand), inverse))
-    return found
+        body: Array = alone @ (side[hand] - own[hand] @ common)
+        bodies.append(Body(body, alone, _gain(own, hand), inverse))
+    return bodies
+
+
+def _sum(parts: Iterable[Array]) -> Array:
+    """One after the other, so that no more than two are made at once."""
+    return reduce(np.add, parts)
 
 
 def _gain(information: Array, hand: slice) -> Array:
@@ -256,17 +278,18 @@ def _gain(information: Array, hand: slice) -> Array:
 def _of_logs(
     learner: OnlineLearner,
     found: Sequence[LogMoments],
+    used: Sequence[LogMoments],
     loads: Mapping[str, tuple[Array, float]],
 ) -> tuple[OfLog, ...]:
-    theta = learner.theta
+    theta, among = learner.theta, {x.content for x in used}
     H, _ = theta.information()
     known = theta.known()
     before = np.linalg.slogdet(H[np.ix_(known, known)])[1]
-    weights, told = theta.weights(), []
+    of, told = Information(theta), []
     for log in found:
         load = loads.get(log.content)
         A = _without(theta, log.A, None if load is None else load[0])
-        information, side = theta.data_information(A, weights)
+        information, side = of(A)
         best = theta.th.copy()
         alone = (information + theta.prior)[np.ix_(known, known)]
         best[known] = np.linalg.solve(alone, (side + theta.prior_rhs)[known])
@@ -274,21 +297,29 @@ def _of_logs(
             np.sqrt(np.maximum(theta.costs(x, A), 0.0) / log.count) for x in (theta.th, best)
         )
         more = (H + information)[np.ix_(known, known)]
-        worth = float(np.linalg.slogdet(more)[1] - before) / len(known)
+        worth = 0.5 * float(np.linalg.slogdet(more)[1] - before) / len(known)
         effects, std = _own_effects(theta, information, side, rmse)
         carried = None if load is None else Load(float(load[0][0]), load[1])
-        told.append(OfLog(log, carried, effects, std, rmse, own_rmse, (), worth))
-    usual = np.median([x.rmse for x in told], axis=0)
+        told.append(
+            OfLog(log, log.content in among, carried, effects, std, rmse, own_rmse, (), worth)
+        )
+    usual = np.median([x.rmse for x in told if x.used], axis=0)
     out = [
-        replace(x, disagrees=_worse(x, usual) if len(told) >= FEWEST_TO_COMPARE else ())
+        replace(x, disagrees=_worse(x, usual, len(told))) if len(told) >= FEWEST_TO_COMPARE else x
         for x in told
     ]
     return tuple(sorted(out, key=lambda x: (x.moments.begin_s, x.moments.path)))
 
 
-def _worse(log: OfLog, usual: Array) -> tuple[int, ...]:
-    """Joints (from 1) that the arm's model fits worse than is usual, and than could be."""
-    worse = log.rmse > TIMES_WORSE * np.maximum(usual, log.own_rmse)
+def _worse(log: OfLog, usual: Array, logs: int) -> tuple[int, ...]:
+    """Joints (from 1) that the arm's model fits worse than is usual, and than could be.
+
+    The few samples of a short recording may be worse than is usual by chance.
+    """
+    least = np.maximum(usual, log.own_rmse)
+    count = max(log.moments.count, 1.0)
+    chance = chi2.sf(count * np.square(log.rmse / np.maximum(least, TINY)), count)
+    worse = (log.rmse > TIMES_WORSE * least) & (chance * logs * len(usual) < BY_CHANCE)
     return tuple(int(j) + 1 for j in np.flatnonzero(worse))
 
 
@@ -306,59 +337,22 @@ def _own_effects(theta: Theta, information: Array, side: Array, rmse: Array) -> 
     return found.reshape(shape), std
 
 
-def _drifts(
-    logs: Sequence[OfLog], effects: Sequence[str], told: Mapping[str, Mapping[str, float]]
-) -> tuple[Drift, ...]:
-    """Parameters that follow time or a column of the manifest."""
+def _series(logs: Sequence[OfLog], effects: Sequence[str]) -> list[Series]:
+    """Effects joint by joint over an arm's recordings."""
+    values, std = (np.array([getattr(x, key) for x in logs]) for key in ("effects", "effects_std"))
+    values[[not x.used for x in logs]] = np.nan
+    return [
+        Series(name, j + 1, values[:, k, j], std[:, k, j])
+        for k, name in enumerate(effects)
+        for j in range(values.shape[2])
+    ]
+
+
+def _columns(logs: Sequence[OfLog], told: Mapping[str, Mapping[str, float]]) -> dict[str, Array]:
+    """What parameters may follow: time, and what the manifest tells of these recordings."""
     begin_s = np.array([x.moments.begin_s for x in logs])
-    columns = {TIME: (begin_s - begin_s.min()) / DAY_S}
-    for name in sorted({key for row in told.values() for key in row}):
-        columns[name] = np.array([told.get(x.moments.content, {}).get(name, np.nan) for x in logs])
-    found: list[tuple[float, Drift]] = []
-    for name, x in columns.items():
-        for k, effect in enumerate(effects_by_name(effects)):
-            for j in range(logs[0].effects.shape[1]):
-                y, std = (
-                    np.array([getattr(log, key)[k, j] for log in logs])
-                    for key in ("effects", "effects_std")
-                )
-                line = _line(x, y, std)
-                if (
-                    line is not None
-                    and line.chance < CHANCE
-                    and line.by_scatter < CHANCE_BY_SCATTER
-                ):
-                    span = abs(line.slope) * float(np.nanmax(x) - np.nanmin(x))
-                    drift = Drift(effect.name, j + 1, name, line.slope, line.std, span)
-                    found.append((line.chance, drift))
-    return tuple(drift for _, drift in sorted(found, key=lambda x: x[0]))
-
-
-class Line(NamedTuple):
-    """A line's slope and its standard deviation.
-
-    Attributes:
-        chance: that no slope looks like it, by the numbers' own standard deviations (or their
-            scatter, where that is larger); by_scatter: by their scatter alone.
-    """
-
-    slope: float
-    std: float
-    chance: float
-    by_scatter: float
-
-
-def _line(x: Array, y: Array, std: Array) -> Line | None:
-    """The line through y (m,) over x (m,); None where too few numbers say anything."""
-    use = np.isfinite(x) & np.isfinite(y) & (std > 0.0)
-    if use.sum() < FEWEST_FOR_DRIFT or np.ptp(x[use]) <= 0.0:
-        return None
-    x, y, weight = x[use], y[use], 1.0 / std[use] ** 2
-    middle = np.sum(weight * x) / np.sum(weight)
-    spread = float(np.sum(weight * (x - middle) ** 2))
-    slope = float(np.sum(weight * (x - middle) * y) / spread)
-    level = np.sum(weight * y) / np.sum(weight)
-    left = float(np.sum(weight * (y - level - slope * (x - middle)) ** 2)) / (len(x) - 2)
-    std_slope, scattered = (float(np.sqrt(k / spread)) for k in (max(1.0, left), left))
-    by_scatter = float(2.0 * student.sf(abs(slope) / max(scattered, 1e-300), len(x) - 2))
-    return Line(slope, std_slope, float(2.0 * norm.sf(abs(slope) / std_slope)), by_scatter)
+    columns: dict[str, Array] = {TIME: (begin_s - begin_s.min()) / DAY_S}
+    own = [told.get(x.moments.content, {}) for x in logs]
+    for name in sorted({key for row in own for key in row} - {TIME}):
+        columns[name] = np.array([row.get(name, np.nan) for row in own])
+    return columns

@@ -5,44 +5,111 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
+from multiprocessing.context import BaseContext
+from threading import Thread
 from typing import Any, TypeVar
 
 from adapter.errors import MeansError
 from adapter.runs.fleet.moments import Broken, Task
 
 Result = TypeVar("Result")
-ROUNDS = 3  # how often a task is tried whose process died
-ANSWER_S = 5.0  # until nobody is there
-DIED = f"the process that read it died, {ROUNDS} times"
+Done = Iterator[tuple[Task, Result | Broken]]
+TRIES = 2  # of a task whose process died, in a process of its own
+AT_HAND = 2  # tasks of each process: one that it does, and the next
+ON_CLUSTER = 1000  # tasks that the scheduler knows of at once
+ANSWER_S, WORKER_S = 5.0, 60.0  # until nobody is there; until no worker is
+DIED = f"the process that read it died, {TRIES + 1} times"
+LOADED_ONCE = "adapter.runs.fleet.moments"  # for all processes, where the system can fork
 
 
-def here(
-    function: Callable[[Task], Result], tasks: Sequence[Task], workers: int
-) -> Iterator[tuple[Task, Result | Broken]]:
+def here(function: Callable[[Task], Result], tasks: Sequence[Task], workers: int) -> Done[Result]:
     """Do tasks in processes of this machine; results come as they are ready.
 
-    A process that dies takes its task and those of its neighbours with it; these are done again,
-    in the last round each in a process of its own.
+    A process that dies takes what its neighbours were doing with it. Each of these few tasks is
+    done again in a process of its own, which shows whose fault it was; the others go on.
     """
-    left = list(tasks)
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the processes: they share the processors
-    for number in range(ROUNDS):
-        if not left:
-            return
-        alone = number == ROUNDS - 1
-        again: list[Task] = []
-        for group in [[x] for x in left] if alone else [left]:
-            for task, result in _round(function, group, min(workers, len(group))):
-                if isinstance(result, BrokenProcessPool):
-                    again.append(task)
+    left = deque(tasks)
+    while left:
+        suspects = yield from _together(function, left, min(workers, len(left)))
+        for task in suspects:
+            yield task, _alone(function, task)
+
+
+def _together(
+    function: Callable[[Task], Result], left: deque[Task], workers: int
+) -> Generator[tuple[Task, Result], None, list[Task]]:
+    """Do tasks from the left until none is left or a process dies; those that it leaves undone."""
+    asked: dict[Future[Result], Task] = {}
+    undone: list[Task] = []
+    with _processes(workers) as pool:
+        while (left and not undone) or asked:
+            while left and not undone and len(asked) < AT_HAND * workers:
+                task = left.popleft()
+                try:
+                    asked[pool.submit(function, task)] = task
+                except BrokenProcessPool:
+                    undone.append(task)
+            for future in wait(asked, return_when=FIRST_COMPLETED).done:
+                task = asked.pop(future)
+                try:
+                    result = future.result()
+                except BrokenProcessPool:
+                    undone.append(task)
                 else:
                     yield task, result
-        left = again
-    for task in left:
-        yield task, Broken(task.path, DIED)
+    return undone
+
+
+def _alone(function: Callable[[Task], Result], task: Task) -> Result | Broken:
+    """Do a task in a process of its own."""
+    for _ in range(TRIES):
+        with _processes(1) as pool:
+            try:
+                return pool.submit(function, task).result()
+            except BrokenProcessPool:
+                continue
+    return Broken(task.path, DIED)
+
+
+def _processes(count: int) -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(count, mp_context=_context(), initializer=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """Let this process end when the one that asked for it has died without a word."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    Thread(target=watch, daemon=True).start()
+
+
+def _context() -> BaseContext:
+    """How processes begin: as copies of one that has loaded everything and runs no threads.
+
+    A copy of this very process would copy its threads' locks; a fresh one loads for seconds.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([LOADED_ONCE])
+    return context
 
 
 def in_threads(
@@ -53,29 +120,17 @@ def in_threads(
         yield from zip(tasks, pool.map(function, tasks), strict=True)
 
 
-def _round(
-    function: Callable[[Task], Result], tasks: Sequence[Task], workers: int
-) -> Iterator[tuple[Task, Result | BrokenProcessPool]]:
-    spawn = multiprocessing.get_context("spawn")  # a fork would copy threads' locks
-    with ProcessPoolExecutor(workers, mp_context=spawn) as pool:
-        asked = {pool.submit(function, task): task for task in tasks}
-        for future in as_completed(asked):
-            try:
-                yield asked[future], future.result()
-            except BrokenProcessPool as error:
-                yield asked[future], error
-
-
 def on_cluster(
     function: Callable[[Task], Result], tasks: Sequence[Task], address: str
-) -> Iterator[tuple[Task, Result | Broken]]:
+) -> Done[Result]:
     """Send tasks to the Dask scheduler at an address; results come as they are ready.
 
     Its workers must have this package, and see the recordings under the same paths. A worker that
     dies costs time: the scheduler gives its tasks to others.
 
     Raises:
-        MeansError: Dask is not installed, or nobody answers at the address.
+        MeansError: Dask is not installed, nobody answers at the address, nobody works there, or
+            the scheduler was lost; what came before is done.
     """
     try:
         distributed = importlib.import_module("distributed")
@@ -88,13 +143,37 @@ def on_cluster(
     except (OSError, ValueError, ImportError) as error:
         raise MeansError(f"--cluster {address}: no Dask scheduler there ({error})") from None
     with client:
-        asked: dict[Any, Task] = dict(
-            zip(client.map(function, tasks, pure=False), tasks, strict=True)
-        )
-        for future in distributed.as_completed(list(asked)):
-            task = asked.pop(future)
-            if future.status == "finished":
-                yield task, future.result()
-            else:
-                yield task, Broken(task.path, f"the cluster gave it up: {future.exception()}")
-            future.release()
+        try:
+            client.wait_for_workers(1, timeout=WORKER_S)
+        except TimeoutError:
+            raise MeansError(f"--cluster {address}: no worker came in {WORKER_S:.0f} s") from None
+        yield from _sent(function, tasks, client, distributed)
+
+
+def _sent(
+    function: Callable[[Task], Result], tasks: Sequence[Task], client: Any, distributed: Any
+) -> Done[Result]:
+    """Keep some tasks with the scheduler until all are done."""
+    left = iter(tasks)
+
+    def send(task: Task) -> Any:
+        future = client.submit(function, task, pure=False)
+        asked[future] = task
+        return future
+
+    asked: dict[Any, Task] = {}
+    waiting = distributed.as_completed([send(task) for task in islice(left, ON_CLUSTER)])
+    for future in waiting:
+        task = asked.pop(future)
+        if future.status == "finished":
+            yield task, future.result()
+        elif future.status == "error":
+            yield task, Broken(task.path, f"the cluster gave it up: {future.exception()}")
+        else:
+            raise MeansError(
+                f"--cluster {client.scheduler.address}: the scheduler was lost; the same command "
+                "goes on from what is done"
+            )
+        future.release()
+        for following in islice(left, 1):
+            waiting.add(send(following))

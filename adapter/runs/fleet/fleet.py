@@ -5,9 +5,9 @@ from __future__ import annotations
 import csv
 import glob
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple, TypeVar
 
 from adapter.errors import SettingsError
 from adapter.model import model_file
@@ -22,11 +22,11 @@ from adapter.runs.fleet.moments import (
     moments_of,
     opened,
 )
-from adapter.runs.fleet.store import Store
+from adapter.runs.fleet.store import Store, mark_of
 from drivers.files.names import RECORDINGS, is_recording
 
 LOG_COLUMNS, ARM_COLUMN = ("log", "path", "file"), "arm"
-BY = ("log", "folder")
+Found = TypeVar("Found")
 
 
 class Manifest(NamedTuple):
@@ -114,13 +114,17 @@ def _on_disk(text: str) -> Iterator[str]:
 
 def _behind(address: str) -> Iterator[str]:
     filesystem, inside = opened(address)
-    scheme = address.partition("://")[0]
     if any(sign in inside for sign in "*?["):
         names = filesystem.glob(inside)
+    elif filesystem.isdir(inside):
+        files = filesystem.find(inside)
+        bags = {str(PurePosixPath(x).parent) for x in files if x.endswith("/metadata.yaml")}
+        loose = [x for x in files if is_recording(Path(x))]
+        parents = {x: {str(y) for y in PurePosixPath(x).parents} for x in loose}
+        names = [*bags, *(x for x in loose if not bags & parents[x])]
     else:
-        names = filesystem.find(inside) if filesystem.isdir(inside) else [inside]
-        names = [x for x in names if x == inside or is_recording(Path(x))]
-    yield from (f"{scheme}://{name}" for name in sorted(names))
+        names = [inside] if filesystem.exists(inside) else []
+    yield from (str(filesystem.unstrip_protocol(name)) for name in sorted(names))
 
 
 def read_manifest(path: Path) -> Manifest:
@@ -174,63 +178,145 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
         given: as `found_logs` returns them.
         documented: what all arms are documented to be.
         settings: how.
+
+    Raises:
+        SettingsError: the model's base floats.
     """
+    if documented.tree.floating:
+        raise SettingsError(
+            f"a fleet is of arms whose base stands; that of {documented.name} floats"
+        )
     model = model_file.dumps(documented)
     store = Store(settings.folder, model)
-    tasks = [Task(path, model, settings.topic) for path in given]
-    broken: list[Broken] = []
-    contents = _contents(store, tasks, settings, broken)
-    first: dict[str, Task] = {}
-    alike = []
-    for task in tasks:
-        if task.path not in contents:
-            continue
-        content = contents[task.path]
-        if content in first:
-            alike.append((task.path, first[content].path))
-        first.setdefault(content, task)
-    left = [task for content, task in first.items() if not store.has(content)]
-    for number, (_, result) in enumerate(_taken(left, settings), start=1):
+    tasks = [Task(path, model, settings.topic) for path in dict.fromkeys(given)]
+    work = _Work(store, {task.path: mark_of(task.path) for task in tasks})
+    work.look_up(tasks, settings)
+    left = work.left(tasks)
+    settings.progress(0, len(left))
+    for number, (task, result) in enumerate(_taken(left, settings), start=1):
         if isinstance(result, LogMoments):
-            store.add(result)
+            if not store.has(result.content):
+                store.add(result)
+            work.found(task.path, result.content)
         else:
-            broken.append(result)
+            work.broken.append(result)
         settings.progress(number, len(left))
-    gone = tuple(task.path for content, task in first.items() if store.forgotten(content))
-    known = store.all()
-    arms = _arms(known, documented, settings)
-    read = len(left) - sum(1 for x in broken if x.path in {task.path for task in left})
-    return Fleet(arms, tuple(broken), read, len(known) - read, gone, tuple(alike))
+    places = {**store.places(), **{content: path for path, content in work.contents.items()}}
+    heads = _newest([replace(x, path=places.get(x.content, x.path)) for x in store.heads()])
+    read = len(left) - sum(x.path in {task.path for task in left} for x in work.broken)
+    gone = tuple(path for path, content in work.contents.items() if store.forgotten(content))
+    arms = _arms(store, heads, documented, settings)
+    return Fleet(arms, tuple(work.broken), read, len(heads) - read, gone, work.alike(tasks))
+
+
+class _Work:
+    """What is known of given recordings, and what is to be done with them.
+
+    Args:
+        store: of the fleet; marks: of the recordings by path, as they were before all reading.
+
+    Attributes:
+        contents: by path, of those whose content is known.
+        broken: those that could not be read.
+    """
+
+    def __init__(self, store: Store, marks: Mapping[str, str]) -> None:
+        self._store, self._marks = store, marks
+        self.contents: dict[str, str] = {}
+        self.broken: list[Broken] = []
+
+    def found(self, path: str, content: str) -> None:
+        """Keep what a recording's content is."""
+        self.contents[path] = content
+        self._store.remember(path, self._marks[path], content)
+
+    def look_up(self, tasks: Sequence[Task], settings: Settings, remote: bool = False) -> None:
+        """Find contents; only what has changed since it was seen is read.
+
+        What lies behind an address is fetched once, for its moments, unless `remote`.
+        """
+        unseen = []
+        for task in tasks:
+            content = self._store.content_seen(task.path, self._marks[task.path])
+            if content is not None:
+                self.contents[task.path] = content
+            elif remote or not _is_address(task.path):
+                unseen.append(task)
+        if not unseen:
+            return
+        for task, result in _each(content_of, unseen, settings):
+            if isinstance(result, Broken):
+                self.broken.append(result)
+            else:
+                self.found(task.path, result)
+
+    def left(self, tasks: Sequence[Task]) -> list[Task]:
+        """Those that have to be read, of each content one."""
+        first: dict[str, Task] = {}
+        without = {x.path for x in self.broken}
+        for task in tasks:
+            if task.path not in without:
+                first.setdefault(self.contents.get(task.path, task.path), task)
+        return [task for content, task in first.items() if not self._store.has(content)]
+
+    def alike(self, tasks: Sequence[Task]) -> tuple[tuple[str, str], ...]:
+        """(path, path) of recordings whose content is that of one before."""
+        first: dict[str, str] = {}
+        contents = [(x.path, self.contents[x.path]) for x in tasks if x.path in self.contents]
+        pairs = [(path, first.setdefault(content, path)) for path, content in contents]
+        return tuple((path, other) for path, other in pairs if path != other)
 
 
 def forget(given: Sequence[str], documented: SelfModel, settings: Settings) -> None:
-    """Leave recordings out of the store from here on."""
-    model = model_file.dumps(documented)
-    store, broken = Store(settings.folder, model), list[Broken]()
-    tasks = [Task(path, model, settings.topic) for path in given]
-    store.forget(_contents(store, tasks, settings, broken).values())
-    if broken:
-        raise SettingsError(f"{broken[0].path}: cannot be forgotten: {broken[0].why}")
+    """Leave recordings out of the store from here on.
+
+    Args:
+        given: paths that the store knows, though they may be gone by now, or what `found_logs`
+            takes.
+
+    Raises:
+        SettingsError: one of them is neither.
+    """
+    store = Store(settings.folder, model_file.dumps(documented))
+    store.forget(_contents_of(store, given, documented, settings))
 
 
-def _contents(
-    store: Store, tasks: Sequence[Task], settings: Settings, broken: list[Broken]
-) -> dict[str, str]:
-    """Content by path; only what has changed since it was seen is read."""
-    found = {task.path: store.content_seen(task.path) for task in tasks}
-    unseen = [task for task in tasks if found[task.path] is None]
-    if settings.cluster is None:
-        results = in_threads(content_of, unseen)
-    else:
-        results = on_cluster(content_of, unseen, settings.cluster)
-    for task, result in results if unseen else ():
-        if isinstance(result, Broken):
-            broken.append(result)
-        else:
-            found[task.path] = result
-    contents = {path: content for path, content in found.items() if content is not None}
-    store.remember(contents)
-    return contents
+def recall(given: Sequence[str], documented: SelfModel, settings: Settings) -> None:
+    """Take back what `forget` did; the recordings are read again when they are given."""
+    store = Store(settings.folder, model_file.dumps(documented))
+    store.recall(_contents_of(store, given, documented, settings))
+
+
+def _contents_of(
+    store: Store, given: Sequence[str], documented: SelfModel, settings: Settings
+) -> set[str]:
+    known: dict[str, set[str]] = {}
+    for content, path in [*((x.content, x.path) for x in store.heads()), *store.places().items()]:
+        known.setdefault(path, set()).add(content)
+    found, unknown = set[str](), list[str]()
+    for text in given:
+        path = text if _is_address(text) else str(Path(text).resolve())
+        found |= known.get(path, set())
+        unknown += [] if path in known else [text]
+    tasks = [Task(path, "", settings.topic) for path in found_logs(unknown)]
+    work = _Work(store, {task.path: mark_of(task.path) for task in tasks})
+    work.look_up(tasks, settings, remote=True)
+    if work.broken:
+        raise SettingsError(f"{work.broken[0].path}: cannot be looked at: {work.broken[0].why}")
+    return found | set(work.contents.values())
+
+
+def _is_address(path: str) -> bool:
+    return "://" in path
+
+
+def _each(
+    function: Callable[[Task], Found], tasks: Sequence[Task], settings: Settings
+) -> Iterator[tuple[Task, Found | Broken]]:
+    """Do what waits for disks."""
+    if settings.cluster is not None:
+        return on_cluster(function, tasks, settings.cluster)
+    return in_threads(function, tasks)
 
 
 def _taken(tasks: Sequence[Task], settings: Settings) -> Iterator[tuple[Task, LogMoments | Broken]]:
@@ -238,19 +324,36 @@ def _taken(tasks: Sequence[Task], settings: Settings) -> Iterator[tuple[Task, Lo
         return iter(())
     if settings.cluster is not None:
         return on_cluster(moments_of, tasks, settings.cluster)
-    if not settings.workers or len(tasks) == 1:
+    if not settings.workers:
         return ((task, moments_of(task)) for task in tasks)
     return here(moments_of, tasks, settings.workers)
 
 
+def _newest(heads: Sequence[LogMoments]) -> list[LogMoments]:
+    """Without what a recording was while it still grew: same place and begin, a shorter span."""
+    longest: dict[tuple[str, float], LogMoments] = {}
+    for head in heads:
+        key = head.path, head.begin_s
+        if key not in longest or head.span_s > longest[key].span_s:
+            longest[key] = head
+    return sorted(longest.values(), key=lambda x: x.content)
+
+
 def _arms(
-    known: Sequence[LogMoments], documented: SelfModel, settings: Settings
+    store: Store, heads: Sequence[LogMoments], documented: SelfModel, settings: Settings
 ) -> tuple[FleetArm, ...]:
+    """One after the other, so that no more than the moments of one are in memory."""
     groups: dict[str, list[LogMoments]] = {}
-    for log in known:
-        groups.setdefault(_arm_of(log, documented, settings), []).append(log)
-    told = {x.content: settings.manifest.told.get(x.path, {}) for x in known}
-    return tuple(learn_arm(name, groups[name], documented, told) for name in sorted(groups))
+    for head in heads:
+        groups.setdefault(_arm_of(head, documented, settings), []).append(head)
+    told = {x.content: settings.manifest.told.get(x.path, {}) for x in heads}
+    found = []
+    for name in sorted(groups):
+        places = {x.content: x.path for x in groups[name]}
+        logs = [replace(x, path=places[x.content]) for x in store.whole(groups[name])]
+        if logs:
+            found.append(learn_arm(name, logs, documented, told))
+    return tuple(found)
 
 
 def _arm_of(log: LogMoments, documented: SelfModel, settings: Settings) -> str:

@@ -29,7 +29,7 @@ from adapter.model import model_file
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.config import PipelineSettings
-from adapter.runs.pipeline import Pipeline, make_learner
+from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.replay import filtered_tables, fitted_to
 from adapter.signals.matching import matching
 from drivers.files.mcap import Log, read_log
@@ -91,10 +91,11 @@ class LogMoments:
             np.savez(file, A=self.A, said=np.array(json.dumps(said)))
 
     @classmethod
-    def load(cls, path: Path) -> LogMoments:
-        """Read them back, to the last bit."""
+    def load(cls, path: Path, whole: bool = True) -> LogMoments:
+        """Read them back, to the last bit; without the moments themselves where not `whole`."""
         with np.load(path) as kept:
-            return cls(A=kept["A"], **json.loads(str(kept["said"])))
+            A = kept["A"] if whole else np.empty(0)
+            return cls(A=A, **json.loads(str(kept["said"])))
 
 
 def effects_for(model: SelfModel) -> tuple[str, ...]:
@@ -113,51 +114,68 @@ def learner_of(model: SelfModel) -> OnlineLearner:
 def content_of(task: Task) -> str | Broken:
     """SHA-256 of a recording's bytes, of a folder's files in the order of their names."""
     try:
-        with _at_hand(task.path) as path:
-            digest = hashlib.sha256()
-            files = sorted(path.rglob("*")) if path.is_dir() else [path]
-            for file in (x for x in files if x.is_file()):
-                if path.is_dir():
-                    digest.update(str(file.relative_to(path)).encode() + b"\0")
-                with file.open("rb") as opened:
-                    while block := opened.read(READ_AT_ONCE):
-                        digest.update(block)
-            return digest.hexdigest()
+        with at_hand(task.path) as path:
+            return _content(path)
     except (OSError, ValueError, MeansError) as error:
         return _broken(task.path, error)
 
 
+def _content(path: Path) -> str:
+    digest = hashlib.sha256()
+    files = sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path)).encode() + b"\0")
+        with file.open("rb") as opened:
+            while block := opened.read(READ_AT_ONCE):
+                digest.update(block)
+    return digest.hexdigest()
+
+
 def moments_of(task: Task) -> LogMoments | Broken:
-    """Read a recording and take its moments; whatever is wrong with it becomes a sentence."""
-    content = content_of(task)
-    if isinstance(content, Broken):
-        return content
+    """Read a recording and take its moments; whatever is wrong with it becomes a sentence.
+
+    One that lies behind an address is fetched once, for its content and for its moments.
+    """
     try:
-        with _at_hand(task.path) as path:
+        with at_hand(task.path) as path:
+            content = _content(path)
             log = read_log(path, topic=task.topic)
-        return _taken(log, _model(task.model), content, task.path)
-    except (DriverError, OSError, ValueError, MemoryError) as error:
+        return taken(log, _model(task.model), content, task.path)
+    except Exception as error:  # of thousands of files one has what no reader has thought of
         return _broken(task.path, error)
 
 
-def _taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
+def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
+    """Moments of a recording in memory.
+
+    Args:
+        log: as it was read; model: the documented arm.
+        content, path: what it is to be known by.
+
+    Raises:
+        DriverError, RecordingRefused: nothing can be learned from it.
+    """
     named = arm_named(log.metadata)
     log = matching(log, model)
     if not len(log):
         raise DriverError("no samples to learn from")
     check_effort_unit(log, model)
     settings, _ = fitted_to(log, PipelineSettings().filter)
-    pipeline = Pipeline(model, PipelineSettings(filter=settings, learner=_learning(model)))
-    learner = pipeline.learner
+    both = PipelineSettings(filter=settings, learner=_learning(model))
+    front_end, learner = make_front_end(model, both), make_learner(model, both)
     frames = model.joint_rotation(), model.lam[:, 3:]
     into, samples = learner.theta.empty_moments(), 0
-    for table in filtered_tables(log, len(log), pipeline.front_end):
-        states = learner.without_known(table)
+    for table in filtered_tables(log, len(log), front_end):
+        states = learner.without_known(learner.sound(table))
         if len(states):
             learner.theta.absorb_again(frames, states[:, learner.layout.before_links], into)
             samples += len(states)
     if not samples:
-        raise DriverError("the arm never moves; nothing can be learned from it")
+        reasons = ", ".join(reason for reason, _ in front_end.refused.most_common())
+        raise DriverError(f"nothing can be learned from it: {reasons or 'no states'}")
+    if not np.isfinite(into.A).all():
+        raise DriverError("its numbers are beyond what can be added up")
     share = 1.0 / learner.theta.noise_gain
     begin, end = int(log.stamp_ns.min()), int(log.stamp_ns.max())
     spans = 1e-9 * begin, 1e-9 * (end - begin)
@@ -183,7 +201,7 @@ def _model(text: str) -> SelfModel:
 
 
 @contextmanager
-def _at_hand(address: str) -> Iterator[Path]:
+def at_hand(address: str) -> Iterator[Path]:
     """The recording on this machine; one behind an address is copied for as long as it takes."""
     if "://" not in address:
         yield Path(address)
@@ -214,4 +232,9 @@ def _broken(path: str, error: Exception) -> Broken:
     if isinstance(error, MemoryError):
         return Broken(path, "there is not enough memory for it")
     said = error.strerror if isinstance(error, OSError) else None
-    return Broken(path, said or str(error).removeprefix(f"{path}: "))
+    told, name = said or str(error), Path(path).name
+    place, there, rest = told.partition(f"{name}: ")  # it is said where the sentence goes
+    if there and (not place or place.endswith("/")):
+        told = rest
+    expected = isinstance(error, DriverError | OSError | ValueError | MeansError)
+    return Broken(path, told if expected and told else f"{type(error).__name__}: {told}")

@@ -9,10 +9,9 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from adapter.model.model_file import whole_file
-from adapter.runs.fleet.moments import FORMAT, LogMoments
+from adapter.runs.fleet.moments import FORMAT, LogMoments, opened
 
-SEEN, FOLDER, GONE = "seen.json", "moments", ".forgotten"
+SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
 
 
 class Store:
@@ -33,26 +32,40 @@ class Store:
     def _path(self, content: str) -> Path:
         return self._folder / f"{self._model}-{content}.npz"
 
-    def _read_seen(self) -> dict[str, list[object]]:
+    def _read_seen(self) -> dict[str, tuple[str, str]]:
+        """Marks and contents by path: a line each, the last one counts, a torn one does not."""
+        seen: dict[str, tuple[str, str]] = {}
         try:
-            seen = json.loads(self._seen_file.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}  # it saves reading files again, no more
-        return seen if isinstance(seen, dict) else {}
+            text = self._seen_file.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return seen  # it saves reading recordings again, no more
+        for line in text.splitlines():
+            try:
+                path, mark, content = json.loads(line)
+            except (ValueError, TypeError):
+                continue
+            seen[path] = mark, content
+        return seen
 
-    def content_seen(self, path: str) -> str | None:
-        """The content of a file as it was when it was read last, None if it may be another."""
-        kept = self._seen.get(path)
-        return str(kept[-1]) if kept is not None and kept[:-1] == _stat(path) else None
+    def content_seen(self, path: str, mark: str) -> str | None:
+        """The content of a recording whose mark was this when it was read, None if unknown."""
+        before, content = self._seen.get(path, ("", ""))
+        return content if mark and mark == before else None
 
-    def remember(self, contents: dict[str, str]) -> None:
-        """Keep contents by path, so that files that do not change are not read again."""
-        for path, content in contents.items():
-            stat = _stat(path)
-            if stat:
-                self._seen[path] = [*stat, content]
-        with whole_file(self._seen_file) as part:
-            part.write_text(json.dumps(self._seen, indent=0), encoding="utf-8")
+    def remember(self, path: str, mark: str, content: str) -> None:
+        """Keep the content of a recording, so that it is not read again while it does not change.
+
+        Args:
+            mark: as it was before it was read, see `mark_of`.
+        """
+        if mark and self._seen.get(path) != (mark, content):
+            self._seen[path] = mark, content
+            with self._seen_file.open("a", encoding="utf-8") as file:
+                file.write("\n" + json.dumps([path, mark, content]))
+
+    def places(self) -> dict[str, str]:
+        """Where contents were seen last."""
+        return {content: path for path, (_, content) in self._seen.items()}
 
     def has(self, content: str) -> bool:
         """Whether nothing is to be done for it: its moments are there, or it was forgotten."""
@@ -77,24 +90,49 @@ class Store:
         for content in contents:
             self._path(content).with_suffix(GONE).unlink(missing_ok=True)
 
-    def all(self) -> list[LogMoments]:
-        """All moments, in the order of the recordings' content: a sum is the same to the last bit.
+    def heads(self) -> list[LogMoments]:
+        """All that is known, without the moments themselves, in the order of content.
 
-        A file that was damaged is taken away, so that its recording is read again.
+        What was damaged is taken away, so that its recording is read again.
         """
-        found = []
-        for path in sorted(self._folder.glob(f"{self._model}-*.npz")):
-            try:
-                found.append(LogMoments.load(path))
-            except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
-                path.unlink(missing_ok=True)
-        return found
+        paths = sorted(self._folder.glob(f"{self._model}-*.npz"))
+        return [x for x in (self._read(path, False) for path in paths) if x is not None]
+
+    def whole(self, heads: Iterable[LogMoments]) -> list[LogMoments]:
+        """These with their moments."""
+        found = (self._read(self._path(head.content), True) for head in heads)
+        return [x for x in found if x is not None]
+
+    def _read(self, path: Path, whole: bool) -> LogMoments | None:
+        try:
+            return LogMoments.load(path, whole)
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            path.unlink(missing_ok=True)
+            return None
 
 
-def _stat(path: str) -> list[object]:
-    """Size and time of change; of a folder or an address nothing, so that it is looked into."""
+def mark_of(path: str) -> str:
+    """What changes with a recording's content and is known without reading it, "" if nothing is.
+
+    Size and time of change of a file, or of all files in a folder; behind an address what its file
+    system knows (an ETag, a version, a time).
+    """
     try:
-        there = os.stat(path)
-    except OSError:
-        return []
-    return [] if os.path.isdir(path) else [there.st_size, there.st_mtime_ns]
+        if "://" in path:
+            filesystem, inside = opened(path)
+            files = filesystem.find(inside) if filesystem.isdir(inside) else [inside]
+            said = [(str(file), str(filesystem.ukey(file))) for file in files]
+        else:
+            said = [(str(file), _changed(file)) for file in _files(Path(path))]
+    except (OSError, ValueError, RuntimeError, NotImplementedError):
+        return ""
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:32]
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
+
+
+def _changed(file: Path) -> str:
+    there = os.stat(file)
+    return f"{there.st_size} {there.st_mtime_ns} {there.st_ino}"

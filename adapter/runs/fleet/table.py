@@ -13,23 +13,25 @@ from adapter.model.model_file import whole_file
 from adapter.runs.fleet.arm import FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
-USED, BROKEN, FORGOTTEN = "used", "broken", "forgotten"
+USED, DISAGREES, BROKEN, FORGOTTEN = "used", "disagrees", "broken", "forgotten"
 
 
 def rows(found: Fleet) -> list[dict[str, Any]]:
     """A row for each recording; columns of joints are numbered from 1."""
-    out = [_row(arm, log) for arm in found.arms for log in arm.logs]
+    out = [_row(arm, k) for arm in found.arms for k in range(len(arm.logs))]
     out += [{"log": x.path, "state": BROKEN, "why": x.why} for x in found.broken]
     out += [{"log": path, "state": FORGOTTEN} for path in found.forgotten]
     columns = dict.fromkeys(key for row in out for key in row)
     return [{key: row.get(key) for key in columns} for row in out]
 
 
-def _row(arm: FleetArm, log: OfLog) -> dict[str, Any]:
+def _row(arm: FleetArm, number: int) -> dict[str, Any]:
+    log = arm.logs[number]
     taken, load = log.moments, log.load
+    out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
     return {
         "log": taken.path,
-        "state": USED,
+        "state": USED if log.used else DISAGREES,
         "why": None,
         "arm": arm.name,
         "content": taken.content,
@@ -39,6 +41,7 @@ def _row(arm: FleetArm, log: OfLog) -> dict[str, Any]:
         "load_kg": None if load is None else load.mass,
         "load_std_kg": None if load is None else load.std,
         "disagrees": " ".join(map(str, log.disagrees)),
+        "stands_out": " ".join(out),
         "worth_nats": log.worth,
         **dict(_by_joint(arm, log)),
     }
