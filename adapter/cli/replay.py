@@ -77,8 +77,9 @@ def run(args: argparse.Namespace) -> int:
         held_out = _as_understood(args, held_out, robot, gains)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
-        rmse = held_out_rmse(held_out, model, config.pipeline)
-        numbers["theta"]["validation_torque_rmse_nm"] = rmse.tolist()
+        for key, judged in (("", model), ("documented_", robot)):
+            rmse = held_out_rmse(held_out, judged, config.pipeline)
+            numbers["theta"][f"{key}validation_torque_rmse_nm"] = rmse.tolist()
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, source)
@@ -110,6 +111,7 @@ def _figures(
         ],
         contacts=result.contacts,
         recording=", ".join(map(str, args.logs)),
+        recordings=list(map(str, args.logs)),
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),

@@ -24,7 +24,7 @@ from adapter.report.gap_tables import (
     tied,
 )
 from adapter.report.html import fill, write_whole
-from adapter.report.page import Tile
+from adapter.report.tables import Tile
 from adapter.report.words import NARROW
 
 TEMPLATE = "gap.html"

@@ -11,11 +11,11 @@ import numpy as np
 
 from adapter.effects.active import active_effects
 from adapter.effects.base import ALL
+from adapter.gap.phrases import THETA
 from adapter.report.torque_panels import EFFECT_UNITS, SHARE_ALONE, theta_started
 from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
 from adapter.runs.run_folder import RunData
 
-THETA_NAMES = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
@@ -40,6 +40,15 @@ class Table:
     heads: Sequence[str]
     rows: Sequence[Sequence[str]]
     units: Sequence[str] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key figure: its name, its value, and what to hold it against."""
+
+    name: str
+    value: str
     note: str = ""
 
 
@@ -144,7 +153,7 @@ def theta_matrix(data: RunData) -> Matrix:
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
         summary = f"none of {10 * data.n} parameters: θ was not learned"
-    return Matrix("Dynamics θ", summary, THETA_NAMES, rows)
+    return Matrix("Dynamics θ", summary, THETA, rows)
 
 
 def _cell(share: float, std: float, unit: str, instead: str) -> Cell:
@@ -212,7 +221,7 @@ def theta_table(data: RunData) -> Table:
         "In brackets: not identifiable on its own; of all possible bodies with the learned "
         "combinations those nearest to the documented ones."
     )
-    return Table(["Link", *THETA_NAMES], rows, ["", *THETA_UNITS], note)
+    return Table(["Link", *THETA], rows, ["", *THETA_UNITS], note)
 
 
 def schema_table(data: RunData) -> Table:

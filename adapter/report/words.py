@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL, counted_from
+from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here
@@ -49,11 +46,6 @@ def small(value: float, unit: str) -> str:
     return f"<{NARROW}0.001{NARROW}{unit}" if value < 1e-3 else quantity(value, unit, 2)
 
 
-def against(figures: Mapping[str, Any]) -> str:
-    """What errors of λ are against: "documentation", or the name of the file that was given."""
-    return Path(str(figures["lambda"].get("reference") or DOCUMENTATION)).name
-
-
 def plus_minus(value: Any, std: Any) -> str:
     """Value ± standard deviation: the latter with two digits, the value with as many decimals.
 
@@ -86,51 +78,3 @@ def spread(values: Sequence[float], unit: str) -> str:
 def is_live(figures: Mapping[str, Any]) -> bool:
     """Whether a clock was involved, so that deadlines mean something."""
     return bool(figures.get("timing") or figures.get("lateness_us"))
-
-
-def headline(figures: Mapping[str, Any]) -> str:
-    """What was learned, how fast and how well, in one sentence."""
-    parts = [
-        schema_words(figures["lambda"], counted_from(figures)),
-        *torque_words(figures["theta"]),
-    ]
-    samples = f"{count(figures['learned'])} of {count(figures['samples'])} samples learned"
-    if is_live(figures):
-        missed = figures.get("missed_deadlines") or 0
-        samples += f", {count(missed)} deadline{'' if missed == 1 else 's'} missed"
-    return "; ".join([*parts, samples]) + "."
-
-
-def schema_words(schema: Mapping[str, Any], start: str) -> str:
-    """λ's part of the headline; times count from `start`."""
-    at, source = schema.get("converged_s"), schema.get("source", "")
-    known = schema.get("reference") in (None, DOCUMENTATION)
-    if source == LAMBDA_MEASURED:
-        goal = "the documentation" if known else "the given truth"
-        if at is None:
-            return f"λ, measured, did not stay within {GOALS} of {goal}"
-        after = quantity(at, "s", 2)
-        return f"λ, measured, lies within {GOALS} of {goal} from {after} after {start} on"
-    goal = "" if known else " (judged against the given truth)"
-    if at is None:
-        return f"λ was to reproduce the documentation but did not stay within {GOALS}{goal}"
-    return f"λ reproduces the documentation {quantity(at, 's', 2)} after {start}{goal}"
-
-
-def torque_words(theta: Mapping[str, Any]) -> list[str]:
-    """θ's parts of the headline."""
-    if theta.get("started_s") is None or not theta.get("torque_rmse_nm"):
-        return ["θ was not learned, because λ had not converged"]
-    words = f"torque explained to {spread(theta['torque_rmse_nm'], 'N m')} rms by joint"
-    held_out = theta.get("validation_torque_rmse_nm")
-    if held_out:
-        words += f" ({spread(held_out, 'N m')} on data held out)"
-    if theta.get("converged_s") is not None:
-        after = quantity(theta["converged_s"], "s", 2)
-        words += f", within {TORQUE_GOAL:g} × batch least squares from {after} on"
-    parts = [words]
-    for change in theta.get("changes") or []:
-        load = change.get("payload")
-        if load:
-            parts.append(f"a load of {quantity(load['m'], 'kg')} noticed at the hand")
-    return parts
