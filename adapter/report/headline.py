@@ -12,7 +12,7 @@ import numpy as np
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.torque_panels import theta_started
-from adapter.report.words import NARROW, plus_minus, quantity
+from adapter.report.words import NARROW, is_live, missed_words, plus_minus, quantity
 from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
 from adapter.runs.run_folder import RunData
 
@@ -46,7 +46,15 @@ def headline(data: RunData, worth: Worth) -> list[str]:
         *_hand(data, worth),
         *_trouble(data.figures),
     ]
-    return found
+    return [*found, *_late(data.figures)]
+
+
+def _late(figures: Mapping[str, Any]) -> list[str]:
+    """Whether deadlines were missed, and by whose fault."""
+    if not is_live(figures):
+        return []
+    said = missed_words(figures)
+    return [f"{said[:1].upper()}{said[1:]}."]
 
 
 def against(figures: Mapping[str, Any]) -> str:
@@ -84,7 +92,7 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
     worst = f"joint {j + 1} {_fall_words(fall, j)}"
     verb = "fell" if fall.better else "rose"
     return [
-        f"The torque error {verb} from {before} with the documented model to {after} with the "
+        f"The torque error of all joints {verb} from {before} with the documented model to {after} with the "
         f"learned one ({fall.seen}); {worst}."
     ]
 

@@ -11,6 +11,7 @@ from adapter.model.self_model import MJCF
 from adapter.report.headline import Worth
 from adapter.report.torque_panels import theta_started
 from adapter.report.words import is_live
+from adapter.report.worth import SLOW, slow_share
 from adapter.runs.run_folder import RunData
 
 MOST = 4
@@ -62,11 +63,12 @@ class _Files:
 def _left_to_find(data: RunData, worth: Worth) -> bool:
     """Whether the documented model explains torque worse than the learned one, or something is
     new or left."""
-    fall = worth.torque
+    fall, slow = worth.torque, slow_share(data) if theta_started(data) else None
     return bool(
         (fall is not None and (fall.before is None or fall.better))
         or data.figures.get("disagreements")
         or worth.loads
+        or (slow is not None and float(slow.max()) > SLOW)
     )
 
 
@@ -102,6 +104,8 @@ def _feedforward(data: RunData, worth: Worth) -> Step | None:
     words += ["--feedforward", "learned", "--duration", f"{span_s:.0f}"]
     words += [] if driver.startswith(SIMULATED) else ["--allow-motion"]
     why = "Let the learned model help the controller; the next report says what that is worth"
+    if figures.get("feedforward") == "learned":
+        why = "Run for longer, so that the learned model gets to help the controller"
     return Step(why, shlex.join(["adapter", *words]))
 
 

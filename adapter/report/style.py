@@ -31,6 +31,12 @@ ACCENT, GOAL = STAND_IN["accent"], STAND_IN["goal"]
 
 # width, height in inches and text in points: two, three or four panels side by side
 SIZES = {"half": (5.4, 2.55, 7.8), "third": (3.7, 2.35, 7.6), "quarter": (2.9, 2.0, 7.8)}
+SUPERFLUOUS = (  # what the page's style says, and what shows nothing
+    r" font-family: [^;\"]*;",
+    r"; stroke-line(cap: square|join: \w+)",
+    r' transform="rotate\(-?0 [^"]*"',
+    r'<path d="[^"]*" style="fill: none"/>',
+)
 NAMED = "line named "
 MOST_POINTS = 500  # along one line; a panel has no more pixels
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -269,7 +275,10 @@ def _svg(figure: Figure, told: str, size: str) -> Markup:
     body = re.sub(rf'<g id="{NAMED}([^"]*)">', r"<g><title>\1</title>", body)
     body = _own_ids(body, f"f{next(Drawing._numbers)}-")
     body = re.sub(r'\bd="[^"]*"', lambda found: _rounded(found.group(0), 1), body)
+    body = re.sub(r'(?<= d=)"[ML][-\d. MLz\n]*"', lambda found: _short(found.group(0)), body)
     body = re.sub(r"<[^>]*>", lambda found: _rounded(found.group(0), 2), body)  # not the text
+    for words in SUPERFLUOUS:
+        body = re.sub(words, "", body)
     body = re.sub(r"\s*\n\s*", "\n", body)
     for name, color in STAND_IN.items():
         body = body.replace(color, f"var(--{name})")
@@ -285,6 +294,11 @@ def _own_ids(body: str, prefix: str) -> str:
         body = re.sub(rf'(["(])#{re.escape(name)}(?=[")])', rf"\1#{prefix}{name}", body)
     body = re.sub(r' id="[^"]*"', "", body)
     return re.sub("\0([^\0]*)\0", r'id="\1"', body)
+
+
+def _short(path: str) -> str:
+    """A path of straight lines in fewer characters: a line goes on without its letter."""
+    return re.sub(r"(?<=\d) ?L (?=[-\d])", " ", re.sub(r"\s+", " ", path)).replace("M ", "M")
 
 
 def _rounded(text: str, digits: int) -> str:

@@ -12,12 +12,13 @@ from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.headline import Worth, against
 from adapter.report.torque_panels import SHARE_ALONE, theta_started
-from adapter.report.words import GOALS, count, is_live, number, quantity, small, spread
+from adapter.report.words import GOALS, count, is_live, missed_words, number, quantity, small, spread
+from adapter.report.worth import BLOCK_S, SLOW, rms, slow_share
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
-MUCH = 3.0  # times the noise of the torque sensor, from which something is left unexplained
+LEFT = "Torque not explained"
 FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
 FEW_REFUSED = 0.05  # share of all samples
 
@@ -34,7 +35,7 @@ class Check:
 def checks(data: RunData, worth: Worth) -> list[Check]:
     """All that the run allows, in the order in which they matter."""
     figures = data.figures
-    found = [_unseen(data, worth), _left(data, worth), _parameters(data), _frames(data)]
+    found = [_unseen(data, worth), _left(data), _parameters(data), _frames(data)]
     found += [_learner(data), _new(figures), _feedforward(figures), _timing(figures)]
     found.append(_samples(figures))
     return [check for check in found if check is not None]
@@ -61,46 +62,26 @@ def _unseen(data: RunData, worth: Worth) -> Check | None:
     return Check(GOOD if ratio.max() < 1.5 else LOOK, "On data not learned from", said)
 
 
-def noise_ratio(data: RunData) -> Any:
-    """(n,) torque that the learned model leaves, over the white noise of the torque sensors; None
-    where that noise is not known."""
-    noise = ((data.figures.get("noise") or {}).get("tau")) or []
-    left = data.figures["theta"].get("torque_rmse_nm") or []
-    if not left or len(noise) != len(left) or None in noise or min(noise) <= 0.0:
-        return None
-    return np.array(left, float) / np.array(noise, float)
-
-
-def _left(data: RunData, worth: Worth) -> Check | None:
-    """How much of the torque stays unexplained, against its size and the sensors' noise."""
+def _left(data: RunData) -> Check | None:
+    """How much of the torque stays unexplained, and whether it is like noise."""
     left = data.figures["theta"].get("torque_rmse_nm")
     if not left or not theta_started(data):
         return None
-    size = np.sqrt(np.mean(data.score_signals()[3] ** 2, axis=0))
+    size = rms(data.score_signals()[3])
     share = 100.0 * np.array(left) / np.maximum(size, 1e-12)
-    said = (
-        f"{spread(left, 'N m')} rms by joint, {spread(share, '%')} of the torque that acted"
-    )
-    ratio = noise_ratio(data)
-    if ratio is None:
-        said += (
-            "; whether that is noise or something the model lacks this page cannot tell: adapter "
-            "gap can"
-        )
-        return Check(LOOK if share.max() > 10.0 else GOOD, "Torque not explained", said)
-    loud = [j + 1 for j in np.flatnonzero(ratio > MUCH)]
-    if not loud:
-        return Check(
-            GOOD,
-            "Torque not explained",
-            f"{said}; at most {number(ratio.max(), 2)} times the noise of the torque sensor",
-        )
-    which = f"joint{'s' if len(loud) > 1 else ''} {numbered(loud)}"
-    said += (
-        f"; up to {number(ratio.max(), 2)} times the noise of the torque sensor ({which}): "
-        "something is left that no learned effect explains"
-    )
-    return Check(LOOK, "Torque not explained", said)
+    said = f"{spread(left, 'N m')} rms by joint, {spread(share, '%')} of the torque that acted"
+    slow = slow_share(data)
+    if slow is None:
+        return Check(LOOK, LEFT, f"{said}; too short to tell whether it is noise")
+    j = int(np.argmax(slow))
+    most = f"{100.0 * slow[j]:.0f} % of it on joint {j + 1}"
+    if slow[j] <= SLOW:
+        return Check(GOOD, LEFT, f"{said}; like noise: at most {most} lasts over {BLOCK_S:g} s")
+    which = [k + 1 for k in np.flatnonzero(slow > SLOW)]
+    joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
+    most = f"{'up to ' if len(which) > 1 else ''}{most}"
+    why = "something acts that no learned effect explains"
+    return Check(LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}")
 
 
 def _parameters(data: RunData) -> Check | None:
@@ -210,25 +191,6 @@ def _timing(figures: Mapping[str, Any]) -> Check | None:
     share = missed / deadlines
     verdict = GOOD if share < FEW_MISSED else LOOK if share < MANY_MISSED else BAD
     return Check(verdict, "Timing", said)
-
-
-def missed_words(figures: Mapping[str, Any]) -> str:
-    """How many deadlines were missed, by our own work and by the machine's."""
-    missed = figures.get("missed_deadlines") or 0
-    deadlines = count(int(figures["samples"]) + missed)
-    if not missed:
-        return f"none of {deadlines} deadlines missed"
-    said = f"{count(missed)} of {deadlines} deadlines missed"
-    timing = figures.get("timing") or {}
-    own = timing.get("missed_own")
-    if own is None:
-        return said
-    simulated = (timing.get("plant_us") or {}).get("p50") is not None
-    work = "our own work" + (" and the arm's simulation" if simulated else "")
-    return (
-        f"{said}: {count(own)} because {work} took too long, {count(missed - own)} because the "
-        "machine ran something else"
-    )
 
 
 def _samples(figures: Mapping[str, Any]) -> Check:

@@ -78,3 +78,22 @@ def spread(values: Sequence[float], unit: str) -> str:
 def is_live(figures: Mapping[str, Any]) -> bool:
     """Whether a clock was involved, so that deadlines mean something."""
     return bool(figures.get("timing") or figures.get("lateness_us"))
+
+
+def missed_words(figures: Mapping[str, Any]) -> str:
+    """How many deadlines were missed, by our own work and by the machine's."""
+    missed = figures.get("missed_deadlines") or 0
+    deadlines = count(int(figures["samples"]) + missed)
+    if not missed:
+        return f"none of {deadlines} deadlines missed"
+    said = f"{count(missed)} of {deadlines} deadlines missed"
+    timing = figures.get("timing") or {}
+    own = timing.get("missed_own")
+    if own is None:
+        return said
+    simulated = (timing.get("plant_us") or {}).get("p50") is not None
+    work = "our own work" + (" and the arm's simulation" if simulated else "")
+    return (
+        f"{said}: {count(own)} because {work} took too long, {count(missed - own)} because the "
+        "machine ran something else"
+    )
