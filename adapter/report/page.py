@@ -58,6 +58,7 @@ def context(data: RunData) -> dict[str, Any]:
         "live": words.is_live(figures),
         "worth_table": worth_table(data, worth),
         "worth_panels": worth_panels(data, worth),
+        "doubt": worth.torque is not None and worth.torque.after_std is not None,
         "checks": checks(data, worth),
         "steps": next_steps(data, worth),
         "joints": [
@@ -74,7 +75,7 @@ def context(data: RunData) -> dict[str, Any]:
         "prequential": prequential_panels(data) if started else [],
         "fit": fit_panels(data) if started else [],
         "fit_span": _fit_span(data) if started else "",
-        "joint_table": tables.joint_table(data),
+        "joint_tables": tables.joint_tables(data),
         "matrices": [tables.schema_matrix(data), tables.theta_matrix(data)],
         "changes": tables.changes_table(data),
         "refused": tables.refused_table(figures),

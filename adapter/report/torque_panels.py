@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import effects_by_name
-from adapter.gap.phrases import THETA
+from adapter.gap.phrases import SHOWN_UNITS, THETA
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -43,8 +43,8 @@ BODY_PARTS = (
     (5, "XZ"),
     (6, "YZ"),
 )
+ROUNDING = 1e-6  # of θ: the spare body moves by less while it is not in use
 MOST_ROWS = 160  # along a line of a small panel
-EFFECT_UNITS = {"kg m2": "kg m²"}
 
 
 def change_times(data: RunData) -> list[float]:
@@ -63,7 +63,7 @@ def bodies_over_time(data: RunData, rows: Array) -> Array:
     n = data.n
     bodies = rows[:, 1 : 1 + 10 * (n + 1)].reshape(len(rows), n + 1, 10)
     spare = data.theta_trace[:, 1 + 10 * n : 1 + 10 * (n + 1)]
-    left = np.flatnonzero((spare != spare[0]).any(axis=1))
+    left = np.flatnonzero(np.abs(spare - spare[0]).max(axis=1) > ROUNDING)
     theta = bodies[:, :n].copy()
     if len(left):
         after = rows[:, 0] >= data.theta_trace[left[0], 0]
@@ -112,10 +112,10 @@ def effect_panels(data: RunData) -> list[Panel]:
     panels = []
     for k, effect in enumerate(effects_by_name(names)):
         drawing = Drawing("quarter")
-        lines_by_joint(drawing.axes[0], t, values[:, k])
+        factor, unit = SHOWN_UNITS.get(effect.unit, (1.0, effect.unit))
+        lines_by_joint(drawing.axes[0], t, factor * values[:, k])
         _finish(drawing, t, data)
         title = effect.name.replace("_", " ").capitalize()
-        unit = EFFECT_UNITS.get(effect.unit, effect.unit)
         panels.append(drawing.panel(f"{title} {effect.key}", unit))
     return panels
 

@@ -69,23 +69,23 @@ def torque_fall(data: RunData) -> Fall | None:
     held_out = theta.get("validation_torque_rmse_nm")
     size = rms(tau)
     if held_out:
-        before = theta.get("documented_validation_torque_rmse_nm")
-        first = None if before is None else np.array(before, float)
-        return Fall(first, np.array(held_out, float), None, None, size, "on data held out")
+        keys = "validation_torque_rmse_nm", "validation_torque_rmse_std_nm"
+        before, before_std = (_known(theta.get(f"documented_{key}")) for key in keys)
+        after_std = _known(theta.get(keys[1]))
+        after = np.array(held_out, float)
+        return Fall(before, after, before_std, after_std, size, "on data held out")
     rows = unseen_rows(data)
     if rows.sum() < FEWEST_ROWS:
         return None
-    after, before = error[rows], None
-    if not data.documented.tree.floating:  # the base's motion is not kept for the page
-        before = (tau - ModelTorque(data.documented)(q, dq, ddq))[rows]
-    return Fall(
-        None if before is None else rms(before),
-        rms(after),
-        None if before is None else spread_of_rms(before),
-        spread_of_rms(after),
-        size,
-        "predicted before it was learned from",
-    )
+    after, seen = error[rows], "predicted before it was learned from"
+    if data.documented.tree.floating:  # the base's motion is not kept for the page
+        return Fall(None, rms(after), None, spread_of_rms(after), size, seen)
+    before = (tau - ModelTorque(data.documented)(q, dq, ddq))[rows]
+    return Fall(rms(before), rms(after), spread_of_rms(before), spread_of_rms(after), size, seen)
+
+
+def _known(values: Any) -> Array | None:
+    return None if values is None else np.array(values, float)
 
 
 def unseen_rows(data: RunData) -> Array:
