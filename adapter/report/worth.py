@@ -17,7 +17,7 @@ from adapter.runs.run_folder import RunData
 BLOCKS = 10  # stretches of the recording whose spread tells how sure an error's size is
 FEWEST_ROWS = 50
 BLOCK_S, FEWEST_BLOCKS = 0.5, 8  # what lasts longer than a block is slow
-SLOW = 0.25  # share from which what is left is not called noise
+SLOW = 0.3  # share from which what is left is not called noise
 SETTLING_S = 2.0  # after a change at the hand, or where nothing says when θ had converged
 BETTER, WORSE = 0.9, 1.1  # times the error before: from here on it is called a change
 
@@ -91,11 +91,15 @@ def _known(values: Any) -> Array | None:
 def unseen_rows(data: RunData) -> Array:
     """(k,) bool: rows of the score that were predicted by what had been learned well before."""
     t = data.times(data.score_trace)
-    changes, converged = change_times(data), data.converged_s("theta")
+    converged = data.converged_s("theta")
     start = t[0] + SETTLING_S if converged is None else converged
-    if changes:
-        start = max(start, changes[-1] + SETTLING_S)
-    return np.asarray(t >= start)
+    return np.asarray(t >= start) & fit_rows(data)
+
+
+def fit_rows(data: RunData) -> Array:
+    """(k,) bool: rows of the score that the learned model is of: after the last change."""
+    t, changes = data.times(data.score_trace), change_times(data)
+    return np.asarray(t >= changes[-1] + SETTLING_S) if changes else np.ones(len(t), dtype=bool)
 
 
 def rms(error: Array) -> Array:
@@ -121,7 +125,7 @@ def slow_share(data: RunData) -> Array | None:
     Of noise behind the filter up to 0.16 was seen in 2 to 17 s (0.02 with little filtering), of
     the logs of real arms 0.36 and more.
     """
-    rows = unseen_rows(data)
+    rows = fit_rows(data)
     left, t = (data.score_signals()[3] - data.fit)[rows], data.times(data.score_trace)[rows]
     if len(t) < FEWEST_ROWS or t[-1] - t[0] < FEWEST_BLOCKS * BLOCK_S:
         return None
