@@ -30,7 +30,19 @@ from adapter.report.words import NARROW
 
 TEMPLATE = "gap.html"
 MOST_NAMED = 3  # recordings, beside the name of the arm
-OURS = ("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints", "torque error", "but ")
+OURS = (
+    "joint",
+    "link",
+    "the ",
+    "something",
+    "from ",
+    "until ",
+    "no ",
+    "a spring",
+    "all joints",
+    "torque error",
+    "but ",
+)
 
 
 def render_gap_page(result: GapResult, folder: Path | None = None) -> str:

@@ -49,16 +49,16 @@ def _any(values: Array) -> bool:
     return bool((np.isfinite(values) & (np.asarray(values) > 0.0)).any())
 
 
-def fall_drawing(
-    before: Array, after: Array, noise: Array | None, names: Sequence[str]
-) -> Drawing:
+def fall_drawing(before: Array, after: Array, noise: Array | None, names: Sequence[str]) -> Drawing:
     """A line per joint from its error before to that after, on a logarithmic scale."""
     drawing = Drawing("half")
     ax = drawing.axes[0]
     ax.set_yscale("log")
     for j, (first, last) in enumerate(zip(before, after, strict=True)):
         if noise is not None and noise[j] > 0.0:
-            ax.plot([j - 0.3, j + 0.3], [noise[j]] * 2, color=MUTED, linewidth=1.4, gid=named("noise"))
+            ax.plot(
+                [j - 0.3, j + 0.3], [noise[j]] * 2, color=MUTED, linewidth=1.4, gid=named("noise")
+            )
         if not (np.isfinite(first) and first > 0.0):
             continue
         name = names[j]

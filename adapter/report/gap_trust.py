@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,9 @@ def _scored(result: GapResult) -> Check:
         return Check(LOOK, "On data not fitted", said)
     lost = worse(result)
     said = "errors before and after are of data that the fit never saw"
-    return Check(LOOK if lost else GOOD, "On data not fitted", f"{said}{'; ' + lost if lost else ''}")
+    return Check(
+        LOOK if lost else GOOD, "On data not fitted", f"{said}{'; ' + lost if lost else ''}"
+    )
 
 
 def _left(result: GapResult) -> Check:
@@ -70,7 +73,9 @@ def _left(result: GapResult) -> Check:
     loud = left_above_noise(result)
     if joints:
         listed = ", ".join(map(str, joints))
-        said = f"something that no effect explains on joint{'s' if len(joints) > 1 else ''} {listed}"
+        said = (
+            f"something that no effect explains on joint{'s' if len(joints) > 1 else ''} {listed}"
+        )
         return Check(LOOK, "Torque not explained", f"{said}{'; ' + loud if loud else ''}")
     if loud:
         return Check(LOOK, "Torque not explained", f"{loud}, and nothing of the catalogue names it")
@@ -80,7 +85,7 @@ def _left(result: GapResult) -> Check:
 
 def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     """What to measure next, and what the new model is for."""
-    asked = [_first_capital(text) for text in result.what_next]
+    asked = _asked(result.what_next)
     figures = FIGURES if folder is None else str(folder / FIGURES)
     steps = [Step(text) for text in asked]
     if asked and result.findings:
@@ -96,6 +101,19 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
         why = "Use it in a simulator or planner: the robot's file with what was found"
         steps.append(Step(why, _command("export", out, "--urdf", "learned.urdf")))
     return steps
+
+
+def _asked(texts: Sequence[str]) -> list[str]:
+    """Experiments, each motion once with all that it tells: "move so: this stays, that grows"."""
+    told: dict[str, dict[str, None]] = {}
+    for text in texts:
+        motion, _, signs = text.partition(": ")
+        told.setdefault(motion, {}).update(dict.fromkeys(filter(None, signs.split(", the "))))
+    found = []
+    for motion, clauses in told.items():
+        signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
+        found.append(_first_capital(f"{motion}: the {signs}" if signs else motion))
+    return found
 
 
 def _robot(result: GapResult) -> tuple[str, ...]:

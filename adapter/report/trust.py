@@ -12,7 +12,16 @@ from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.headline import Worth, against
 from adapter.report.torque_panels import SHARE_ALONE, theta_started
-from adapter.report.words import GOALS, count, is_live, missed_words, number, quantity, small, spread
+from adapter.report.words import (
+    GOALS,
+    count,
+    is_live,
+    missed_words,
+    number,
+    quantity,
+    small,
+    spread,
+)
 from adapter.report.worth import BLOCK_S, SLOW, rms, slow_share
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
@@ -45,9 +54,11 @@ def _unseen(data: RunData, worth: Worth) -> Check | None:
     """Whether what was learned holds on rows that the fit had not seen."""
     fall = worth.torque
     if fall is None:
-        return Check(BAD, "On data not learned from", "nothing to judge by") if (
-            theta_started(data)
-        ) else None
+        return (
+            Check(BAD, "On data not learned from", "nothing to judge by")
+            if (theta_started(data))
+            else None
+        )
     fit = np.array(data.figures["theta"]["torque_rmse_nm"], float)
     ratio = fall.after / np.maximum(fit, 1e-12)
     said = (
@@ -81,7 +92,9 @@ def _left(data: RunData) -> Check | None:
     joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
     most = f"{'up to ' if len(which) > 1 else ''}{most}"
     why = "something acts that no learned effect explains"
-    return Check(LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}")
+    return Check(
+        LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
+    )
 
 
 def _parameters(data: RunData) -> Check | None:
@@ -112,8 +125,10 @@ def _frames(data: RunData) -> Check:
     off = _off_words(data, goal)
     shown = f"motion shows {rank} of {every} directions of λ"
     if schema.get("source") == LAMBDA_MEASURED:
-        when = f"did not stay within {GOALS}" if at is None else (
-            f"within {GOALS} from {quantity(at, 's', 2)} after {start} on"
+        when = (
+            f"did not stay within {GOALS}"
+            if at is None
+            else (f"within {GOALS} from {quantity(at, 's', 2)} after {start} on")
         )
         return Check(
             LOOK if at is None else GOOD,

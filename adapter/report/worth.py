@@ -151,11 +151,12 @@ def hand_off_m(data: RunData) -> float | None:
     """How far (rms over postures of the run, m) the outermost link stands from where the
     documentation puts it; None where no posture or no such link is known."""
     q = some_postures(data)
-    tips = [[placed_arm(data, lam, row).tips for row in q] for lam in (data.documented.lam, data.model.lam)]
+    tips = [
+        [placed_arm(data, lam, row).tips for row in q]
+        for lam in (data.documented.lam, data.model.lam)
+    ]
     apart = [
-        np.linalg.norm(there[j] - here[j])
-        for there, here in zip(*tips, strict=True)
-        for j in there
+        np.linalg.norm(there[j] - here[j]) for there, here in zip(*tips, strict=True) for j in there
     ]
     return float(np.sqrt(np.mean(np.square(apart)))) if apart else None
 

@@ -35,7 +35,9 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
         columns.append(("Path error, with model", "mrad rms", _values(1e3 * tracking.after)))
     if not columns:
         return None
-    heads, units, cells = zip(("Joint", "", list(data.documented.tree.joint_names)), *columns)
+    heads, units, cells = zip(
+        ("Joint", "", list(data.documented.tree.joint_names)), *columns, strict=True
+    )
     return Table(heads, list(zip(*cells, strict=True)), units)
 
 

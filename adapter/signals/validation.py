@@ -24,9 +24,7 @@ def validation_torque_rmse(
     return np.sqrt(np.mean(validation_error(stamp_s, q, dq, tau, torque) ** 2, axis=0))
 
 
-def validation_error(
-    stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel
-) -> Array:
+def validation_error(stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel) -> Array:
     """Torque error (k, n) of a model on a recording, N m, by the project's recipe.
 
     Drop samples identical to the one before in all of q, dq, tau; interpolate linearly on a 1 ms

@@ -46,7 +46,9 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     assert not re.search(r"https?:|url\((?!#)|@import", page)
     assert "default-src 'none'" in page
     scripts = re.findall(r"<script>(.*?)</script>", page, re.S)
-    assert page.count("<script") == len(scripts) == 1  # one of the page's own, and it is the allowed
+    assert (
+        page.count("<script") == len(scripts) == 1
+    )  # one of the page's own, and it is the allowed
     digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in page
     assert len(links.ids) == len(set(links.ids))
@@ -64,8 +66,9 @@ addEventListener("load", () => {
   const wide = page.documentElement.clientWidth, outside = [], lost = [];
   for (const one of page.querySelectorAll("body *")) {
     const box = one.getBoundingClientRect();
-    if (box.right > wide + 1 && !one.closest(".said, pre")) outside.push(one.outerHTML.slice(0, 120));
-    if (one.matches("td") && box.width * box.height === 0) lost.push(one.outerHTML.slice(0, 120));
+    const said = one.outerHTML.slice(0, 120);
+    if (box.right > wide + 1 && !one.closest(".said, pre")) outside.push(said);
+    if (one.matches("td") && box.width * box.height === 0) lost.push(said);
   }
   const answer = { wide, scrolls: page.documentElement.scrollWidth - wide, outside, lost,
     cells: page.querySelectorAll("td").length };

@@ -95,8 +95,7 @@ def test_physics_time_is_told_apart_and_an_empty_report_says_none():
 
 @pytest.mark.parametrize(("used_ms", "own"), [(0.2, 0), (1.2, 2), (4.0, 3)])
 def test_who_is_to_blame_for_a_missed_deadline(used_ms: float, own: int) -> None:
-    """A tick that ends 3.5 ms late: our own work as far as the thread was running, else the machine.
-    """
+    """A tick that ends 3.5 ms late: our own work as far as the thread ran, else the machine."""
     ms = 1_000_000
     state = {"now": 0, "used": 0}
     clock = Clock(

@@ -195,8 +195,7 @@ def test_frames_and_bodies_are_a_matrix_in_the_order_of_the_joints() -> None:
 
 def test_an_effect_of_several_joints_is_one_row() -> None:
     entries = [
-        {"effect": "coulomb_friction", "joints": [j], "parameters": {"Fc": 0.1 * j}}
-        for j in (3, 5)
+        {"effect": "coulomb_friction", "joints": [j], "parameters": {"Fc": 0.1 * j}} for j in (3, 5)
     ]
     (row,) = effect_rows(compare(PANDA, replace(PANDA, effects=tuple(entries))))
     assert row[0] == "coulomb_friction" and row[1].splitlines() == [
