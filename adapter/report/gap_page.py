@@ -29,6 +29,7 @@ from adapter.report.tables import Tile
 from adapter.report.words import NARROW
 
 TEMPLATE = "gap.html"
+WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
 OURS = (
     "joint",
@@ -40,7 +41,7 @@ OURS = (
     "no ",
     "a spring",
     "all joints",
-    "torque error",
+    WORTH,
     "but ",
 )
 
@@ -99,6 +100,9 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
 def _headline(result: GapResult) -> list[str]:
     """Sentences on a page: capital, arrow, no break before a unit."""
     parts = headline_parts(result)
+    worth = [k for k, part in enumerate(parts) if part.startswith(WORTH)]
+    if worth:  # right behind the first finding
+        parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
     said = [_first_capital(text) if text.startswith(OURS) else text for text in parts]

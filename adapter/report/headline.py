@@ -12,7 +12,7 @@ import numpy as np
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.torque_panels import theta_started
-from adapter.report.words import NARROW, is_live, missed_words, plus_minus, quantity
+from adapter.report.words import NARROW, is_live, missed_words, not_learned, plus_minus, quantity
 from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
 from adapter.runs.run_folder import RunData
 
@@ -92,8 +92,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
     worst = f"joint {j + 1} {_fall_words(fall, j)}"
     verb = "fell" if fall.better else "rose"
     return [
-        f"The torque error of all joints {verb} from {before} with the documented model to {after} with the "
-        f"learned one ({fall.seen}); {worst}."
+        f"The torque error of all joints {verb} from {before} with the documented model to "
+        f"{after} with the learned one ({fall.seen}); {worst}."
     ]
 
 
@@ -142,7 +142,7 @@ def _hand(data: RunData, worth: Worth) -> list[str]:
 
 def _trouble(figures: Mapping[str, Any]) -> list[str]:
     fault = figures.get("fault")
-    new = len(figures.get("disagreements") or [])
+    new = len(not_learned(figures))
     said = [f"The run ended early: {fault}."] if fault else []
     if new:
         said.append(

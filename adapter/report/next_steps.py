@@ -10,7 +10,7 @@ from typing import Any
 from adapter.model.self_model import MJCF
 from adapter.report.headline import Worth
 from adapter.report.torque_panels import theta_started
-from adapter.report.words import is_live
+from adapter.report.words import is_live, not_learned
 from adapter.report.worth import SLOW, slow_share
 from adapter.runs.run_folder import RunData
 
@@ -66,7 +66,7 @@ def _left_to_find(data: RunData, worth: Worth) -> bool:
     fall, slow = worth.torque, slow_share(data) if theta_started(data) else None
     return bool(
         (fall is not None and (fall.before is None or fall.better))
-        or data.figures.get("disagreements")
+        or not_learned(data.figures)
         or worth.loads
         or (slow is not None and float(slow.max()) > SLOW)
     )
