@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
+from rich.console import Console
 from rich.table import Table
 
 from adapter.cli.common import robot_of
 from adapter.report.difference_words import (
-    HEADS,
+    EFFECT_HEADS,
     LEGEND,
+    MATRIX_HEADS,
     difference_json,
-    difference_rows,
+    difference_matrix,
     difference_summary,
+    effect_rows,
 )
 from adapter.runs.compare import compare, documentation_of
 from adapter.runs.terminal import console, output, write_json
@@ -28,12 +32,22 @@ def run(args: argparse.Namespace) -> int:
     found = compare(first, second)
     write_json(args.json, difference_json(found))
     shown = console if str(args.json) == "-" else output
-    rows = difference_rows(found)
-    if rows:
-        table = Table(*HEADS, box=None, pad_edge=False, caption=LEGEND, caption_justify="left")
-        for row in rows:
-            table.add_row(*row)
-        shown.print(table)
     for line in difference_summary(found):
         shown.print(line, soft_wrap=True)
+    for heads, rows in (
+        (MATRIX_HEADS, difference_matrix(found)),
+        (EFFECT_HEADS, effect_rows(found)),
+    ):
+        if rows:
+            _print(shown, heads, rows)
+    if found.changes:
+        shown.print(LEGEND, soft_wrap=True)
     return 0
+
+
+def _print(shown: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """A table whose cells hold lines of their own."""
+    table = Table(*heads, box=None, pad_edge=False, title_justify="left", padding=(0, 2, 0, 0))
+    for row in rows:
+        table.add_row(*row)
+    shown.print(table)

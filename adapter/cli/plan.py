@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,6 +17,7 @@ from adapter.control.excitation import plan_lines
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
+from adapter.report.next_steps import Step
 from adapter.report.plan_page import write_plan
 from adapter.runs.terminal import results_folder, say, show
 from drivers.interface import Driver, JointSample
@@ -44,13 +49,27 @@ def run(args: argparse.Namespace) -> int:
         *push_bound(robot, motion, limits, plan.config.safety).lines(),
     ]
     page = results_folder(args.out, "plan") / PLAN_PAGE
-    write_plan(page, draw.arm, motion, limits, draw.least, lines)
+    steps = _steps(sys.argv[2:], plan.maybe_real)
+    write_plan(page, draw.arm, motion, limits, draw.least, lines, steps)
     for line in lines:
         show(line)
+    for step in steps:
+        show(f"next: {step.why}: {step.command}")
     say(f"As a page: {page}")
     if not args.trust_model:
         check_resting_torque(robot, sample.q, sample.tau)
     return ExitCode.DONE
+
+
+def _steps(words: Sequence[str], maybe_real: bool) -> list[Step]:
+    """The run of this plan: the same words, but where the plan goes."""
+    kept = [
+        word
+        for before, word in pairwise(["", *words])
+        if "--out" not in (before, word) and not word.startswith("--out=")
+    ]
+    leave = ["--allow-motion"] if maybe_real else []
+    return [Step("Move the arm so", shlex.join(["adapter", "run", *kept, *leave]))]
 
 
 def _measured(driver: Driver) -> JointSample:

@@ -17,6 +17,7 @@ from adapter.errors import SettingsError
 from adapter.gap.screen import check_effort_unit
 from adapter.gap.torque_gains import TorqueGains, in_newton_metres
 from adapter.model.self_model import SelfModel
+from adapter.report.worth import rms, spread_of_rms
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines
@@ -25,7 +26,7 @@ from adapter.runs.replay import (
     Replay,
     ReplayOptions,
     fitted_to,
-    held_out_rmse,
+    held_out_error,
     noise_levels,
     one_after_other,
     seconds,
@@ -77,8 +78,10 @@ def run(args: argparse.Namespace) -> int:
         held_out = _as_understood(args, held_out, robot, gains)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
-        rmse = held_out_rmse(held_out, model, config.pipeline)
-        numbers["theta"]["validation_torque_rmse_nm"] = rmse.tolist()
+        for key, judged in (("", model), ("documented_", robot)):
+            error = held_out_error(held_out, judged, config.pipeline)
+            numbers["theta"][f"{key}validation_torque_rmse_nm"] = rms(error).tolist()
+            numbers["theta"][f"{key}validation_torque_rmse_std_nm"] = spread_of_rms(error).tolist()
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, source)
@@ -110,6 +113,7 @@ def _figures(
         ],
         contacts=result.contacts,
         recording=", ".join(map(str, args.logs)),
+        recordings=list(map(str, args.logs)),
         robot=robot.name,
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),

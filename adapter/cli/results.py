@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.table import Column, Table
+from rich.text import Text
 
 from adapter.effects.active import check_effects
 from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
@@ -17,8 +18,11 @@ from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.report import write_report
+from adapter.report.headline import Worth, headline
+from adapter.report.next_steps import next_steps
+from adapter.report.words import is_live, missed_words, small
 from adapter.runs.outcome import Outcome
-from adapter.runs.run_folder import load_run, run_data, save_run
+from adapter.runs.run_folder import RunData, load_run, run_data, save_run
 from adapter.runs.score import Reference, counted_from
 from adapter.runs.terminal import json_ready, output, program_version, show, warn, write_json
 from adapter.signals.front_end import FrontEnd
@@ -61,11 +65,22 @@ def conclude(
     if not args.no_report:
         figures["report"] = str(write_report(folder / "report.html", data))
     write_json(args.json, figures)
-    print_figures(figures)
+    print_figures(data, figures.get("report"))
 
 
-def print_figures(figures: dict[str, Any]) -> None:
-    """The few figures that people want first."""
+def print_figures(data: RunData, report: str | None) -> None:
+    """What changed and what it is worth, the figures behind it, and what to do next."""
+    worth = Worth.of(data)
+    for number, said in enumerate(headline(data, worth)):
+        output.print(said, style="bold" if number == 0 else "", soft_wrap=True)
+    output.print(_figures(data.figures, report))
+    for step in next_steps(data, worth):
+        output.print(Text.assemble(("next ", "cyan"), step.why), soft_wrap=True)
+        if step.command:
+            output.print(f"  {step.command}", soft_wrap=True)
+
+
+def _figures(figures: dict[str, Any], report: str | None) -> Table:
     lam, theta, tick = figures["lambda"], figures["theta"], figures["tick_us"]
     table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
     refused = ", ".join(f"{count} {reason}" for reason, count in figures["refused"].items())
@@ -74,8 +89,9 @@ def print_figures(figures: dict[str, Any]) -> None:
         table.add_row("not learned", refused)
     table.add_row(
         f"λ ({lam['source']})",
-        f"{_reached(figures, 'lambda')}; worst joint {max(lam['rotation_error_rad']):.2g} rad, "
-        f"{max(lam['position_error_m']):.2g} m against {lam['reference']}; "
+        f"{_reached(figures, 'lambda')}; worst joint "
+        f"{small(1e3 * max(lam['rotation_error_rad']), 'mrad')}, "
+        f"{small(1e3 * max(lam['position_error_m']), 'mm')} from {lam['reference']}; "
         f"{lam['identifiable_rank']} directions shown",
     )
     if lam["restarts"]:
@@ -97,13 +113,13 @@ def print_figures(figures: dict[str, Any]) -> None:
     if tick.get("p50") is not None:
         table.add_row(
             "tick",
-            f"p50 {tick['p50']:.0f} µs, p99 {tick['p99']:.0f} µs; "
-            f"{figures['missed_deadlines']} deadlines missed",
+            f"p50 {tick['p50']:.0f} µs, p99 {tick['p99']:.0f} µs"
+            + (f"; {missed_words(figures)}" if is_live(figures) else ""),
         )
     table.add_row("model", figures["model"])
-    if "report" in figures:
-        table.add_row("report", figures["report"])
-    output.print(table)
+    if report:
+        table.add_row("report", report)
+    return table
 
 
 def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:

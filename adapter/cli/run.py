@@ -276,6 +276,10 @@ def _go(
     return dataclasses.replace(result, contacts=contacts_of(watching.observer, robot))
 
 
+def _recording_path(args: argparse.Namespace, folder: Path) -> Path:
+    return args.record or folder / "recording.mcap"
+
+
 def _recording(
     args: argparse.Namespace, plan: RunPlan, driver: Driver, folder: Path, truth: Path | None
 ) -> RecordingJob:
@@ -292,7 +296,7 @@ def _recording(
     if truth is not None:
         attachments["truth.json"] = truth.read_bytes()
     return RecordingJob(
-        args.record or folder / "recording.mcap",
+        _recording_path(args, folder),
         metadata,
         attachments,
         overwrite=args.record is None,
@@ -336,6 +340,7 @@ def _conclude(
         contacts=result.contacts,
         robot=robot.name,
         driver=args.driver,
+        recordings=[] if args.no_record else [_recording_path(args, folder)],
         scenario=args.scenario,
         program=f"panda-adapter {program_version()}",
         timing=result.timing.as_dict(),

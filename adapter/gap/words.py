@@ -13,6 +13,7 @@ from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.phrases import (
     listed,
     numbered,
+    parameter_lines,
     phrase,
     phrase_of,
     plain,
@@ -37,16 +38,21 @@ SIGNALS = {
 
 def headline(result: GapResult) -> str:
     """The outcome in one sentence."""
+    return "; ".join(headline_parts(result))
+
+
+def headline_parts(result: GapResult) -> list[str]:
+    """The outcome in clauses: what was found, what it is worth, what is left."""
     if result.problem is not None:
-        return result.problem
+        return [result.problem]
     if not result.findings and not result.unexplained:
-        said = (_nothing(result), *result.contradictions, stopped(result))
-        return "; ".join(filter(None, said))
+        said = [_nothing(result), *result.contradictions, stopped(result)]
+        return [part for part in said if part]
     parts = _finding_parts(result.findings)
     if result.findings:
         parts += [_shrink(result), worse(result)]
     parts += [_left(result.unexplained), *result.contradictions, stopped(result)]
-    return "; ".join(part for part in parts if part)
+    return [part for part in parts if part]
 
 
 def stopped(result: GapResult) -> str:
@@ -143,11 +149,27 @@ def data_words(result: GapResult) -> str:
     return "this recording" if len(result.recordings) <= 1 else "these recordings"
 
 
+def noise_times(result: GapResult) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) torque errors before and after in units of the noise; NaN where that is not known."""
+    noise = np.where(result.noise_floor_nm > 0.0, result.noise_floor_nm, np.nan)
+    return result.before.torque_rmse_nm / noise, result.after.torque_rmse_nm / noise
+
+
+def left_above_noise(result: GapResult) -> str:
+    """What the new model leaves above the noise, though nothing names it; empty where nothing."""
+    times = np.nan_to_num(noise_times(result)[1])
+    loud = [int(j) + 1 for j in np.flatnonzero(times > ABOVE_NOISE)]
+    if not loud:
+        return ""
+    most = plain(float(times.max()), 2)
+    if len(loud) == 1:
+        return f"{most} times the noise stays on joint {loud[0]}"
+    return f"up to {most} times the noise stays on joints {numbered(loud)}"
+
+
 def _nothing(result: GapResult) -> str:
     said = "the model explains " + data_words(result)
-    noise = np.where(result.noise_floor_nm > 0.0, result.noise_floor_nm, np.nan)
-    before = _largest(result.before.torque_rmse_nm / noise)
-    after = _largest(result.after.torque_rmse_nm / noise)
+    before, after = (_largest(times) for times in noise_times(result))
     if after > ABOVE_NOISE:
         return (
             f"no effect of the catalogue is called for; the model explains {data_words(result)} "
@@ -165,17 +187,22 @@ def _largest(ratio: np.ndarray) -> float:
 
 def _finding_parts(findings: Sequence[Finding]) -> list[str]:
     """Findings in words, those of the same kind in one; the largest first where there are many."""
-    by_kind: dict[tuple[str, str], list[Finding]] = {}
-    for finding in findings:
-        each = bool(finding.recording) and finding.throughout
-        key = (finding.effect, "in each" if each else span(finding))
-        by_kind.setdefault(key, []).append(finding)
-    groups = list(by_kind.values())
+    groups = by_kind(findings)
     if len(groups) > MOST_PARTS:
         groups.sort(key=lambda group: -max(_size(f) for f in group))
     parts = [_group(group) for group in groups[:MOST_PARTS]]
     more = sum(len(group) for group in groups[MOST_PARTS:])
     return [*parts, f"{more} more finding{'' if more == 1 else 's'}"] if more else parts
+
+
+def by_kind(findings: Sequence[Finding]) -> list[list[Finding]]:
+    """Findings of one effect that act at the same time, together; in order of the first."""
+    groups: dict[tuple[str, str], list[Finding]] = {}
+    for finding in findings:
+        each = bool(finding.recording) and finding.throughout
+        key = (finding.effect, "in each" if each else span(finding))
+        groups.setdefault(key, []).append(finding)
+    return list(groups.values())
 
 
 def _size(finding: Finding) -> float:
@@ -280,12 +307,17 @@ def console_summary(result: GapResult) -> list[str]:
     """Headline, findings, figures by joint, what to do next; for `rich.console.Console.print`."""
     color = "red" if result.problem is not None else "bold"
     lines = [f"[{color}]{escape(headline(result))}[/{color}]"]
-    for findings in alike(result.findings):
-        lines += [_finding(finding) for finding in findings]
-        lines += [f"  [dim]{escape(other)}[/dim]" for other in [rivals(findings)] if other]
+    for findings in by_kind(result.findings):
+        lines += _found(findings)
+        others = [rivals(same) for same in alike(findings)]
+        lines += [f"  [dim]{escape(other)}[/dim]" for other in others if other]
     lines += carried(result)
     lines += [f"[red]![/red] {escape(text)}" for text in result.contradictions]
     lines += [f"[yellow]?[/yellow] {escape(leftover_sentence(x))}" for x in result.unexplained]
+    left = left_above_noise(result) if result.findings and not result.unexplained else ""
+    lines += [f"[yellow]?[/yellow] {escape(left)}, and no effect of the catalogue names it"] * (
+        left != ""
+    )
     lines += _figures(result)
     lines += [f"[cyan]next[/cyan] {escape(text)}" for text in result.what_next]
     lines += [f"[dim]note[/dim] {escape(text)}" for text in result.notes]
@@ -294,10 +326,20 @@ def console_summary(result: GapResult) -> list[str]:
     return lines
 
 
-def _finding(finding: Finding) -> str:
-    there = "that one of them is there " if finding.two_readings else ""
-    sure = f"evidence {there}{percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
-    return f"[green]•[/green] {escape(sentence(finding))} [dim]({sure})[/dim]"
+def _found(findings: Sequence[Finding]) -> list[str]:
+    """Findings of one kind: one sentence, and below it a line per joint where there are several."""
+    if len(findings) == 1:
+        (finding,) = findings
+        there = "that one of them is there " if finding.two_readings else ""
+        sure = f"evidence {there}{percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
+        return [f"[green]•[/green] {escape(sentence(finding))} [dim]({sure})[/dim]"]
+    lines = [f"[green]•[/green] {escape(_group(findings))}"]
+    for finding in sorted(findings, key=lambda f: (f.recording, f.joints)):
+        where = finding.recording or who(finding.effect, finding.joints)
+        sure = f"evidence {percent(finding.evidence)}, z {plain(finding.detectability, 2)}"
+        values = ", ".join(parameter_lines(finding))
+        lines.append(f"    {escape(f'{where}: {values}')} [dim]({sure})[/dim]")
+    return lines
 
 
 def carried(result: GapResult) -> list[str]:

@@ -38,8 +38,8 @@ class Clock:
     Attributes:
         k: number of the deadline that `wait` returned at last; -1 before the first.
         missed: deadlines that went by unused.
-        missed_own: of these, such as the loop's own work took longer than a period for; at the
-            others the machine had given the processor to somebody else.
+        missed_own: of these, such as the loop's own work filled, by the processor time that it
+            used; at the others the machine had given the processor to somebody else.
     """
 
     def __init__(
@@ -67,9 +67,13 @@ class Clock:
             skipped = round((now_ns - self._t0) / self.period_ns) - 1
             if skipped > 0:
                 self.missed += skipped
-                if self._used() - self._used_ns > self.period_ns:
-                    self.missed_own += skipped
+                self.missed_own += self._own(skipped)
         self._t0, self._used_ns = now_ns, self._used()
+
+    def _own(self, skipped: int) -> int:
+        """Of the deadlines that went by, such as the loop's own work filled, or ran into."""
+        periods = (self._used() - self._used_ns) / self.period_ns
+        return min(skipped, int(periods) + 1) if periods > 1.0 else 0
 
     def wait(self) -> int:
         """Wait for the next deadline; returns by how much it is late, ns.
@@ -85,8 +89,7 @@ class Clock:
         if behind > self.period_ns:
             skipped = behind // self.period_ns + 1
             self.missed += skipped
-            if self._used() - self._used_ns > self.period_ns:
-                self.missed_own += skipped
+            self.missed_own += self._own(skipped)
             k += skipped
         self.k = k
         deadline = self._t0 + k * self.period_ns

@@ -19,8 +19,53 @@ from adapter.runs.compare import (
 )
 
 HEADS = ("what", "from A to B", "z", "N m", "mm")
+MATRIX_HEADS = ("joint", "its frame in the one before", "the link behind it")
+EFFECT_HEADS = ("effect", "from A to B, joint by joint", "z", "N m")
 LEGEND = "z: standard deviations; N m, mm: what it alone does to torque and to the hand, rms"
 MOSTLY = 0.5  # share that data can show, below which it is told
+
+
+def difference_matrix(found: ModelDifference) -> list[tuple[str, ...]]:
+    """Rows under `MATRIX_HEADS`, a joint each, in order: what differs of its frame and of its link;
+    none where nothing of these is listed."""
+    cells = {(change.joint, change.what): _cell(change) for change in found.changes}
+    rows = [(joint, *(cells.get((joint, k), "") for k in (FRAME, BODY))) for joint in found.joints]
+    return [row for row in rows if any(row[1:])]
+
+
+def _cell(change: Change) -> str:
+    """What differs, and below it how sure and how much that is."""
+    if not _listed(change):
+        return ""
+    sure = [] if change.z is None else [f"z {change.z:.1f}"]
+    moved = [f"hand {1e3 * change.hand_m:.2g} mm"] if change.hand_m > NOTHING else []
+    torque = f"{change.torque_nm:.2g} N m on {change.torque_joint}"
+    sizes = [*sure, *moved, *([torque] if change.torque_nm > NOTHING else [])]
+    return f"{_change_words(change)}\n({', '.join(sizes)})"
+
+
+def effect_rows(found: ModelDifference) -> list[tuple[str, ...]]:
+    """Rows under `EFFECT_HEADS`, an effect each with all its joints; what is of no joint too."""
+    groups: dict[str, list[Change]] = {}
+    for change in found.changes:
+        if change.what not in (FRAME, BODY) and _listed(change):
+            groups.setdefault(change.what, []).append(change)
+    order = {joint: k for k, joint in enumerate(found.joints)}
+    rows = []
+    for what, changes in groups.items():
+        changes.sort(key=lambda change: order.get(change.joint, -1))
+        said = "\n".join(f"{c.joint + ': ' if c.joint else ''}{_change_words(c)}" for c in changes)
+        z = _from_to([c.z for c in changes if c.z is not None])
+        rows.append((what, said, z, _from_to([c.torque_nm for c in changes])))
+    return rows
+
+
+def _from_to(values: list[float]) -> str:
+    """Smallest to largest."""
+    if not values:
+        return "-"
+    low, high = (f"{x:.0f}" if x >= 10.0 else f"{x:.2g}" for x in (min(values), max(values)))
+    return low if low == high else f"{low} to {high}"
 
 
 def difference_rows(found: ModelDifference) -> list[tuple[str, ...]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from adapter.gap.phrases import DASH, listed, plain
 from adapter.gap.result import GapResult, Leftover
-from adapter.gap.words import fall, headline, signal_words
+from adapter.gap.words import by_kind, fall, headline_parts, left_above_noise, signal_words
 from adapter.model.spatial import Array
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
@@ -23,18 +23,35 @@ from adapter.report.gap_tables import (
     rival_rows,
     tied,
 )
+from adapter.report.gap_trust import gap_checks, gap_steps
 from adapter.report.html import fill, write_whole
-from adapter.report.page import Tile
+from adapter.report.tables import Tile
 from adapter.report.words import NARROW
 
 TEMPLATE = "gap.html"
+WORTH = "torque error"  # how the clause begins that says what findings are worth
 MOST_NAMED = 3  # recordings, beside the name of the arm
-OURS = ("joint", "link", "the ", "something", "from ", "until ", "no ", "a spring", "all joints")
+OURS = (
+    "joint",
+    "link",
+    "the ",
+    "something",
+    "from ",
+    "until ",
+    "no ",
+    "a spring",
+    "all joints",
+    WORTH,
+    "but ",
+)
 
 
-def render_gap_page(result: GapResult) -> str:
-    """The page as HTML text; parts that the result does not have are left out."""
-    return fill(TEMPLATE, context(result))
+def render_gap_page(result: GapResult, folder: Path | None = None) -> str:
+    """The page as HTML text; parts that the result does not have are left out.
+
+    `folder`: where the page and the result's figures are, for commands that take these.
+    """
+    return fill(TEMPLATE, context(result, folder))
 
 
 def write_gap_page(result: GapResult, path: str | Path) -> Path:
@@ -43,10 +60,10 @@ def write_gap_page(result: GapResult, path: str | Path) -> Path:
     Raises:
         RunFolderError: the file cannot be written.
     """
-    return write_whole(path, render_gap_page(result))
+    return write_whole(path, render_gap_page(result, Path(path).parent))
 
 
-def context(result: GapResult) -> dict[str, Any]:
+def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     """What the template shows."""
     told = result.problem is None
     shown = _tiles(result) if told else []
@@ -73,19 +90,23 @@ def context(result: GapResult) -> dict[str, Any]:
         "unexplained_panels": unexplained_panels(result),
         "correction": correction_table(result) if told else None,
         "correction_words": _correction_words(result),
-        "next": [_first_capital(text) for text in result.what_next],
+        "checks": gap_checks(result),
+        "steps": gap_steps(result, folder),
         "notes": result.notes,
         "provenance": _provenance(result),
     }
 
 
-def _headline(result: GapResult) -> str:
-    """As a sentence on a page: capital, arrow, no break before a unit."""
-    text = headline(result)
+def _headline(result: GapResult) -> list[str]:
+    """Sentences on a page: capital, arrow, no break before a unit."""
+    parts = headline_parts(result)
+    worth = [k for k, part in enumerate(parts) if part.startswith(WORTH)]
+    if worth:  # right behind the first finding
+        parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
-        return text
-    text = _first_capital(text) if text.startswith(OURS) else text
-    return tied(text.replace(" -> ", " → ")) + "."
+        return parts
+    said = [_first_capital(text) if text.startswith(OURS) else text for text in parts]
+    return [f"{tied(text.replace(' -> ', ' → '))}." for text in said]
 
 
 def _first_capital(text: str) -> str:
@@ -117,10 +138,7 @@ def _after_words(result: GapResult) -> str:
 def _tiles(result: GapResult) -> list[Tile]:
     before, after = result.before, result.after
     noise = np.asarray(result.noise_floor_nm, dtype=float)
-    count = len(result.findings)
-    left = len(result.unexplained)
-    note = f"{left} thing{'' if left == 1 else 's'} unexplained" if left else "nothing unexplained"
-    tiles = [Tile("Effects found", str(count), note)]
+    tiles = [Tile("Effects found", str(len(by_kind(result.findings))), _left_words(result))]
     worst = _worst(before.torque_rmse_nm / np.where(noise > 0.0, noise, np.nan))
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
@@ -133,6 +151,14 @@ def _tiles(result: GapResult) -> list[Tile]:
             )
         )
     return [*tiles, *_rollout_tile(result)]
+
+
+def _left_words(result: GapResult) -> str:
+    """What stays beside the findings: named as unexplained, or above the noise without a name."""
+    left = len(result.unexplained)
+    if left:
+        return f"{left} thing{'' if left == 1 else 's'} unexplained"
+    return left_above_noise(result) or "nothing above the noise left"
 
 
 def _rollout_tile(result: GapResult) -> list[Tile]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from adapter.gap.phrases import DASH, THETA, THETA_UNITS, parameter_lines, plain, who
 from adapter.gap.result import Finding, GapResult
-from adapter.gap.words import alike, carried_words, percent, shares_of, span, title_of
+from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
 from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW
@@ -41,25 +42,47 @@ class FindingRow:
 
 
 def finding_rows(result: GapResult) -> list[FindingRow]:
-    """What, where, when, how much, how sure."""
-    return [
-        FindingRow(
-            what=_first_capital(finding.title),
-            where=who(finding.effect, finding.joints),
-            when=span(finding) or "throughout",
-            values=[tied(line) for line in parameter_lines(finding)],
-            evidence=percent(finding.evidence).replace("more than", ">"),
-            worth=_worth(finding),
-        )
-        for finding in result.findings
-    ]
+    """What, where, when, how much, how sure: one row for what is the same on several joints."""
+    return [_row(findings) for findings in by_kind(result.findings)]
 
 
-def _worth(finding: Finding) -> str:
-    worth = np.asarray(finding.torque_rms_nm, dtype=float)
-    if not np.isfinite(worth).any():
+def _row(findings: Sequence[Finding]) -> FindingRow:
+    first = findings[0]
+    ordered = sorted(findings, key=lambda f: (f.recording, f.joints))
+    joints = sorted({j for f in ordered for j in f.joints})
+    least = min(f.evidence for f in ordered)
+    sure = percent(least).replace("more than", ">")
+    alone = len(ordered) == 1
+    if first.recording and not alone:
+        when = f"in {len({f.recording for f in ordered})} recordings"
+    else:
+        when = span(first) or "throughout"
+    return FindingRow(
+        what=_first_capital(first.title),
+        where=who(first.effect, joints),
+        when=when,
+        values=[line for f in ordered for line in _values(f, alone)],
+        evidence=sure if alone or sure.startswith(">") else f"{sure} and more",
+        worth=_worth(ordered),
+    )
+
+
+def _values(finding: Finding, alone: bool) -> list[str]:
+    """A line per parameter; of one of several findings all on one, behind its joint."""
+    lines = [tied(line) for line in parameter_lines(finding)]
+    if alone:
+        return lines
+    where = finding.recording or who(finding.effect, finding.joints)
+    return [f"{where}: {', '.join(lines)}"]
+
+
+def _worth(findings: Sequence[Finding]) -> str:
+    sizes = [np.asarray(f.torque_rms_nm, dtype=float) for f in findings]
+    most = [float(np.nanmax(x)) for x in sizes if np.isfinite(x).any()]
+    if not most:
         return DASH
-    return f"{plain(np.nanmax(worth), 2)} N m"
+    low, high = plain(min(most), 2), plain(max(most), 2)
+    return tied(f"{low} N m" if low == high else f"{low} to {high} N m")
 
 
 def _first_capital(text: str) -> str:

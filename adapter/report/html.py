@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from adapter.model.model_file import whole_file
 from adapter.runs.run_folder import RunFolderError
+
+SCRIPT = "page_script.html"  # the one script that a page may run: hover and zoom
 
 
 def fill(template: str, context: dict[str, Any], package: str = "adapter.report") -> str:
@@ -26,7 +31,10 @@ def fill(template: str, context: dict[str, Any], package: str = "adapter.report"
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(template).render(context)
+    script = environment.get_template(SCRIPT).render()
+    digest = b64encode(sha256(script.encode()).digest()).decode()
+    given = {"script": Markup(script), "script_digest": digest}
+    return environment.get_template(template).render({**given, **context})
 
 
 def write_whole(path: str | Path, page: str) -> Path:

@@ -16,6 +16,7 @@ from adapter.control.meshes import read_mesh
 from adapter.control.path_motion import PathMotion
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.report.html import fill, write_whole
+from adapter.report.next_steps import Step
 from adapter.report.skeleton import from_a_corner
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 
@@ -40,8 +41,9 @@ def write_plan(
     limits: MotionLimits,
     nearest: Clearance,
     lines: Sequence[str],
+    steps: Sequence[Step] = (),
 ) -> Path:
-    """Write the page of a motion in its cell. Raises RunFolderError."""
+    """Write the page of a motion in its cell, with what to do next. Raises RunFolderError."""
     start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
     span_s = max(nearest.path_s, 30.0)
     poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
@@ -52,6 +54,7 @@ def write_plan(
         "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
         "joints": _joint_panels(motion, limits, arm.model.tree.joint_names),
         "lines": lines,
+        "steps": steps,
     }
     return write_whole(path, fill(TEMPLATE, context))
 

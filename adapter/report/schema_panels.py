@@ -14,6 +14,7 @@ from adapter.report.style import (
     log_axis,
     log_time,
     mark,
+    named,
     thin_rows,
     time_axis,
 )
@@ -80,7 +81,9 @@ def _components(t: Array, values: Array, converged: float | None) -> Drawing:
     ax = drawing.axes[0]
     for j in range(values.shape[1]):
         for axis, dashes in enumerate(DASHES):
-            ax.plot(t, values[:, j, axis], color=joint_color(j), linewidth=1.0, linestyle=dashes)
+            name = named(f"joint {j + 1} {'xyz'[axis]}")
+            style = {"color": joint_color(j), "linewidth": 1.0, "linestyle": dashes}
+            ax.plot(t, values[:, j, axis], gid=name, **style)
     ax.set_xlim(min(0.0, t[0]), t[-1])
     ax.margins(y=0.12)  # room for the words of the mark
     if converged is not None:

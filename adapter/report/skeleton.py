@@ -48,12 +48,12 @@ def skeleton_panels(data: RunData) -> list[Panel]:
     q = posture(data)
     reference = data.documented.lam if data.reference is None else data.reference
     arms = {
-        "documented": _arm(data, data.documented.lam, q),
-        "initial": replace(_arm(data, data.start_lam, q), tips={}),  # all in one place
-        "learned": _arm(data, data.model.lam, q),
+        "documented": placed_arm(data, data.documented.lam, q),
+        "initial": replace(placed_arm(data, data.start_lam, q), tips={}),  # all in one place
+        "learned": placed_arm(data, data.model.lam, q),
     }
     if has_reference(data):
-        arms["reference"] = _arm(data, reference, q)
+        arms["reference"] = placed_arm(data, reference, q)
     views: tuple[tuple[str, Projection, str], ...] = (
         ("Seen from a corner", from_a_corner, "short ticks are the joint axes"),
         ("Seen from the side", _side, "x to the right, z up"),
@@ -72,17 +72,23 @@ def has_reference(data: RunData) -> bool:
 def posture(data: RunData) -> Array:
     """(n,) rad: of the run's postures the one that spreads widest in all directions of a plane;
     the middle of the joints' ranges where there are none."""
-    if not len(data.score_trace):
+    some = some_postures(data)
+    if not len(some):
         limits = data.documented.limits
         return np.nan_to_num(0.5 * (limits.lower + limits.upper), posinf=0.0, neginf=0.0)
-    q = data.score_signals()[0]
-    some = q[np.linspace(0, len(q) - 1, min(len(q), POSTURES)).astype(int)]
-    points = [_arm(data, data.documented.lam, row).p for row in some]
+    points = [placed_arm(data, data.documented.lam, row).p for row in some]
     spread = [np.linalg.svd(p - p.mean(axis=0), compute_uv=False) for p in points]
     return np.asarray(some[int(np.argmax([s[min(1, len(s) - 1)] for s in spread]))])
 
 
-def _arm(data: RunData, lam: Array, q: Array) -> Skeleton:
+def some_postures(data: RunData) -> Array:
+    """(k, n) rad: postures of the run, spread over it; none where nothing was kept."""
+    q = data.score_signals()[0] if len(data.score_trace) else np.zeros((0, data.n))
+    return np.asarray(q[np.linspace(0, len(q) - 1, min(len(q), POSTURES)).astype(int)])
+
+
+def placed_arm(data: RunData, lam: Array, q: Array) -> Skeleton:
+    """The arm of a λ (n, 6) in a posture (n,) rad."""
     tree = data.documented.tree
     R, p = placed(tree, matrix_from_zxz(lam[:, :3]) @ rot_z(q), lam[:, 3:])
     tips = {}

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup, escape
@@ -30,6 +31,13 @@ ACCENT, GOAL = STAND_IN["accent"], STAND_IN["goal"]
 
 # width, height in inches and text in points: two, three or four panels side by side
 SIZES = {"half": (5.4, 2.55, 7.8), "third": (3.7, 2.35, 7.6), "quarter": (2.9, 2.0, 7.8)}
+SUPERFLUOUS = (  # what the page's style says, and what shows nothing
+    r" font-family: [^;\"]*;",
+    r"; stroke-line(cap: square|join: \w+)",
+    r' transform="rotate\(-?0 [^"]*"',
+    r'<path d="[^"]*" style="fill: none"/>',
+)
+NAMED = "line named "
 MOST_POINTS = 500  # along one line; a panel has no more pixels
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -71,6 +79,7 @@ class Drawing:
 
         width, height, text = SIZES[size]
         self.size = size
+        self.named_x = False  # names along x, no numbers
         self.figure = Figure(figsize=(width, height * stretch))
         FigureCanvasSVG(self.figure)
         with rc_context({"font.size": text, "axes.linewidth": 0.6}):
@@ -93,7 +102,34 @@ class Drawing:
     def panel(self, title: str, unit: str = "", note: str = "") -> Panel:
         """Done: the SVG and its words."""
         label = f"{title}, {unit}" if unit else title
-        return Panel(title, unit, _svg(self.figure, label, self.size), self.size, note)
+        told = f' aria-label="{escape(label)}"{self._scales(unit)}'
+        return Panel(title, unit, _svg(self.figure, told, self.size), self.size, note)
+
+    def _scales(self, unit: str) -> str:
+        """Attributes from which the page's script tells what is under the pointer; none where the
+        axes have no scales."""
+        boxes = [_scale(ax, self.figure, unit) for ax in self.axes if ax.axison]
+        if not boxes:
+            return ""
+        x = self.axes[-1].get_xlabel()
+        given = f' data-x="{escape(x)}"' if x and not self.named_x else ""
+        return f' data-axes="{escape(json.dumps(boxes, separators=(",", ":")))}"{given}'
+
+
+def _scale(ax: Axes, figure: Figure, unit: str) -> list[Any]:
+    """Where axes lie and what they show: [left, top, right, bottom, x from, x to, y from, y to,
+    x and y logarithmic, unit of y], the first four in the drawing's own units."""
+    width, height = 72.0 * figure.get_size_inches()
+    at = ax.get_position()
+    edges = at.x0 * width, (1 - at.y1) * height, at.x1 * width, (1 - at.y0) * height
+    numbers = [float(f"{x:.4g}") for x in (*edges, *ax.get_xlim(), *ax.get_ylim())]
+    logarithmic = [int(scale == "log") for scale in (ax.get_xscale(), ax.get_yscale())]
+    return [*numbers, *logarithmic, ax.get_ylabel() or unit]
+
+
+def named(name: str) -> str:
+    """A line's `gid` by which the page tells its name under the pointer."""
+    return f"{NAMED}{name}"
 
 
 def _dress(ax: Axes, text: float, bare: bool) -> None:
@@ -218,8 +254,11 @@ def thin_rows(t: Array, rows: Array, most: int = MOST_POINTS) -> tuple[Array, Ar
     return t[keep], rows[keep]
 
 
-def _svg(figure: Figure, label: str, size: str) -> Markup:
-    """The figure as inline SVG in the page's colours, without any reference to the outside."""
+def _svg(figure: Figure, told: str, size: str) -> Markup:
+    """The figure as inline SVG in the page's colours, without any reference to the outside.
+
+    `told`: more attributes of it, as markup.
+    """
     from matplotlib import rc_context
 
     buffer = io.StringIO()
@@ -233,13 +272,17 @@ def _svg(figure: Figure, label: str, size: str) -> Markup:
     body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.S)
     body = re.sub(r"<style.*?</style>", "", body, flags=re.S)
     body = body.replace("xlink:href", "href")
+    body = re.sub(rf'<g id="{NAMED}([^"]*)">', r"<g><title>\1</title>", body)
     body = _own_ids(body, f"f{next(Drawing._numbers)}-")
     body = re.sub(r'\bd="[^"]*"', lambda found: _rounded(found.group(0), 1), body)
+    body = re.sub(r'(?<= d=)"[ML][-\d. MLz\n]*"', lambda found: _short(found.group(0)), body)
     body = re.sub(r"<[^>]*>", lambda found: _rounded(found.group(0), 2), body)  # not the text
+    for words in SUPERFLUOUS:
+        body = re.sub(words, "", body)
     body = re.sub(r"\s*\n\s*", "\n", body)
     for name, color in STAND_IN.items():
         body = body.replace(color, f"var(--{name})")
-    head = f'<svg class="{size}" viewBox="{box.group(1)}" role="img" aria-label="{escape(label)}">'
+    head = f'<svg class="{size}" viewBox="{box.group(1)}" role="img"{told}>'
     return Markup(f"{head}{body}</svg>")
 
 
@@ -251,6 +294,11 @@ def _own_ids(body: str, prefix: str) -> str:
         body = re.sub(rf'(["(])#{re.escape(name)}(?=[")])', rf"\1#{prefix}{name}", body)
     body = re.sub(r' id="[^"]*"', "", body)
     return re.sub("\0([^\0]*)\0", r'id="\1"', body)
+
+
+def _short(path: str) -> str:
+    """A path of straight lines in fewer characters: a line goes on without its letter."""
+    return re.sub(r"(?<=\d) ?L (?=[-\d])", " ", re.sub(r"\s+", " ", path)).replace("M ", "M")
 
 
 def _rounded(text: str, digits: int) -> str:
@@ -266,4 +314,5 @@ def _rounded(text: str, digits: int) -> str:
 def lines_by_joint(ax: Axes, t: Array, values: Array, joints: Iterable[int] | None = None) -> None:
     """One line per joint, values (k, n), in the joints' colours."""
     for j in range(values.shape[1]) if joints is None else joints:
-        ax.plot(*thin(t, values[:, j]), color=joint_color(j), linewidth=1.1)
+        line = thin(t, values[:, j])
+        ax.plot(*line, color=joint_color(j), linewidth=1.1, gid=named(f"joint {j + 1}"))

@@ -11,11 +11,11 @@ import numpy as np
 
 from adapter.effects.active import active_effects
 from adapter.effects.base import ALL
-from adapter.report.torque_panels import EFFECT_UNITS, SHARE_ALONE, theta_started
+from adapter.gap.phrases import SHOWN_UNITS, THETA
+from adapter.report.torque_panels import SHARE_ALONE, theta_started
 from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
 from adapter.runs.run_folder import RunData
 
-THETA_NAMES = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
 LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
@@ -44,6 +44,15 @@ class Table:
 
 
 @dataclass(frozen=True)
+class Tile:
+    """A key figure: its name, its value, and what to hold it against."""
+
+    name: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
 class Cell:
     """A cell of an identifiability matrix: "alone", "mixed" or "hidden", and its words."""
 
@@ -61,13 +70,12 @@ class Matrix:
     rows: Sequence[tuple[str, Sequence[Cell]]] = field(default_factory=list)
 
 
-def joint_table(data: RunData) -> Table:
-    """One row per joint: errors, standard deviations, torque, effects."""
+def joint_tables(data: RunData) -> list[Table]:
+    """One row per joint: errors, standard deviations and torque; in a second table effects."""
     schema, theta = data.figures["lambda"], data.figures["theta"]
     std = schema.get("std") or {}
-    columns: list[tuple[str, str, list[str]]] = [
-        ("Joint", "", list(data.documented.tree.joint_names))
-    ]
+    names = ("Joint", "", list(data.documented.tree.joint_names))
+    columns: list[tuple[str, str, list[str]]] = [names]
     for head, unit, key, std_key in (
         ("Turn error", "mrad", "rotation_error_rad", "rotation_rad"),
         ("Shift error", "mm", "position_error_m", "position_m"),
@@ -83,7 +91,11 @@ def joint_table(data: RunData) -> Table:
         columns.append(("Not explained", "N m rms", _column(theta["torque_rmse_nm"])))
     if theta.get("validation_torque_rmse_nm"):
         columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
-    columns += _effect_columns(data)
+    effects = _effect_columns(data)
+    return [_table(columns), *([_table([names, *effects])] if effects else [])]
+
+
+def _table(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
     heads, units, cells = zip(*columns, strict=True)
     return Table(heads, list(zip(*cells, strict=True)), units)
 
@@ -109,13 +121,14 @@ def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
         for key, value in active.values.items():
             if np.ndim(value) or joints[0] < 0:
                 continue
-            unit = effect.units()[key]
+            given = effect.units()[key]
+            factor, unit = SHOWN_UNITS.get(given, (1.0, given))
             head = effect.name.replace("_", " ").capitalize()
-            column = columns.setdefault(
-                (head, f"{key}, {EFFECT_UNITS.get(unit, unit)}"), [NOTHING] * data.n
-            )
+            column = columns.setdefault((head, f"{key}, {unit}"), [NOTHING] * data.n)
+            std = active.std.get(key)
+            shown = plus_minus(factor * value, None if std is None else factor * std)
             for j in joints:
-                column[j] = plus_minus(value, active.std.get(key))
+                column[j] = shown
     return [(head, unit, cells) for (head, unit), cells in columns.items()]
 
 
@@ -144,7 +157,7 @@ def theta_matrix(data: RunData) -> Matrix:
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
         summary = f"none of {10 * data.n} parameters: θ was not learned"
-    return Matrix("Dynamics θ", summary, THETA_NAMES, rows)
+    return Matrix("Dynamics θ", summary, THETA, rows)
 
 
 def _cell(share: float, std: float, unit: str, instead: str) -> Cell:
@@ -212,7 +225,7 @@ def theta_table(data: RunData) -> Table:
         "In brackets: not identifiable on its own; of all possible bodies with the learned "
         "combinations those nearest to the documented ones."
     )
-    return Table(["Link", *THETA_NAMES], rows, ["", *THETA_UNITS], note)
+    return Table(["Link", *THETA], rows, ["", *THETA_UNITS], note)
 
 
 def schema_table(data: RunData) -> Table:

@@ -7,15 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.report.style import (
-    ACCENT,
-    JOINT_COLORS,
-    MUTED,
-    SIZES,
-    Drawing,
-    Panel,
-    joint_color,
-)
+from adapter.report.style import ACCENT, MUTED, SIZES, Drawing, Panel
 from adapter.report.tables import TIMES, Table
 from adapter.report.words import count, number
 
@@ -77,25 +69,3 @@ def tracking_table(figures: Mapping[str, Any]) -> Table | None:
         )
     heads = ["Control", "Samples", "rms, all joints", "largest"]
     return Table(heads, rows, ["", "", "mrad", "mrad"]) if rows else None
-
-
-def tracking_panel(figures: Mapping[str, Any]) -> Panel | None:
-    """Tracking error by joint as bars; None where nothing was tracked."""
-    ways = tracked(figures)
-    if not ways:
-        return None
-    drawing = Drawing("half")
-    ax = drawing.axes[0]
-    width = 0.8 / len(ways)
-    n = 0
-    for k, (name, values) in enumerate(ways.items()):
-        rms = 1e3 * np.array(values["rms_rad"], float)
-        n = len(rms)
-        at = np.arange(1, n + 1) + (k - 0.5 * (len(ways) - 1)) * width
-        color = MUTED if k == 0 else ACCENT if k == 1 else joint_color((k + 1) % JOINT_COLORS)
-        ax.bar(at, rms, 0.92 * width, color=color, label=name)
-    ax.set_xticks(range(1, n + 1))
-    ax.grid(False, axis="x")
-    ax.legend(frameon=False, labelcolor=MUTED, fontsize=SIZES["half"][2], loc="best")
-    ax.set_xlabel("joint", color=MUTED, labelpad=1.5, fontsize=SIZES["half"][2])
-    return drawing.panel("Tracking error", "mrad rms")

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from adapter.effects import effects_by_name
+from adapter.gap.phrases import SHOWN_UNITS, THETA
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
     GOAL,
     INK,
     MUTED,
+    SIZES,
     Drawing,
     Panel,
     joint_color,
     lines_by_joint,
     mark,
+    named,
     thin,
     thin_rows,
     time_axis,
@@ -27,12 +32,19 @@ SHOWN_FIT_S = 20.0  # of the end of the run
 SHARE_ALONE = 0.99  # from here on a parameter is identifiable on its own
 SHOWN_ERROR = 2.0  # times what it comes down to; what is higher leaves the panel
 FIRST_SHOWN_S = 0.2  # of the running mean; before it there is next to nothing in it
-GROUPS = (
-    ("Mass", "kg", slice(0, 1)),
-    ("First moments mX mY mZ", "kg m", slice(1, 4)),
-    ("Inertia XX to ZZ", "kg m²", slice(4, 10)),
+GROUPS = (("kg", (0,)), ("kg m", (1, 2, 3)), ("kg m²", (4, 7, 9, 5, 6, 8)))  # of ten parameters
+COLOR_OF = (7, 0, 1, 2, 0, 3, 4, 1, 5, 2)  # of each parameter, as of a joint of that number
+BODY_PARTS = (
+    (8, "m"),
+    (1, "mX, XX"),
+    (2, "mY, YY"),
+    (3, "mZ, ZZ"),
+    (4, "XY"),
+    (5, "XZ"),
+    (6, "YZ"),
 )
-EFFECT_UNITS = {"kg m2": "kg m²"}
+ROUNDING = 1e-6  # of θ: the spare body moves by less while it is not in use
+MOST_ROWS = 160  # along a line of a small panel
 
 
 def change_times(data: RunData) -> list[float]:
@@ -51,7 +63,7 @@ def bodies_over_time(data: RunData, rows: Array) -> Array:
     n = data.n
     bodies = rows[:, 1 : 1 + 10 * (n + 1)].reshape(len(rows), n + 1, 10)
     spare = data.theta_trace[:, 1 + 10 * n : 1 + 10 * (n + 1)]
-    left = np.flatnonzero((spare != spare[0]).any(axis=1))
+    left = np.flatnonzero(np.abs(spare - spare[0]).max(axis=1) > ROUNDING)
     theta = bodies[:, :n].copy()
     if len(left):
         after = rows[:, 0] >= data.theta_trace[left[0], 0]
@@ -59,27 +71,37 @@ def bodies_over_time(data: RunData, rows: Array) -> Array:
     return theta
 
 
-def theta_panels(data: RunData) -> list[Panel]:
-    """θ over time (the paper's Fig. 6b) by kind of parameter."""
-    t, rows = thin_rows(data.times(data.theta_trace), data.theta_trace)
+def body_panels(data: RunData) -> list[Panel]:
+    """θ over time (the paper's Fig. 6b), a panel per link: mass, first moments, inertia."""
+    t, rows = thin_rows(data.times(data.theta_trace), data.theta_trace, MOST_ROWS)
     theta = bodies_over_time(data, rows)
     panels = []
-    for title, unit, part in GROUPS:
-        drawing = Drawing("third")
-        ax = drawing.axes[0]
-        for j in range(data.n):
-            for k in range(part.start, part.stop):
+    for j, link in enumerate(data.documented.tree.link_names):
+        drawing = Drawing("quarter", rows=(0.7, 1.0, 1.3), stretch=1.7)
+        for ax, (unit, parts) in zip(drawing.axes, GROUPS, strict=True):
+            for k in parts:
                 alone = data.theta_shown[j, k] > SHARE_ALONE
                 ax.plot(
                     t,
                     theta[:, j, k],
-                    color=joint_color(j),
+                    color=joint_color(COLOR_OF[k]),
                     linewidth=1.3 if alone else 0.7,
                     alpha=1.0 if alone else 0.6,
+                    gid=named(THETA[k] if alone else f"({THETA[k]})"),
                 )
+            ax.set_ylabel(unit, color=MUTED, fontsize=SIZES["quarter"][2], labelpad=1.0)
+            ax.yaxis.set_major_locator(_few())
+        drawing.figure.subplots_adjust(left=0.21, hspace=0.1)
+        drawing.figure.align_ylabels()
         _finish(drawing, t, data)
-        panels.append(drawing.panel(title, unit))
+        panels.append(drawing.panel(link, ""))
     return panels
+
+
+def _few() -> Any:
+    from matplotlib.ticker import MaxNLocator
+
+    return MaxNLocator(3)
 
 
 def effect_panels(data: RunData) -> list[Panel]:
@@ -90,19 +112,19 @@ def effect_panels(data: RunData) -> list[Panel]:
     panels = []
     for k, effect in enumerate(effects_by_name(names)):
         drawing = Drawing("quarter")
-        lines_by_joint(drawing.axes[0], t, values[:, k])
+        factor, unit = SHOWN_UNITS.get(effect.unit, (1.0, effect.unit))
+        lines_by_joint(drawing.axes[0], t, factor * values[:, k])
         _finish(drawing, t, data)
         title = effect.name.replace("_", " ").capitalize()
-        unit = EFFECT_UNITS.get(effect.unit, effect.unit)
         panels.append(drawing.panel(f"{title} {effect.key}", unit))
     return panels
 
 
 def _finish(drawing: Drawing, t: Array, data: RunData) -> None:
-    ax = drawing.axes[0]
-    ax.set_xlim(min(0.0, t[0]), t[-1])
+    drawing.axes[0].set_xlim(min(0.0, t[0]), t[-1])
     for at in change_times(data):
-        mark(ax, at, "change")
+        for ax in drawing.axes:
+            mark(ax, at, "change" if ax is drawing.axes[0] else "")
     time_axis(drawing)
 
 
@@ -123,10 +145,10 @@ def _against_batch(data: RunData) -> Panel:
     drawing = Drawing("half")
     ax = drawing.axes[0]
     shown, inside = t > t[0] + FIRST_SHOWN_S, t[early] > t[0] + FIRST_SHOWN_S
-    ax.plot(*thin(t[early][inside], batch[inside]), color=MUTED, linewidth=1.1)
+    ax.plot(*thin(t[early][inside], batch[inside]), color=MUTED, linewidth=1.1, gid=named("batch"))
     goal = thin(t[early][inside], TORQUE_GOAL * batch[inside])
-    ax.plot(*goal, color=GOAL, linewidth=1.0, linestyle=(0, (4, 2)))
-    ax.plot(*thin(t[shown], ours[shown]), color=ACCENT, linewidth=1.5)
+    ax.plot(*goal, color=GOAL, linewidth=1.0, linestyle=(0, (4, 2)), gid=named("goal"))
+    ax.plot(*thin(t[shown], ours[shown]), color=ACCENT, linewidth=1.5, gid=named("learned online"))
     if inside.any():
         usual = float(np.median(ours[t >= 0.5 * (t[0] + t[-1])]))
         ax.set_ylim(0.0, max(SHOWN_ERROR * TORQUE_GOAL * float(batch[inside].max()), 1.5 * usual))
@@ -178,11 +200,11 @@ def fit_panels(data: RunData) -> list[Panel]:
     for j in range(data.n):
         drawing = Drawing("quarter", rows=(2.3, 1.0), stretch=1.15)
         above, below = drawing.axes
-        above.plot(*thin(t, tau[:, j]), color=INK, linewidth=2.2, alpha=0.3)
-        above.plot(*thin(t, fit[:, j]), color=joint_color(j), linewidth=1.0)
+        above.plot(*thin(t, tau[:, j]), color=INK, linewidth=2.2, alpha=0.3, gid=named("measured"))
+        above.plot(*thin(t, fit[:, j]), color=joint_color(j), linewidth=1.0, gid=named("model"))
         left = tau[:, j] - fit[:, j]
         below.axhline(0.0, color=MUTED, linewidth=0.6)
-        below.plot(*thin(t, left), color=joint_color(j), linewidth=0.7)
+        below.plot(*thin(t, left), color=joint_color(j), linewidth=0.7, gid=named("left"))
         widest = max(float(np.abs(left).max()), 1e-6)
         below.set_ylim(-1.15 * widest, 1.15 * widest)
         below.yaxis.set_major_locator(MaxNLocator(3))

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD, TORQUE_GOAL, counted_from
+from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here
@@ -49,11 +46,6 @@ def small(value: float, unit: str) -> str:
     return f"<{NARROW}0.001{NARROW}{unit}" if value < 1e-3 else quantity(value, unit, 2)
 
 
-def against(figures: Mapping[str, Any]) -> str:
-    """What errors of λ are against: "documentation", or the name of the file that was given."""
-    return Path(str(figures["lambda"].get("reference") or DOCUMENTATION)).name
-
-
 def plus_minus(value: Any, std: Any) -> str:
     """Value ± standard deviation: the latter with two digits, the value with as many decimals.
 
@@ -88,49 +80,34 @@ def is_live(figures: Mapping[str, Any]) -> bool:
     return bool(figures.get("timing") or figures.get("lateness_us"))
 
 
-def headline(figures: Mapping[str, Any]) -> str:
-    """What was learned, how fast and how well, in one sentence."""
-    parts = [
-        schema_words(figures["lambda"], counted_from(figures)),
-        *torque_words(figures["theta"]),
-    ]
-    samples = f"{count(figures['learned'])} of {count(figures['samples'])} samples learned"
-    if is_live(figures):
-        missed = figures.get("missed_deadlines") or 0
-        samples += f", {count(missed)} deadline{'' if missed == 1 else 's'} missed"
-    return "; ".join([*parts, samples]) + "."
+def missed_words(figures: Mapping[str, Any]) -> str:
+    """How many deadlines were missed, by our own work and by the machine's."""
+    missed = figures.get("missed_deadlines") or 0
+    deadlines = count(int(figures["samples"]) + missed)
+    if not missed:
+        return f"none of {deadlines} deadlines missed"
+    said = f"{count(missed)} of {deadlines} deadlines missed"
+    timing = figures.get("timing") or {}
+    own = timing.get("missed_own")
+    if own is None:
+        return said
+    simulated = (timing.get("plant_us") or {}).get("p50") is not None
+    work = "our own work" + (" and the arm's simulation" if simulated else "")
+    return (
+        f"{said}: {count(own)} because {work} took too long, {count(missed - own)} because the "
+        "machine ran something else"
+    )
 
 
-def schema_words(schema: Mapping[str, Any], start: str) -> str:
-    """λ's part of the headline; times count from `start`."""
-    at, source = schema.get("converged_s"), schema.get("source", "")
-    known = schema.get("reference") in (None, DOCUMENTATION)
-    if source == LAMBDA_MEASURED:
-        goal = "the documentation" if known else "the given truth"
-        if at is None:
-            return f"λ, measured, did not stay within {GOALS} of {goal}"
-        after = quantity(at, "s", 2)
-        return f"λ, measured, lies within {GOALS} of {goal} from {after} after {start} on"
-    goal = "" if known else " (judged against the given truth)"
-    if at is None:
-        return f"λ was to reproduce the documentation but did not stay within {GOALS}{goal}"
-    return f"λ reproduces the documentation {quantity(at, 's', 2)} after {start}{goal}"
+LEARNED_WITHIN_S = 2.0  # a load that was noticed so soon after it began is the same one
 
 
-def torque_words(theta: Mapping[str, Any]) -> list[str]:
-    """θ's parts of the headline."""
-    if theta.get("started_s") is None or not theta.get("torque_rmse_nm"):
-        return ["θ was not learned, because λ had not converged"]
-    words = f"torque explained to {spread(theta['torque_rmse_nm'], 'N m')} rms by joint"
-    held_out = theta.get("validation_torque_rmse_nm")
-    if held_out:
-        words += f" ({spread(held_out, 'N m')} on data held out)"
-    if theta.get("converged_s") is not None:
-        after = quantity(theta["converged_s"], "s", 2)
-        words += f", within {TORQUE_GOAL:g} × batch least squares from {after} on"
-    parts = [words]
-    for change in theta.get("changes") or []:
-        load = change.get("payload")
-        if load:
-            parts.append(f"a load of {quantity(load['m'], 'kg')} noticed at the hand")
-    return parts
+def not_learned(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Disagreements that the learned model does not hold: a load that it noticed is in it."""
+    noticed = [change["stamp_s"] for change in figures["theta"].get("changes") or []]
+
+    def held(report: Mapping[str, Any]) -> bool:
+        near = any(abs(at - report["since_s"]) <= LEARNED_WITHIN_S for at in noticed)
+        return report["what"] == "payload" and near
+
+    return [report for report in figures.get("disagreements") or [] if not held(report)]

@@ -25,7 +25,7 @@ from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.settings import FilterSettings
-from adapter.signals.validation import validation_torque_rmse
+from adapter.signals.validation import validation_error
 from drivers.files.mcap import Log
 from drivers.interface import DriverError, JointSample, LinkMotion
 
@@ -254,21 +254,21 @@ def noise_levels(log: Log) -> dict[str, Array]:
     }
 
 
-def held_out_rmse(log: Log, model: SelfModel, settings: PipelineSettings) -> Array:
-    """Torque RMSE (n,) of a model on a recording it has not seen, N m.
+def held_out_error(log: Log, model: SelfModel, settings: PipelineSettings) -> Array:
+    """Torque error (k, n) of a model on a recording it has not seen, N m.
 
     Of a base that floats, on the states that the front end makes of the recording; else by the
     recipe of `validation`.
     """
     if not model.tree.floating:
         signals = seconds(log), log.q, log.dq, log.tau
-        return validation_torque_rmse(*signals, ModelTorque(model))
+        return validation_error(*signals, ModelTorque(model))
     front_end = make_front_end(model, settings)
     states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
     at = front_end.layout
     q, dq, ddq = (states[:, part] for part in (at.q, at.dq, at.ddq))
     error = states[:, at.joint_tau] - ModelTorque(model, states[:, at.base])(q, dq, ddq)
-    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+    return np.asarray(error)
 
 
 def seconds(log: Log) -> Array:

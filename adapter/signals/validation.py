@@ -20,7 +20,12 @@ TorqueModel = Callable[[Array, Array, Array], Array]
 def validation_torque_rmse(
     stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel
 ) -> Array:
-    """Torque RMSE (n,) of a model on a recording, N m, by the project's recipe.
+    """Torque RMSE (n,) of a model on a recording, N m; see `validation_error`."""
+    return np.sqrt(np.mean(validation_error(stamp_s, q, dq, tau, torque) ** 2, axis=0))
+
+
+def validation_error(stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel) -> Array:
+    """Torque error (k, n) of a model on a recording, N m, by the project's recipe.
 
     Drop samples identical to the one before in all of q, dq, tau; interpolate linearly on a 1 ms
     grid of the stamps; zero-phase fourth-order Butterworth at 10 Hz; ddq = numpy.gradient of the
@@ -35,8 +40,7 @@ def validation_torque_rmse(
     """
     q, dq, ddq, tau = smooth(stamp_s, q, dq, tau)
     edge = round(EDGE_S / GRID_S)
-    error = (tau - torque(q, dq, ddq))[edge:-edge]
-    return np.sqrt(np.mean(error**2, axis=0))
+    return np.asarray((tau - torque(q, dq, ddq))[edge:-edge])
 
 
 def smooth(stamp_s: Array, q: Array, dq: Array, tau: Array) -> tuple[Array, Array, Array, Array]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import html
+import json
 import os
 import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,7 +34,7 @@ class Links(HTMLParser):
                 self.ids.append(value)
             if name in ("src", "href", "xlink:href", "action", "data", "poster", "srcset"):
                 self.found.append(value)
-        if tag in ("script", "link", "iframe", "object", "embed", "base"):
+        if tag in ("link", "iframe", "object", "embed", "base"):
             self.found.append(tag)
 
 
@@ -40,14 +45,71 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     assert [link for link in links.found if not link.startswith("#")] == []
     assert not re.search(r"https?:|url\((?!#)|@import", page)
     assert "default-src 'none'" in page
+    scripts = re.findall(r"<script>(.*?)</script>", page, re.S)
+    assert (
+        page.count("<script") == len(scripts) == 1
+    )  # one of the page's own, and it is the allowed
+    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}'" in page
     assert len(links.ids) == len(set(links.ids))
     return links.ids
+
+
+FOUND = "found: "
+MEASURE = """
+<iframe id="page" style="width:WIDTHpx;height:900px;border:0" srcdoc="PAGE"></iframe>
+<pre id="out"></pre>
+<script>
+addEventListener("load", () => {
+  const page = document.getElementById("page").contentDocument;
+  page.querySelectorAll("details").forEach((one) => { one.open = true; });
+  const wide = page.documentElement.clientWidth, outside = [], lost = [];
+  for (const one of page.querySelectorAll("body *")) {
+    const box = one.getBoundingClientRect();
+    const said = one.outerHTML.slice(0, 120);
+    if (box.right > wide + 1 && !one.closest(".said, pre")) outside.push(said);
+    if (one.matches("td") && box.width * box.height === 0) lost.push(said);
+  }
+  const answer = { wide, scrolls: page.documentElement.scrollWidth - wide, outside, lost,
+    cells: page.querySelectorAll("td").length };
+  document.getElementById("out").textContent = "FOUND" + JSON.stringify(answer);
+});
+</script>
+"""
+
+
+def laid_out(page: str, folder: Path, width: int) -> dict[str, Any]:
+    """How a page of that width lies in headless Chromium, with everything unfolded.
+
+    Of the answer `wide` is the width, `scrolls` by how much the page is wider, `outside` what
+    reaches over its right edge, `lost` cells of tables without any area, `cells` how many there
+    are. The page runs in a frame, for no window can be so narrow.
+    """
+    outer = MEASURE.replace("WIDTH", str(width)).replace("FOUND", FOUND)
+    text = outer.replace("PAGE", html.escape(page))
+    done = _chromium(text, folder, "--virtual-time-budget=4000", "--dump-dom")
+    answer = re.search(rf"{FOUND}(.*?)</pre>", done.stdout)
+    assert answer is not None, done.stderr
+    return dict(json.loads(html.unescape(answer[1])))
 
 
 def screenshot(
     page: str, folder: Path, size: tuple[int, int] = (1300, 1200), dark: bool = False
 ) -> tuple[bytes, list[str]]:
-    """PNG of a page in headless Chromium, and what it said on its console.
+    """PNG of a page in headless Chromium, and what it said on its console."""
+    picture = folder / "page.png"
+    done = _chromium(
+        page,
+        folder,
+        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
+        f"--window-size={size[0]},{size[1]}",
+        f"--screenshot={picture}",
+    )
+    return picture.read_bytes(), [x for x in done.stderr.splitlines() if "CONSOLE" in x]
+
+
+def _chromium(page: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
+    """Run headless Chromium on a page.
 
     A browser without network: each address but that of the file itself is unknown to it. Skips
     the test where there is no Chromium, which CI must have.
@@ -55,16 +117,14 @@ def screenshot(
     if not CHROMIUM.exists():
         assert not os.environ.get("CI"), f"CI needs {CHROMIUM}"
         pytest.skip(f"{CHROMIUM} is not installed")
-    path, picture, profile = folder / "page.html", folder / "page.png", folder / "profile"
+    path, profile = folder / "page.html", folder / "profile"
     path.write_text(page, encoding="utf-8")
     command = [
         str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
         "--no-first-run", "--disable-background-networking", "--disable-component-update",
         "--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND",
-        f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0",
-        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
-        f"--window-size={size[0]},{size[1]}", f"--screenshot={picture}", path.as_uri(),
+        f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *options, path.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
     shutil.rmtree(profile, ignore_errors=True)
-    return picture.read_bytes(), [x for x in done.stderr.splitlines() if "CONSOLE" in x]
+    return done

@@ -27,18 +27,18 @@ from adapter.report.gap_page import render_gap_page, write_gap_page
 from adapter.report.gap_signatures import shown_joints
 from adapter.runs.run_folder import RunFolderError
 from tests.helpers import gap_results as made_up
-from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, screenshot
+from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, laid_out, screenshot
 
 MOST_BYTES = 2_000_000
 KINDS = ["one_finding", "pair", "unexplained", "nothing", "problem", "two_joints", "many"]
 SECTIONS = {
-    "one_finding": "findings gap signatures confusion next correction notes provenance",
-    "pair": "findings gap signatures confusion next correction notes provenance",
-    "unexplained": "unexplained gap signatures next correction notes provenance",
-    "nothing": "gap signatures provenance",
+    "one_finding": "findings gap trust next signatures confusion correction notes provenance",
+    "pair": "findings gap trust next signatures confusion correction notes provenance",
+    "unexplained": "gap trust unexplained next signatures correction notes provenance",
+    "nothing": "gap trust signatures provenance",
     "problem": "next provenance",
-    "two_joints": "findings gap signatures confusion provenance",
-    "many": "findings unexplained gap signatures confusion next correction notes provenance",
+    "two_joints": "findings gap trust signatures confusion provenance",
+    "many": "findings gap trust unexplained next signatures confusion correction notes provenance",
 }
 SAID = {
     "one_finding": "joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; "
@@ -73,7 +73,7 @@ def pages() -> dict[str, str]:
 
 def text_of(page: str) -> str:
     """What a reader sees, with plain spaces."""
-    text = re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.S)
+    text = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.S)
     return re.sub(r"\s+", " ", html.unescape(text))
 
 
@@ -118,9 +118,10 @@ def test_a_browser_shows_it_without_complaint(
 def test_page_tells_the_finding(pages: dict[str, str]) -> None:
     text = text_of(pages["one_finding"])
     for said in (
-        "Joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction; torque error 1.92 → 0.05 N m over "
+        "Joint 4 lacks 2.000 ± 0.030 N m of Coulomb friction. Torque error 1.92 → 0.05 N m over "
         "all joints, "
         "1.92 → 0.02 of joint 4, the worst.",
+        "adapter diff nominal.json nominal+coulomb_friction.json",
         "Fc = 2.000 ± 0.030 N m", "> 99.9 %", "load-dependent friction 97 %", "96.0",
         "repeat the motion with a ladder of loads", "Forward simulation", "Against velocity",
         "Against position", "Against load", "Against acceleration", "Over time",
@@ -128,6 +129,33 @@ def test_page_tells_the_finding(pages: dict[str, str]) -> None:
     ):  # fmt: skip
         assert said in text, said
     assert pages["one_finding"].count("<svg") == 2 + 4 + 2
+
+
+def test_findings_of_one_effect_are_one_row_and_one_line(pages: dict[str, str]) -> None:
+    text = text_of(pages["many"])
+    assert text.count("Coulomb friction joints 1 to 7 throughout") == 1
+    assert "joint 4: Fc = 0.450 ± 0.011 N m" in text
+    lines = console_summary(result_of("many"))
+    assert sum("Coulomb friction" in line and "•" in line for line in lines) == 1
+    assert any("joint 4: Fc = 0.450 ± 0.011 N m" in line for line in lines)
+
+
+def test_what_is_many_times_the_noise_is_not_called_explained(pages: dict[str, str]) -> None:
+    """12 times the noise on a joint is said, though nothing of it was listed as unexplained."""
+    after = made_up.errors([0.02] * 6 + [12.0 * made_up.NOISE_NM])
+    result = replace(result_of("one_finding"), after=after)
+    text = text_of(render_gap_page(result))
+    assert "12 times the noise stays on joint 7" in text
+    assert "nothing above the noise" not in text and "nothing unexplained" not in text
+    assert any("12 times the noise stays on joint 7" in line for line in console_summary(result))
+    assert "nothing above the noise left" in text_of(pages["one_finding"])
+
+
+@pytest.mark.parametrize("kind", ["many", "pair"])
+def test_nothing_is_lost_on_a_phone(kind: str, pages: dict[str, str], tmp_path: Path) -> None:
+    found = laid_out(pages[kind], tmp_path, 420)
+    assert found["scrolls"] <= 0
+    assert found["outside"] == [] and found["lost"] == []
 
 
 def test_page_tells_what_stays_unexplained(pages: dict[str, str]) -> None:

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adapter.cli.main import build_parser
 from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
+from adapter.physics.rigid_arm import RigidArm
 from adapter.realtime.session import run_lockstep
 from adapter.report import render, write_report
+from adapter.report.headline import Worth, headline
+from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import rotation_path
 from adapter.report.style import thin
-from adapter.report.words import headline
+from adapter.report.worth import SLOW, slow_share
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import Pipeline
@@ -27,10 +33,13 @@ from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data,
 from adapter.runs.score import Course, figures, reference_from
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
-from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, screenshot
+from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, laid_out, screenshot
 
 PERCENTILES = {"p50": 90.0, "p99": 140.0, "p99.9": 200.0, "max": 900.0}
-SECTIONS = "schema skeleton dynamics prequential fit joints identifiability samples provenance"
+SECTIONS = (  # worth, trust, what to do; then details in the order in which they are of use
+    "worth trust next fit joints identifiability prequential dynamics schema skeleton samples "
+    "provenance"
+)
 MOST_BYTES = 2_000_000
 
 
@@ -72,11 +81,10 @@ def with_figures(data: RunData, **more) -> RunData:
 
 
 def test_page_has_all_sections_and_is_small(page: str) -> None:
-    for section in SECTIONS.split():
-        assert f'id="{section}"' in page, section
+    assert re.findall(r'<(?:section|footer) id="(\w+)"', page) == SECTIONS.split()
     assert len(page.encode()) < MOST_BYTES
-    # 4 of λ, 3 views, 3 + 1 of θ, 2 prequential, 7 joints
-    assert page.count("<svg") == 20
+    # what it is worth; 4 of λ, 3 views, 7 bodies and 1 effect, 2 prequential, 7 joints
+    assert page.count("<svg") == 1 + 4 + 3 + 7 + 1 + 2 + 7
     assert "36 of 42 directions" in page
     assert "43 combinations of 70 parameters" in page
 
@@ -87,21 +95,27 @@ def test_page_fetches_nothing(page: str) -> None:
         assert target in ids
 
 
+def text_of(page: str) -> str:
+    """What a reader sees, with plain spaces."""
+    text = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.S)
+    return re.sub(r"\s+", " ", html.unescape(text))
+
+
 def test_nothing_missing_is_shown_as_null(page: str) -> None:
-    text = re.sub(r"<style.*?</style>|<[^>]+>", " ", page, flags=re.S)
-    assert not re.search(r"\b(None|nan|null|Undefined)\b", text)
+    assert not re.search(r"\b(None|nan|null|Undefined)\b", text_of(page))
     for absent in ("timing", "changes", "tracking", "warnings"):
         assert f'id="{absent}"' not in page
     assert "eadlines" not in page
 
 
 def test_lambda_says_where_it_comes_from(data: RunData, page: str) -> None:
-    assert page.count("reproduces the documentation") >= 5
+    assert page.count("reproduces the documentation") >= 4
     measured = with_figures(data, **{"lambda": {**data.figures["lambda"], "source": "measured"}})
     measured = replace(measured, model=replace(data.model, lambda_source="measured"))
     text = render(measured)
     assert "reproduces the documentation" not in text
-    assert text.count("measured") >= 5
+    assert text_of(text).count("measured") >= 5
+    assert "of the joints" in text or "where the documentation puts them" in text
 
 
 def test_optional_parts_appear_when_the_run_has_them(data: RunData) -> None:
@@ -110,6 +124,7 @@ def test_optional_parts_appear_when_the_run_has_them(data: RunData) -> None:
         "payload": {"m": 0.3, "m_std": 0.002, "cx": 0.02, "cy": 0.0, "cz": 0.15},
     }
     error = {"samples": 1000, "rms_rad": [0.01] * 7, "max_rad": [0.03] * 7}
+    better = {"samples": 1000, "rms_rad": [0.0002] * 7, "max_rad": [0.001] * 7}
     text = render(
         with_figures(
             data,
@@ -125,7 +140,8 @@ def test_optional_parts_appear_when_the_run_has_them(data: RunData) -> None:
                 "loop_us": dict.fromkeys(PERCENTILES),
                 "histograms": {"tick_us": {"edges_us": [80, 90, 100], "counts": [3, 900]}},
             },
-            tracking={"feedback": error, "feedforward": error, "saturated": 0},
+            tracking={"feedback": error, "feedforward": better, "saturated": 0},
+            feedforward="learned",
             warnings=["a <b>warning</b>"],
             granted=["memory locked"],
             refused={"repeated": 12, "never_heard_of": 3},
@@ -136,7 +152,10 @@ def test_optional_parts_appear_when_the_run_has_them(data: RunData) -> None:
     for shown in (
         'id="changes"', 'id="tracking"', 'id="timing"', 'id="refused"', 'id="warnings"',
         "0.3000 ± 0.0020", "Begin of the tick after its deadline", "900", "memory locked",
-        "never heard of", "1 gap in", "On data held out", "0 deadlines missed",
+        "never heard of", "1 gap in", "on data held out", "deadlines missed",
+        "The arm follows its path to 0.20\u202fmrad instead of 10.0\u202fmrad",
+        "Path error by joint",
+        "0.3000 ± 0.0020\u202fkg was noticed",
         "a &lt;b&gt;warning&lt;/b&gt;", "the arm went away", "ticks per bin",
     ):  # fmt: skip
         assert shown in text, shown
@@ -170,7 +189,8 @@ def test_an_arm_that_never_moved_has_a_report(data: RunData) -> None:
     )
     text = render(still)
     assert "θ was not learned" in text
-    assert "not reached" in text
+    assert "Torque was not learned" in text and "to teach most" not in text
+    assert "adapter info" in text  # what to do next
     assert 'id="fit"' not in text
 
 
@@ -180,16 +200,79 @@ def test_without_a_reference_no_errors_are_drawn(data: RunData) -> None:
     assert "Orientation error" not in text
 
 
-def test_headline(data: RunData) -> None:
-    said = headline(data.figures)
-    assert re.match(r"λ reproduces the documentation [\d.]+\u202fs after the first motion; ", said)
-    assert "torque explained to" in said
-    assert "samples learned" in said
-    truth = {**data.figures["lambda"], "source": "measured", "reference": "a/truth.json"}
-    said = headline({**data.figures, "lambda": {**truth, "converged_s": None}})
-    assert said.startswith(
-        "λ, measured, did not stay within 0.01\u202frad and 5\u202fmm of the given"
+def said_of(data: RunData, **more) -> str:
+    """The headline of a run, in one line and with plain spaces."""
+    changed = with_figures(data, **more)
+    return " ".join(headline(changed, Worth.of(changed))).replace("\u202f", " ")
+
+
+def test_headline_says_what_changed_and_what_it_is_worth(data: RunData) -> None:
+    """The simulated arm is as documented: there is nothing to gain, and nothing is claimed."""
+    said = said_of(data)
+    assert said.startswith("The learned model predicts torque as the documentation does: to 0.1")
+    assert "e-1" not in said and "mrad" not in said
+    worse = replace(data.documented, theta=1.3 * data.documented.theta)
+    heavy = replace(data, documented=worse)
+    said = said_of(heavy)
+    number = r"([\d.]+) ± [\d.]+ N m"
+    found = re.match(
+        rf"The torque error of all joints fell from {number} with the docu.* to {number}", said
     )
+    assert found is not None, said
+    q, dq, ddq, tau, error = data.score_signals()
+    rows = data.times(data.score_trace) >= data.converged_s("theta")
+    expected = RigidArm.of(worse).torque(q, dq, ddq) - tau
+    for text, table in zip(found.groups(), (expected, error), strict=True):
+        size = np.sqrt(np.mean(table[rows] ** 2, axis=0).sum())
+        assert float(text) == pytest.approx(size, rel=0.05)
+
+
+def test_late_ticks_of_our_own_are_told_from_the_machine_s(data: RunData) -> None:
+    live = {"timing": {"missed_own": 3, "loop_us": PERCENTILES}, "missed_deadlines": 250}
+    said = said_of(data, **live)
+    assert "250 of " in said
+    assert "3 because our own work took too long, 247 because the machine ran something" in said
+    text = text_of(render(with_figures(data, **live))).replace("\u202f", " ")
+    assert "our work takes 90.0 µs a tick, p99 140 µs" in text
+
+
+def test_what_lasts_is_not_called_noise(data: RunData) -> None:
+    share = slow_share(data)
+    assert share is not None and share.max() < SLOW
+    assert "like noise: at most" in text_of(render(data))
+    t = data.times(data.score_trace)
+    pushed = np.zeros_like(data.fit)
+    pushed[:, 3] = 0.3 * np.sin(2.0 * t)  # what no effect explains, slower than noise
+    left = replace(data, fit=data.fit + pushed)
+    share = slow_share(left)
+    assert share is not None and list(np.flatnonzero(share > SLOW)) == [3]
+    text = text_of(render(left))
+    assert "not noise on joint 4" in text and "like noise" not in text
+
+
+def test_next_steps_are_commands_of_this_program(data: RunData) -> None:
+    """Each one is taken by the parser, as typed."""
+    folder = "runs/it's here"
+    given = with_figures(
+        data, model=f"{folder}/model.json", recordings=[f"{folder}/recording.mcap"],
+        driver="pybullet:panda", timing={"missed_own": 0},
+        tracking={"feedback": {"samples": 9, "rms_rad": [0.01] * 7}}, feedforward="none",
+    )  # fmt: skip
+    lost = {**data.figures["theta"], "converged_s": None}
+    seen = set()
+    for run in (
+        given,
+        with_figures(given, theta=lost),
+        with_figures(given, timing=None, theta=lost),
+    ):
+        steps = next_steps(run, Worth.of(run))
+        assert 2 <= len(steps) <= 4
+        for step in steps:
+            program, *words = shlex.split(step.command)
+            assert program == "adapter"
+            assert build_parser().parse_args(words) is not None
+            seen.add(words[0])
+    assert seen >= {"run", "replay", "diff", "export", "info"}
 
 
 def test_run_folder_round_trip(data: RunData, page: str, tmp_path: Path) -> None:
@@ -263,6 +346,14 @@ def test_rotation_path_has_no_jump_at_half_a_turn() -> None:
     path = rotation_path(lam)
     assert np.abs(np.diff(path[:, 0, 0])).max() < 0.05
     assert path[-1, 0, 0] == pytest.approx(3.8)
+
+
+def test_nothing_is_lost_on_a_phone(page: str, tmp_path: Path) -> None:
+    """Everything unfolded, every cell of every table is inside the page's 420 pixels."""
+    found = laid_out(page, tmp_path, 420)
+    assert found["wide"] <= 420 and found["scrolls"] <= 0
+    assert found["outside"] == [] and found["lost"] == []
+    assert found["cells"] > 7 * (6 + 10)  # the matrices' alone
 
 
 def test_a_browser_shows_it_without_complaint(page: str, tmp_path: Path) -> None:

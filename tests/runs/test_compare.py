@@ -16,7 +16,13 @@ from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from adapter.model.spatial import exp_rotation, zxz_from_matrix
-from adapter.report.difference_words import difference_json, difference_rows, difference_summary
+from adapter.report.difference_words import (
+    difference_json,
+    difference_matrix,
+    difference_rows,
+    difference_summary,
+    effect_rows,
+)
 from adapter.runs.compare import Change, ModelDifference, compare, documentation_of
 
 PANDA = documented("panda")
@@ -164,7 +170,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert json.loads(said.out)["changes"][0]["values"]["mass_kg"] == pytest.approx(
         [0.7355, 1.2355], abs=1e-4
     )
-    assert "panda_link7 body" in said.err and "0.7355 -> 1.236 kg" in said.err
+    assert "the link behind it" in said.err and "0.7355 -> 1.236 kg" in said.err
     assert main(["diff", "panda", path, "--json", str(tmp_path / "diff.json")]) == 0
     assert json.loads((tmp_path / "diff.json").read_text())["hand_max_m"] == 0.0
     for wrong, told in (
@@ -174,3 +180,25 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         capsys.readouterr()
         assert main(wrong) == 2
         assert told in capsys.readouterr().err
+
+
+def test_frames_and_bodies_are_a_matrix_in_the_order_of_the_joints() -> None:
+    """What differs most does not come first: a row per joint, its frame beside its link."""
+    moved = bent(5, [0.0, 0.03, 0.0], [0.0, 0.0, 0.002])
+    both = replace(heavier({(2, 1): 0.2, (5, 1): 0.3}), lam=moved.lam)
+    first, second = difference_matrix(compare(PANDA, both))
+    assert (first[0], second[0]) == ("panda_joint3", "panda_joint6")
+    assert first[1] == "" and "kg" in first[2] and "N m on" in first[2]
+    assert second[1].startswith("turned by 1.72°") and "hand" in second[1] and "kg" in second[2]
+    assert not effect_rows(compare(PANDA, both))
+
+
+def test_an_effect_of_several_joints_is_one_row() -> None:
+    entries = [
+        {"effect": "coulomb_friction", "joints": [j], "parameters": {"Fc": 0.1 * j}} for j in (3, 5)
+    ]
+    (row,) = effect_rows(compare(PANDA, replace(PANDA, effects=tuple(entries))))
+    assert row[0] == "coulomb_friction" and row[1].splitlines() == [
+        "panda_joint3: Fc none -> 0.3 N m",
+        "panda_joint5: Fc none -> 0.5 N m",
+    ]

@@ -35,9 +35,8 @@ from adapter.experiments.page.words import (
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.report.html import fill, write_whole
-from adapter.report.page import Tile
 from adapter.report.style import JOINT_COLORS
-from adapter.report.tables import Table
+from adapter.report.tables import Table, Tile
 from adapter.report.words import JOIN, NARROW, NOTHING
 
 TEMPLATE = "experiment.html"

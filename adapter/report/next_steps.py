@@ -1,0 +1,137 @@
+"""What to do next after a run: one sentence and one command each, the most useful first."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from adapter.model.self_model import MJCF
+from adapter.report.headline import Worth
+from adapter.report.torque_panels import theta_started
+from adapter.report.words import is_live, not_learned
+from adapter.report.worth import SLOW, slow_share
+from adapter.runs.run_folder import RunData
+
+MOST = 4
+LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is held out
+LONGER = 2.0  # times the duration of a run that was too short
+SIMULATED = "pybullet"
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to do, why, and the command that does it; "" where no command does."""
+
+    why: str
+    command: str = ""
+
+
+def next_steps(data: RunData, worth: Worth) -> list[Step]:
+    """At most `MOST` steps; never none."""
+    files = _Files(data)
+    started = theta_started(data)
+    found: list[Step | None] = []
+    if _left_to_find(data, worth):
+        found.append(files.gap("Name what the documented model lacks, with its evidence"))
+    if not started or data.figures["theta"].get("converged_s") is None:
+        found.append(_longer(data, files))
+    if started:
+        found += [_feedforward(data, worth), _held_out(data, files), *_use(data, files)]
+    steps = [step for step in found if step is not None]
+    return steps[:MOST] or [files.gap("Look for what the documented model lacks")]
+
+
+class _Files:
+    """Names of what the run left, and how commands take them."""
+
+    def __init__(self, data: RunData) -> None:
+        self.model = str(data.figures.get("model") or "model.json")
+        self.documented = str(Path(self.model).with_name("documented.json"))
+        logs = data.figures.get("recordings")
+        self.logs: list[str] = [str(log) for log in logs] if logs else []
+
+    def command(self, *words: Any) -> str:
+        return shlex.join(["adapter", *map(str, words)])
+
+    def gap(self, why: str) -> Step:
+        logs = self.logs or ["LOG"]
+        return Step(why, self.command("gap", *logs, "--model", self.documented))
+
+
+def _left_to_find(data: RunData, worth: Worth) -> bool:
+    """Whether the documented model explains torque worse than the learned one, or something is
+    new or left."""
+    fall, slow = worth.torque, slow_share(data) if theta_started(data) else None
+    return bool(
+        (fall is not None and (fall.before is None or fall.better))
+        or not_learned(data.figures)
+        or worth.loads
+        or (slow is not None and float(slow.max()) > SLOW)
+    )
+
+
+def _longer(data: RunData, files: _Files) -> Step:
+    """More motion, or a better one."""
+    if is_live(data.figures):
+        span_s = LONGER * (_seconds(data) or 30.0)
+        why = "The learner had not settled: run for longer, with a motion designed to teach most"
+        driver = str(data.figures.get("driver") or "ADDRESS")
+        more = [] if driver.startswith(SIMULATED) else ["--allow-motion"]
+        words = ["run", "--driver", driver, "--duration", f"{span_s:.0f}"]
+        return Step(why, files.command(*words, "--excitation", "designed", *more))
+    why = "The learner had not settled: see what this motion lacks"
+    return Step(why, files.command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))
+
+
+def _seconds(data: RunData) -> float | None:
+    """How long the run moved, s."""
+    trace = data.schema_trace if len(data.schema_trace) > 1 else data.score_trace
+    return float(data.times(trace)[-1]) if len(trace) > 1 else None
+
+
+def _feedforward(data: RunData, worth: Worth) -> Step | None:
+    """The learned model has not helped the controller yet."""
+    figures = data.figures
+    moved = (figures.get("tracking") or {}).get("feedback") or {}
+    if worth.tracking is not None or not moved.get("rms_rad"):
+        return None
+    span_s = max(LONGER * (_seconds(data) or 30.0), 30.0)
+    driver = str(figures.get("driver") or "ADDRESS")
+    words = ["run", "--driver", driver]
+    words += ["--scenario", str(figures["scenario"])] if figures.get("scenario") else []
+    words += ["--feedforward", "learned", "--duration", f"{span_s:.0f}"]
+    words += [] if driver.startswith(SIMULATED) else ["--allow-motion"]
+    why = "Let the learned model help the controller; the next report says what that is worth"
+    if figures.get("feedforward") == "learned":
+        why = "Run for longer, so that the learned model gets to help the controller"
+    return Step(why, shlex.join(["adapter", *words]))
+
+
+def _held_out(data: RunData, files: _Files) -> Step | None:
+    """Nothing was held out."""
+    span_s = _seconds(data)
+    one = len(files.logs) == 1
+    if data.figures["theta"].get("validation_torque_rmse_nm") or not one or not span_s:
+        return None
+    at = f"{LEARNED_SHARE * span_s:.3g}"
+    why = "Judge the model on data that it never saw"
+    return Step(why, files.command("replay", files.logs[0], "--validate-from", at))
+
+
+def _use(data: RunData, files: _Files) -> list[Step]:
+    """What the learned model is for."""
+    source = data.model.source
+    mjcf = source is not None and source.format == MJCF
+    target = ("--mjcf", "learned.xml") if mjcf else ("--urdf", "learned.urdf")
+    return [
+        Step(
+            "See joint by joint what differs from the documentation",
+            files.command("diff", files.model),
+        ),
+        Step(
+            "Use it in a simulator or planner: the robot's file with what was learned",
+            files.command("export", files.model, *target),
+        ),
+    ]

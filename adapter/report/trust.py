@@ -1,0 +1,225 @@
+"""Whether to trust a run: each check with a verdict, the numbers behind it, and their limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.gap.phrases import numbered
+from adapter.model.self_model import LAMBDA_MEASURED
+from adapter.report.headline import Worth, against
+from adapter.report.torque_panels import SHARE_ALONE, theta_started
+from adapter.report.words import (
+    GOALS,
+    count,
+    is_live,
+    missed_words,
+    not_learned,
+    number,
+    quantity,
+    small,
+    spread,
+)
+from adapter.report.worth import BLOCK_S, SLOW, rms, slow_share
+from adapter.runs.run_folder import RunData
+from adapter.runs.score import TORQUE_GOAL, counted_from
+
+GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
+LEFT = "Torque not explained"
+FEW_MISSED, MANY_MISSED = 1e-3, 1e-2  # shares of all deadlines
+FEW_REFUSED = 0.05  # share of all samples
+
+
+@dataclass(frozen=True)
+class Check:
+    """One reason to trust or to doubt: its verdict, what was looked at, what was seen."""
+
+    verdict: str
+    name: str
+    words: str
+
+
+def checks(data: RunData, worth: Worth) -> list[Check]:
+    """All that the run allows, in the order in which they matter."""
+    figures = data.figures
+    found = [_unseen(data, worth), _left(data), _parameters(data), _frames(data)]
+    found += [_learner(data), _new(figures), _feedforward(figures), _timing(figures)]
+    found.append(_samples(figures))
+    return [check for check in found if check is not None]
+
+
+def _unseen(data: RunData, worth: Worth) -> Check | None:
+    """Whether what was learned holds on rows that the fit had not seen."""
+    fall = worth.torque
+    if fall is None:
+        return (
+            Check(BAD, "On data not learned from", "nothing to judge by")
+            if (theta_started(data))
+            else None
+        )
+    fit = np.array(data.figures["theta"]["torque_rmse_nm"], float)
+    ratio = fall.after / np.maximum(fit, 1e-12)
+    said = (
+        f"the worst joint's torque error, {fall.seen}, is {number(ratio.max(), 2)} times that of "
+        f"the fit (joint {int(np.argmax(ratio)) + 1}): {spread(fall.after, 'N m')} rms by joint"
+    )
+    if fall.worse:
+        return Check(BAD, "On data not learned from", f"{said}; worse than the documentation")
+    held = bool(data.figures["theta"].get("validation_torque_rmse_nm"))
+    if not held:
+        said += "; no recording was held out"
+    return Check(GOOD if ratio.max() < 1.5 else LOOK, "On data not learned from", said)
+
+
+def _left(data: RunData) -> Check | None:
+    """How much of the torque stays unexplained, and whether it is like noise."""
+    left = data.figures["theta"].get("torque_rmse_nm")
+    if not left or not theta_started(data):
+        return None
+    size = rms(data.score_signals()[3])
+    share = 100.0 * np.array(left) / np.maximum(size, 1e-12)
+    said = f"{spread(left, 'N m')} rms by joint, {spread(share, '%')} of the torque that acted"
+    slow = slow_share(data)
+    if slow is None:
+        return Check(LOOK, LEFT, f"{said}; too short to tell whether it is noise")
+    j = int(np.argmax(slow))
+    most = f"{100.0 * slow[j]:.0f} % of it on joint {j + 1}"
+    if slow[j] <= SLOW:
+        return Check(GOOD, LEFT, f"{said}; like noise: at most {most} lasts over {BLOCK_S:g} s")
+    which = [k + 1 for k in np.flatnonzero(slow > SLOW)]
+    joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
+    most = f"{'up to ' if len(which) > 1 else ''}{most}"
+    why = "something acts that no learned effect explains"
+    return Check(
+        LOOK, LEFT, f"{said}; not noise on {joints}: {most} lasts over {BLOCK_S:g} s, {why}"
+    )
+
+
+def _parameters(data: RunData) -> Check | None:
+    theta = data.figures["theta"]
+    if not theta_started(data):
+        said = "θ was not learned: it waits until λ has settled, and λ had not"
+        return Check(BAD, "Inertias and friction", said)
+    rank, every = theta.get("base_parameters"), 10 * data.n
+    alone = data.theta_shown > SHARE_ALONE
+    said = (
+        f"torques show {rank} combinations of {every} inertial parameters, "
+        f"{int(alone.sum())} of them on their own"
+    )
+    at, goal = theta.get("converged_s"), f"{TORQUE_GOAL:g} × the error of batch least squares"
+    if at is None:
+        said += f"; the prequential error did not stay within {goal}"
+        return Check(LOOK, "Inertias and friction", said)
+    after = quantity(at, "s", 2)
+    said += f"; within {goal} from {after} after {counted_from(data.figures)} on"
+    return Check(GOOD, "Inertias and friction", said)
+
+
+def _frames(data: RunData) -> Check:
+    schema = data.figures["lambda"]
+    rank, every = schema.get("identifiable_rank"), 6 * data.n
+    start, at = counted_from(data.figures), schema.get("converged_s")
+    goal = against(data.figures) if data.reference is not None else "documentation"
+    off = _off_words(data, goal)
+    shown = f"motion shows {rank} of {every} directions of λ"
+    if schema.get("source") == LAMBDA_MEASURED:
+        when = (
+            f"did not stay within {GOALS}"
+            if at is None
+            else (f"within {GOALS} from {quantity(at, 's', 2)} after {start} on")
+        )
+        return Check(
+            LOOK if at is None else GOOD,
+            "Where the joints are",
+            f"measured; {shown}; {when}{off}",
+        )
+    if at is None:
+        said = f"λ was to reproduce the documentation but did not stay within {GOALS}{off}"
+        return Check(BAD, "Where the joints are", said)
+    said = (
+        f"reproduces the documentation ({shown}; after {quantity(at, 's', 2)}{off}): no "
+        "measurement of this arm, which needs sensors on its links"
+    )
+    return Check(GOOD, "Where the joints are", said)
+
+
+def _off_words(data: RunData, goal: str) -> str:
+    schema = data.figures["lambda"]
+    turn, shift = schema.get("rotation_error_rad"), schema.get("position_error_m")
+    if data.reference is None or not turn or not shift or None in [*turn, *shift]:
+        return ""
+    worst = f"{small(1e3 * max(turn), 'mrad')} and {small(1e3 * max(shift), 'mm')}"
+    what = "the documentation" if goal == "documentation" else goal
+    return f", off {what} by {worst} on the worst joint"
+
+
+def _learner(data: RunData) -> Check | None:
+    restarts = data.figures["lambda"].get("restarts")
+    if not restarts:
+        return None
+    said = f"joints' frames started anew {restarts} time{'' if restarts == 1 else 's'}, out of "
+    return Check(GOOD, "On its way", f"{said}wrong valleys of the error")
+
+
+def _new(figures: Mapping[str, Any]) -> Check | None:
+    new = figures.get("disagreements")
+    if new is None:
+        return Check(
+            LOOK,
+            "New disagreements",
+            "not watched for in batches (--every above 1) and where the base floats",
+        )
+    if not_learned(figures):
+        return Check(BAD, "New disagreements", f"{len(new)}, listed among the warnings")
+    if new:
+        said = f"{len(new)}, of a load that the model holds since it was noticed"
+        return Check(GOOD, "New disagreements", said)
+    return Check(GOOD, "New disagreements", "none: nothing new began during the run")
+
+
+def _feedforward(figures: Mapping[str, Any]) -> Check | None:
+    """That the learned model was to help the controller and did not get to."""
+    tracking = figures.get("tracking") or {}
+    helped = (tracking.get("feedforward") or {}).get("samples")
+    if figures.get("feedforward") != "learned" or helped or "feedforward" not in tracking:
+        return None
+    said = "asked for, but the learned model was not sure enough before the run ended"
+    return Check(LOOK, "Feed-forward", said)
+
+
+def _timing(figures: Mapping[str, Any]) -> Check | None:
+    """Deadlines that were missed, and by whose fault."""
+    if not is_live(figures):
+        return None
+    timing = figures.get("timing") or {}
+    missed = figures.get("missed_deadlines") or 0
+    deadlines = max(int(figures["samples"]) + missed, 1)
+    said = missed_words(figures)
+    loop, plant = (timing.get(key) or {} for key in ("loop_us", "plant_us"))
+    if loop.get("p50") is not None:
+        said += f"; our work takes {quantity(loop['p50'], 'µs')} a tick, p99 "
+        said += quantity(loop.get("p99"), "µs")
+    if plant.get("p50") is not None:
+        said += (
+            f", beside it the physics of the simulated arm {quantity(plant['p50'], 'µs')}, p99 "
+            f"{quantity(plant.get('p99'), 'µs')}"
+        )
+    share = missed / deadlines
+    verdict = GOOD if share < FEW_MISSED else LOOK if share < MANY_MISSED else BAD
+    return Check(verdict, "Timing", said)
+
+
+def _samples(figures: Mapping[str, Any]) -> Check:
+    samples, learned = int(figures["samples"]), int(figures["learned"])
+    said = f"{count(learned)} of {count(samples)} learned from"
+    lost = figures.get("unrecorded") or 0
+    if lost:
+        said += f"; {count(lost)} are missing in the recording"
+    gaps = len(figures.get("gaps") or [])
+    if gaps:
+        said += f"; {gaps} gap{'' if gaps == 1 else 's'} in the stamps"
+    bad = not learned or lost or learned < (1.0 - FEW_REFUSED) * samples
+    return Check(LOOK if bad and learned else BAD if bad else GOOD, "Samples", said)

@@ -1,0 +1,172 @@
+"""What the learned model is worth: torque and tracking errors before and after, the load found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.torque import ModelTorque
+from adapter.model.spatial import Array
+from adapter.report.skeleton import placed_arm, some_postures
+from adapter.report.torque_panels import change_times, theta_started
+from adapter.runs.run_folder import RunData
+
+BLOCKS = 10  # stretches of the recording whose spread tells how sure an error's size is
+FEWEST_ROWS = 50
+BLOCK_S, FEWEST_BLOCKS = 0.5, 8  # what lasts longer than a block is slow
+SLOW = 0.3  # share from which what is left is not called noise
+SETTLING_S = 2.0  # after a change at the hand, or where nothing says when θ had converged
+BETTER, WORSE = 0.9, 1.1  # times the error before: from here on it is called a change
+
+
+@dataclass(frozen=True)
+class Fall:
+    """An error by joint before and after, of what nobody had fitted to the rows it is judged on.
+
+    Attributes:
+        before, after: (n,) rms; None where nothing is known of it.
+        before_std, after_std: (n,) of these, from the spread between stretches of the recording.
+        size: (n,) rms of the quantity itself.
+        seen: how the rows after stand to the fit: "predicted before it was learned from".
+    """
+
+    before: Array | None
+    after: Array
+    before_std: Array | None
+    after_std: Array | None
+    size: Array | None
+    seen: str
+
+    @property
+    def better(self) -> bool:
+        """Whether the error of all joints is clearly smaller than before."""
+        return self.before is not None and together(self.after) < BETTER * together(self.before)
+
+    @property
+    def worse(self) -> bool:
+        """Whether it is clearly larger."""
+        return self.before is not None and together(self.after) > WORSE * together(self.before)
+
+
+def together(values: Array) -> float:
+    """Root of the sum of squares over the joints."""
+    return float(np.sqrt(np.sum(np.asarray(values, dtype=float) ** 2)))
+
+
+def torque_fall(data: RunData) -> Fall | None:
+    """Torque errors of the documented and of the learned model, N m; None where θ was not learned.
+
+    On data held out where there are any; else on rows that were predicted before they were learned
+    from, once θ had converged and after the last change at the hand.
+    """
+    theta = data.figures["theta"]
+    if not theta_started(data) or not theta.get("torque_rmse_nm"):
+        return None
+    q, dq, ddq, tau, error = data.score_signals()
+    held_out = theta.get("validation_torque_rmse_nm")
+    size = rms(tau)
+    if held_out:
+        keys = "validation_torque_rmse_nm", "validation_torque_rmse_std_nm"
+        before, before_std = (_known(theta.get(f"documented_{key}")) for key in keys)
+        after_std = _known(theta.get(keys[1]))
+        after = np.array(held_out, float)
+        return Fall(before, after, before_std, after_std, size, "on data held out")
+    rows = unseen_rows(data)
+    if rows.sum() < FEWEST_ROWS:
+        return None
+    after, seen = error[rows], "predicted before it was learned from"
+    if data.documented.tree.floating:  # the base's motion is not kept for the page
+        return Fall(None, rms(after), None, spread_of_rms(after), size, seen)
+    before = (tau - ModelTorque(data.documented)(q, dq, ddq))[rows]
+    return Fall(rms(before), rms(after), spread_of_rms(before), spread_of_rms(after), size, seen)
+
+
+def _known(values: Any) -> Array | None:
+    return None if values is None else np.array(values, float)
+
+
+def unseen_rows(data: RunData) -> Array:
+    """(k,) bool: rows of the score that were predicted by what had been learned well before."""
+    t = data.times(data.score_trace)
+    converged = data.converged_s("theta")
+    start = t[0] + SETTLING_S if converged is None else converged
+    return np.asarray(t >= start) & fit_rows(data)
+
+
+def fit_rows(data: RunData) -> Array:
+    """(k,) bool: rows of the score that the learned model is of: after the last change."""
+    t, changes = data.times(data.score_trace), change_times(data)
+    return np.asarray(t >= changes[-1] + SETTLING_S) if changes else np.ones(len(t), dtype=bool)
+
+
+def rms(error: Array) -> Array:
+    """(n,) of an error (k, n)."""
+    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
+
+
+def spread_of_rms(error: Array) -> Array:
+    """(n,) standard deviation of the rms of an error (k, n), from that of stretches of it.
+
+    Neighbouring rows are alike, so they do not count one by one.
+    """
+    parts = [part for part in np.array_split(error**2, BLOCKS) if len(part)]
+    squares = np.array([part.mean(axis=0) for part in parts])
+    std = squares.std(axis=0, ddof=1) / np.sqrt(len(parts))
+    return np.asarray(0.5 * std / np.maximum(np.sqrt(squares.mean(axis=0)), 1e-12))
+
+
+def slow_share(data: RunData) -> Array | None:
+    """(n,) share of the power of what the learned model leaves that lasts over `BLOCK_S`, that is
+    the power of its means over so long; None where there are too few.
+
+    Of noise behind the filter up to 0.16 was seen in 2 to 17 s (0.02 with little filtering), of
+    the logs of real arms 0.36 and more.
+    """
+    rows = fit_rows(data)
+    left, t = (data.score_signals()[3] - data.fit)[rows], data.times(data.score_trace)[rows]
+    if len(t) < FEWEST_ROWS or t[-1] - t[0] < FEWEST_BLOCKS * BLOCK_S:
+        return None
+    block = ((t - t[0]) / BLOCK_S).astype(int)
+    count = np.bincount(block)
+    full = count >= 0.5 * np.median(count[count > 0])
+    sums = np.stack([np.bincount(block, weights=x) for x in left.T], axis=1)
+    means = sums[full] / count[full, None]
+    return np.asarray(means.var(axis=0) / np.maximum(left.var(axis=0), 1e-18))
+
+
+def tracking_fall(figures: Mapping[str, Any]) -> Fall | None:
+    """Tracking errors, rad, by feedback alone and with the model; None where not both are known."""
+    tracking = figures.get("tracking") or {}
+    alone, with_model = (tracking.get(key) or {} for key in ("feedback", "feedforward"))
+    if not alone.get("rms_rad") or not with_model.get("rms_rad"):
+        return None
+    before, after = (np.array(x["rms_rad"], float) for x in (alone, with_model))
+    return Fall(before, after, None, None, None, f"{figures.get('feedforward')} model")
+
+
+def hand_off_m(data: RunData) -> float | None:
+    """How far (rms over postures of the run, m) the outermost link stands from where the
+    documentation puts it; None where no posture or no such link is known."""
+    q = some_postures(data)
+    tips = [
+        [placed_arm(data, lam, row).tips for row in q]
+        for lam in (data.documented.lam, data.model.lam)
+    ]
+    apart = [
+        np.linalg.norm(there[j] - here[j]) for there, here in zip(*tips, strict=True) for j in there
+    ]
+    return float(np.sqrt(np.mean(np.square(apart)))) if apart else None
+
+
+def loads(data: RunData) -> list[tuple[float, float, float | None]]:
+    """(when, s after the first motion, kg, its standard deviation) of the loads that were found."""
+    found = []
+    pairs = zip(change_times(data), data.figures["theta"].get("changes") or [], strict=True)
+    for at_s, change in pairs:
+        load = change.get("payload")
+        if load:
+            found.append((at_s, load["m"], load.get("m_std")))
+    return found
