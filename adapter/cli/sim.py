@@ -6,6 +6,8 @@ import argparse
 from importlib import import_module
 from typing import NamedTuple
 
+from adapter.shadowed import own_name
+
 
 class Served(NamedTuple):
     """An arm that can be served: in words; modules with its options, and with what carries it out.
@@ -47,7 +49,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve; returns the exit code."""
     served = ARMS[args.arm]
-    options = import_module(served.options)
+    options = import_module(own_name(served.options))
     parser = argparse.ArgumentParser(
         prog=f"adapter sim {args.arm}",
         description=f"Serve {served.words}, until SIGTERM or Ctrl-C.",
@@ -55,4 +57,4 @@ def run(args: argparse.Namespace) -> int:
     options.add_arguments(parser)
     asked = parser.parse_args(args.rest)
     options.check(asked)
-    return int(import_module(served.command).run(asked))
+    return int(import_module(own_name(served.command)).run(asked))
