@@ -13,6 +13,7 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.bristles import wind
 from adapter.signals.checks import (
+    MARKS,
     STREAK,
     Mark,
     Verdict,
@@ -227,7 +228,7 @@ class FrontEnd:
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0
-        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + 13, dtype=np.int64)
+        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + MARKS + 2, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
         self._memory.bristles.place[:] = np.nan
