@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drivers.interface import Driver, DriverError
+from drivers.errors import DriverError, choices
 
-Builder = Callable[[str], Driver]
+if TYPE_CHECKING:
+    from drivers.interface import Driver
+
+Builder = Callable[[str], "Driver"]
 # Loaded by name when one is opened: no arm needs the libraries of another, and an address that is
 # wrong is told before anything is loaded.
 LOG = ".files.log:LogArm"  # takes (file, joint names)
@@ -54,7 +57,7 @@ def open_driver(
     if scheme == "log":
         return _load(LOG)(rest, joint_names)
     if scheme not in HARDWARE:
-        raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+        raise DriverError(f"no driver '{scheme}'; {choices(scheme, SCHEMES)}")
     return _load(HARDWARE[scheme])(address, joint_names, allow_motion)
 
 
