@@ -29,7 +29,7 @@ from adapter.cli.exit_codes import ExitCode, listed
 from adapter.cli.parser import Parser
 from adapter.errors import MeansError, ModelWarning
 from adapter.experiments import arguments as experiments
-from adapter.runs.terminal import begin, complain, program_version, warn
+from adapter.runs.terminal import begin, complain, program_version, show, warn
 from drivers.errors import DriverError, NotReady
 
 
@@ -170,7 +170,8 @@ class _Version(argparse.Action):
     """Looks the version up when it is asked for."""
 
     def __call__(self, parser: argparse.ArgumentParser, *where: Any) -> None:
-        parser.exit(message=f"{program_version()}\n")
+        show(program_version())
+        parser.exit()
 
 
 def build_parser() -> Parser:
@@ -240,6 +241,8 @@ def _told(value: Any) -> Any:
         return (
             _told(value[0]) + (f" and {len(value) - 1} more" * (len(value) > 1)) if value else "-"
         )
+    if value is None:
+        return "the documented arm"
     return value.name if isinstance(value, Path) else value
 
 

@@ -111,7 +111,7 @@ def _check(args: argparse.Namespace) -> None:
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
         )
     check_learning(args)
-    if args.fault is not None or simulated(args.driver):
+    if args.fault is not None or args.scenario or args.set:
         import_module(NAMES).check_run(args)
 
 
