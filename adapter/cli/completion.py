@@ -47,7 +47,7 @@ def complete(parser: argparse.ArgumentParser) -> None:
             elif action.dest in NAMES_OF:
                 module, name = NAMES_OF[action.dest]
                 _complete_with(action, tuple(getattr(import_module(own_name(module)), name)))
-    import_module("argcomplete").autocomplete(parser)
+    import_module("argcomplete").autocomplete(parser, always_complete_options=False)
 
 
 def _parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
