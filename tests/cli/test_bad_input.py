@@ -1,5 +1,6 @@
 """Bad input gets one clear sentence that names the file, the place and the choices."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -175,7 +176,7 @@ def test_models_of_different_joints_are_not_compared(tmp_path, capsys) -> None:
 def test_times_count_from_the_recordings_start(tmp_path, capsys) -> None:
     """Not from the year 1970, from which robots and ROS count."""
     began = 1_700_000_000_000_000_000
-    samples = [dataclasses.replace(s, stamp_ns=began + s.stamp_ns) for s in motion()]
+    samples = [dataclasses.replace(s, stamp_ns=began + s.stamp_ns) for s in motion(2200)]
     del samples[1000:1300]
     samples[1700].q[3] = np.nan
     path = record(tmp_path / "log.mcap", samples)

@@ -30,15 +30,8 @@ FILES = {  # the words after a command, FILE being what cannot be used
     "info": ["FILE"],
 }
 WITHOUT = {"sim", "experiment", "bench", "completion"}  # take no file as such
-USELESS = (
-    "gone.mcap",
-    "folder",
-    "empty.mcap",
-    "empty.json",
-    "empty.urdf",
-    "empty.csv",
-    "noise.mcap",
-)
+EMPTY = ("empty.mcap", "empty.json", "empty.urdf", "empty.csv")
+USELESS = ("gone.mcap", "folder", "noise.mcap", *EMPTY)
 NOISE = bytes(range(256)) * 8
 
 
