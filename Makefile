@@ -13,7 +13,7 @@ SHARED := $(PAIRS) -m "not alone and not slow"
 WITH_ALONE := $(sort $(shell grep --recursive --files-with-matches --include '*.py' mark.alone tests))
 REAL_TIME := -m "alone and not slow" $(WITH_ALONE)
 
-.PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench clean
+.PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench licences clean
 
 run: $(STAMP)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
@@ -90,6 +90,9 @@ bench: $(STAMP)
 	$(BIN)/python tests/benchmarks/wires.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/tree_rate.py --json runs/tree_rate.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/fleet.py --json runs/bench_fleet.json
+
+licences: $(STAMP)
+	PYTHONPATH=. $(BIN)/python tests/benchmarks/licences.py
 
 clean:
 	rm -rf $(VENV) build *.egg-info

@@ -14,6 +14,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from adapter.shadowed import keep_apart, own_name
+
 if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` finds the same
     from adapter.discovery import Discovery
     from adapter.gap.result import GapResult
@@ -35,6 +37,8 @@ if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` fi
         regressor,
     )
     from drivers.files.mcap import Log
+
+keep_apart()  # before anything asks for `drivers` or `sim`
 
 # name -> the module that has it, loaded when the name is first asked for
 _FROM = {
@@ -86,7 +90,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _FROM:
         raise AttributeError(f"module 'adapter' has no attribute '{name}'")
-    value = getattr(import_module(_FROM[name]), name)
+    value = getattr(import_module(own_name(_FROM[name])), name)
     globals()[name] = value
     return value
 

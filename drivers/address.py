@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import parse_qsl, urlsplit
 
-from drivers.interface import DriverError
+from drivers.errors import DriverError, choices
 
 
 @dataclass(frozen=True)
@@ -44,5 +44,5 @@ class Address:
             raise DriverError(f"'{address}': an option is given twice")
         for key in options:
             if key not in known:
-                raise DriverError(f"'{address}': no option '{key}'; have: {', '.join(known)}")
+                raise DriverError(f"'{address}': no option '{key}'; {choices(key, known)}")
         return cls(parts.scheme, host, int(tail) if tail else None, options)

@@ -9,19 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import DriverError as DriverError  # light; by this name for everybody
+from drivers.errors import EndOfStream as EndOfStream
+from drivers.errors import NotReady as NotReady
+
 Array = NDArray[np.float64]
-
-
-class DriverError(RuntimeError):
-    """An arm, bus or recording cannot do what was asked; the message says what can be done."""
-
-
-class NotReady(DriverError):
-    """The arm is there and cannot move yet (reflex, user stop, brakes): no wrong use, no fault."""
-
-
-class EndOfStream(DriverError):
-    """A finite source (a recording) has no further sample."""
 
 
 @dataclass(frozen=True, slots=True)

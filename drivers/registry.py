@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drivers.interface import Driver, DriverError
+from drivers.errors import DriverError, choices
 
-Builder = Callable[[str], Driver]
+if TYPE_CHECKING:
+    from drivers.interface import Driver
+
+Builder = Callable[[str], "Driver"]
 # Loaded by name when one is opened: no arm needs the libraries of another, and an address that is
 # wrong is told before anything is loaded.
-LOG = "drivers.files.log:LogArm"  # takes (file, joint names)
+LOG = ".files.log:LogArm"  # takes (file, joint names)
 # Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
-HARDWARE = {"fci": "drivers.fci.arm:FciArm", "can": "drivers.damiao.arm:DamiaoArm"}
-COUNT = {"fci": "drivers.fci.arm:joint_count", "can": "drivers.damiao.settings:joint_count"}
+HARDWARE = {"fci": ".fci.arm:FciArm", "can": ".damiao.arm:DamiaoArm"}
+COUNT = {"fci": ".fci.arm:joint_count", "can": ".damiao.settings:joint_count"}
 NAMELESS = ("can",)  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
@@ -54,7 +57,7 @@ def open_driver(
     if scheme == "log":
         return _load(LOG)(rest, joint_names)
     if scheme not in HARDWARE:
-        raise DriverError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+        raise DriverError(f"no driver '{scheme}'; {choices(scheme, SCHEMES)}")
     return _load(HARDWARE[scheme])(address, joint_names, allow_motion)
 
 
@@ -65,7 +68,7 @@ def joint_count(address: str) -> int | None:
 
 
 def _load(target: str) -> Callable[..., Any]:
-    """What "MODULE:NAME" names."""
+    """What "MODULE:NAME" names; the module relative to this package, whatever that is called."""
     module, _, name = target.partition(":")
-    found: Callable[..., Any] = getattr(import_module(module), name)
+    found: Callable[..., Any] = getattr(import_module(module, __package__), name)
     return found

@@ -9,8 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sim.compiled import compiled
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def resting(gravity: Array) -> Array:
     return base
 
 
-@njit(cache=True)
+@compiled
 def link_motion(frames: Frames, base: Array, q: Array, dq: Array, ddq: Array) -> Array:
     """What ideal sensors at the origins of the link frames would read.
 
@@ -82,7 +83,7 @@ def link_motion(frames: Frames, base: Array, q: Array, dq: Array, ddq: Array) ->
     return out
 
 
-@njit(cache=True)
+@compiled
 def torques(frames: Frames, theta: Array, base: Array, q: Array, dq: Array, ddq: Array) -> Array:
     """Inverse dynamics (n,) N m.
 
@@ -114,7 +115,7 @@ def torques(frames: Frames, theta: Array, base: Array, q: Array, dq: Array, ddq:
     return tau
 
 
-@njit(cache=True)
+@compiled
 def _body(theta: Array, motion: Array, force: Array, moment: Array) -> None:
     """Force and moment about its origin that one link's motion takes."""
     m, c, w, dw, a = theta[0], theta[1:4], motion[W], motion[DW], motion[A]
@@ -135,7 +136,7 @@ def _body(theta: Array, motion: Array, force: Array, moment: Array) -> None:
     moment[2] = xz * dw[0] + yz * dw[1] + zz * dw[2] + t[2] + u[2]
 
 
-@njit(cache=True)
+@compiled
 def mass_matrix(frames: Frames, theta: Array, q: Array) -> Array:
     """(n, n) kg m²: the torques of unit accelerations."""
     n = len(q)
@@ -147,7 +148,7 @@ def mass_matrix(frames: Frames, theta: Array, q: Array) -> Array:
     return M
 
 
-@njit(cache=True)
+@compiled
 def end_effector(frames: Frames, q: Array, tool: Array) -> tuple[Array, Array]:
     """Pose of the end of a serial arm and its Jacobian, in base axes.
 
@@ -184,7 +185,7 @@ def end_effector(frames: Frames, q: Array, tool: Array) -> tuple[Array, Array]:
     return pose, J
 
 
-@njit(cache=True)
+@compiled
 def turned(R0: Array, q: float, out: Array) -> None:
     """out becomes R0 Rz(q)."""
     c, s = np.cos(q), np.sin(q)
@@ -194,21 +195,21 @@ def turned(R0: Array, q: float, out: Array) -> None:
         out[i, 2] = R0[i, 2]
 
 
-@njit(cache=True)
+@compiled
 def into(E: Array, x: Array, out: Array) -> None:
     """out becomes E^T x: outer axes to inner ones."""
     for i in range(3):
         out[i] = E[0, i] * x[0] + E[1, i] * x[1] + E[2, i] * x[2]
 
 
-@njit(cache=True)
+@compiled
 def out_of(E: Array, x: Array, out: Array) -> None:
     """out becomes E x: inner axes to outer ones."""
     for i in range(3):
         out[i] = E[i, 0] * x[0] + E[i, 1] * x[1] + E[i, 2] * x[2]
 
 
-@njit(cache=True)
+@compiled
 def cross(a: Array, b: Array, out: Array) -> None:
     """out becomes a x b."""
     out[0] = a[1] * b[2] - a[2] * b[1]

@@ -31,6 +31,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import choices
+
 Array = NDArray[np.float64]
 Number = float | list[float]
 
@@ -106,7 +108,7 @@ class Effect:
 
     def __post_init__(self) -> None:
         if self.name not in SPECS:
-            raise ValueError(f"no effect {self.name!r}; have: {', '.join(SPECS)}")
+            raise ValueError(f"no effect {self.name!r}; {choices(self.name, SPECS)}")
         object.__setattr__(self, "joints", tuple(int(j) for j in self.joints))
         _check_keys(self)
         _check_joints(self)
@@ -211,7 +213,7 @@ def _check_keys(effect: Effect) -> None:
     for key, value in effect.parameters.items():
         if key not in needed + optional:
             raise ValueError(
-                f"{effect.name} has no parameter {key!r}; have: {', '.join(needed + optional)}"
+                f"{effect.name} has no parameter {key!r}; {choices(key, needed + optional)}"
             )
         shape = (LENGTHS[key],) if key in LENGTHS else ()
         try:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from drivers.errors import choices
+
 
 class Value(NamedTuple):
     """What may stand for VALUE: in words, and which numbers are that."""
@@ -67,7 +69,7 @@ def read_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
     head, at, when = text.strip().partition("@")
     name, equals, value = head.partition("=")
     if name not in kinds:
-        raise ValueError(f"no fault {name!r}; have: {', '.join(kinds)}")
+        raise ValueError(f"no fault {name!r}; {choices(name, kinds)}")
     kind = kinds[name]
     if at and not kind.timed:
         raise ValueError(f"fault {text!r}: {name} has no time")

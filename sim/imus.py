@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from drivers.errors import choices
 from drivers.interface import LinkMotion
 from sim.truth import Array
 
@@ -55,7 +56,7 @@ class Imus:
     ) -> None:
         for name in on:
             if name not in names:
-                raise ValueError(f"no link {name!r} for a sensor; have: {', '.join(names)}")
+                raise ValueError(f"no link {name!r} for a sensor; {choices(name, names)}")
         self._rng = np.random.default_rng([seed, STREAM])
         self._n, self._k = len(names), -1
         self.sensors = [self._drawn(names.index(name), period_s) for name in on]

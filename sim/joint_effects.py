@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 
+from sim.compiled import compiled
 from sim.effects import MOTION, Effect
 from sim.truth import Array, Truth
 
@@ -108,7 +108,7 @@ def losses_at(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Arr
     return Losses(*add_up(rows, t, q, v, rigid, bent))
 
 
-@njit(cache=True)
+@compiled
 def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array) -> Array:
     """(5, n): explicit, viscous, positive, negative, armature; arguments as in `losses_at`."""
     out = np.zeros((5, len(q)))
@@ -146,7 +146,7 @@ def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array)
     return out
 
 
-@njit(cache=True)
+@compiled
 def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
     """Level of a friction that is alike in both directions, N m."""
     kind, a, b, c = int(row[0]), row[3], row[4], row[5]
@@ -159,7 +159,7 @@ def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
     return a * (1.0 + np.sin(q + b))
 
 
-@njit(cache=True)
+@compiled
 def _torque(row: Array, q: float, t: float) -> float:
     """Torque of position or time alone, N m."""
     kind, a, b, c = int(row[0]), row[3], row[4], row[5]
@@ -172,7 +172,7 @@ def _torque(row: Array, q: float, t: float) -> float:
     return a * np.sin(2 * np.pi * b * t + c)
 
 
-@njit(cache=True)
+@compiled
 def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
     """Carry the Dahl bristles (r,) on by h (s) of motion at v (n,), N m: s0 dz = Fc dq - z |dq|."""
     for r in range(len(rows)):
@@ -182,7 +182,7 @@ def bend(rows: Array, v: Array, h: float, bent: Array) -> None:
             bent[r] = goal + (bent[r] - goal) * np.exp(-abs(speed) * h / way)
 
 
-@njit(cache=True)
+@compiled
 def step(M: Array, bias: Array, v: Array, h: float, parts: Array, drive: Array) -> Array:
     """What of the drives' torques reaches the rigid arm in a sub-step of h (s), (n,) N m.
 

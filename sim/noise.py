@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import choices
 from drivers.interface import JointSample, LinkMotion
 from sim.noise_levels import NOISES, NoiseLevels, check_levels
 from sim.truth import Array, facts_of
@@ -36,7 +37,7 @@ def levels_of(name: str, **changes: float) -> NoiseLevels:
         ValueError: unknown name or unknown level; the message has the choices.
     """
     if name not in NOISES:
-        raise ValueError(f"no noise {name!r}; have: {', '.join(NOISES)}")
+        raise ValueError(f"no noise {name!r}; {choices(name, NOISES)}")
     check_levels(changes)
     base = NoiseLevels() if name == "none" else NoiseLevels(**facts_of("panda")["noise"])
     return replace(base, **changes)

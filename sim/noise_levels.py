@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import choices
+
 Array = NDArray[np.float64]
 NOISES = ("real", "none")
 
@@ -67,11 +69,13 @@ def check_levels(levels: Any) -> None:
     Raises:
         ValueError: no mapping of names to numbers from 0 up; with the names there are.
     """
-    known = ", ".join(sorted(item.name for item in fields(NoiseLevels)))
+    known = sorted(item.name for item in fields(NoiseLevels))
     if not isinstance(levels, Mapping):
-        raise ValueError(f'levels is {levels!r}; have: {{"NAME": NUMBER, ...}} of {known}')
+        raise ValueError(
+            f'levels is {levels!r}; have: {{"NAME": NUMBER, ...}} of {", ".join(known)}'
+        )
     for key in levels.keys() - NoiseLevels.__dataclass_fields__.keys():
-        raise ValueError(f"no noise level {key!r}; have: {known}")
+        raise ValueError(f"no noise level {key!r}; {choices(key, known)}")
     try:
         NoiseLevels(**levels)
     except TypeError:

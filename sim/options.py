@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from drivers.errors import choices
 from drivers.files.bounded import parse_json
 from sim.noise_levels import NOISES, check_levels
 
@@ -40,18 +41,18 @@ def check(name: str, options: Mapping[str, Any]) -> dict[str, float]:
         ValueError: unknown scenario, option, noise or level, or a value out of range; with choices.
     """
     if name not in SCENARIOS:
-        raise ValueError(f"no scenario {name!r}; have: {', '.join(SCENARIOS)}")
+        raise ValueError(f"no scenario {name!r}; {choices(name, SCENARIOS)}")
     own = SCENARIOS[name].options
     for key in options.keys() - {*own, *COMMON_OPTIONS}:
-        raise ValueError(f"{name} has no option {key!r}; have: {', '.join(own + COMMON_OPTIONS)}")
+        raise ValueError(f"{name} has no option {key!r}; {choices(key, own + COMMON_OPTIONS)}")
     numbers = {key: _size(name, key, options[key]) for key in own if key in options}
     links, noise = options.get("links", False), options.get("noise", NOISES[0])
     if not isinstance(links, bool):
         raise ValueError(f"{name}: links is {links!r}; have: True, False")
     if noise not in NOISES:
-        raise ValueError(f"no noise {noise!r}; have: {', '.join(NOISES)}")
+        raise ValueError(f"no noise {noise!r}; {choices(noise, NOISES)}")
     if options.get("robot", ROBOTS[0]) not in ROBOTS:
-        raise ValueError(f"no robot {options['robot']!r}; have: {', '.join(ROBOTS)}")
+        raise ValueError(f"no robot {options['robot']!r}; {choices(options['robot'], ROBOTS)}")
     check_levels(options.get("levels", {}))
     imus = options.get("imus", [])
     if not isinstance(imus, list) or not all(isinstance(x, str) for x in imus):

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from drivers.files.mcap import McapWriter
+from sim.compiled import compiled
 from sim.dynamics import Frames, mass_matrix, torques
 from sim.truth import Array, Truth
 
@@ -107,7 +107,7 @@ def record(
     return PositionRecording(truth.joint_names, stamp_ns, q, commands)
 
 
-@njit(cache=True)
+@compiled
 def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> None:
     """One millisecond under one command: small steps, forces as at their middles.
 

@@ -154,7 +154,7 @@ def lam_of(turns: Array, p: Array) -> Array:
 
 def facts_of(robot: str) -> dict[str, Any]:
     """The data file of a robot in `sim/models`, with what it shares with another one."""
-    text = (resources.files("sim") / "models" / f"{robot}.toml").read_text("utf-8")
+    text = (resources.files(__package__) / "models" / f"{robot}.toml").read_text("utf-8")
     facts = tomllib.loads(text)
     like = facts.pop("like", None)
     return facts if like is None else facts_of(like) | facts

@@ -7,9 +7,12 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from adapter import optional
 from adapter.cli import (
+    completion,
     diff_options,
     discover_options,
     excite_options,
@@ -23,111 +26,162 @@ from adapter.cli import (
     sim,
 )
 from adapter.cli.exit_codes import ExitCode, listed
+from adapter.cli.parser import Parser
 from adapter.errors import MeansError, ModelWarning
 from adapter.experiments import arguments as experiments
-from adapter.runs.terminal import complain, program_version, warn
-from drivers.interface import DriverError, NotReady
+from adapter.runs.terminal import begin, complain, program_version, show, warn
+from drivers.errors import DriverError, NotReady
 
 
 class Command(NamedTuple):
     """What declares its options and may set `check`, one line of help, what carries it out.
 
     `run_by` is loaded by name, after the command line was found right: most bring libraries that
-    take a second to load. `tests/house` reads this table, too.
+    take a second to load. Before that `begins`, filled with the arguments, says what is being done.
+    `tests/house` reads this table, too.
     """
 
     declare: Callable[[argparse.ArgumentParser], None]
     words: str
     run_by: str
     may_end: tuple[ExitCode, ...] = ()  # beside what every command may
+    begins: str = ""
+    simulates: bool = False  # whatever the arguments
 
 
 COMMANDS = {  # in the order of --help
-    "run": Command(run_options.declare, "learn live", "adapter.cli.run:run", tuple(ExitCode)),
+    "run": Command(
+        run_options.declare,
+        "learn live",
+        "adapter.cli.run:run",
+        tuple(ExitCode),
+        "learning live from {driver}, {duration:g} s",
+    ),
     "plan": Command(
         run_options.declare_plan,
         "where run would move the arm",
         "adapter.cli.plan:run",
         (ExitCode.NOT_READY,),
+        "planning a motion for {driver}",
     ),
     "excite": Command(
         excite_options.declare,
         "design a motion that teaches most, or that tells effects apart",
         "adapter.cli.excite:run",
+        begins="designing a motion for {robot}",
     ),
     "replay": Command(
         replay_options.declare,
         "learn from a recording",
         "adapter.cli.replay:run",
         (ExitCode.NOTHING_LEARNED,),
+        "learning from {logs}",
     ),
-    "gap": Command(gap_options.declare, "find what a model lacks", "adapter.cli.gap:run"),
+    "gap": Command(
+        gap_options.declare,
+        "find what a model lacks",
+        "adapter.cli.gap:run",
+        begins="comparing {model} with {logs}",
+    ),
     "fleet": Command(
         fleet_options.declare,
         "one model per arm from many recordings",
         "adapter.cli.fleet:run",
         (ExitCode.NOTHING_LEARNED,),
+        "learning one model per arm from {logs}",
     ),
     "load": Command(
         load_options.declare,
         "what the hand carries, to type into the robot",
         "adapter.cli.load:run",
+        begins="weighing what the hand carries in {log}",
     ),
     "diff": Command(
-        diff_options.declare, "two models of one arm, joint by joint", "adapter.cli.diff:run"
+        diff_options.declare,
+        "two models of one arm, joint by joint",
+        "adapter.cli.diff:run",
+        begins="comparing {first} with {second}",
     ),
     "discover": Command(
         discover_options.declare,
         "find the tree of a robot from the motion of its links",
         "adapter.cli.discover:run",
+        begins="looking for the tree of the robot in {log}",
     ),
     "sim": Command(
-        sim.declare, "simulated hardware behind real wire protocols", "adapter.cli.sim:run"
+        sim.declare,
+        "simulated hardware behind real wire protocols",
+        "adapter.cli.sim:run",
+        begins="starting a simulated {arm} arm",
+        simulates=True,
     ),
     "import": Command(
         files_options.declare_import,
         "turn tables into a recording",
         "adapter.cli.files:run_import",
+        begins="reading {sources}",
     ),
     "export": Command(
         results_options.declare_export,
         "write a model file as URDF",
         "adapter.cli.results:run_export",
+        begins="reading {model}",
     ),
     "report": Command(
         results_options.declare_report,
         "make the HTML page of a run again",
         "adapter.cli.results:run_report",
+        begins="making the page of {folder}",
     ),
     "recover": Command(
         files_options.declare_recover,
         "mend a recording that was cut",
         "adapter.cli.files:run_recover",
+        begins="mending {file}",
     ),
     "info": Command(
         files_options.declare_info,
         "what is in a recording or a model file",
         "adapter.cli.files:run_info",
+        begins="reading {file}",
     ),
     "experiment": Command(
         experiments.experiment,
         "rerun the paper's experiments",
         "adapter.experiments.command:run",
+        begins="rerunning the paper's experiments: {names}",
+        simulates=True,
     ),
     "bench": Command(
-        experiments.bench, "time the update beside its rivals", "adapter.experiments.benchmark:run"
+        experiments.bench,
+        "time the update beside its rivals",
+        "adapter.experiments.benchmark:run",
+        begins="timing the update beside its rivals",
+    ),
+    "completion": Command(
+        completion.declare,
+        "what a shell needs to complete command lines",
+        "adapter.cli.completion:run",
     ),
 }
 
 
-def build_parser() -> argparse.ArgumentParser:
+class _Version(argparse.Action):
+    """Looks the version up when it is asked for."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *where: Any) -> None:
+        show(program_version())
+        parser.exit()
+
+
+def build_parser() -> Parser:
     """The command line; what it returns carries `command` and `check`, which may raise."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="adapter",
         description="Lets a torque-sensed arm learn its own body while it moves.",
         epilog=f"adapter COMMAND --help tells more. {listed(ExitCode)}",
     )
-    parser.add_argument("--version", action="version", version=program_version())
+    parser.add_argument("--version", action=_Version, nargs=0, help="which this is")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
         part = commands.add_parser(name, help=command.words)
@@ -139,12 +193,18 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    args = build_parser().parse_args(arguments)
+    parser = build_parser()
+    completion.complete(parser)
+    args = parser.parse_args(arguments)
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
-        args.check(args)
-        module, _, function = COMMANDS[args.command].run_by.partition(":")
-        return int(getattr(import_module(module), function)(args))
+        return _carry_out(COMMANDS[args.command], args)
+    except ModuleNotFoundError as error:
+        sentence = optional.missing(error.name)
+        if sentence is None:
+            raise
+        complain(sentence)
+        return ExitCode.NO_MEANS
     except MeansError as error:
         complain(error)
         return ExitCode.NO_MEANS
@@ -162,6 +222,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ExitCode.WRONG_USE
     except KeyboardInterrupt:
         return ExitCode.INTERRUPTED
+
+
+def _carry_out(command: Command, args: argparse.Namespace) -> int:
+    """Check the arguments, say what is being done, do it; returns the exit code."""
+    args.check(args)
+    if command.begins and not getattr(args, "quiet", False):
+        begin(command.begins.format_map({key: _told(x) for key, x in vars(args).items()}))
+    if command.simulates:
+        optional.load("pybullet")
+    module, _, function = command.run_by.partition(":")
+    return int(getattr(import_module(module), function)(args))
+
+
+def _told(value: Any) -> Any:
+    """An argument in a sentence: files by their names, of many the first."""
+    if isinstance(value, list | tuple):
+        return (
+            _told(value[0]) + (f" and {len(value) - 1} more" * (len(value) > 1)) if value else "-"
+        )
+    if value is None:
+        return "the documented arm"
+    return value.name if isinstance(value, Path) else value
 
 
 def _show_warning(message: Any, category: type[Warning], *where: Any) -> None:

@@ -8,6 +8,7 @@ from adapter.effects import LEARNED
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.errors import SettingsError
 from adapter.runs.config import read_config
+from drivers.errors import choices
 from drivers.faults.spec import Faults
 from sim.options import DEFAULT_SCENARIO, options_of
 from sim.options import check as check_scenario
@@ -32,7 +33,7 @@ def effects_named(text: str) -> tuple[str, ...]:
     names: dict[str, None] = {}
     for name in (name.strip() for name in text.split(",") if name.strip()):
         if name != "real" and name not in LEARNED:
-            raise SettingsError(f"no effect '{name}'; have: none, real, {', '.join(LEARNED)}")
+            raise SettingsError(f"no effect '{name}'; {choices(name, ('none', 'real', *LEARNED))}")
         names.update(dict.fromkeys(REAL_ARM_EFFECTS if name == "real" else [name]))
     return tuple(names)
 

@@ -12,7 +12,8 @@ from importlib import import_module
 from pathlib import Path
 
 from adapter.errors import UsageError
-from adapter.model.robots import names as robot_names
+from adapter.model.robot_names import ROBOT_FILES, robot_names
+from drivers.errors import choices
 from drivers.files.names import RECORDINGS, is_recording
 
 MODES = ("moments", "sample")  # of `adapter.learning.learner`
@@ -113,15 +114,19 @@ def check_learning(args: argparse.Namespace) -> None:
         import_module(NAMES).check_learning(args)
 
 
+def expanded_by(name: str) -> str:
+    """The command that makes a URDF of xacro."""
+    return f"xacro {name} > {name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
+
+
 def check_robot(name: str) -> None:
     """Refuse what is neither a known robot nor a file of one. Raises UsageError."""
     if name in robot_names():
         return
+    if Path(name).suffix.lower() == ".xacro":
+        raise UsageError(f"{name}: is xacro; make a URDF of it: {expanded_by(name)}")
     if Path(name).suffix.lower() not in MODEL_FILES:
-        raise UsageError(
-            f"no robot '{name}'; have: {', '.join(robot_names())}, a .urdf file, an MJCF file "
-            "(.xml) or a .json model file"
-        )
+        raise UsageError(f"no robot '{name}'; {choices(name, robot_names(), ROBOT_FILES)}")
     check_files(Path(name))
 
 

@@ -109,8 +109,9 @@ def _figures(
             *log.warnings,
             *front_end.messages,
             *result.outcome.lam_notes,
-            *contact_lines(result.contacts, robot.tree.joint_names),
+            *contact_lines(result.contacts, robot.tree.joint_names, front_end.start_s),
         ],
+        start_s=front_end.start_s,
         contacts=result.contacts,
         recording=", ".join(map(str, args.logs)),
         recordings=list(map(str, args.logs)),
@@ -118,7 +119,10 @@ def _figures(
         every=args.every,
         times_real_time=result.span_s / max(result.wall_s, 1e-9),
         noise=noise_levels(log),
-        gaps=[{"after_s": 1e-9 * stamp, "length_s": length} for stamp, length in front_end.gaps],
+        gaps=[
+            {"after_s": 1e-9 * stamp - front_end.start_s, "length_s": length}
+            for stamp, length in front_end.gaps
+        ],
     )
 
 

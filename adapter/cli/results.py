@@ -81,6 +81,7 @@ def print_figures(data: RunData, report: str | None) -> None:
 
 
 def _figures(figures: dict[str, Any], report: str | None) -> Table:
+    start_s = figures.get("start_s") or 0.0
     lam, theta, tick = figures["lambda"], figures["theta"], figures["tick_us"]
     table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
     refused = ", ".join(f"{count} {reason}" for reason, count in figures["refused"].items())
@@ -104,8 +105,8 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     for change in theta["changes"]:
         load = change.get("payload")
         what = f"{load['m']:.3f} ± {load['m_std']:.3f} kg" if load else "superseded"
-        table.add_row("change at the hand", f"at {change['stamp_s']:.2f} s: {what}")
-    for line in disagreement_lines(figures.get("disagreements", [])):
+        table.add_row("change at the hand", f"at {change['stamp_s'] - start_s:.2f} s: {what}")
+    for line in disagreement_lines(figures.get("disagreements", []), start_s):
         table.add_row("new disagreement", line)
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])
@@ -122,11 +123,11 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     return table
 
 
-def disagreement_lines(reports: list[dict[str, Any]] | None) -> list[str]:
-    """One line each; one that says so where nothing watched."""
+def disagreement_lines(reports: list[dict[str, Any]] | None, start_s: float = 0.0) -> list[str]:
+    """One line each, times from the stamp `start_s`; one that says so where nothing watched."""
     if reports is None:
         return ["not watched for in batches (--every above 1) and where the base floats"]
-    return [sentence(report) for report in reports]
+    return [sentence(report, start_s) for report in reports]
 
 
 def _reached(figures: dict[str, Any], which: str) -> str:

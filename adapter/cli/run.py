@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
+from adapter import optional
 from adapter.cli.agreement import agree, need_somebody, reading
 from adapter.cli.common import configure, recording_metadata, robot_of, with_motion
 from adapter.cli.display import make_display
@@ -106,6 +107,7 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     scheme, _ = split_address(args.driver)
     world = None
     if simulated(args.driver):
+        optional.load("pybullet")
         builder = import_module(SIMULATED_BY)
         world = builder.simulation(args.driver, args.scenario, args.set, args.seed or 0)
     names = _joints_of_arm(args.driver, world) or counted(
@@ -335,8 +337,9 @@ def _conclude(
             *front_end.messages,
             *result.troubles,
             *outcome.lam_notes,
-            *contact_lines(result.contacts, robot.tree.joint_names),
+            *contact_lines(result.contacts, robot.tree.joint_names, front_end.start_s),
         ],
+        start_s=front_end.start_s,
         contacts=result.contacts,
         robot=robot.name,
         driver=args.driver,

@@ -9,7 +9,8 @@ from pathlib import Path
 from adapter.cli.options import NAMES, add_learning, add_motion, check_learning
 from adapter.control.settings import KINDS
 from adapter.errors import UsageError
-from adapter.model.robots import names as robot_names
+from adapter.model.robot_names import robot_names
+from drivers.errors import choices
 from drivers.registry import NAMELESS, SCHEMES, split_address
 
 FEEDFORWARD = ("none", "documented", "learned")
@@ -92,9 +93,9 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f"--duration must be above zero, got {args.duration}")
     scheme, rest = split_address(args.driver)
     if scheme not in SCHEMES:
-        raise UsageError(f"no driver '{scheme}'; have: {', '.join(SCHEMES)}")
+        raise UsageError(f"no driver '{scheme}'; {choices(scheme, SCHEMES)}")
     if scheme == "pybullet" and rest not in SIMULATED:
-        raise UsageError(f"no simulated arm '{rest}'; have: {', '.join(SIMULATED)}")
+        raise UsageError(f"no simulated arm '{rest}'; {choices(rest, SIMULATED)}")
     if (args.scenario or args.set) and not simulated(args.driver):
         raise UsageError(
             f"--scenario and --set need --driver pybullet:..., not {args.driver}; for a served "
@@ -110,7 +111,7 @@ def _check(args: argparse.Namespace) -> None:
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
         )
     check_learning(args)
-    if args.fault is not None or simulated(args.driver):
+    if args.fault is not None or args.scenario or args.set:
         import_module(NAMES).check_run(args)
 
 

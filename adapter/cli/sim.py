@@ -6,6 +6,9 @@ import argparse
 from importlib import import_module
 from typing import NamedTuple
 
+from adapter.cli.parser import Parser
+from adapter.shadowed import own_name
+
 
 class Served(NamedTuple):
     """An arm that can be served: in words; modules with its options, and with what carries it out.
@@ -42,17 +45,22 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "adapter sim ARM --help tells more."
     parser.add_argument("arm", choices=tuple(ARMS), metavar="ARM", help=", ".join(ARMS))
     parser.add_argument("rest", nargs=argparse.REMAINDER, metavar="...", help="options of the arm")
+    parser.set_defaults(check=_check)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Serve; returns the exit code."""
+def _check(args: argparse.Namespace) -> None:
+    """The arm's own options. Raises ValueError, DriverError with the choices."""
     served = ARMS[args.arm]
-    options = import_module(served.options)
-    parser = argparse.ArgumentParser(
+    options = import_module(own_name(served.options))
+    parser = Parser(
         prog=f"adapter sim {args.arm}",
         description=f"Serve {served.words}, until SIGTERM or Ctrl-C.",
     )
     options.add_arguments(parser)
-    asked = parser.parse_args(args.rest)
-    options.check(asked)
-    return int(import_module(served.command).run(asked))
+    args.asked = parser.parse_args(args.rest)
+    options.check(args.asked)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve; returns the exit code."""
+    return int(import_module(own_name(ARMS[args.arm].command)).run(args.asked))

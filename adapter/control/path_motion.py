@@ -24,6 +24,7 @@ from adapter.control.settings import ExcitationSettings
 from adapter.errors import SettingsError
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
+from drivers.errors import choices
 
 UNKNOWN_RANGE = 0.5  # rad to each side, of a joint whose range nobody documented
 
@@ -174,7 +175,7 @@ def moving(limits: MotionLimits, settings: ExcitationSettings) -> Array:
     names = limits.joint_names
     for name in settings.move:
         if name not in names:
-            raise SettingsError(f"no joint '{name}' to move; have: {', '.join(names)}")
+            raise SettingsError(f"no joint '{name}' to move; {choices(name, names)}")
     wanted = settings.move or names
     return np.array([name in wanted for name in names]) if names else np.ones(len(limits.effort))
 

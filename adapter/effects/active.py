@@ -24,6 +24,7 @@ from adapter.effects.by_joint import ByJoint, EffectSums
 from adapter.effects.catalogue import CATALOGUE
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
+from drivers.errors import choices
 
 WHOLE = (-np.inf, np.inf)
 NEEDED = ("effect", "parameters")
@@ -133,7 +134,7 @@ def _of_entry(entry: Any, n: int) -> list[Active]:
         raise ModelError(f"an effect needs {' and '.join(NEEDED)}, got {entry!r}")
     name = entry["effect"]
     if not isinstance(name, str) or name not in CATALOGUE:
-        raise ModelError(f"no effect '{name}'; have: {', '.join(CATALOGUE)}")
+        raise ModelError(f"no effect '{name}'; {choices(name, CATALOGUE)}")
     effect = CATALOGUE[name]
     values = entry["parameters"]
     if not isinstance(values, Mapping):

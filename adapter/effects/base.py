@@ -27,6 +27,7 @@ from adapter.effects.splits import DecidingExperiment
 from adapter.errors import ModelError
 from adapter.model.spatial import Array
 from adapter.model.urdf_text import NO_PLACE, Additions
+from drivers.errors import choices
 
 Flags = NDArray[np.bool_]
 Values = Mapping[str, Any]
@@ -323,7 +324,7 @@ class Effect(ABC):
         known = [p.key for p in self.parameters]
         for key in values:
             if key not in known:
-                raise ModelError(f"{self.name} has no parameter '{key}'; have: {', '.join(known)}")
+                raise ModelError(f"{self.name} has no parameter '{key}'; {choices(key, known)}")
         for p in self.parameters:
             if p.key not in values:
                 if p.optional:

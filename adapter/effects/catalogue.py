@@ -30,6 +30,7 @@ from adapter.effects.torque_offset import TorqueOffset
 from adapter.effects.torque_ripple import TorqueRipple
 from adapter.effects.viscous_friction import ViscousFriction
 from adapter.errors import SettingsError
+from drivers.errors import choices
 
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
@@ -105,5 +106,5 @@ def effects_by_name(names: Iterable[str]) -> tuple[LearnedEffect, ...]:
     chosen = list(names)
     for name in chosen:
         if name not in LEARNED:
-            raise SettingsError(f"no effect '{name}'; have: {', '.join(LEARNED)}")
+            raise SettingsError(f"no effect '{name}'; {choices(name, LEARNED)}")
     return tuple(LEARNED[name] for name in chosen)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+from importlib import import_module
 from pathlib import Path
 
 from adapter.errors import UsageError
-from adapter.experiments.split import LEAST_TRAJECTORIES, learned_samples
 from adapter.runs.terminal import check_writable
 
 EXPERIMENTS = ("atlas", "panda")
+SPLIT = "adapter.experiments.split"  # brings NumPy; loaded by name where it is used
 LEAST_LEARNED = 50  # samples; far fewer show λ and θ of 30 joints only by chance
 
 
@@ -52,11 +53,12 @@ def _check_experiment(args: argparse.Namespace) -> None:
 
 def _check_falls(trajectories: int, seconds: float) -> None:
     """Raises UsageError where there would be too little to learn from."""
-    if trajectories < LEAST_TRAJECTORIES:
-        raise UsageError(f"--trajectories must be at least {LEAST_TRAJECTORIES}")
+    split = import_module(SPLIT)
+    if trajectories < split.LEAST_TRAJECTORIES:
+        raise UsageError(f"--trajectories must be at least {split.LEAST_TRAJECTORIES}")
     if not 0.0 < seconds < math.inf:
         raise UsageError(f"--seconds must be above 0 and finite, got {seconds}")
-    learned = learned_samples(trajectories, round(1000.0 * seconds))
+    learned = split.learned_samples(trajectories, round(1000.0 * seconds))
     if learned < LEAST_LEARNED:
         raise UsageError(
             f"{trajectories} falls of {seconds:g} s give {learned} samples to learn "

@@ -12,6 +12,7 @@ from adapter.errors import ModelError
 from adapter.model.inertia import theta_from_body
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
+from drivers.errors import choices
 
 FLANGES = ("tool0", "flange")  # what makers call the face that a tool is bolted to
 LOAD_KG = 4.0  # one standard deviation
@@ -87,7 +88,7 @@ def hand_frame(model: SelfModel, name: str | None = None) -> FixedFrame:
         for frame in (own, *riding):
             if frame.name == name:
                 return frame
-        have = ", ".join(frame.name for frame in (own, *riding))
-        raise ModelError(f"no frame '{name}' rides on the last link; have: {have}")
+        have = choices(name, [frame.name for frame in (own, *riding)])
+        raise ModelError(f"no frame '{name}' rides on the last link; {have}")
     called = [frame for key in FLANGES for frame in riding if frame.name.endswith(key)]
     return (*called, *riding, own)[0]

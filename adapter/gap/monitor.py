@@ -77,6 +77,7 @@ class Monitor:
         tool_theta: (10,) of a known tool on the last link, which θ leaves out.
         delay_s: age of a filtered state against the sample that completed it.
         say: takes a sentence when something is reported, and when it is over.
+        start_s: stamp that the sentences' times count from; the first state's where nobody knows.
     """
 
     def __init__(
@@ -85,7 +86,9 @@ class Monitor:
         tool_theta: Array | None = None,
         delay_s: float = 0.0,
         say: Callable[[str], None] | None = None,
+        start_s: float | None = None,
     ) -> None:
+        self._start_s = start_s
         self._n, self._delay_s, self._layout = n, delay_s, StateLayout(n)
         self._tool = np.zeros(10) if tool_theta is None else np.array(tool_theta)
         self._blocks, self._found = Blocks(n), DisagreementList(say)
@@ -106,6 +109,9 @@ class Monitor:
 
     def __call__(self, learner: OnlineLearner, table: Array) -> None:
         """Look at states (m, size) that the learner has just learned from."""
+        if self._start_s is None and len(table):
+            self._start_s = 1e-9 * stamp_of(table[0])
+        self._found.start_s = self._start_s or 0.0
         rows = self._blocks.add(table)
         if not rows:
             return

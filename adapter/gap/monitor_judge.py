@@ -257,11 +257,13 @@ class DisagreementList:
     Attributes:
         reports: every entry ever made.
         active: those that last, and those that ended within the window.
+        start_s: stamp that the sentences' times count from.
     """
 
     def __init__(self, say: Callable[[str], None] | None = None) -> None:
         self.reports: list[dict[str, Any]] = []
         self.active: list[Disagreement] = []
+        self.start_s = 0.0
         self._say = say or (lambda line: None)
 
     def name(self, belief: Belief, told: Report) -> None:
@@ -272,13 +274,13 @@ class DisagreementList:
         entry["ambiguous_with"] = [{"what": c.name, "joints": c.joints} for c in told.close]
         self.active.append(Disagreement(candidate, entry, told.since_s, at=len(belief.rhs)))
         belief.extend(candidate.std)
-        self._say(sentence(entry))
+        self._say(sentence(entry, self.start_s))
 
     def unexplained(self, joints: list[int], since_s: float, now_s: float, score: float) -> None:
         """Report that nothing explains what is new on these joints (from 0)."""
         entry = self._entry(UNEXPLAINED, [j + 1 for j in joints], since_s, now_s, score)
         self.active.append(Disagreement(None, entry, since_s, joints=joints))
-        self._say(sentence(entry))
+        self._say(sentence(entry, self.start_s))
 
     def _entry(
         self, what: str, joints: list[int], since_s: float, now_s: float, score: float
@@ -299,7 +301,7 @@ class DisagreementList:
     def close(self, found: Disagreement, over_s: float) -> None:
         """Something acts no more."""
         found.over_s = found.entry["over_s"] = over_s
-        self._say(sentence(found.entry))
+        self._say(sentence(found.entry, self.start_s))
 
     def columns(self, rows: RowGroup) -> Array:
         """(r, n, D) the rows' Z with the columns of what was reported, where it acts."""
@@ -342,12 +344,12 @@ class DisagreementList:
             found.entry["size"] = found.candidate.decode(a)
 
 
-def sentence(report: Mapping[str, Any]) -> str:
-    """One line on a report, for people."""
+def sentence(report: Mapping[str, Any], start_s: float) -> str:
+    """One line on a report, for people; times count from the stamp `start_s`."""
     where = f" on joint {', '.join(map(str, report['joints']))}" if report["joints"] else ""
     size = ", ".join(f"{key} {value:.3g}" for key, value in report["size"].items())
-    over = "" if report["over_s"] is None else f", over at {report['over_s']:.2f} s"
+    over = "" if report["over_s"] is None else f", over at {report['over_s'] - start_s:.2f} s"
     also = " or ".join(other["what"] for other in report["ambiguous_with"])
     what = report["what"] + (f" (or {also})" if also else "")
-    line = f"{what.replace('_', ' ')}{where} since {report['since_s']:.2f} s{over}"
-    return f"{line}{': ' + size if size else ''} (seen at {report['reported_s']:.2f} s)"
+    line = f"{what.replace('_', ' ')}{where} since {report['since_s'] - start_s:.2f} s{over}"
+    return f"{line}{': ' + size if size else ''} (seen at {report['reported_s'] - start_s:.2f} s)"

@@ -18,6 +18,7 @@ from adapter.learning.settings import SchemaSettings
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.signals.records import KIND, LinkMotionKind, stamps_of
+from drivers.errors import choices
 
 FIRST_S, GROWTH, MOST_S = 1.0, 1.25, 4.0  # of motion: first solution, and from one to the next
 HELD_S = 60.0  # of readings; the older half of more becomes a paraboloid
@@ -231,8 +232,8 @@ def imu_links(tree: Tree, names: Sequence[str]) -> tuple[int, ...]:
     """Places of links by name. Raises SettingsError with the names there are."""
     for name in names:
         if name not in tree.link_names:
-            have = ", ".join(tree.link_names)
-            raise SettingsError(f"no link '{name}' that a sensor could be on; have: {have}")
+            have = choices(name, tree.link_names)
+            raise SettingsError(f"no link '{name}' that a sensor could be on; {have}")
     return tuple(tree.link_names.index(name) for name in names)
 
 

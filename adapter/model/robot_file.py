@@ -21,6 +21,7 @@ from adapter.model.locking import LOCKED
 from adapter.model.self_model import FixedFrame, Limits, SelfModel, Source, turned_theta
 from adapter.model.spatial import Array, exp_rotation, z_to_axis, zxz_from_matrix
 from adapter.model.tree import BASE, Tree
+from drivers.errors import choices
 
 TURNING = ("revolute", "continuous")
 SLIDING = ("prismatic",)
@@ -132,10 +133,9 @@ def _check_joints(robot: FileRobot, names: Iterable[str], kinds: Sequence[str], 
         joint = robot.joints.get(name)
         if joint is None or joint.kind not in kinds:
             fault = "is not there" if joint is None else f"is {joint.kind}"
-            have = ", ".join(j.name for j in robot.joints.values() if j.kind in kinds)
-            raise ModelError(
-                f"{robot.file}: joint '{name}', asked for, {fault}; have {what}: {have}"
-            )
+            have = [j.name for j in robot.joints.values() if j.kind in kinds]
+            told = f"of the {what} {choices(name, have)}"
+            raise ModelError(f"{robot.file}: joint '{name}', asked for, {fault}; {told}")
 
 
 @dataclass

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from adapter.errors import ModelError
+from drivers.errors import choices
 
 BASE = -1
 
@@ -89,7 +90,7 @@ class Tree:
     def joint_index(self, name: str) -> int:
         """Index of a joint by name. Raises ModelError with the names there are."""
         if name not in self.joint_names:
-            raise ModelError(f"no joint '{name}'; have: {', '.join(self.joint_names)}")
+            raise ModelError(f"no joint '{name}'; {choices(name, self.joint_names)}")
         return self.joint_names.index(name)
 
 

@@ -95,7 +95,9 @@ def context(data: RunData) -> dict[str, Any]:
 def _warnings(figures: dict[str, Any]) -> list[str]:
     fault = figures.get("fault")
     ended = [f"The run ended early: {fault}"] if fault else []
-    new = [f"New disagreement: {sentence(report)}" for report in figures.get("disagreements") or []]
+    start_s = figures.get("start_s") or 0.0
+    reports = figures.get("disagreements") or []
+    new = [f"New disagreement: {sentence(report, start_s)}" for report in reports]
     return [*ended, *new, *map(str, figures.get("warnings") or [])]
 
 

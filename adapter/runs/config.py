@@ -17,6 +17,7 @@ from adapter.errors import SettingsError
 from adapter.learning.settings import LearnerSettings
 from adapter.model.self_model import SelfModel, Tool
 from adapter.signals.settings import FilterSettings, FrontEndSettings
+from drivers.errors import choices
 from drivers.files.bounded import read_text
 
 
@@ -149,10 +150,10 @@ def _build(kind: Any, table: Any, where: str) -> Any:
     if not isinstance(table, dict):
         raise SettingsError(f"{where}: needs a table, got {table!r}")
     hints = get_type_hints(kind)
-    choices = [f.name for f in dataclasses.fields(kind)]
+    known = [f.name for f in dataclasses.fields(kind)]
     for key in table:
-        if key not in choices:
-            raise SettingsError(f"{where}: no setting '{key}'; have: {', '.join(choices)}")
+        if key not in known:
+            raise SettingsError(f"{where}: no setting '{key}'; {choices(key, known)}")
     values = {key: _value(hints[key], part, f"{where}: {key}") for key, part in table.items()}
     try:
         return kind(**values)

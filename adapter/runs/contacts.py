@@ -54,14 +54,16 @@ def contacts_of(observer: ContactObserver, documented: SelfModel) -> list[dict[s
     ]
 
 
-def contact_lines(contacts: Sequence[dict[str, Any]], names: Sequence[str]) -> list[str]:
-    """A sentence on the contacts, where there were any."""
+def contact_lines(
+    contacts: Sequence[dict[str, Any]], names: Sequence[str], start_s: float
+) -> list[str]:
+    """A sentence on the contacts, where there were any; times from the stamp `start_s`."""
     if not contacts:
         return []
     first = contacts[0]
     j = first["joint"] - 1
     more = f", and {len(contacts) - 1} more" if len(contacts) > 1 else ""
     return [
-        f"something pushed the arm: {first['kind']} at {1e-9 * first['begin_ns']:.3f} s, "
+        f"something pushed the arm: {first['kind']} at {1e-9 * first['begin_ns'] - start_s:.3f} s, "
         f"{first['torque_nm'][j]:+.1f} N m on {names[j]}{more}"
     ]

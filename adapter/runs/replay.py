@@ -139,7 +139,8 @@ def replay(
         tool = None if documented.tool is None else documented.tool.theta()
         delay_s = pipeline.front_end.delay_s
         if not documented.tree.floating:  # what it knows of disagreements is of a base that rests
-            pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say)
+            start_s = 1e-9 * float(log.stamp_ns[0])
+            pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say, start_s)
     if resume is not None:
         load_checkpoint(pipeline.learner, resume)
     observer = None

@@ -9,47 +9,66 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from datetime import datetime
-from importlib.metadata import PackageNotFoundError, version
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.text import Text
+if TYPE_CHECKING:
+    from rich.console import Console
 
-
-class PatientConsole(Console):
-    """Reads no styles out of text; goes on where nobody listens: results are still written."""
-
-    def __init__(self, stderr: bool) -> None:
-        super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
-
-    def on_broken_pipe(self) -> None:
-        """Whoever read this has gone (`| head`); where rich would end the program, it goes on."""
-        self.quiet = True
-        with suppress(OSError, ValueError), open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), self.file.fileno())
-
-    def print(self, *objects: Any, **options: Any) -> None:
-        """As rich does, without an error."""
-        with suppress(OSError):
-            super().print(*objects, **options)
+    console: Console
+    output: Console
 
 
-console = PatientConsole(stderr=True)
-output = PatientConsole(stderr=False)
+@cache
+def _consoles() -> dict[str, Console]:
+    """Of results (`output`) and of all else (`console`), made when something is printed.
+
+    They read no styles out of text, and go on where nobody listens: results are still written.
+    """
+    from rich.console import Console
+
+    class PatientConsole(Console):
+        def on_broken_pipe(self) -> None:
+            """Whoever read this has gone (`| head`); rich would end the program here."""
+            self.quiet = True
+            with suppress(OSError, ValueError), open(os.devnull, "wb") as nowhere:
+                os.dup2(nowhere.fileno(), self.file.fileno())
+
+        def print(self, *objects: Any, **options: Any) -> None:
+            """As rich does, without an error."""
+            with suppress(OSError):
+                super().print(*objects, **options)
+
+    plain: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
+    streams = {"console": True, "output": False}
+    return {name: PatientConsole(stderr=stream, **plain) for name, stream in streams.items()}
+
+
+def __getattr__(name: str) -> Console:
+    if name not in ("console", "output"):
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    return _consoles()[name]
+
+
+def begin(line: str) -> None:
+    """What is being done, before anything that takes long is loaded (rich does, for some)."""
+    with suppress(OSError):
+        print(f"{line} ...", file=sys.stderr, flush=True)
 
 
 def say(line: str) -> None:
     """A line about how it goes."""
-    console.print(line, soft_wrap=True)
+    _consoles()["console"].print(line, soft_wrap=True)
 
 
 def show(line: str) -> None:
     """A line of the result."""
-    output.print(line, soft_wrap=True)
+    _consoles()["output"].print(line, soft_wrap=True)
 
 
 def warn(lines: Iterable[str]) -> None:
@@ -65,11 +84,15 @@ def complain(sentence: object) -> None:
 
 def labelled(label: str, style: str, line: str) -> None:
     """A line about how it goes behind a label in a style of rich."""
-    console.print(Text.assemble((label, style), " ", line), soft_wrap=True)
+    from rich.text import Text
+
+    _consoles()["console"].print(Text.assemble((label, style), " ", line), soft_wrap=True)
 
 
 def program_version() -> str:
     """Version of the installed distribution."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version("panda-adapter")
     except PackageNotFoundError:
@@ -97,7 +120,7 @@ def json_text(figures: Any) -> str:
 def write_json(path: Path | None, figures: Any) -> None:
     """Figures to a file, if one was asked for; `-` is the standard output."""
     if str(path) == "-":
-        output.print(json_text(figures), end="", soft_wrap=True)
+        _consoles()["output"].print(json_text(figures), end="", soft_wrap=True)
     elif path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json_text(figures), encoding="utf-8")

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from drivers.errors import choices
 from drivers.files.mcap import READERS, FrameMotion, Log
 from drivers.interface import DriverError
 
@@ -46,7 +47,7 @@ def frames_on_base(robot: SelfModel, link: str) -> dict[str, Place]:
         moves = " moves on it" if link in robot.tree.link_names else " is not there"
         raise ModelError(
             f"{robot.name}: a base that floats is the root link or one fixed to it; '{link}'"
-            f"{moves}; have: {', '.join(places)}"
+            f"{moves}; {choices(link, places)}"
         )
     return {link: places[link], **places}
 

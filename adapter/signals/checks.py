@@ -34,7 +34,10 @@ STREAK = 10  # so many old stamps in a row are a clock put back, not late sample
 # Those of speed and effort are of a millisecond, or of a shorter period.
 USUAL_STEPS, Q_STEP, DQ_STEP, TAU_STEP = 6.0, 0.5, 0.02, 0.02
 PLAY_RAD = 0.012  # a motor crosses the play of its gear in no time: no step of an encoder
-USUAL_OVER = 200.0  # samples that "usual" looks back on
+USUAL_OVER = 200  # samples that "usual" looks back on
+# Readings whose noise nobody knows yet: what speeds and torques do from one to the next is usual.
+# The filter settles meanwhile, so that nothing is learned from them.
+UNKNOWN = 10
 JUMP_CONFIRMED = 3  # samples in a row that confirm a step of position
 GAP_PERIODS = 3.0  # samples that may be missing are no hole
 STUCK_RAD = 3e-3  # a joint's readings stand still while its speed would have brought it so far
@@ -90,7 +93,7 @@ class Memory(NamedTuple):
         usual: (3, n) squares of the readings' usual changes.
         since: (n,) int64 stamps at which the joints' readings last changed.
         ahead: (c,) the reading whose stamp lay far ahead, as it goes into the filter.
-        marks: (11,) int64, see `Mark`.
+        marks: (MARKS,) int64, see `Mark`.
         filter: of the filter.
         fastest: (n,) highest filtered |dq|, rad/s.
         bristles: in the joints.
@@ -122,6 +125,10 @@ class Mark(IntEnum):
     USUAL_DT = 8  # ns between samples
     LAST = 9  # stamp of `Memory.last`
     WITHOUT = 10  # samples since the last one that became a state
+    COMPARED = 11  # samples whose steps made "usual", at most USUAL_OVER
+
+
+MARKS = len(Mark)
 
 
 def rules_of(limits: Limits, settings: FrontEndSettings, joint_filter: JointFilter) -> Rules:
@@ -163,17 +170,17 @@ def room(n: int, base: int) -> int:
 
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + 13,).
+    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + MARKS + 2,).
 
     Behind the joints' 3 n the base's motion, b numbers, and the bristles', K n, pass the filter.
     """
-    n = whole.shape[0] - 13
+    n = whole.shape[0] - MARKS - 2
     rest_dq, gap_ns, states, samples = rules[8 * n], rules[8 * n + 1], rules[8 * n + 2], rules[-5]
     gains = Gains(rules[-4], rules[-3], int(rules[-2]), int(rules[-1]))
     allowed, floor = rules[: 4 * n].reshape(4, n), rules[5 * n : 8 * n].reshape(3, n)
     per = int(gap_ns), int(states), int(samples)
     own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, per[0], per[1], per[2], gains)
-    since, marks, times = whole[:n], whole[n : n + 11], whole[n + 11 :]
+    since, marks, times = whole[:n], whole[n : n + MARKS], whole[n + MARKS :]
     tables = memory[: 12 * n].reshape(4, 3, n)
     last, good, doubted, usual = tables[0], tables[1], tables[2], tables[3]
     size = (memory.shape[0] - (16 + len(WAYS_RAD)) * n) // 4
@@ -261,13 +268,13 @@ def steps(x, reference, dt_ns, usual, floor, usual_dt_ns):
 
 
 @jit
-def get_used(x, reference, dt_ns, usual, floor):
-    """Let the usual changes follow; what is out of the usual counts as just not."""
+def get_used(x, reference, dt_ns, usual, floor, over):
+    """Let the usual changes over so many samples follow; what is out of them counts as just not."""
     for s in range(3):
         for j in range(x.shape[1]):
             most = USUAL_STEPS * math.sqrt(usual[s, j]) + floor[s, j]
             e = min(off(s, j, x, reference, dt_ns), most)
-            usual[s, j] += (e * e - usual[s, j]) / USUAL_OVER
+            usual[s, j] += (e * e - usual[s, j]) / over
 
 
 @jit
@@ -300,8 +307,9 @@ def plausible(stamp, x, rules, memory):
         return Verdict.GOOD
     usual_dt = marks[Mark.USUAL_DT]
     found = steps(x, good, dt_ns, usual, rules.floor, usual_dt)
-    get_used(x, good, dt_ns, usual, rules.floor)
-    if found == 0:
+    marks[Mark.COMPARED] = min(marks[Mark.COMPARED] + 1, USUAL_OVER)
+    get_used(x, good, dt_ns, usual, rules.floor, marks[Mark.COMPARED])
+    if found == 0 or (found == 1 and marks[Mark.COMPARED] <= UNKNOWN):
         return Verdict.GOOD
     marks[Mark.CONFIRMED] += 1
     since_ns = stamp - marks[Mark.DOUBTED]

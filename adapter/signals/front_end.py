@@ -13,6 +13,7 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.bristles import wind
 from adapter.signals.checks import (
+    MARKS,
     STREAK,
     Mark,
     Verdict,
@@ -209,6 +210,7 @@ class FrontEnd:
     Attributes:
         refused: how many samples were not passed on, by reason.
         gaps: (stamp_ns, seconds) of each hole that restarted the filter.
+        start_ns: stamp of the first sample, which sentences count from; None before it.
     """
 
     def __init__(
@@ -227,7 +229,7 @@ class FrontEnd:
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
         base = BASE if documented.tree.floating else 0
-        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + 13, dtype=np.int64)
+        self._kept, self._whole = np.zeros(room(n, base)), np.zeros(n + MARKS + 2, dtype=np.int64)
         self._memory = unpacked(self._packed, self._kept, self._whole)[1]
         self._memory.last[:] = np.nan
         self._memory.bristles.place[:] = np.nan
@@ -239,6 +241,7 @@ class FrontEnd:
         self._records = self.layout.new(self._rules.states)
         self.refused: Counter[str] = Counter()
         self.gaps: list[tuple[int, float]] = []
+        self.start_ns: int | None = None
         self._told: list[str] = []
         self._velocity = documented.limits.velocity
 
@@ -327,15 +330,21 @@ class FrontEnd:
         self.twist.fill_table(records, Raw(last, q[good], dq[good], own))
         return records
 
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first sample, s; 0 before it."""
+        return 1e-9 * (self.start_ns or 0)
+
     def _refuse(self, verdict: int, sample: JointSample, hole: NDArray[np.int64]) -> None:
+        if self.start_ns is None:  # nothing is learned of a first sample, so it comes here
+            self.start_ns = sample.stamp_ns
         if hole.any():
             before_ns, behind_ns = int(hole[0]), int(hole[1])
             gap_s = 1e-9 * (behind_ns - before_ns)
             if not self.gaps:
-                self._told.append(
-                    f"at {1e-9 * before_ns:.3f} s: {gap_s:.3f} s without a sample; the filter "
-                    "starts anew"
-                )
+                at = f"at {1e-9 * (before_ns - self.start_ns):.3f} s"
+                said = f"{gap_s:.3f} s without a sample; the filter starts anew"
+                self._told.append(f"{at}: {said}")
             self.gaps.append((before_ns, gap_s))
         reason = Verdict(verdict)
         name = reason.name.lower()
@@ -344,7 +353,7 @@ class FrontEnd:
         self.refused[name] += 1
 
     def _sentence(self, reason: Verdict, sample: JointSample) -> str:
-        at = f"at {1e-9 * sample.stamp_ns:.3f} s"
+        at = f"at {1e-9 * (sample.stamp_ns - (self.start_ns or 0)):.3f} s"
         if reason == Verdict.OUT_OF_RANGE:
             lower, upper, dq_max, tau_max = self._rules.range
             for signal, value, low, high in (

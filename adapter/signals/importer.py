@@ -26,6 +26,7 @@ from adapter.signals.source_table import (
     read_parquet,
     read_table,
 )
+from drivers.errors import choices
 from drivers.files.mcap import Log, McapWriter, derive_velocity
 from drivers.interface import Array, DriverError
 
@@ -120,7 +121,7 @@ def _assignments(text: str, what: str) -> dict[str, tuple[str, ...]]:
         name, equals, value = word.partition("=")
         if equals:
             if _signal(name) not in SIGNALS:
-                raise DriverError(f"no signal '{name}' for a {what}; have: {', '.join(SIGNALS)}")
+                raise DriverError(f"no signal '{name}' for a {what}; {choices(name, SIGNALS)}")
             current = found.setdefault(_signal(name), [])
             current.append(value)
         elif current is None:
@@ -135,7 +136,7 @@ def unit_factor(units: Mapping[str, str], signal: str) -> float:
     usual = units.get("q", "rad") if signal == "dq" else next(iter(UNITS[signal]))
     unit = units.get(signal, usual)
     if unit not in UNITS[signal]:
-        raise DriverError(f"no unit '{unit}' for {signal}; have: {', '.join(UNITS[signal])}")
+        raise DriverError(f"no unit '{unit}' for {signal}; {choices(unit, UNITS[signal])}")
     return UNITS[signal][unit]
 
 
@@ -237,7 +238,7 @@ class _Reader:
         asked = (*spec.sources, *spec.columns, *spec.units)
         unknown = [s for s in asked if s not in SIGNALS and s != ALL]
         if unknown:
-            raise DriverError(f"no signal '{unknown[0]}'; have: {', '.join(SIGNALS)}")
+            raise DriverError(f"no signal '{unknown[0]}'; {choices(unknown[0], SIGNALS)}")
         self._spec = spec
         self._tables: dict[Path, SourceTable] = {}
         self._arrays: dict[Path, dict[str, Array]] = {}

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from adapter.model.self_model import SelfModel
+from drivers.errors import choices
 from drivers.files.mcap import Carrier, FrameMotion, Log
 from drivers.files.ros import IMU
 from drivers.interface import DriverError
@@ -95,8 +96,8 @@ def _asked(
         topic, _, name = text.partition("=")
         motion = next((m for m in told if m.topic == topic), None)
         if motion is None:
-            have = ", ".join(m.topic for m in told) or "none"
-            raise DriverError(f"{log.path}: no Imu topic {topic} that can be used; have: {have}")
+            have = choices(topic, [m.topic for m in told] or ["none"])
+            raise DriverError(f"{log.path}: no Imu topic {topic} that can be used; {have}")
         link = _link_of(name or motion.frame, robot)
         if link is None:
             raise DriverError(

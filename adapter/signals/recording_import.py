@@ -16,6 +16,7 @@ from adapter.model.model_file import whole_file
 from adapter.signals.importer import ALL, ImportReport, ImportSpec, imported_by, unit_factor
 from adapter.signals.matching import corresponding
 from adapter.signals.plausible import refuse_wild, value_doubts, velocity_doubts
+from drivers.errors import choices
 from drivers.files.mcap import (
     Log,
     McapWriter,
@@ -137,7 +138,7 @@ def _with_joints(log: _AnyLog, want: tuple[str, ...]) -> tuple[_AnyLog, list[str
     missing = [name for name, have in zip(want, found, strict=True) if have is None]
     if missing:
         raise DriverError(
-            f"{log.path}: has no joint {', '.join(missing)}; have: {', '.join(log.joint_names)}"
+            f"{log.path}: has no joint {', '.join(missing)}; {choices(missing[0], log.joint_names)}"
         )
     chosen = log.select([name for name in found if name is not None])
     return replace(chosen, joint_names=want), [f"{log.path}: {sentence}" for sentence in said]

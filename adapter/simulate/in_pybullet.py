@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from adapter import optional
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -31,6 +32,7 @@ class PybulletArm(SimulatedArm):
 
     Raises:
         ModelError: a joint that is not there, a body that cannot exist.
+        MeansError: PyBullet is not installed.
     """
 
     def __init__(
@@ -39,8 +41,7 @@ class PybulletArm(SimulatedArm):
         simulated: tuple[int, int] | None = None,
         period_s: float = 1e-3,
     ) -> None:
-        import pybullet
-
+        pybullet = optional.load("pybullet")
         super().__init__(Effects(model, period_s, "bodies"))
         self._bullet, self._alone = pybullet, simulated is None
         self.client, self.body = simulated or _alone(model, period_s)
@@ -93,8 +94,7 @@ class PybulletArm(SimulatedArm):
 
 def _alone(model: SelfModel, period_s: float) -> tuple[int, int]:
     """Client and body of the arm by itself."""
-    import pybullet
-
+    pybullet = optional.load("pybullet")
     text = plain_urdf(model)
     client: int = pybullet.connect(pybullet.DIRECT)
     with tempfile.TemporaryDirectory() as folder:

@@ -18,6 +18,7 @@ from adapter.model.spatial import Array
 from adapter.simulate.arm import SimulatedArm
 from adapter.simulate.in_mujoco import MujocoArm, library
 from adapter.simulate.in_pybullet import PybulletArm
+from drivers.errors import choices
 
 STEP_S = 1e-3  # longest step
 UNEVEN = 1e-3  # of a period: what a table's times may lack of a whole number of steps
@@ -63,7 +64,7 @@ class Rollouts:
 
     def __init__(self, simulator: str = "pybullet") -> None:
         if simulator not in SIMULATORS:
-            raise SettingsError(f"no simulator '{simulator}'; have: {', '.join(SIMULATORS)}")
+            raise SettingsError(f"no simulator '{simulator}'; {choices(simulator, SIMULATORS)}")
         if simulator == "mujoco":
             library()
         self.simulator, self.troubles = simulator, list[str]()

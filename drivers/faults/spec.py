@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from drivers.errors import choices
 from drivers.interface import DriverError
 
 _NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
@@ -122,7 +123,7 @@ def _fault(text: str) -> Fault:
     """One item. Raises DriverError."""
     name = re.split(r"[:=@]", text, maxsplit=1)[0]
     if name not in KINDS:
-        raise DriverError(f"no fault '{name}'; have: {', '.join(KINDS)}")
+        raise DriverError(f"no fault '{name}'; {choices(name, KINDS)}")
     kind, usage = KINDS[name], usage_of(name)
     found = _ITEM.fullmatch(text)
     if found is None or kind.timed != (found["how"] == "@"):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from drivers.errors import choices
 from sim.damiao.codec import (
     AT_REST,
     INTEGER_REGISTERS,
@@ -83,7 +84,7 @@ SETS: dict[str, tuple[Fitting, ...]] = {
 def motor_set(name: str) -> tuple[Fitting, ...]:
     """The motors of a set, joint 1 first. Raises ValueError, naming the choices."""
     if name not in SETS:
-        raise ValueError(f"no motors {name!r}; have: {', '.join(SETS)}")
+        raise ValueError(f"no motors {name!r}; {choices(name, SETS)}")
     return SETS[name]
 
 

@@ -241,7 +241,7 @@ def _make(jobs: list[_Job], processes: int) -> None:
         for job in jobs:
             job.make()
         return
-    command = [sys.executable, "-c", "from sim.falls.data_set import work; work()"]
+    command = [sys.executable, "-P", "-c", f"from {__name__} import work; work()"]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
     workers = [
         subprocess.Popen(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from sim.compiled import compiled
 from sim.dynamics import Frames, link_motion
 from sim.falls.tree_truth import TreeTruth
 from sim.truth import Array
@@ -45,7 +45,7 @@ def link_tables(
     return LinkTables(*_tables(frames, np.stack(base, axis=1), q, dq, ddq).transpose(2, 0, 1, 3))
 
 
-@njit(cache=True)
+@compiled
 def _tables(frames: Frames, base: Array, q: Array, dq: Array, ddq: Array) -> Array:
     """(m, n, 4, 3) link motion for tables (m, n) and base (m, 4, 3)."""
     out = np.empty((*q.shape, 4, 3))

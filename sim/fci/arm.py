@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from drivers.interface import DriverError, JointSample
+from sim.compiled import compiled
 from sim.dynamics import cross, end_effector, mass_matrix, torques
 from sim.effects import payload
 from sim.fci.cartesian import difference, impedance, posture
@@ -191,7 +191,7 @@ def motor_inertias(truth: Truth) -> Array:
     return found
 
 
-@njit(cache=True)
+@compiled
 def wrench_at(pose: Array, jacobian: Array, tool: Array, torque: Array, least: float) -> Array:
     """Wrench (6,) [f; m] at a frame whose joint torques come nearest to `torque`, base axes.
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from sim.compiled import compiled
 from sim.dynamics import Frames, cross, end_effector
 from sim.fci.codec import TICK_S, Generator, RobotCommand
 from sim.fci.joint_limits import ROOM, LimitErrors, broken
@@ -193,7 +193,7 @@ def moved(pose: Array, twist: Array) -> Array:
 STEPS, CLOSE, DAMPING = 6, 1e-10, 1e-8  # of Newton's method; the last keeps singular postures calm
 
 
-@njit(cache=True)
+@compiled
 def posture(
     frames: Frames, tool: Array, start: Array, pose: Array, elbow: float
 ) -> tuple[Array, float]:
@@ -230,7 +230,7 @@ def posture(
     return q, miss
 
 
-@njit(cache=True)
+@compiled
 def impedance(
     M: Array, J: Array, error: Array, rate_error: Array, stiffness: Array, fastest: float
 ) -> tuple[Array, Array]:

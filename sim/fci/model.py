@@ -37,7 +37,7 @@ def model_source(truth: Truth) -> str:
         _table("P0[N][3]", truth.p.ravel()),
         _table("THETA[N][10]", truth.theta.ravel()),
     )
-    body = (resources.files("sim.fci") / "model.c").read_text("utf-8")
+    body = (resources.files(__package__) / "model.c").read_text("utf-8")
     return "".join((_HEAD, f"#define FLANGE {FLANGE_M!r}\n", *tables, body, *_frames()))
 
 

@@ -1,5 +1,6 @@
 """Bad input gets one clear sentence that names the file, the place and the choices."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -170,6 +171,21 @@ def test_a_folder_cannot_be_written_to(tmp_path, capsys) -> None:
 def test_models_of_different_joints_are_not_compared(tmp_path, capsys) -> None:
     said = refused(capsys, "diff", "panda", with_gripper(tmp_path))
     assert "different trees" in said and "--lock JOINT=VALUE takes one away" in said
+
+
+def test_times_count_from_the_recordings_start(tmp_path, capsys) -> None:
+    """Not from the year 1970, from which robots and ROS count."""
+    began = 1_700_000_000_000_000_000
+    samples = [dataclasses.replace(s, stamp_ns=began + s.stamp_ns) for s in motion(2200)]
+    del samples[1000:1300]
+    samples[1700].q[3] = np.nan
+    path = record(tmp_path / "log.mcap", samples)
+    said = replayed(tmp_path, capsys, path)
+    assert "at 0.999 s: 0.301 s without a sample" in said
+    assert "at 2.000 s: a reading is not a finite number" in said
+    main(["info", str(path)])
+    said += capsys.readouterr().out
+    assert "17000000" not in said and "1.7e+09" not in said
 
 
 def test_degrees(tmp_path, capsys) -> None:

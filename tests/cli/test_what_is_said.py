@@ -51,10 +51,12 @@ def test_results_go_to_the_standard_output(
         arguments = [str(tmp_path / x) if x == "a.urdf" else str(x) for x in arguments]
         assert main(arguments) == 0
         said = capsys.readouterr()
-        assert said.out and not said.err
+        assert (
+            said.out and said.err.endswith(" ...\n") and said.err.count("\n") == 1
+        )  # what it does
     assert main(["info", "gone.json"]) == ExitCode.WRONG_USE
     said = capsys.readouterr()
-    assert said.err.startswith("error: ") and not said.out
+    assert said.err.startswith("error: ") and not said.out  # before anything is done
 
 
 def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:

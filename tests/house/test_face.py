@@ -64,7 +64,7 @@ def test_importing_the_package_loads_next_to_nothing() -> None:
         (["--help"], 0, "COMMAND"),
         (["--version"], 0, "."),
         (["run", "--help"], 0, "--allow-motion"),
-        (["nonsense"], 2, "invalid choice"),
+        (["nonsense"], 2, "no command"),
         (["run", "--nonsense"], 2, "--nonsense"),
         (["run", "--duration", "-1"], 2, "--duration"),
         (["run", "--driver", "pybullet:pnada"], 2, "panda"),

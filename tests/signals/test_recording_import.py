@@ -55,8 +55,8 @@ def refused(capsys, source, *options):
     assert main(["import", str(source), "--to", str(out), *options]) == ExitCode.WRONG_USE
     assert not list(source.parent.glob("none*"))
     said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    return said[0]
+    assert len(said) == 2 and said[0].startswith("reading ")
+    return said[1]
 
 
 @pytest.mark.parametrize("name", MAKERS)

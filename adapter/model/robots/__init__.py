@@ -12,16 +12,14 @@ from numpy.typing import ArrayLike
 from adapter.errors import ModelError
 from adapter.model.locking import restricted
 from adapter.model.model_file import load_model
+from adapter.model.robot_names import ROBOT_FILES
+from adapter.model.robot_names import robot_names as names
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import vector3
 from adapter.model.urdf import read_urdf
+from drivers.errors import choices
 
 _FOLDER = Path(__file__).parent
-
-
-def names() -> tuple[str, ...]:
-    """The robots that are known by name."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.urdf")))
 
 
 def documented(
@@ -50,10 +48,7 @@ def documented(
         return read_urdf(_FOLDER / f"{text}.urdf", joints, floating, gravity, lock)
     suffix = Path(text).suffix.lower()
     if suffix not in (".urdf", ".json"):
-        raise ModelError(
-            f"no robot '{text}'; have: {', '.join(names())}, a .urdf file, an MJCF file (.xml) or "
-            "a .json model file"
-        )
+        raise ModelError(f"no robot '{text}'; {choices(text, names(), ROBOT_FILES)}")
     if suffix == ".urdf":
         return read_urdf(text, joints, floating, gravity, lock)
     model = restricted(_sourced(load_model(text)).with_base(floating), joints, lock or {})

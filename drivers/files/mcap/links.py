@@ -51,9 +51,10 @@ class Carrier:
         own, first = np.unique(own_ns, return_index=True)
         near, close = _nearest(self._onto, own)
         if not close.any():
+            theirs, joints = (_span(stamps, self._onto[0]) for stamps in (own, self._onto))
             self._warnings.append(
-                f"{self._path}: {name}: its stamps ({_span(own)}) lie outside those of the joint "
-                f"samples ({_span(self._onto)}); do they share a clock? Left out"
+                f"{self._path}: {name}: its stamps ({theirs}) lie outside those of the joint "
+                f"samples ({joints}); do they share a clock? Left out"
             )
             return None
         missed = len(own) - int(close.sum())
@@ -85,8 +86,9 @@ def _rate(own_ns: NDArray[np.int64]) -> str:
     return f"{1e9 / float(np.median(np.diff(own_ns))):.0f} Hz"
 
 
-def _span(stamp_ns: NDArray[np.int64]) -> str:
-    return f"{1e-9 * stamp_ns[0]:.3f} to {1e-9 * stamp_ns[-1]:.3f} s"
+def _span(stamp_ns: NDArray[np.int64], start_ns: int) -> str:
+    first, last = 1e-9 * (stamp_ns[[0, -1]] - start_ns)
+    return f"{first:.3f} to {last:.3f} s"
 
 
 def _nearest(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import choices
 from drivers.files.bounded import parse_json
 from drivers.files.html_table import NOTHING, html_table
 from drivers.files.mcap.bags import open_scan
@@ -170,7 +171,7 @@ def _columns(values: Array, columns: list[int]) -> Array:
 def _places(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[int]:
     missing = [name for name in want if name not in have]
     if missing:
-        raise DriverError(f"{trouble} {', '.join(missing)}; have: {', '.join(have)}")
+        raise DriverError(f"{trouble} {', '.join(missing)}; {choices(missing[0], have)}")
     return [have.index(name) for name in want]
 
 
@@ -321,7 +322,7 @@ def _summary(topics: Mapping[str, Series]) -> dict[str, Topic]:
 def _nothing_found(scan: Scan, topics: Mapping[str, Series], topic: str) -> str:
     others = [name for name, s in topics.items() if s.schema in JOINT_SCHEMAS and name != topic]
     found = [f"{name} ({s.count} {s.schema or s.encoding})" for name, s in sorted(topics.items())]
-    hint = f"; other topics of joint states: {', '.join(others)}" if others else ""
+    hint = f"; of joint states {choices(topic, others)}" if others else ""
     cut = " up to the cut" if scan.truncated else ""
     return (
         f"{scan.path}: has no message on {topic}{cut}; found: {', '.join(found) or 'no topic'}"

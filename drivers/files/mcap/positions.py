@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.errors import choices
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.joints import assemble_joints, fits, stamps
 from drivers.files.mcap.series import Series, collect
@@ -40,8 +41,8 @@ class PositionLog:
         missing = [name for name in joint_names if name not in self.joint_names]
         if missing:
             raise DriverError(
-                f"{self.path}: has no joint {', '.join(missing)}; have: "
-                f"{', '.join(self.joint_names)}"
+                f"{self.path}: has no joint {', '.join(missing)}; "
+                f"{choices(missing[0], self.joint_names)}"
             )
         at = [self.joint_names.index(name) for name in joint_names]
         q, q_command = self.q[:, at], self.q_command[:, at]

@@ -1,0 +1,145 @@
+"""Every command, given what cannot be: one sentence, exit code 2, and no traceback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from adapter.cli.exit_codes import ExitCode
+from adapter.cli.main import COMMANDS, build_parser, main
+from drivers.errors import choices
+
+FILES = {  # the words after a command, FILE being what cannot be used
+    "run": ["--driver", "log:FILE", "--duration", "1"],
+    "plan": ["--robot", "FILE"],
+    "excite": ["FILE"],
+    "replay": ["FILE"],
+    "gap": ["FILE", "--model", "panda"],
+    "fleet": ["--model", "FILE"],
+    "load": ["FILE"],
+    "diff": ["FILE"],
+    "discover": ["FILE"],
+    "import": ["FILE", "--to", "new.mcap"],
+    "export": ["FILE", "--urdf", "new.urdf"],
+    "report": ["FILE"],
+    "recover": ["FILE"],
+    "info": ["FILE"],
+}
+WITHOUT = {"sim", "experiment", "bench", "completion"}  # take no file as such
+EMPTY = ("empty.mcap", "empty.json", "empty.urdf", "empty.csv")
+USELESS = ("gone.mcap", "folder", "noise.mcap", *EMPTY)
+NOISE = bytes(range(256)) * 8
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    """What the command says against it, in one line."""
+    try:
+        code = main(words)
+    except SystemExit as end:
+        code = int(end.code or 0)
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if not line.endswith(" ...")]
+    assert code == ExitCode.WRONG_USE, f"{code}: {said.err}"
+    assert len(lines) == 1 and lines[0].startswith("error: "), said.err
+    assert "Errno" not in lines[0] and "object at 0x" not in lines[0]
+    return lines[0]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of useless files, which is where the user is."""
+    for name in USELESS[2:]:
+        (tmp_path / name).write_bytes(NOISE if name.startswith("noise") else b"")
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_useless_file_is_refused_by_its_name(command: str, here: Path, capsys) -> None:
+    assert set(COMMANDS) == {*FILES, *WITHOUT}
+    for name in USELESS if command in FILES else ():
+        said = refused(capsys, command, *(w.replace("FILE", name) for w in FILES[command]))
+        assert name in said, said
+    assert not list(here.glob("new.*"))
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, capsys) -> None:
+    words = [word.replace("FILE", "gone") for word in FILES.get(command, [])]
+    words = {"sim": ["fci"], "experiment": ["panda"], "completion": ["bash"]}.get(command, words)
+    assert "has no option '--nonsense'" in refused(capsys, command, *words, "--nonsense")
+    options = [o for a in _parser(command)._actions for o in a.option_strings if len(o) > 6]
+    for option in (o for o in options if o != "--help"):
+        wrong = option[:-2] + option[-1] + option[-2]
+        if wrong not in options and wrong != option:
+            assert "did you mean --" in refused(capsys, command, *words, f"{wrong}=1")
+
+
+def _parser(command: str):
+    (found,) = (a for a in build_parser()._actions if a.dest == "command")
+    return found.choices[command]
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "missing: COMMAND"),
+        ("replya x", "did you mean replay? have: run, plan"),
+        ("run --duration soon", "--duration: takes a number, got 'soon'"),
+        ("run --seed 1.5", "--seed: takes a whole number, got '1.5'"),
+        ("run --duration", "--duration"),
+        ("run --mode moment", "did you mean moments? have: moments, sample"),
+        ("run --robot pnada", "did you mean panda? have: fr3, panda"),
+        ("run --robot arm.urdf.xacro", "xacro arm.urdf.xacro > arm.urdf"),
+        ("run --effects coulom_friction", "did you mean coulomb_friction?"),
+        ("run --scenario freiction", "did you mean friction?"),
+        ("run --set lniks=true", "did you mean links?"),
+        ("run --driver pybulet:panda", "did you mean pybullet?"),
+        ("run --fault lsot=0.1", "did you mean lost?"),
+        ("run --move panda_jonit1 --duration 1", "did you mean panda_joint1?"),
+        ("replay LOG --joints panda_jiont1", "did you mean panda_joint1?"),
+        ("replay LOG --topic /joint_sates", "did you mean /joint_states?"),
+        ("sim can --motors opnarm", "have: "),
+        ("completion bsh", "did you mean bash?"),
+    ],
+)
+def test_what_is_misspelt_is_guessed(line: str, said: str, here: Path, capsys) -> None:
+    log = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
+    assert said in refused(capsys, *(str(log) if w == "LOG" else w for w in line.split()))
+
+
+def test_nothing_alike_is_not_guessed() -> None:
+    assert choices("zebra", ["panda", "fr3"]) == "have: panda, fr3"
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("adapter rep", {"replay", "report"}),
+        ("adapter run --robot pa", {"panda"}),
+        ("adapter run --scenario pay", {"payload_at_20s"}),
+        ("adapter gap --effec", set()),
+        ("adapter completion ", {"bash", "zsh", "fish"}),
+        ("adapter run --effects coul", {"coulomb_friction"}),
+    ],
+)
+def test_shells_are_offered_what_there_is(line: str, offered: set[str], tmp_path: Path) -> None:
+    """As the code of `adapter completion bash` asks."""
+    answer = tmp_path / "answer"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "_ARGCOMPLETE_SUPPRESS_SPACE": "1"}
+    asked |= {"COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+    asked |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(answer)}
+    code = "import sys; sys.argv = ['adapter']; from adapter.cli import main; main()"
+    where = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, **where, **asked},
+        cwd=tmp_path,
+        timeout=100,
+    )
+    assert {word.strip() for word in answer.read_text().splitlines()} == offered
