@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from adapter.realtime.jobs import View
+from adapter.realtime.showing import View
 from adapter.runs.terminal import console
 
 

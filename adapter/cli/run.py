@@ -34,9 +34,10 @@ from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.realtime.following import FollowingObserver
-from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
+from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
+from adapter.realtime.showing import DisplayJob
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines, contacts_of

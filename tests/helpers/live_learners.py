@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.realtime.jobs import LearnerJob, View
+from adapter.realtime.jobs import LearnerJob
+from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot, nothing_known
 from adapter.signals.records import stamp_of
 
