@@ -14,7 +14,7 @@ from adapter.realtime.ring import read_before, set_after
 from adapter.realtime.shared import SharedBlock
 from adapter.realtime.timing import BINS, COUNTED, Histogram
 
-MISSED, MISSED_OWN, LINES_LENGTH, END_LENGTH = range(4)  # words of the header
+MISSED, MISSED_OWN, LINES_LENGTH, END_LENGTH, BEGAN = range(5)  # words of the header
 HEADER_WORDS, LINES_BYTES, END_BYTES, LINE_BYTES = 16, 16384, 2048, 1000
 START = 8 * HEADER_WORDS
 BLOCK_BYTES = START + LINES_BYTES + END_BYTES + 8 * len(COUNTED) * BINS
@@ -78,6 +78,15 @@ class LoopBoard:
         """Loop: deadlines missed so far, and those of them by our own work."""
         set_after(self._header, MISSED, missed)
         set_after(self._header, MISSED_OWN, own)
+
+    def write_begin(self, stamp_ns: int) -> None:
+        """Loop: stamp of the first that was passed on, on the arm's clock."""
+        set_after(self._header, BEGAN, stamp_ns)
+
+    @property
+    def began_ns(self) -> int:
+        """Anybody: that stamp; 0 before."""
+        return int(self._header[BEGAN])
 
     def write_line(self, line: str) -> bool:
         """Loop: a line for people; false where there is no room left for it."""

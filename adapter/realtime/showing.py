@@ -39,6 +39,7 @@ class View:
         news: what the learner found, see `SnapshotReader.read_news`.
         timing: of the loop, at most `TIMING_S` old; None where it does not say.
         lines: all that was said to people in the loop so far.
+        began_ns: stamp of the first of `samples`, on the arm's clock; 0 where it is not known.
         ended: why the loop came to its end and what was wrong; None before.
     """
 
@@ -52,6 +53,7 @@ class View:
     news: dict[str, Any] = field(default_factory=dict)
     timing: LoopTiming | None = None
     lines: list[str] = field(default_factory=list)
+    began_ns: int = 0
     ended: tuple[str, str] | None = None
 
 
@@ -147,6 +149,7 @@ class Looker:
             self._news,
             self._timing,
             [] if board is None else board.lines(),
+            0 if board is None else board.began_ns,
             None if board is None else board.end(),
         )
 

@@ -422,9 +422,10 @@ class SnapshotReader(Board):
     def read_news(self, timeout_s: float = READ_TIMEOUT_S) -> dict[str, Any]:
         """What the learner found so far; empty before it said anything. Raises as `read`.
 
-        "findings": as `adapter.gap.monitor.Monitor.reports`, each with its "line" for people;
-        "load": what was picked up ("m", "m_std" in kg, "since_s"), or None; "theta_started":
-        whether θ is being learned already.
+        "findings": as `adapter.gap.monitor.Monitor.reports`; "load": what was picked up ("m",
+        "m_std" in kg, "since_s" on the arm's clock), or None; "changes_s": at the hand, on the
+        same clock; "theta_started": whether θ is being learned already; "notes": what is wrong
+        with sensors; "refused": states that were none.
         """
         slots = self._taken(self._news, timeout_s)
         length = int(slots.words[LENGTH])

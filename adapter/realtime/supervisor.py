@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adapter.model.spatial import Array
 from adapter.realtime.jobs import Jobs, LearnerJob, LearnerTask, RecorderTask, RecordingJob
 from adapter.realtime.loop_board import LoopBoard
@@ -222,6 +224,8 @@ class Supervisor:
         """Hand a filtered state to the learner; never waits."""
         if self.learner is None or self.states is None:
             return
+        if not self.passed_on and self.loop_board is not None:
+            self.loop_board.write_begin(int(record[:1].view(np.int64)[0]))
         if self.learner.held and self.states.push(record):
             self.passed_on += 1
         else:

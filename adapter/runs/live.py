@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from adapter.gap.monitor import Monitor
-from adapter.gap.monitor_judge import sentence
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -152,7 +151,7 @@ class Publisher:
 def news_of(learner: OnlineLearner) -> dict[str, Any]:
     """What was found so far, for whoever looks at the run; see `SnapshotReader.read_news`."""
     reports = [] if learner.watch is None else learner.watch.reports
-    findings = [{**told, "line": sentence(told)} for told in reports[-MOST_FINDINGS:]]
+    findings = list(reports[-MOST_FINDINGS:])
     stamps = [change.stamp_ns for change in learner.changes]
     changes = changes_at(stamps, learner.theta.payload)[-MOST_FINDINGS:]
     load = changes[-1].get("payload") if changes else None
