@@ -25,7 +25,7 @@ from adapter.runs.terminal import json_ready
 from adapter.view.history import Recent, Whole
 from adapter.view.now import KnownRun, Now, Onlooker, Skeleton, skeleton
 
-DIGITS = 4  # significant, of every number
+DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
 ESTIMATE_S = 0.5
 THETA = (
     *(("m", "kg"), ("mX", "kg m"), ("mY", "kg m"), ("mZ", "kg m")),
@@ -40,11 +40,11 @@ TIMED = ("loop_us", "lateness_us")
 Message = dict[str, Any]
 
 
-def numbers(values: Array | float) -> Any:
-    """As lists of plain numbers with `DIGITS` digits; what is not finite becomes None."""
+def numbers(values: Array | float, digits: int = DIGITS) -> Any:
+    """As lists of plain numbers with so many digits; what is not finite becomes None."""
     x = np.atleast_1d(np.asarray(values, dtype=np.float64))
     with np.errstate(divide="ignore", invalid="ignore"):
-        size = 10.0 ** (DIGITS - 1 - np.floor(np.log10(np.abs(x))))
+        size = 10.0 ** (digits - 1 - np.floor(np.log10(np.abs(x))))
         rounded = np.where(x == 0.0, 0.0, np.round(x * size) / size)
     found = json_ready(np.where(np.isfinite(x), rounded, np.nan))
     return found if np.ndim(values) else found[0]
@@ -159,13 +159,13 @@ class Messages:
         unknown = np.full_like(snapshot.theta, np.nan)
         return {
             "t": round(now.t_s, 2),
-            "off": numbers(1e3 * frames.off),
-            "off_std": numbers(1e3 * frames.off_std),
+            "off": numbers(1e3 * frames.off, FINE_DIGITS),
+            "off_std": numbers(1e3 * frames.off_std, FINE_DIGITS),
             "hidden": frames.hidden.tolist(),
-            "theta": numbers(snapshot.theta if known else unknown),
-            "theta_std": numbers(snapshot.theta_std if known else unknown),
-            "effects": numbers(snapshot.effects),
-            "effects_std": numbers(snapshot.effects_std),
+            "theta": numbers(snapshot.theta if known else unknown, FINE_DIGITS),
+            "theta_std": numbers(snapshot.theta_std if known else unknown, FINE_DIGITS),
+            "effects": numbers(snapshot.effects, FINE_DIGITS),
+            "effects_std": numbers(snapshot.effects_std, FINE_DIGITS),
         }
 
     def _news(self, now: Now) -> Message:

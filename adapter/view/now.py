@@ -72,7 +72,7 @@ class Now:
 
     Attributes:
         view: what was seen.
-        t_s: since the run's first sample, on the arm's clock.
+        stamp_ns: of the newest that is shown, on the arm's clock; t_s: since the run's first one.
         q, dq, tau: (n,) of the newest filtered state; NaN before the first.
         residual: (n,) N m, measured torque less that of the estimate; NaN before θ is learned.
         rms: (n,) N m of it over the last second; noise: (n,) what the estimate leaves unexplained
@@ -87,6 +87,7 @@ class Now:
     """
 
     view: View
+    stamp_ns: int
     t_s: float
     q: Array
     dq: Array
@@ -189,9 +190,11 @@ class Onlooker:
         lam, theta = states_of(view, learning)
         findings = [self._on_run_clock(found, view) for found in news.get("findings", [])]
         load = news.get("load")
-        now = Now(
+        stamp_ns = max(self._stamp_ns, 0 if view.push is None else view.push.stamp_ns)
+        return Now(
             view,
-            self._t_s(view),
+            stamp_ns,
+            1e-9 * (stamp_ns - view.began_ns) if stamp_ns and view.began_ns else 0.0,
             *self._last,
             residual,
             rms,
@@ -205,12 +208,6 @@ class Onlooker:
             headline(view, (lam, theta), self.known.documented.tree),
             self._lately(view),
         )
-        return now
-
-    def _t_s(self, view: View) -> float:
-        stamps = [self._stamp_ns] + ([] if view.push is None else [view.push.stamp_ns])
-        newest = max(stamps)
-        return 1e-9 * (newest - view.began_ns) if newest and view.began_ns else 0.0
 
     def _on_run_clock(self, told: dict[str, Any], view: View) -> dict[str, Any]:
         times = ("since_s", "reported_s", "over_s")

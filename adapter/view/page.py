@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from adapter.realtime.showing import View
 from adapter.report.html import fill
+from adapter.view.foxglove_view import FoxgloveView
 from adapter.view.messages import Messages, encode
 from adapter.view.now import KnownRun, Now, Onlooker
 from adapter.view.server import ViewServer
@@ -70,6 +71,8 @@ def make_view(
     onlooker, shows = Onlooker(known), list[Show]()
     if listening is not None:
         shows.append(LivePage(onlooker, listening))
+    if foxglove_port is not None:
+        shows.append(FoxgloveView(known, foxglove_port))
 
     def show(view: View) -> None:
         now = onlooker.look(view)

@@ -26,6 +26,7 @@ LOOSE = {"__init__.py", "__main__.py", "errors.py", "py.typed"}
 HEAVY = {
     *("torch", "numba", "pybullet", "matplotlib", "scipy", "filterpy", "clarabel", "sklearn"),
     *("pinocchio", "coal", "mujoco", "can", "differentiable_robot_model", "figaroh"),
+    "foxglove",
 }
 FACES = {
     "adapter",

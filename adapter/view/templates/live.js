@@ -1,6 +1,6 @@
 "use strict";
 (() => {
-  const WINDOW_S = 20, GAP_S = 0.6, STALE_S = 3, FAST = 400, SLOW = 300;
+  const WINDOW_S = 20, SCALE_S = 5, GAP_S = 0.6, STALE_S = 3, FAST = 400, SLOW = 300;
   const by = (id) => document.getElementById(id);
   const make = (tag, text, kind) => {
     const node = document.createElement(tag);
@@ -28,6 +28,15 @@
   };
   const signed = (x, digits) => (x > 0 ? "+" : "") + number(x, digits);
   const count = (x) => String(x).replace(/\B(?=(\d{3})+$)/g, "\u202f");
+
+  // Names without what all of them begin with: panda_joint1, panda_joint2 -> joint1, joint2.
+  const shortened = (names) => {
+    if (names.length < 2) return names;
+    let k = 0;
+    while (k < names[0].length && names.every((n) => n[k] === names[0][k])) k++;
+    const cut = Math.max(names[0].lastIndexOf("_", k - 1), names[0].lastIndexOf("/", k - 1)) + 1;
+    return names.map((n) => n.slice(cut));
+  };
 
   let hello = null, frame = null, news = null, timing = null, chosen = -1;
   let frames = [], estimates = [], heard = 0, connected = false;
@@ -114,9 +123,10 @@
         `Residual of ${panel.name}: rms ${number(rms, 2)} N m, noise ${number(noise, 2)} N m, ${frame.words[j]}`);
       const [g, w, h] = surface(panel.canvas);
       const seen = frames.filter((f) => f.t >= start && some(f.residual[j]));
-      const sizes = seen.map((f) => Math.abs(f.residual[j])).sort((a, b) => a - b);
-      const reach = rounder(Math.max(1.15 * (sizes[sizes.length - 1] || 0), 3.2 * (noise || 0)) || 1);
-      const x = (t) => w * (t - start) / WINDOW_S, y = (v) => h / 2 - (h / 2 - 2) * v / reach;
+      const recent = seen.filter((f) => f.t >= end - SCALE_S).map((f) => Math.abs(f.residual[j]));
+      const reach = rounder(Math.max(1.1 * Math.max(0, ...recent), 3.2 * (noise || 0)) || 1);
+      const x = (t) => w * (t - start) / WINDOW_S;
+      const y = (v) => h / 2 - (h / 2 - 2) * Math.max(-1, Math.min(1, v / reach));
       const bands = seen.filter((f) => some(f.noise[j])).map((f) => [f.t, -2 * f.noise[j], 2 * f.noise[j]]);
       g.fillStyle = colors.wash;
       if (bands.length > 1) band(g, bands, x, y);
@@ -151,8 +161,8 @@
       return;
     }
     const reach = hello.reach_m, flat = projected();
-    const scale = Math.min(h / (1.28 * reach), w / (1.9 * reach));
-    const at = (p) => { const [a, b] = flat(p); return [w / 2 + scale * a, 0.84 * h - scale * b]; };
+    const scale = Math.min(h / (1.06 * reach), w / (1.5 * reach));
+    const at = (p) => { const [a, b] = flat(p); return [w / 2 + scale * a, 0.86 * h - scale * b]; };
     const stroke = (points) => {
       g.beginPath();
       points.forEach((p, k) => { const [a, b] = at(p); if (k) g.lineTo(a, b); else g.moveTo(a, b); });
@@ -351,7 +361,8 @@
     document.title = `${hello.robot}: ${frame.headline}`;
     const last = estimates[estimates.length - 1];
     const open = (part) => last.off.flatMap((row, j) => row.slice(...part).map((v, k) => last.hidden[j][k + part[0]] ? 0 : Math.abs(v)));
-    const far = last ? `${number(most(open([0, 3])), 2)} mrad, ${number(most(open([3, 6])), 2)} mm at most from the documentation` : "";
+    const within = (x) => (x < 0.001 ? "0.001" : number(x, 2));
+    const far = last ? `within ${within(most(open([0, 3])))} mrad and ${within(most(open([3, 6])))} mm of the documentation` : "";
     tile("tile-lam", frame.lam, far, frame.lam === "converged" ? "good" : "");
     const ratio = most(frame.rms.map((v, j) => v / frame.noise[j]));
     tile("tile-theta", frame.theta === "waiting" ? "waits for λ" : frame.theta,
@@ -439,6 +450,8 @@
   const begin = (message) => {
     const same = hello && hello.key === message.key;
     hello = message;
+    hello.joints = shortened(hello.joints);
+    hello.links = shortened(hello.links);
     if (same) return;
     frame = news = timing = null;
     frames = [];
