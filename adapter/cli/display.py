@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -70,48 +72,47 @@ class LiveTable:
             self._console.print(line, soft_wrap=True)
 
 
-def table_of(now: Now, known: KnownRun) -> Table:
+def table_of(now: Now, known: KnownRun) -> Group:
     """The run as a table: a row for each joint, what concerns all of them around it."""
-    table = Table(
-        title=Text(now.headline, style="bold"),
-        caption=_caption(now, known),
-        title_justify="left",
-        caption_justify="left",
-        caption_style="",
-        padding=(0, 1),
-    )
-    table.add_column("joint")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    table.add_column("joint", no_wrap=True)
     for name in ("torque", "unexplained", "noise"):
-        table.add_column(f"{name}\nN m", justify="right")
-    table.add_column("state")
+        table.add_column(f"{name}, N m", justify="right", no_wrap=True)
+    table.add_column("state", no_wrap=True)
     names = known.documented.tree.joint_names
     rows = zip(names, now.tau, now.rms, now.noise, now.joint_states, strict=True)
     for name, tau, rms, noise, state in rows:
         loud = math.isfinite(rms) and rms > ABOVE_NOISE * noise
         style = LOUD if loud else GOOD if state == "as expected" else DIM
         table.add_row(name, _number(tau, 2), _number(rms, 3), _number(noise, 3), Text(state, style))
-    return table
+    head = Text(now.headline, "bold", no_wrap=True, overflow="ellipsis")
+    return Group(head, table, _learning(now), _progress(now, known))
 
 
-def _caption(now: Now, known: KnownRun) -> Text:
-    """λ, θ, load; time, timing: two lines."""
-    text = Text()
+def _learning(now: Now) -> Text:
+    """λ, θ, load, contact."""
+    text = Text(no_wrap=True, overflow="ellipsis")
     for name, state in (("λ", now.lam_state), ("θ", now.theta_state)):
         text.append(f"{name} ").append(state, GOOD if state == CONVERGED else LOUD).append(" · ")
     load = now.load
-    text.append(
-        "load " + ("none noticed" if load is None else f"{load['m']:.3f} ± {load['m_std']:.3f} kg")
-    )
+    carried = "none noticed" if load is None else f"{load['m']:.3f} ± {load['m_std']:.3f} kg"
+    text.append(f"load {carried} · contact ")
+    contact = "none" if now.contact is None else f"joint {now.contact + 1}"
+    return text.append(contact, "" if now.contact is None else LOUD)
+
+
+def _progress(now: Now, known: KnownRun) -> Text:
+    """Time, samples, timing."""
     end = "" if known.duration_s is None else f" of {known.duration_s:g}"
-    text.append(f"\n{now.t_s:.1f}{end} s · ")
+    text = Text(f"{now.t_s:.1f}{end} s", no_wrap=True, overflow="ellipsis")
     if now.view.snapshot is not None:
-        text.append(f"{now.view.snapshot.learned} learned, {now.view.waiting} wait · ")
+        text.append(f" · {now.view.snapshot.learned} learned, {now.view.waiting} wait")
     if now.lately is not None and now.view.timing is not None:
         p99 = now.lately.of("loop_us").percentile_us(99.0)
         missed = now.view.timing.missed
-        text.append(f"tick p99 {_number(p99, 0)} µs, ").append(
-            f"{missed} deadline{'' if missed == 1 else 's'} missed", LOUD if missed else ""
-        )
+        text.append(f" · tick p99 {_number(p99, 0)} µs, ")
+        said = f"{missed} deadline{'' if missed == 1 else 's'} missed"
+        text.append(said, LOUD if now.lately.missed else "")
     return text
 
 

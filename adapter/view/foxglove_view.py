@@ -171,10 +171,8 @@ class FoxgloveView:
 
         arm = known.documented
         self._arm, self._messages = arm, Messages(arm.tree.joint_names)
-        context = foxglove.Context()
-        self._channels = {
-            topic: self._channel(topic, name, context) for topic, name in TOPICS.items()
-        }
+        self._context = context = foxglove.Context()  # channels end with it
+        self._channels = {topic: self._channel(topic, context) for topic in TOPICS}
         try:
             self._server = foxglove.start_server(
                 name=f"panda-adapter, {arm.name}",

@@ -27,6 +27,7 @@ RMS_S, LATELY_S = 1.0, 5.0  # of residuals; of timing
 FRAMES_EVERY = 300  # states; they take milliseconds
 ABOVE_NOISE = 2.0  # times the noise, beyond which a residual is said to be more
 SHOWN_ALONE = 0.99  # of a parameter's direction, that lies in what torques show
+BEHIND = 1000  # samples that wait for the learner, beyond which it is said
 WAITING, LEARNING, CONVERGED = "waiting", "learning", "converged"
 
 
@@ -204,7 +205,7 @@ class Onlooker:
             theta,
             None if load is None else self._on_run_clock(load, view),
             findings,
-            joint_words(view, findings, rms, noise),
+            joint_words(view, findings, (rms, noise), theta),
             headline(view, (lam, theta), self.known.documented.tree),
             self._lately(view),
         )
@@ -263,10 +264,17 @@ def states_of(view: View, learning: bool) -> tuple[str, str]:
     return lam, CONVERGED if snapshot.theta_converged else LEARNING
 
 
-def joint_words(view: View, findings: list[dict[str, Any]], rms: Array, noise: Array) -> list[str]:
-    """A word or two on each joint: what is wrong there, or that nothing is."""
+def joint_words(
+    view: View, findings: list[dict[str, Any]], sizes: tuple[Array, Array], theta: str
+) -> list[str]:
+    """A word or two on each joint: what is wrong there, or that nothing is.
+
+    Args:
+        sizes: (n,) rms of the residual, and what is usual of it, N m; theta: its state.
+    """
+    learning = "learning, " if theta == LEARNING else ""
     words = []
-    for j, (size, usual) in enumerate(zip(rms, noise, strict=True)):
+    for j, (size, usual) in enumerate(zip(*sizes, strict=True)):
         active = [f["what"] for f in findings if f["over_s"] is None and j + 1 in f["joints"]]
         if view.push is not None and view.push.contact_joint == j:
             words.append("contact")
@@ -275,7 +283,7 @@ def joint_words(view: View, findings: list[dict[str, Any]], rms: Array, noise: A
         elif not (math.isfinite(size) and math.isfinite(usual) and usual > 0.0):
             words.append("not learned yet")
         elif size > ABOVE_NOISE * usual:
-            words.append(f"{size / usual:.2g} times the noise")
+            words.append(f"{learning}{size / usual:.2g} times the noise")
         else:
             words.append("as expected")
     return words
@@ -300,7 +308,12 @@ def headline(view: View, states: tuple[str, str], tree: Tree) -> str:
         return "Ended"
     if view.push is not None and view.push.contact_joint is not None:
         return f"Contact: something pushes {tree.joint_names[view.push.contact_joint]}"
-    lam, theta = states
+    late = f"; the learner is {view.waiting} samples behind" if view.waiting > BEHIND else ""
+    return progress(*states) + late
+
+
+def progress(lam: str, theta: str) -> str:
+    """How far learning is, in a sentence."""
     if lam == WAITING:
         return "Waiting for the first motion"
     if lam == LEARNING:
