@@ -88,8 +88,8 @@ def screenshot(
 class Tab:
     """A page that is open in headless Chromium, driven over the DevTools protocol."""
 
-    def __init__(self, socket: Any) -> None:
-        self._socket, self._number = socket, 0
+    def __init__(self, socket: Any, pid: int) -> None:
+        self._socket, self._number, self.pid = socket, 0, pid
         self.console: list[str] = []
         for domain in ("Runtime", "Page", "Log"):
             self.call(f"{domain}.enable")
@@ -171,4 +171,4 @@ def _opened(browser: subprocess.Popen[str]) -> Iterator[Tab]:
     host = whole.split("/")[2]
     place = f"ws://{host}/devtools/page/{page['targetId']}"
     with connect(place, compression=None, max_size=None) as socket:
-        yield Tab(socket)
+        yield Tab(socket, browser.pid)
