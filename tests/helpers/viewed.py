@@ -33,13 +33,13 @@ class Seen:
         known: the run.
         views: in order; the last one is done.
         states: all filtered states, (m, size).
-        predicted: (m, n) N m by the learner itself for those of the last view's records.
+        residuals: (n,) N m of the newest state of each look, by the learner itself.
     """
 
     known: KnownRun
     views: list[View]
     states: np.ndarray
-    predicted: np.ndarray
+    residuals: list[np.ndarray]
 
 
 def settings() -> PipelineSettings:
@@ -58,7 +58,7 @@ def seen_run(seconds: float) -> Seen:
     board, loop = SnapshotWriter.create(names, FRICTION, name=None), LoopBoard.create()
     reader, observer = SnapshotReader(board.name), ContactObserver(PANDA, FRICTION)
     looker, timing, views = Looker(ring, reader, loop), Timing(loop.bins), list[View]()
-    states: list[np.ndarray] = []
+    states, residuals = list[np.ndarray](), list[np.ndarray]()
 
     class Published:
         """A learner whose estimate is published, and looked at."""
@@ -75,6 +75,8 @@ def seen_run(seconds: float) -> Seen:
                 board.publish(publish(learner))
                 board.publish_news(news_of(learner))
                 views.append(looker.look(False))
+                tau = state[front_end.layout.joint_tau]
+                residuals.append(tau - learner.predict(state[None])[0])
 
     def watch(sample, command) -> None:
         torque = observer.step(sample)
@@ -83,8 +85,6 @@ def seen_run(seconds: float) -> Seen:
         board.publish_external(push)
 
     run_lockstep(simulated_arm(), front_end, Published(), controller, seconds, each=watch)
-    last = np.array(states[-len(views[-1].records) :])
-    predicted = learner.predict(last)
     loop.write_end("duration", None)
     ring.finish()
     views.append(replace(looker.look(True), elapsed_s=views[-1].elapsed_s + 1.0))
@@ -92,7 +92,7 @@ def seen_run(seconds: float) -> Seen:
         part.close()
     for made in (board, loop, ring):
         made.unlink()
-    return Seen(known, views, np.array(states), predicted)
+    return Seen(known, views, np.array(states), residuals)
 
 
 def again(views: list[View]) -> Iterator[View]:

@@ -485,24 +485,30 @@
     timing: (m) => { timing = m; },
   };
   const rates = { arm: 33, words: 200, residuals: 200, estimate: 1000 };
-  const drawn = {};
-  const due = (what, now) => {
-    if (now - (drawn[what] || 0) < rates[what]) return false;
-    drawn[what] = now;
-    return true;
+  const draws = {
+    arm: drawArm,
+    words: () => { drawWords(); drawTiming(); drawBadge(); },
+    residuals: drawResiduals,
+    estimate: drawEstimate,
   };
-  let asked = false;
+  const drawn = {};
+  let asked = false, later = 0;
+  // Each picture at its own rate; one that is not due yet is drawn later, also if nothing more comes.
+  const draw = (now) => {
+    asked = false;
+    if (!hello) return;
+    let left = false;
+    for (const [what, rate] of Object.entries(rates)) {
+      if (now - (drawn[what] ?? -Infinity) < rate) { left = true; continue; }
+      drawn[what] = now;
+      draws[what]();
+    }
+    if (left && !later) later = setTimeout(() => { later = 0; ask(); }, 250);
+  };
   const ask = () => {
     if (asked || document.hidden) return;
     asked = true;
-    requestAnimationFrame((now) => {
-      asked = false;
-      if (!hello) return;
-      if (due("arm", now)) drawArm();
-      if (due("residuals", now)) drawResiduals();
-      if (due("words", now)) { drawWords(); drawTiming(); drawBadge(); }
-      if (due("estimate", now)) drawEstimate();
-    });
+    requestAnimationFrame(draw);
   };
 
   let wait = 500;
