@@ -19,6 +19,7 @@ from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
+from adapter.cli.watching import known_run, view_job
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.designed import Designer
 from adapter.control.excitation import RandomMotion
@@ -35,16 +36,25 @@ from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.realtime.following import FollowingObserver
-from adapter.realtime.jobs import DisplayJob, Jobs, RecordingJob
+from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
+from adapter.realtime.showing import DisplayJob
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines, contacts_of
 from adapter.runs.live import describe_estimate, learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
-from adapter.runs.terminal import complain, program_version, results_folder, say, show, warn
+from adapter.runs.terminal import (
+    complain,
+    console,
+    program_version,
+    results_folder,
+    say,
+    show,
+    warn,
+)
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.matching import counted, present
 from drivers.faults.driver import FaultyDriver, with_faults
@@ -241,7 +251,12 @@ def _go(
     controller = controller_of(args, plan, driver)
     duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
-    display = None if args.quiet else DisplayJob(partial(make_display, duration_s))
+    effects = config.pipeline.learner.effects
+    known = known_run(args, robot, effects, duration_s)
+    # without a terminal (a pipe, CI) there is no table, and who has something to say says it
+    display = None
+    if console.is_terminal and not args.quiet:
+        display = DisplayJob(partial(make_display, known), says=True)
 
     later: list[Callable[[], Path] | None] = []
 
@@ -252,13 +267,12 @@ def _go(
         elif maybe_real:
             later.append(agree(args, driver, controller, duration_s, folder, stopped))
 
-    learner = learner_job(
-        robot, config.pipeline, args.checkpoint, args.resume, aloud=not args.quiet
-    )
+    aloud = display is None and not args.quiet
+    learner = learner_job(robot, config.pipeline, args.checkpoint, args.resume, aloud)
     deadman = maybe_real and controller is not None
     safety, watching = config.safety, None
     if safety.watch_contacts or safety.stop_at_contact:
-        observer = ContactObserver(robot, config.pipeline.learner.effects)
+        observer = ContactObserver(robot, effects)
         names = robot.tree.joint_names
         watching = FollowingObserver(observer, safety.stop_at_contact, names)
         if controller is not None:
@@ -267,7 +281,7 @@ def _go(
         driver,
         front_end,
         controller,
-        Jobs(learner, recording, display),
+        Jobs(learner, recording, display, view_job(args, known)),
         LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
         say=say,
     )

@@ -15,6 +15,8 @@ from drivers.registry import NAMELESS, SCHEMES, split_address
 
 FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
+ANY = -1  # the usual port, or any other where that is taken
+DEFAULT_PORT, MOST_PORT = 8765, 65535  # of Foxglove; of all
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +73,24 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="model that helps the controller (default none; for a designed motion documented); "
         "its worth is told as tracking error",
     )
+    add(
+        "--view",
+        nargs="?",
+        type=_port,
+        const=ANY,
+        metavar="PORT",
+        help="serve a page to watch the run on, on this machine alone (default port 8400, or "
+        "another where that is taken; 0: any)",
+    )
+    add(
+        "--foxglove",
+        nargs="?",
+        type=_port,
+        const=DEFAULT_PORT,
+        metavar="PORT",
+        help="serve Foxglove's WebSocket protocol, which PlotJuggler takes too, on this machine "
+        "alone (default port 8765; needs panda-adapter[live])",
+    )
     add("--record", type=Path, metavar="FILE", help="default: in the results")
     add("--no-record", action="store_true", help="keep no recording")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
@@ -86,6 +106,14 @@ def declare_plan(parser: argparse.ArgumentParser) -> None:
         "and as a page; nothing moves."
     )
     parser.set_defaults(allow_motion=True)
+
+
+def _port(text: str) -> int:
+    """A port's number. Raises ValueError."""
+    port = int(text)
+    if not 0 <= port <= MOST_PORT:
+        raise argparse.ArgumentTypeError(f"a port is 0 to {MOST_PORT}, got {port}")
+    return port
 
 
 def _check(args: argparse.Namespace) -> None:

@@ -1,7 +1,7 @@
 """What the workers are asked to do, and what their processes run until their ring is drained.
 
-A `...Job` says what to learn, record or show; all of it is picklable. A `...Task` runs in the
-worker's process.
+A `...Job` says what to learn or record (or show: `showing`); all of it is picklable. A `...Task`
+runs in the worker's process.
 
 A learner that dies is succeeded by one that takes its last kept state and, from the ring, all
 that came after it. The name of a kept state is the number of records behind it, and a record is
@@ -25,6 +25,7 @@ from adapter.model.spatial import Array
 from adapter.realtime.raw_layout import RawLayout
 from adapter.realtime.ring import Ring
 from adapter.realtime.shared import leave
+from adapter.realtime.showing import DisplayJob
 from adapter.realtime.snapshot import Snapshot, SnapshotReader, SnapshotWriter
 from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter
@@ -48,23 +49,26 @@ class LearnerJob:
         make: builds the learner there (and imports torch there).
         collect: what comes back at the end, picklable.
         publish: the estimate as it stands; None publishes nothing.
+        news: what was found so far, for `SnapshotWriter.publish_news`; None says nothing.
         save: writes a checkpoint; None writes none.
         keep: writes the whole state into an empty folder (learner, folder), for a successor if
             this process dies; restore: puts a fresh learner into it. Where None, nobody succeeds.
         effect_names: effects in the published estimate.
         bodies: rows of θ in it; one per joint where None.
-        publish_s, save_s: how often.
+        publish_s, news_s, save_s: how often.
     """
 
     make: Callable[[], LearnerLike]
     collect: Callable[[Any], Any]
     publish: Callable[[Any], Snapshot] | None = None
+    news: Callable[[Any], Mapping[str, Any]] | None = None
     save: Callable[[Any], None] | None = None
     keep: Callable[[Any, Path], None] | None = None
     restore: Callable[[Any, Path], None] | None = None
     effect_names: tuple[str, ...] = ()
     bodies: int | None = None
     publish_s: float = 0.01
+    news_s: float = 0.25
     save_s: float = 5.0
 
 
@@ -97,45 +101,18 @@ class RecordingJob:
 
 
 @dataclass(frozen=True)
-class View:
-    """What a display shows.
-
-    Attributes:
-        samples: passed on by the loop so far (filtered states where it learns).
-        waiting: of these, not taken by their worker yet.
-        elapsed_s: since the display began.
-        snapshot: the newest estimate, None where none is published.
-        done: nothing comes any more.
-    """
-
-    samples: int
-    waiting: int
-    elapsed_s: float
-    snapshot: Snapshot | None
-    done: bool
-
-
-@dataclass(frozen=True)
-class DisplayJob:
-    """A display in its own process, so that a slow terminal never holds up the loop.
-
-    Attributes:
-        make: builds the display there; it is called with a `View` again and again, at last with
-            one that is `done`.
-        period_s: how often.
-    """
-
-    make: Callable[[], Callable[[View], None]]
-    period_s: float = 0.25
-
-
-@dataclass(frozen=True)
 class Jobs:
-    """What the workers of a run do; None leaves a worker out."""
+    """What the workers of a run do; None leaves a worker out.
+
+    Attributes:
+        display: on the terminal; not followed by another where it dies.
+        view: for other programs (browsers); followed by another where it dies.
+    """
 
     learner: LearnerJob | None = None
     recording: RecordingJob | None = None
     display: DisplayJob | None = None
+    view: DisplayJob | None = None
 
 
 @dataclass(frozen=True)
@@ -186,7 +163,7 @@ class LearnerTask:
         job = self.job
         keeping = self.keep_in is not None and job.keep is not None
         own = np.zeros(ring.size)  # the learner never sees memory that the loop writes to
-        fresh, publish_at = False, 0.0
+        fresh, publish_at, news_at = False, 0.0, 0.0
         save_at = keep_at = time.monotonic() + job.save_s
         while True:
             finished = ring.finished
@@ -206,6 +183,9 @@ class LearnerTask:
             if due and board is not None and job.publish is not None:
                 board.publish(job.publish(learner))
                 fresh, publish_at = False, now + job.publish_s
+            if board is not None and job.news is not None and (now >= news_at or drained):
+                board.publish_news(job.news(learner))
+                news_at = now + job.news_s
             if keeping and (now >= keep_at or 2 * ring.kept > ring.rows):
                 self._keep(learner, ring)
                 keep_at = now + job.save_s
@@ -318,31 +298,3 @@ class RecorderTask:
         describe = asdict if self.job.describe is None else self.job.describe
         writer.write_estimate(snapshot.stamp_ns, dict(describe(snapshot)))
         return snapshot.version
-
-
-@dataclass(frozen=True)
-class DisplayTask:
-    """Run by the display's process."""
-
-    job: DisplayJob
-    ring: str
-    snapshot: str | None
-
-    def __call__(self, port: Port) -> None:
-        """Show until the ring is finished and drained."""
-        ring = Ring.attach(self.ring, touch=False)
-        reader = None if self.snapshot is None else SnapshotReader(self.snapshot)
-        try:
-            show = self.job.make()
-            port.ready()
-            begin = time.monotonic()
-            done = False
-            while not done:
-                done = (ring.finished and not ring.unread) or port.orphaned
-                snapshot = None if reader is None else reader.read()
-                elapsed_s = time.monotonic() - begin
-                show(View(ring.pushed, ring.unread, elapsed_s, snapshot, done))
-                if not done:
-                    time.sleep(self.job.period_s)
-        finally:
-            leave(False, [], ring, reader)

@@ -228,6 +228,8 @@ def run_live(
                 controller.detach()
             if options.observer is not None:
                 options.observer.detach()
+            if session is not None:
+                supervisor.note_end(session.ended, session.fault)
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
         tracking = None if controller is None else controller.tracking()
         return loop.result(real_time.grants, collected, tracking)
@@ -287,7 +289,9 @@ class _Loop:
     ) -> None:
         self._driver, self._session, self._supervisor = driver, session, supervisor
         self._stop, self._deadman = stop, deadman
-        self._clock, self._timing = Clock(driver.period_ns), Timing()
+        board = supervisor.loop_board
+        self._clock = Clock(driver.period_ns)
+        self._timing = Timing(None if board is None else board.bins)
 
     def run(self, duration_s: float | None) -> None:
         """Tick until the session has come to its end, or somebody has no patience."""
@@ -307,6 +311,7 @@ class _Loop:
                 session.begin_stop(Ended.INTERRUPTED)
             if ticks % LOOK_EVERY == 0:
                 self._supervisor.look_after()
+                self._supervisor.note_missed(self._clock.missed, self._clock.missed_own)
                 if self._deadman is not None and self._deadman.gone():
                     session.begin_stop(Ended.OPERATOR_GONE)
                 if wall_s is not None and time.monotonic() - begin > wall_s:

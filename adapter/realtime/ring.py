@@ -52,6 +52,14 @@ def set_after(header, place, value):
     header[place] = value
 
 
+@jit
+def read_before(header, place):
+    """Read a header word before everything after it is done."""
+    value = header[place]
+    fence()
+    return value
+
+
 def _compile(size: int) -> None:
     """Compile (or load) the kernels before the clock runs."""
     header = np.zeros(HEADER_WORDS, np.int64)
@@ -140,6 +148,20 @@ class Ring:
         if limit is not None:
             count = min(count, limit)
         return self._table[start : start + count]
+
+    def newest(self, count: int) -> Array:
+        """Anybody: copy of up to `count` of the newest records (m, size), oldest first.
+
+        A spectator takes nothing and holds nobody up; it gets none where the producer wrote over
+        them meanwhile, which takes it all but `count` rows.
+        """
+        unread_rows(self._header)
+        head = self.pushed
+        count = max(min(count, head, self.rows - 1), 0)
+        found: Array = self._table[np.arange(head - count, head) % self.rows]
+        if self.pushed - (head - count) >= self.rows:
+            return found[:0]
+        return found
 
     def take(self, count: int) -> None:
         """Consumer: the next `peek` begins `count` records later; they are kept for a successor."""

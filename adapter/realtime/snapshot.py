@@ -1,6 +1,7 @@
 """What other processes may know of a run, in shared memory under a name.
 
-The learner publishes its estimate, and the loop what pushes the arm, 1000 times a second.
+The learner publishes its estimate and, as text, what it found; the loop what pushes the arm, 1000
+times a second.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ import json
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +24,12 @@ from adapter.realtime.shared import SharedBlock, SharedMemoryError
 from adapter.realtime.slots import SEQUENCE, Slots, split
 from drivers.files.bounded import parse_json
 
-MAGIC = 0x5041534E41503034  # "PASNAP04"
-VERSION, EXTERNAL_VERSION = 0, 1  # words of the header, as are the next ones
+MAGIC = 0x5041534E41503035  # "PASNAP05"
+VERSION, EXTERNAL_VERSION, NEWS_VERSION = 0, 1, 2  # words of the header, as are the next ones
 KIND, N, BODIES, EFFECTS, PID, TEXT = range(8, 14)
-HEADER_WORDS, TEXT_BYTES = 16, 8192
+HEADER_WORDS, TEXT_BYTES, NEWS_BYTES = 16, 8192, 16384
 STAMP, LEARNED, PUBLISHED, FLAGS, SOURCE = range(1, 6)  # words of an estimate
+LENGTH = LEARNED  # of the news, bytes
 CONTACT = FLAGS  # of the external torque: joint (from 1) where it stands out in a contact, or 0
 LAM_CONVERGED, THETA_CONVERGED = 1, 2
 DEFAULT_NAME = "panda_adapter"
@@ -72,11 +75,13 @@ class Board:
         start, size = start + Slots.bytes_of(size), value_count(self._external_shapes)
         newest = self._header[EXTERNAL_VERSION:]
         self._external: Slots | None = Slots(self._block, newest, start, size)
+        start, newest = start + Slots.bytes_of(size), self._header[NEWS_VERSION:]
+        self._news: Slots | None = Slots(self._block, newest, start, NEWS_BYTES // 8)
 
     def close(self) -> None:
         """Let go of the memory; may be called more than once."""
         self._header = np.zeros(0, np.int64)
-        self._estimate = self._external = None
+        self._estimate = self._external = self._news = None
         self._block.close()
 
 
@@ -101,6 +106,7 @@ def block_size(n: int, bodies: int, effects: int) -> int:
     """Bytes of a block."""
     both = estimate_shapes(n, bodies, effects), push_shapes(n)
     slots = sum(Slots.bytes_of(value_count(shapes)) for shapes in both)
+    slots += Slots.bytes_of(NEWS_BYTES // 8)
     return 8 * HEADER_WORDS + TEXT_BYTES + slots
 
 
@@ -264,7 +270,7 @@ class SnapshotWriter(Board):
         h[[N, BODIES, EFFECTS, PID, TEXT]] = n, b, e, os.getpid(), len(text)
         board._block.array((len(text),), np.uint8, 8 * HEADER_WORDS)[:] = list(text)
         board._map()
-        for slots in filter(None, (board._estimate, board._external)):
+        for slots in filter(None, (board._estimate, board._external, board._news)):
             slots.blank()
         h[KIND] = MAGIC
         return board
@@ -300,6 +306,19 @@ class SnapshotWriter(Board):
         words[STAMP], words[LEARNED] = push.stamp_ns, push.learned
         words[PUBLISHED] = time.monotonic_ns()
         words[CONTACT] = 0 if joint is None else joint + 1
+        return slots.put()
+
+    def publish_news(self, news: Mapping[str, Any]) -> int:
+        """As `publish`, what was found so far: anything JSON can hold.
+
+        Raises ValueError for what takes more than `NEWS_BYTES` as JSON, or is none.
+        """
+        slots, text = self._news, json.dumps(news, allow_nan=False).encode()
+        assert slots is not None, "closed"
+        if len(text) > NEWS_BYTES:
+            raise ValueError(f"news take {len(text)} bytes; at most {NEWS_BYTES}")
+        slots.values.view(np.uint8)[: len(text)] = np.frombuffer(text, np.uint8)
+        slots.words[LENGTH], slots.words[PUBLISHED] = len(text), time.monotonic_ns()
         return slots.put()
 
     def _filled(
@@ -399,6 +418,26 @@ class SnapshotReader(Board):
             version=int(words[SEQUENCE]),
             published_ns=int(words[PUBLISHED]),
         )
+
+    def read_news(self, timeout_s: float = READ_TIMEOUT_S) -> dict[str, Any]:
+        """What the learner found so far; empty before it said anything. Raises as `read`.
+
+        "findings": as `adapter.gap.monitor.Monitor.reports`; "load": what was picked up ("m",
+        "m_std" in kg, "since_s" on the arm's clock), or None; "changes_s": at the hand, on the
+        same clock; "theta_started": whether θ is being learned already; "notes": what is wrong
+        with sensors; "refused": states that were none.
+        """
+        slots = self._taken(self._news, timeout_s)
+        length = int(slots.words[LENGTH])
+        if not length:
+            return {}
+        if not 0 < length <= NEWS_BYTES:
+            raise foreign(self.name)
+        try:
+            found = parse_json(slots.values.view(np.uint8)[:length].tobytes())
+        except ValueError:
+            raise foreign(self.name) from None
+        return dict(found) if isinstance(found, dict) else {}
 
     def _taken(self, slots: Slots | None, timeout_s: float) -> Slots:
         if slots is None:

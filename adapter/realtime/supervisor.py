@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from adapter.model.spatial import Array
-from adapter.realtime.jobs import (
-    DisplayTask,
-    Jobs,
-    LearnerJob,
-    LearnerTask,
-    RecorderTask,
-    RecordingJob,
-)
+from adapter.realtime.jobs import Jobs, LearnerJob, LearnerTask, RecorderTask, RecordingJob
+from adapter.realtime.loop_board import LoopBoard
 from adapter.realtime.raw_layout import RawLayout
 from adapter.realtime.real_time import split_cores
 from adapter.realtime.ring import Ring, affordable_rows
 from adapter.realtime.shared import SharedMemoryError
+from adapter.realtime.showing import DisplayTask
 from adapter.realtime.snapshot import DEFAULT_NAME, SnapshotError, SnapshotWriter
 from adapter.realtime.worker import (
     RESTARTS,
     RestartableWorker,
     RestartPolicy,
     Worker,
+    WorkerError,
     WorkerStarter,
 )
 from drivers.interface import Driver, JointSample
@@ -35,6 +35,7 @@ from drivers.interface import Driver, JointSample
 SHORTEST_RING_S = 1.0
 RECORDER_NICE, DISPLAY_NICE = 5, 10
 DISPLAY_STALL_S = 3.0
+VIEW_END_S = 4.0  # at the end, for browsers to hear of it
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class Supervisor:
             died, known at the end.
         kept: samples that were to be recorded; recorded: of these, in files, known at the end.
         troubles: one sentence for each worker that died.
+        loop_board: what the loop says of itself; None where nobody looks.
     """
 
     def __init__(
@@ -93,6 +95,8 @@ class Supervisor:
         self.learner: RestartableWorker | None = None
         self.recorder: RestartableWorker | None = None
         self.display: Worker | None = None
+        self.view: RestartableWorker | None = None
+        self.loop_board: LoopBoard | None = None
         self.passed_on = self.unlearned = self.kept = self.skipped = 0
         self.recorded: int | None = None
         self.troubles: list[str] = []
@@ -114,14 +118,40 @@ class Supervisor:
         if jobs.recording is not None:
             self.samples = Ring.create(self.raw.size, rows)
             self.recorder = self._start_recorder(jobs.recording, self.samples, board)
-        shown = self.states or self.samples
-        if jobs.display is not None and shown is not None:
-            show = DisplayTask(jobs.display, shown.name, board)
-            self.display = Worker("display process", show, self._cores, DISPLAY_NICE)
+        self._start_displays(board)
         first = [part.worker for part in (self.recorder, self.learner) if part is not None]
         for worker in (*first, self.display):
             if worker is not None:
                 worker.wait_ready(cancelled=cancelled)
+        self._wait_for_view(cancelled)
+
+    def _start_displays(self, board: str | None) -> None:
+        jobs, shown = self._jobs, self.states or self.samples
+        if shown is None or (jobs.display is None and jobs.view is None):
+            return
+        self.loop_board = LoopBoard.create()
+        names = shown.name, board, self.loop_board.name
+        if jobs.display is not None:
+            show = DisplayTask(jobs.display, *names)
+            self.display = Worker("display process", show, self._cores, DISPLAY_NICE)
+        if jobs.view is not None:
+            name, task = "view process", DisplayTask(jobs.view, *names)
+            policy = self._policy("nothing more is shown", RESTARTS)
+            build = partial(Worker, name, task, self._cores)
+            self.view = RestartableWorker(name, lambda k: build(), policy)
+
+    def _wait_for_view(self, cancelled: Callable[[], bool]) -> None:
+        """Until it shows; a run does without one that cannot."""
+        if self.view is None or self.view.worker is None:
+            return
+        try:
+            self.view.worker.wait_ready(cancelled=cancelled)
+        except WorkerError as error:
+            if cancelled():
+                raise
+            self.view.kill()
+            self.view = None
+            self._tell(f"{error}; the arm goes on, nothing is shown")
 
     def _start_learner(self, job: LearnerJob, ring: Ring, board: str) -> RestartableWorker:
         lasting = job.keep is not None and job.restore is not None
@@ -194,6 +224,8 @@ class Supervisor:
         """Hand a filtered state to the learner; never waits."""
         if self.learner is None or self.states is None:
             return
+        if not self.passed_on and self.loop_board is not None:
+            self.loop_board.write_begin(int(record[:1].view(np.int64)[0]))
         if self.learner.held and self.states.push(record):
             self.passed_on += 1
         else:
@@ -217,10 +249,30 @@ class Supervisor:
                 worker.look_after()
                 if not worker.held:
                     self._abandon(ring)
+        if self.view is not None and self.view.held:
+            self.view.look_after()
 
     def _tell(self, line: str) -> None:
         self.troubles.append(line)
-        self._say(line)
+        if not self._display_says(line):
+            self._say(line)
+
+    def _display_says(self, line: str) -> bool:
+        """Whether the display has the line said, where it is there and says lines itself."""
+        job, shown, board = self._jobs.display, self.display, self.loop_board
+        if job is None or not job.says or shown is None or board is None:
+            return False
+        return shown.alive and board.write_line(line)
+
+    def note_missed(self, missed: int, own: int) -> None:
+        """Let who looks know of deadlines missed so far; never waits."""
+        if self.loop_board is not None:
+            self.loop_board.count_missed(missed, own)
+
+    def note_end(self, ended: str, fault: str | None) -> None:
+        """Let who looks know why the loop came to its end."""
+        if self.loop_board is not None:
+            self.loop_board.write_end(ended, fault)
 
     def _abandon(self, ring: Ring) -> None:
         """Empty the ring that nobody reads any more, which a display may be waiting for."""
@@ -245,6 +297,9 @@ class Supervisor:
             self.skipped = self.states.skipped
         if self.display is not None:
             self.display.finish(lambda: 0, stall_s=DISPLAY_STALL_S)
+        if self.view is not None and self.view.held:
+            latest = time.monotonic() + VIEW_END_S
+            self.view.finish(lambda: 0, hurry=lambda: time.monotonic() > latest)
         return None if learner is None else learner.result
 
     def _end(
@@ -262,13 +317,13 @@ class Supervisor:
         """End what still runs and free all memory; may be called more than once."""
         if self._starter is not None:
             self._starter.close()
-        for worker in (self.learner, self.recorder, self.display):
+        for worker in (self.learner, self.recorder, self.display, self.view):
             if worker is not None:
                 worker.kill()
-        for part in (self.states, self.samples, self.board):
+        for part in (self.states, self.samples, self.board, self.loop_board):
             if part is not None:
                 part.close()
                 part.unlink()
-        self.states = self.samples = self.board = None
+        self.states = self.samples = self.board = self.loop_board = None
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

@@ -1,4 +1,7 @@
-"""What the loop's timing was: counted while it runs in memory that does not grow."""
+"""What the loop's timing was: counted while it runs in memory that does not grow.
+
+That memory may be shared with other processes (`LoopBoard`), which read the counts as they stand.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,25 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 SHARES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9}
 BITS = 9  # a bin is narrower than 1/512 of its value
 OCTAVES = 40  # up to 2^47 ns, a day and a half
+BINS = (OCTAVES + 2) << BITS
+# What is counted, in the order of the rows of a `Timing`'s bins.
+COUNTED = ("tick_us", "loop_us", "plant_us", "lateness_us", "period_us", "age_us")
 
 
 class Histogram:
-    """Durations in bins of equal relative width; the largest and the sum exactly."""
+    """Durations in bins of equal relative width; the largest and the sum exactly.
 
-    def __init__(self) -> None:
-        self._bins = np.zeros((OCTAVES + 2) << BITS, np.int64)
+    Args:
+        bins: (BINS,) of zeros to count in; own ones where None.
+    """
+
+    def __init__(self, bins: NDArray[np.int64] | None = None) -> None:
+        self._bins = np.zeros(BINS, np.int64) if bins is None else bins
         self.count = 0
         self.total_ns = 0
         self.max_ns = 0
@@ -32,15 +43,23 @@ class Histogram:
         if ns > self.max_ns:
             self.max_ns = ns
 
+    @classmethod
+    def of(cls, bins: NDArray[np.int64]) -> Histogram:
+        """From the counts (BINS,) alone: the largest then to the width of its bin, no sum."""
+        found = cls(bins)
+        found.count = int(bins.sum())
+        if found.count:
+            found.max_ns = upper_ns(int(np.flatnonzero(bins)[-1]))
+        return found
+
     def percentile_us(self, share: float) -> float | None:
         """The duration that `share` percent do not exceed, µs, to within 0.1 %; None if empty."""
         if not self.count:
             return None
         upto = np.cumsum(self._bins)
         index = int(np.searchsorted(upto, max(share / 100 * self.count, 1.0)))
-        shift = max((index >> BITS) - 1, 0)
-        lower_ns = (index - (shift << BITS)) << shift
-        return min(lower_ns + 0.5 * ((1 << shift) - 1), self.max_ns) * 1e-3
+        width = 1 << max((index >> BITS) - 1, 0)
+        return min(upper_ns(index) - 0.5 * (width - 1), self.max_ns) * 1e-3
 
     def summary_us(self) -> dict[str, float | None]:
         """p50, p99, p99.9 and max, µs; None where nothing was counted."""
@@ -52,6 +71,12 @@ class Histogram:
     def mean_us(self) -> float | None:
         """The mean, µs; None if empty."""
         return 1e-3 * self.total_ns / self.count if self.count else None
+
+
+def upper_ns(index: int) -> int:
+    """The longest duration that a bin counts."""
+    shift = max((index >> BITS) - 1, 0)
+    return ((index - (shift << BITS) + 1) << shift) - 1
 
 
 @dataclass(frozen=True)
@@ -108,11 +133,17 @@ class TimingReport:
 
 
 class Timing:
-    """Collects while the loop runs; a tick costs some 2 µs."""
+    """Collects while the loop runs; a tick costs some 2 µs.
 
-    def __init__(self) -> None:
-        self._tick, self._loop, self._plant = Histogram(), Histogram(), Histogram()
-        self._late, self._period, self._age = Histogram(), Histogram(), Histogram()
+    Args:
+        bins: (len(COUNTED), BINS) of zeros to count in; own ones where None.
+    """
+
+    def __init__(self, bins: NDArray[np.int64] | None = None) -> None:
+        rows = np.zeros((len(COUNTED), BINS), np.int64) if bins is None else bins
+        self._tick, self._loop, self._plant, self._late, self._period, self._age = map(
+            Histogram, rows
+        )
         self._began: int | None = None
 
     def add(

@@ -16,13 +16,15 @@ from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
 from adapter.realtime.jobs import LearnerJob
-from adapter.realtime.snapshot import Snapshot
+from adapter.realtime.snapshot import NEWS_BYTES, Snapshot
 from adapter.runs.config import PipelineSettings
-from adapter.runs.outcome import collect
+from adapter.runs.outcome import changes_at, collect
 from adapter.runs.pipeline import make_front_end, make_learner
+from adapter.runs.terminal import json_ready, json_text
 from adapter.signals.records import LinkMotionKind
 
 KEPT_LEARNER, KEPT_MONITOR = "learner.npz", "monitor.pickle"
+MOST_FINDINGS = 40  # the newest, that other processes are told of
 STD_EVERY = 50  # publications; the covariance behind the standard deviations takes a millisecond
 
 
@@ -56,12 +58,14 @@ def learner_job(
 
     Args:
         checkpoint: where the learner's state is kept; resume: one to go on from.
-        aloud: whether new disagreements are told on standard error when they are found.
+        aloud: whether new disagreements are told on standard error when they are found; where a
+            display says them (`news_of`), nobody else should.
     """
     return LearnerJob(
         make=partial(single_thread_learner, documented, settings, resume, aloud),
         collect=collect,
         publish=Publisher(),
+        news=news_of,
         save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
         keep=keep_learner,
         restore=restore_learner,
@@ -70,11 +74,15 @@ def learner_job(
 
 
 def tell(line: str) -> None:
-    """A line to standard error, over the display's own line in a terminal (it comes back)."""
-    clear = "\r\x1b[K" if sys.stderr.isatty() else ""
+    """A line to standard error; a table on a terminal would run into it, and says it itself."""
     with suppress(OSError):  # the terminal may be gone; the learner goes on
-        sys.stderr.write(f"{clear}new disagreement: {line}\n")
+        sys.stderr.write(f"{disagreement(line)}\n")
         sys.stderr.flush()
+
+
+def disagreement(line: str) -> str:
+    """What people are told when the monitor has found something."""
+    return f"new disagreement: {line}"
 
 
 def keep_quiet(line: str) -> None:
@@ -138,6 +146,27 @@ class Publisher:
             bodies[rows],
             std[10 * (n + 1) :].reshape(-1, n),
         )
+
+
+def news_of(learner: OnlineLearner) -> dict[str, Any]:
+    """What was found so far, for whoever looks at the run; see `SnapshotReader.read_news`."""
+    reports = [] if learner.watch is None else learner.watch.reports
+    findings = list(reports[-MOST_FINDINGS:])
+    stamps = [change.stamp_ns for change in learner.changes]
+    changes = changes_at(stamps, learner.theta.payload)[-MOST_FINDINGS:]
+    load = changes[-1].get("payload") if changes else None
+    news = {
+        "theta_started": learner.theta_started_ns is not None,
+        "load": None if load is None else {**load, "since_s": changes[-1]["stamp_s"]},
+        "changes_s": [change["stamp_s"] for change in changes],
+        "notes": list(learner.schema.notes),
+        "refused": learner.refused,
+        "findings": findings,
+    }
+    while len(json_text(news).encode()) > NEWS_BYTES and findings:
+        del findings[0]
+    plain: dict[str, Any] = json_ready(news)
+    return plain
 
 
 def describe_estimate(snapshot: Snapshot) -> dict[str, Any]:

@@ -302,9 +302,16 @@ def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, An
 
 def changes(outcome: Outcome) -> list[dict[str, Any]]:
     """Changes at the hand, with what the last one brought (payload in the last link's frame)."""
-    found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in outcome.changes_ns]
-    if found and outcome.payload is not None:
-        theta, covariance = outcome.payload
+    return changes_at(outcome.changes_ns, outcome.payload)
+
+
+def changes_at(
+    stamps_ns: Sequence[int], payload: tuple[Array, Array] | None
+) -> list[dict[str, Any]]:
+    """The same from their stamps and what the hand carries since the last one."""
+    found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in stamps_ns]
+    if found and payload is not None:
+        theta, covariance = payload
         found[-1]["payload"] = {
             "m": float(theta[0]),
             "m_std": float(np.sqrt(covariance[0, 0])),

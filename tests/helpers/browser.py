@@ -10,14 +10,23 @@ import os
 import re
 import shutil
 import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.sync.client import connect
 
 CHROMIUM = Path("/usr/bin/chromium")
 TIMEOUT_S = 120
+# Without a network of its own: nothing but this machine has an address.
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+)  # fmt: skip
 
 
 class Links(HTMLParser):
@@ -53,6 +62,13 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     assert f"script-src 'sha256-{digest}'" in page
     assert len(links.ids) == len(set(links.ids))
     return links.ids
+
+
+def need_chromium() -> None:
+    """Skip the test where there is no Chromium, which CI must have."""
+    if not CHROMIUM.exists():
+        assert not os.environ.get("CI"), f"CI needs {CHROMIUM}"
+        pytest.skip(f"{CHROMIUM} is not installed")
 
 
 FOUND = "found: "
@@ -114,17 +130,102 @@ def _chromium(page: str, folder: Path, *options: str) -> subprocess.CompletedPro
     A browser without network: each address but that of the file itself is unknown to it. Skips
     the test where there is no Chromium, which CI must have.
     """
-    if not CHROMIUM.exists():
-        assert not os.environ.get("CI"), f"CI needs {CHROMIUM}"
-        pytest.skip(f"{CHROMIUM} is not installed")
+    need_chromium()
     path, profile = folder / "page.html", folder / "profile"
     path.write_text(page, encoding="utf-8")
     command = [
-        str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
-        "--no-first-run", "--disable-background-networking", "--disable-component-update",
-        "--disable-sync", "--host-resolver-rules=MAP * ~NOTFOUND",
+        str(CHROMIUM), *FLAGS, "--host-resolver-rules=MAP * ~NOTFOUND",
         f"--user-data-dir={profile}", "--enable-logging=stderr", "--v=0", *options, path.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT_S)
     shutil.rmtree(profile, ignore_errors=True)
     return done
+
+
+class Tab:
+    """A page that is open in headless Chromium, driven over the DevTools protocol."""
+
+    def __init__(self, socket: Any, pid: int) -> None:
+        self._socket, self._number, self.pid = socket, 0, pid
+        self.console: list[str] = []
+        for domain in ("Runtime", "Page", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Result of a command; what the page says meanwhile goes to `console`."""
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=TIMEOUT_S))
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                return message["result"]
+            if message.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.console.append(json.dumps(message["params"])[:500])
+
+    def size(self, width: int, height: int, dark: bool = False) -> None:
+        """Show it in a window of this size."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
+        )  # fmt: skip
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+
+    def open(self, address: str) -> None:
+        """Go there; returns before all is loaded."""
+        self.call("Page.navigate", url=address)
+
+    def value(self, expression: str) -> Any:
+        """Of a JavaScript expression."""
+        found = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait_for(self, expression: str, timeout_s: float = TIMEOUT_S) -> None:
+        """Until a JavaScript expression is true."""
+        end = time.monotonic() + timeout_s
+        while not self.value(expression):
+            assert time.monotonic() < end, f"not in {timeout_s} s: {expression}"
+            time.sleep(0.1)
+
+    def picture(self, path: Path | None = None, whole: bool = True) -> bytes:
+        """PNG of the page as it looks, all of it or what is in the window."""
+        found = self.call("Page.captureScreenshot", captureBeyondViewport=whole)
+        data = base64.b64decode(found["data"])
+        if path is not None:
+            path.write_bytes(data)
+        return data
+
+
+@contextmanager
+def tab(folder: Path) -> Iterator[Tab]:
+    """An empty page in a Chromium of its own, with a new profile in this folder."""
+    need_chromium()
+    profile = folder / "profile"
+    command = [str(CHROMIUM), *FLAGS, "--remote-debugging-port=0", f"--user-data-dir={profile}"]
+    browser = subprocess.Popen([*command, "about:blank"], stderr=subprocess.PIPE, text=True)
+    try:
+        yield from _opened(browser)
+    finally:
+        browser.terminate()
+        browser.wait(TIMEOUT_S)
+        shutil.rmtree(profile, ignore_errors=True)
+
+
+def _opened(browser: subprocess.Popen[str]) -> Iterator[Tab]:
+    assert browser.stderr is not None
+    for line in browser.stderr:
+        if "DevTools listening on " in line:
+            break
+    else:
+        raise AssertionError("Chromium did not start")
+    whole = line.split()[-1]
+    with connect(whole, compression=None) as socket:
+        socket.send(json.dumps({"id": 0, "method": "Target.getTargets"}))
+        targets = json.loads(socket.recv())["result"]["targetInfos"]
+    page = next(target for target in targets if target["type"] == "page")
+    host = whole.split("/")[2]
+    place = f"ws://{host}/devtools/page/{page['targetId']}"
+    with connect(place, compression=None, max_size=None) as socket:
+        yield Tab(socket, browser.pid)

@@ -1,4 +1,4 @@
-"""Learners and a display for tests of the live process.
+"""Learners and displays for tests of the live process.
 
 Its worker processes import this file, and nothing that takes long.
 """
@@ -9,13 +9,15 @@ import hashlib
 import os
 import pickle
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from adapter.realtime.jobs import LearnerJob, View
+from adapter.realtime.jobs import LearnerJob
+from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot, nothing_known
 from adapter.signals.records import stamp_of
 
@@ -114,3 +116,35 @@ def learner_job(kind: Callable[[], Digest] = Digest, save=None) -> LearnerJob:
 def lasting_job(kind: type[Digest] = Digest) -> LearnerJob:
     """The same with successors."""
     return replace(learner_job(kind), keep=Digest.keep, restore=Digest.restore)
+
+
+class Witness:
+    """A view that writes down its process and what it saw last, and does not end by itself."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        (folder / f"{os.getpid()}.view").touch()
+
+    def __call__(self, view: View) -> None:
+        ended = "" if view.ended is None else ",".join(view.ended)
+        ticks = 0 if view.timing is None else view.timing.of("loop_us").count
+        whole = self._folder / f"{os.getpid()}.part"
+        whole.write_text(f"{view.samples} {ticks} {view.done} {ended}")
+        whole.rename(self._folder / "last")
+        if view.done:
+            time.sleep(600.0)
+
+
+class Lines:
+    """A display that writes the loop's lines to a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __call__(self, view: View) -> None:
+        self._path.write_text("\n".join(view.lines))
+
+
+def no_view() -> None:
+    """In place of a view that cannot be made."""
+    raise RuntimeError("the page cannot be drawn")

@@ -25,11 +25,14 @@ from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' 
     Digest,
     Dying,
     Failing,
+    Lines,
     Mortal,
+    Witness,
     die_once,
     lasting_job,
     learner_job,
     no_learner,
+    no_view,
     save_count,
 )
 

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from adapter.realtime.clock import sleep_until
-from adapter.realtime.jobs import DisplayJob, Jobs
+from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
 from adapter.realtime.session import Session, run_lockstep
+from adapter.realtime.showing import DisplayJob
 from adapter.realtime.worker import WorkerError
 from drivers.files.mcap import read_estimates, read_log
 from drivers.interface import DriverError

@@ -1,0 +1,228 @@
+"""What a page is told, as JSON: who the arm is, once; and where it stands, again and again.
+
+    hello     names, units, the documented model: once for each page
+    history   rows of the residuals of the last seconds and of the estimate of the whole run
+    frame     some 20 times a second: residuals, push, skeleton, state
+    estimate  twice a second: λ and θ with standard deviations
+    news      where it changed: findings, load, lines
+    timing    twice a second
+
+Each message is whole in itself, so that one that a slow page never gets is no loss.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.catalogue import CATALOGUE, effects_by_name
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array, matrix_from_zxz
+from adapter.runs.terminal import json_ready
+from adapter.view.history import Recent, Whole
+from adapter.view.now import KnownRun, Now, Onlooker, Skeleton, skeleton
+
+DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
+ESTIMATE_S = 0.5
+THETA = (
+    *(("m", "kg"), ("mX", "kg m"), ("mY", "kg m"), ("mZ", "kg m")),
+    *((f"{a}{b}", "kg m²") for a, b in ("XX", "XY", "XZ", "YY", "YZ", "ZZ")),
+)
+LAMBDA = (
+    *((f"turn about {axis}", "mrad") for axis in "xyz"),
+    *((f"shift along {axis}", "mm") for axis in "xyz"),
+)
+RECENT = ("t", "residual", "noise")  # of a frame, that a page gets of the past
+TIMED = ("loop_us", "lateness_us")
+Message = dict[str, Any]
+
+
+def numbers(values: Array | float, digits: int = DIGITS) -> Any:
+    """As lists of plain numbers with so many digits; what is not finite becomes None."""
+    x = np.atleast_1d(np.asarray(values, dtype=np.float64))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = 10.0 ** (digits - 1 - np.floor(np.log10(np.abs(x))))
+        rounded = np.where(x == 0.0, 0.0, np.round(x * size) / size)
+    found = json_ready(np.where(np.isfinite(x), rounded, np.nan))
+    return found if np.ndim(values) else found[0]
+
+
+def encode(message: Mapping[str, Any]) -> bytes:
+    """As JSON, on one line."""
+    return json.dumps(message, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+
+
+class Messages:
+    """Makes the messages of a run, look after look.
+
+    Args:
+        onlooker: of the run.
+    """
+
+    def __init__(self, onlooker: Onlooker) -> None:
+        self._onlooker, self._known = onlooker, onlooker.known
+        self._documented = self._known.documented
+        self._recent, self._whole = Recent(), Whole()
+        self._estimate_at = -np.inf
+        self._said: Message = {}
+        self._timing: Any = None
+
+    def hello(self) -> Message:
+        """Who the arm is."""
+        known, arm = self._known, self._documented
+        return {
+            "key": known.key,
+            "robot": arm.name,
+            "driver": known.driver,
+            "duration_s": known.duration_s,
+            "joints": list(arm.tree.joint_names),
+            "links": list(arm.tree.link_names),
+            "parents": list(arm.tree.parent),
+            "lambda": [list(entry) for entry in LAMBDA],
+            "theta": [list(entry) for entry in THETA],
+            "theta_documented": numbers(arm.theta),
+            "theta_alone": self._onlooker.shown_alone.tolist(),
+            "effects": [
+                [effect.title, effect.units()[effect.key]]
+                for effect in effects_by_name(known.effects)
+            ],
+            "reach_m": reach(arm),
+        }
+
+    def history(self) -> bytes:
+        """What was shown before, encoded."""
+        parts = b",".join(self._recent.rows()), b",".join(self._whole.rows())
+        return b'{"frames":[%s],"estimates":[%s]}' % parts
+
+    def take(self, now: Now) -> dict[str, Message]:
+        """Messages that are due, by their kind."""
+        due = {"frame": self._frame(now)}
+        self._recent.add(encode({key: due["frame"][key] for key in RECENT}))
+        final, elapsed_s = now.view.done, now.view.elapsed_s
+        if now.frames is not None and (final or elapsed_s >= self._estimate_at):
+            self._estimate_at = elapsed_s + ESTIMATE_S
+            due["estimate"] = self._estimate(now)
+            self._whole.add(now.t_s, encode(due["estimate"]))
+        news = self._news(now)
+        if news != self._said:
+            due["news"] = self._said = news
+        if now.lately is not None and (final or now.view.timing is not self._timing):
+            self._timing = now.view.timing
+            due["timing"] = self._times(now)
+        return due
+
+    def _frame(self, now: Now) -> Message:
+        view, push = now.view, now.view.push
+        return {
+            "t": round(now.t_s, 3),
+            "headline": now.headline,
+            "done": view.done,
+            "ended": None if view.ended is None else list(view.ended),
+            "lam": now.lam_state,
+            "theta": now.theta_state,
+            "samples": view.samples,
+            "waiting": view.waiting,
+            "learned": 0 if view.snapshot is None else view.snapshot.learned,
+            "q": numbers(now.q),
+            "tau": numbers(now.tau),
+            "residual": numbers(now.residual),
+            "rms": numbers(now.rms),
+            "noise": numbers(now.noise),
+            "words": now.joint_states,
+            "contact": now.contact,
+            "push": None if push is None else numbers(push.torque),
+            "push_std": None if push is None else numbers(push.torque_std),
+            "wrench": None if push is None else numbers(push.wrench),
+            "wrench_std": None if push is None else numbers(push.wrench_std),
+            "push_learned": push is not None and push.learned,
+            "arms": self._arms(now),
+        }
+
+    def _arms(self, now: Now) -> dict[str, Any]:
+        """Skeletons, documented and learned; none before anything is known."""
+        arm = self._documented
+        if not np.isfinite(now.q).all():
+            return {}
+        told = matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:]
+        arms = {"documented": _points(skeleton(arm, *told, now.q))}
+        if now.frames is not None:
+            arms["learned"] = _points(skeleton(arm, now.frames.R, now.frames.p, now.q))
+        return arms
+
+    def _estimate(self, now: Now) -> Message:
+        snapshot, frames = now.view.snapshot, now.frames
+        assert snapshot is not None and frames is not None
+        known = now.theta_state != "waiting"
+        unknown = np.full_like(snapshot.theta, np.nan)
+        return {
+            "t": round(now.t_s, 2),
+            "off": numbers(1e3 * frames.off, FINE_DIGITS),
+            "off_std": numbers(1e3 * frames.off_std, FINE_DIGITS),
+            "hidden": frames.hidden.tolist(),
+            "theta": numbers(snapshot.theta if known else unknown, FINE_DIGITS),
+            "theta_std": numbers(snapshot.theta_std if known else unknown, FINE_DIGITS),
+            "effects": numbers(snapshot.effects, FINE_DIGITS),
+            "effects_std": numbers(snapshot.effects_std, FINE_DIGITS),
+        }
+
+    def _news(self, now: Now) -> Message:
+        news = now.view.news
+        told = {
+            "findings": [_finding(found) for found in now.findings],
+            "load": now.load,
+            "notes": news.get("notes", []),
+            "refused": news.get("refused", 0),
+            "lines": now.view.lines,
+        }
+        plain: Message = json_ready(told)
+        return plain
+
+    def _times(self, now: Now) -> Message:
+        timing, lately = now.view.timing, now.lately
+        assert timing is not None and lately is not None
+        told: Message = {"missed": timing.missed, "missed_own": timing.missed_own}
+        told["missed_lately"] = lately.missed
+        for what in TIMED:
+            whole, late = timing.of(what), lately.of(what)
+            told[what] = {
+                "count": whole.count,
+                "p50": whole.percentile_us(50.0),
+                "p99": whole.percentile_us(99.0),
+                "max": 1e-3 * whole.max_ns,
+                "p50_lately": late.percentile_us(50.0),
+                "p99_lately": late.percentile_us(99.0),
+            }
+        plain: Message = json_ready(told)
+        return plain
+
+
+def _finding(found: Mapping[str, Any]) -> Message:
+    """One of the monitor's, with names and units for people."""
+    effect = CATALOGUE.get(found["what"])
+    units = {} if effect is None else effect.units()
+    size = {} if effect is None else {k: v for k, v in found["size"].items() if k in units}
+    return {
+        "title": found["what"] if effect is None else effect.title,
+        "size": [[key, numbers(value), units[key]] for key, value in size.items()],
+        "or": [rival["what"].replace("_", " ") for rival in found["ambiguous_with"]],
+        **{key: found[key] for key in ("joints", "since_s", "reported_s", "over_s")},
+    }
+
+
+def _points(arm: Skeleton) -> Message:
+    places = {"joints": arm.joints, "axes": arm.axes, "tips": arm.tips}
+    return {key: np.round(x, 4).tolist() for key, x in places.items()} | {"tip_of": arm.tip_of}
+
+
+def reach(arm: SelfModel) -> float:
+    """How far the arm reaches at most, m: for the scale of its picture."""
+    lengths = np.linalg.norm(arm.lam[:, 3:], axis=1)
+    return float(max(lengths.sum(), 1e-3))
+
+
+def messages_of(known: KnownRun) -> Messages:
+    """Of a run that is known."""
+    return Messages(Onlooker(known))

@@ -1,0 +1,257 @@
+"""What being watched costs the loop: `PYTHONPATH=. python tests/benchmarks/view_cost.py`.
+
+One live run of the simulated Panda. Its time is cut into pairs of stretches: without the view (its
+process is stopped, the browser shows an empty page), and with it (the page is open in headless
+Chromium and drawn). The loop's own counts are read at the edges from the shared memory that the
+view reads, so both of a pair come from the same process within seconds. Which of a pair comes
+first alternates. `--whole N` adds N pairs of whole runs, with `--view` and a browser and without.
+
+The view runs only where nobody else wants the processor. On a machine that is busy otherwise it
+hardly runs at all, and so costs nothing; `--awake` gives it ordinary priority, which it never has,
+so that it runs in full: what is then told is more than it ever costs.
+
+Told: p50 and p99 of a tick's compute (`loop_us`, without the simulated arm's physics) and of its
+lateness, over all stretches of a kind and as ratios by pair; processor time of the view process
+and of the browser; what the machine did beside.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from soak import family
+
+from adapter.realtime.loop_board import BLOCK_BYTES, LoopBoard, LoopTiming
+from adapter.realtime.shared import SHM_FOLDER, SharedBlock
+from tests.helpers.browser import Tab, tab
+
+SETTLE_S, EDGE_S = 4.0, 1.5  # after the first frame, and after each change of what is shown
+LONGER_S = 25.0  # than its stretches, of a run: a browser starts meanwhile
+START_S = 180.0
+WATCHED = ("loop_us", "tick_us", "lateness_us")
+SHARES = (50.0, 99.0)
+EMPTY = "about:blank"
+
+
+def processor_s(pids: list[int]) -> float:
+    """Processor time that processes have used."""
+    total = 0.0
+    for pid in pids:
+        try:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        total += (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return total
+
+
+@contextmanager
+def live_run(
+    seconds: float, folder: Path, view: bool
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """`adapter run`, and where it can be watched ("" where it cannot)."""
+    command = [
+        sys.executable,
+        "-u",
+        "-m",
+        "adapter",
+        "run",
+        "--duration",
+        str(seconds),
+        "--seed",
+        "5",
+    ]
+    command += ["--quiet", "--out", str(folder), "--json", str(folder / "figures.json")]
+    command += ["--view", "0"] if view else []
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    try:
+        address = ""
+        assert run.stderr is not None
+        while view and not address:
+            line = run.stderr.readline()
+            found = re.search(r"http://\S+", line)
+            address = found.group(0) if found else ""
+            if not line:
+                raise SystemExit("the run did not start")
+        yield run, address
+    finally:
+        if run.poll() is None:
+            run.send_signal(signal.SIGINT)
+        run.communicate()
+
+
+def view_process(run: int) -> tuple[int, str]:
+    """The process that serves the page, and the name of the loop's board in shared memory."""
+    end = time.monotonic() + START_S
+    while time.monotonic() < end:
+        for pid in family(run)[1:]:
+            try:
+                maps = Path(f"/proc/{pid}/maps").read_text()
+            except OSError:
+                continue
+            for name in set(re.findall(r"/dev/shm/(\S+)", maps)):
+                path = SHM_FOLDER / name
+                if path.exists() and path.stat().st_size == BLOCK_BYTES:
+                    return pid, name
+        time.sleep(0.1)
+    raise SystemExit("no view process")
+
+
+class Stretches:
+    """Stretches of one run, with the view and without it.
+
+    Args:
+        board: of the loop; pid: of the view process; page: in the browser; address: of the page.
+    """
+
+    def __init__(self, board: LoopBoard, pid: int, page: Tab, address: str) -> None:
+        self._board, self._pid, self._page, self._address = board, pid, page, address
+
+    def measure(self, watched: bool, seconds: float) -> LoopTiming:
+        """What the loop counted in one."""
+        if watched:
+            os.kill(self._pid, signal.SIGCONT)
+            self._page.open(self._address)
+            self._page.wait_for("document.title.includes(': ')")
+        else:
+            self._page.open(EMPTY)
+            os.kill(self._pid, signal.SIGSTOP)
+        time.sleep(EDGE_S)
+        before = self._board.timing()
+        time.sleep(seconds)
+        return self._board.timing().since(before)
+
+
+def percentiles(timing: LoopTiming) -> dict[str, dict[str, float | None]]:
+    """p50 and p99 of what is watched, µs."""
+    return {
+        what: {f"p{share:g}": timing.of(what).percentile_us(share) for share in SHARES}
+        for what in WATCHED
+    }
+
+
+def added(parts: list[LoopTiming]) -> LoopTiming:
+    """All that was counted in several stretches."""
+    bins = sum(part.bins for part in parts)
+    missed = sum(part.missed for part in parts), sum(part.missed_own for part in parts)
+    return LoopTiming(np.asarray(bins), *missed)
+
+
+def wake(pid: int) -> None:
+    """Give all threads of a process ordinary priority."""
+    for thread in Path(f"/proc/{pid}/task").iterdir():
+        os.sched_setscheduler(int(thread.name), os.SCHED_OTHER, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, int(thread.name), 0)
+
+
+def in_one_run(pairs: int, seconds: float, awake: bool) -> dict[str, Any]:
+    """See the module."""
+    long_s = pairs * 2 * (seconds + EDGE_S) + LONGER_S
+    found: dict[bool, list[LoopTiming]] = {True: [], False: []}
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        tab(Path(folder)) as page,
+        live_run(long_s, Path(folder) / "run", view=True) as (run, address),
+    ):
+        pid, name = view_process(run.pid)
+        if awake:
+            wake(pid)
+        board = LoopBoard(SharedBlock.attach(name))
+        page.open(address)
+        page.wait_for("!!document.getElementById('clock')?.textContent", START_S)
+        time.sleep(SETTLE_S)
+        browser = family(page.pid)
+        used, began = (processor_s([pid]), processor_s(browser)), time.monotonic()
+        stretches = Stretches(board, pid, page, address)
+        for k in range(pairs):
+            for watched in (k % 2 == 0, k % 2 == 1):
+                found[watched].append(stretches.measure(watched, seconds))
+        os.kill(pid, signal.SIGCONT)
+        wall_s = time.monotonic() - began
+        cost = processor_s([pid]) - used[0], processor_s(browser) - used[1]
+        board.close()
+    ratios = {what: _ratios(found, what) for what in ("loop_us", "tick_us")}
+    return {
+        "awake": awake,
+        "pairs": pairs,
+        "seconds_each": seconds,
+        "without": percentiles(added(found[False])),
+        "with": percentiles(added(found[True])),
+        "missed_without": added(found[False]).missed,
+        "missed_with": added(found[True]).missed,
+        "p99_with_over_without": ratios,
+        "view_processor_share_while_watched": cost[0] / (pairs * (seconds + EDGE_S)),
+        "browser_processor_share_while_watched": cost[1] / (pairs * (seconds + EDGE_S)),
+        "wall_s": wall_s,
+    }
+
+
+def _ratios(found: dict[bool, list[LoopTiming]], what: str) -> dict[str, Any]:
+    """p99 with the view over p99 without, all together and pair by pair."""
+
+    def p99(timing: LoopTiming) -> float:
+        return timing.of(what).percentile_us(99.0) or np.nan
+
+    pairs = [p99(a) / p99(b) for a, b in zip(found[True], found[False], strict=True)]
+    spread = float(np.std(pairs, ddof=1) / np.sqrt(len(pairs))) if len(pairs) > 1 else None
+    return {
+        "all": p99(added(found[True])) / p99(added(found[False])),
+        "median_of_pairs": float(np.median(pairs)),
+        "standard_error": spread,
+        "pairs": [round(x, 3) for x in pairs],
+    }
+
+
+def whole_runs(pairs: int, seconds: float) -> list[dict[str, Any]]:
+    """Pairs of whole runs."""
+    rows = []
+    for k in range(pairs):
+        row: dict[str, Any] = {}
+        for watched in (k % 2 == 0, k % 2 == 1):
+            with tempfile.TemporaryDirectory() as folder, tab(Path(folder)) as page:
+                out = Path(folder) / "run"
+                with live_run(seconds, out, watched) as (run, address):
+                    if watched:
+                        page.open(address)
+                    run.communicate()
+                timing = json.loads((out / "figures.json").read_text())["timing"]
+            row["with" if watched else "without"] = {what: timing[what] for what in WATCHED}
+        rows.append(row)
+    return rows
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pairs", type=int, default=8, help="of stretches in the run (default 8)")
+    parser.add_argument("--seconds", type=float, default=8.0, help="of a stretch (default 8)")
+    parser.add_argument("--whole", type=int, default=0, help="pairs of whole runs beside it")
+    parser.add_argument("--awake", action="store_true", help="the view at ordinary priority")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    load = os.getloadavg()[0]
+    told = {"load_before": load, "one_run": in_one_run(args.pairs, args.seconds, args.awake)}
+    if args.whole:
+        told["whole_runs"] = whole_runs(args.whole, 20.0)
+    told["load_after"] = os.getloadavg()[0]
+    text = json.dumps(told, indent=1)
+    print(text)
+    if args.json is not None:
+        args.json.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,344 @@
+"""What is shown of a run: against the learner itself, another kinematics, and in a real browser."""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap_ros2._dynamic import generate_dynamic  # not what encoded it
+from rich.console import Console
+from websockets.sync.client import connect
+
+from adapter.cli.display import LiveTable, table_of
+from adapter.realtime.timing import Histogram
+from adapter.signals.records import stamp_of
+from adapter.view import foxglove_view
+from adapter.view.foxglove_view import FoxgloveView, free_port
+from adapter.view.messages import Messages, encode
+from adapter.view.now import Now, Onlooker
+from adapter.view.page import LivePage, page_of
+from adapter.view.server import address, bind
+from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, tab
+from tests.helpers.live_tools import PANDA
+from tests.helpers.robot_models import PANDA as PANDA_URDF
+from tests.helpers.viewed import TICK_NS, Seen, again, seen_run
+
+SECONDS = 4.0
+CONTACT = {"contact_joint": 3, "learned": True}
+FOUND = {
+    "what": "viscous_friction",
+    "joints": [2],
+    "since_s": 1.5,
+    "reported_s": 2.25,
+    "over_s": None,
+    "size": {"Fv": 0.75},
+    "score": 9.0,
+    "ambiguous_with": [{"what": "coulomb_friction", "joints": [2]}],
+}
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    return seen_run(SECONDS)
+
+
+@pytest.fixture(scope="module")
+def course(seen: Seen) -> list[Now]:
+    """What was to be shown, look by look."""
+    onlooker = Onlooker(seen.known)
+    return [onlooker.look(view) for view in seen.views]
+
+
+def test_the_residual_is_the_learners_own(seen: Seen, course: list[Now]) -> None:
+    known = [now for now in course if np.isfinite(now.residual).all() and not now.view.done]
+    assert len(known) > 20
+    off = [
+        np.abs(now.residual - expected) / now.noise
+        for now, expected in zip(known, seen.residuals[-len(known) :], strict=True)
+    ]
+    assert np.median(off) < 0.01 and np.max(off) < 0.5  # friction's turn is smoothed otherwise
+    assert all((now.rms > 0.0).all() for now in known)
+
+
+def test_the_course_of_a_run(course: list[Now], seen: Seen) -> None:
+    assert course[0].headline == "Learning where the joints sit (λ)"
+    assert np.isnan(course[0].residual).all() and course[0].joint_states[0] == "not learned yet"
+    assert course[-2].headline == "Learning what the links weigh (θ); λ has converged"
+    assert course[-1].headline == "Ended: the planned time is over"
+    lasted_s = 1e-9 * (stamp_of(seen.states[-1]) - stamp_of(seen.states[0]))
+    assert abs(course[-1].t_s - lasted_s) < 0.1 and course[0].t_s < 0.2
+    off = course[-1].frames
+    assert off is not None and np.abs(off.off).max() < 1e-6 and off.hidden.sum() == 6
+    states = [(now.lam_state, now.theta_state) for now in course]
+    assert states == sorted(states, key=[*dict.fromkeys(states)].index)  # never back
+
+
+def test_the_skeleton_stands_where_pinocchio_puts_it(course: list[Now], seen: Seen) -> None:
+    import pinocchio as pin
+
+    messages = Messages(Onlooker(seen.known))
+    arms = messages.take(course[-1])["frame"]["arms"]
+    model = pin.buildModelFromUrdf(str(PANDA_URDF))
+    data, q = model.createData(), course[-1].q
+    pin.forwardKinematics(model, data, q)
+    wanted = np.array([data.oMi[j + 1].translation for j in range(7)])
+    np.testing.assert_allclose(arms["documented"]["joints"], wanted, atol=1e-4)
+    np.testing.assert_allclose(arms["learned"]["joints"], wanted, atol=1e-4)
+    axes = np.array([data.oMi[j + 1].rotation[:, 2] for j in range(7)])
+    np.testing.assert_allclose(arms["learned"]["axes"], axes, atol=1e-4)
+
+
+def test_timing_of_the_last_seconds_alone(course: list[Now]) -> None:
+    whole = course[-1].view.timing
+    assert whole is not None and course[-1].lately is not None
+    ticks = whole.of("loop_us")
+    assert ticks.count > 1000 * SECONDS - 200
+    assert abs(ticks.percentile_us(99.0) - 1e-3 * TICK_NS) < 1.0
+    assert Histogram.of(whole.bins[0]).count == ticks.count
+    assert 0 < course[-1].lately.of("loop_us").count <= ticks.count
+
+
+def troubled(seen: Seen) -> Now:
+    """The last instant, with a contact, a finding and a load: what a page has to make loud."""
+    onlooker = Onlooker(seen.known)
+    for view in again(seen.views):
+        last = view
+        onlooker.look(view)
+    assert last.push is not None
+    begin_s = 1e-9 * last.began_ns
+    found = {k: v + begin_s if k in ("since_s", "reported_s") else v for k, v in FOUND.items()}
+    load = {"m": 0.5231, "m_std": 0.0112, "since_s": begin_s + 2.0}
+    news = {**last.news, "findings": [found], "load": load}
+    push = replace(last.push, torque=np.arange(7.0) + 10.0, **CONTACT)
+    return onlooker.look(replace(last, news=news, push=push, lines=["a <b>line</b>"]))
+
+
+def test_words_of_trouble(seen: Seen) -> None:
+    now = troubled(seen)
+    assert now.headline == "Contact: something pushes panda_joint4" and now.contact == 3
+    assert now.joint_states[3] == "contact" and now.joint_states[1] == "viscous friction"
+    assert now.load is not None and abs(now.load["since_s"] - 2.0) < 1e-6
+    news = Messages(Onlooker(seen.known)).take(now)["news"]
+    (finding,) = news["findings"]
+    assert finding["title"] == "viscous friction" and finding["or"] == ["coulomb friction"]
+    assert finding["size"] == [["Fv", 0.75, "N m s/rad"]]
+    assert abs(finding["since_s"] - 1.5) < 1e-6
+    failed = replace(now.view, ended=("driver_error", "the cable came off"))
+    assert Onlooker(seen.known).look(failed).headline.startswith("Ended: the cable came off")
+    behind = replace(now.view, push=None, waiting=31_000)
+    assert "31000 samples behind" in Onlooker(seen.known).look(behind).headline
+
+
+def test_messages_are_small_and_plain(seen: Seen, course: list[Now]) -> None:
+    messages = Messages(Onlooker(seen.known))
+    for now in course:
+        for kind, message in messages.take(now).items():
+            assert len(encode(message)) < 6000, kind
+    history = json.loads(messages.history())
+    assert len(history["frames"]) == len(course) and 5 < len(history["estimates"]) <= len(course)
+
+
+def test_the_table_on_a_terminal(seen: Seen) -> None:
+    text = Console(width=90, no_color=True, force_terminal=False)
+    with text.capture() as captured:
+        text.print(table_of(troubled(seen), seen.known))
+    lines = captured.get().splitlines()
+    assert lines[0].startswith("Contact: something pushes panda_joint4")
+    assert [line.split()[0] for line in lines if "panda_joint" in line][1:] == [
+        f"panda_joint{j}" for j in range(1, 8)
+    ]
+    assert any("load 0.523 ± 0.011 kg · contact joint 4" in line for line in lines)
+    assert any("tick p99 200 µs, 0 deadlines missed" in line for line in lines)
+    assert max(map(len, lines)) <= 90
+
+
+def test_lines_come_out_above_the_table(seen: Seen, tmp_path: Path) -> None:
+    """On a terminal that is emulated: what stays on it when the table is gone."""
+    path = tmp_path / "typescript"
+    with path.open("w") as file:
+        shown = Console(file=file, force_terminal=True, width=100, height=40)
+        table = LiveTable(seen.known, shown)  # type: ignore[arg-type]
+        for k, view in enumerate(seen.views[::8]):
+            table(replace(view, lines=["the recorder process died"] if k > 3 else []))
+        table(seen.views[-1])
+    rows, row = [""] * 400, 0
+    for part in _pieces(path.read_bytes().decode()):
+        if part == "\n":
+            row += 1
+        elif part == "\x1b[1A":
+            row -= 1
+        elif part == "\x1b[2K":
+            rows[row] = ""
+        elif not part.startswith("\x1b"):
+            rows[row] = part if part.strip("\r") else rows[row]
+    left = [line.strip() for line in rows if line.strip()]
+    assert left == ["the recorder process died"]
+
+
+def _pieces(text: str) -> Iterator[str]:
+    import re
+
+    yield from (x for x in re.split(r"(\x1b\[[0-9;?]*[A-Za-z]|\n)", text.replace("\r", "")) if x)
+
+
+def test_the_page_needs_nothing_but_itself(seen: Seen) -> None:
+    page, policy = page_of(seen.known)
+    assert "default-src 'none'" in policy and "connect-src 'self'" in policy
+    script = page.index("<script>")
+    marked = page.replace("<script>", f'<meta content="{policy.split(";")[0]}"><template>')
+    marked = marked.replace("</script>", "</template>").replace('href="data:,"', 'href="#"')
+    marked = marked.replace('<link rel="icon" href="#">', "")
+    ids_of_a_page_that_fetches_nothing(marked)
+    assert script > 0 and "innerHTML" not in page
+
+
+@pytest.mark.parametrize("width", [1200, 390, 360])
+def test_the_page_in_a_browser(seen: Seen, tmp_path: Path, width: int) -> None:
+    """Numbers, words and pictures of a run with trouble; nothing wider than the window."""
+    listening = bind(0)
+    shown = LivePage(Onlooker(seen.known), listening)
+    now = troubled(seen)
+    with tab(tmp_path) as page:
+        page.size(width, 900, dark=width == 360)
+        page.open(address(listening))
+        page.wait_for("document.getElementById('who')?.textContent.includes('pybullet')")
+        shown(now)
+        page.wait_for("document.getElementById('headline').textContent.startsWith('Contact')")
+        text = page.value("document.body.innerText")
+        for words in ("0.523 ± 0.011 kg", "viscous friction (or coulomb friction)", "joint4"):
+            assert words in text
+        assert "on joint2, from 1.50 s on" in text and "a <b>line</b>" in text
+        assert page.value("document.documentElement.scrollWidth") <= width
+        assert page.value(PAINTED) > 0.9
+        page.value("document.querySelectorAll('input[name=joint]')[1].click()")
+        title = "document.getElementById('theta-title').textContent"
+        page.wait_for(f"{title} === 'θ: inertial parameters of link2'")
+        assert len(page.picture()) > 20_000 and page.console == []
+        shown(replace(now, headline="Ended: somebody stopped it", view=seen.views[-1]))
+        page.wait_for("document.getElementById('badge').textContent === 'ended'")
+        assert page.value("document.getElementById('headline').textContent").startswith("Ended")
+        assert "0.523 ± 0.011 kg" in page.value("document.body.innerText")  # the last state stays
+
+
+# Share of the residuals' and parameters' pictures that are not empty.
+PAINTED = """(() => {
+  const all = [...document.querySelectorAll('#residuals canvas, #arm')];
+  const full = all.filter((c) => c.getContext('2d').getImageData(0, 0, c.width, c.height)
+    .data.some((v) => v > 0));
+  return full.length / all.length;
+})()"""
+
+
+def test_a_page_comes_back_by_itself(seen: Seen, tmp_path: Path) -> None:
+    """The process dies and another serves the same run, then a new run, at the same address."""
+    listening = bind(0)
+    port = listening.getsockname()[1]
+    first = LivePage(Onlooker(seen.known), listening)
+    onlooker = Onlooker(seen.known)
+    for view in again(seen.views):
+        first(onlooker.look(view))
+    with tab(tmp_path) as page:
+        page.size(1200, 900)
+        page.open(f"http://127.0.0.1:{port}/")
+        page.wait_for("document.getElementById('clock')?.textContent.includes('s of')")
+        first._server.stop()
+        page.wait_for("document.getElementById('badge').textContent.includes('trying again')")
+        other = replace(seen.known, key="another", driver="fci://arm")
+        second = LivePage(Onlooker(other), bind(port))
+        second(Onlooker(other).look(seen.views[3]))
+        page.wait_for("document.getElementById('badge').textContent === 'live'")
+        page.wait_for("document.getElementById('who').textContent.includes('fci://arm')")
+        assert "Learning where" in page.value("document.getElementById('headline').textContent")
+        second._server.stop()
+
+
+def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
+    """A client subscribes to every topic and decodes it by the definition that came along."""
+    port = free_port(0)
+    shown = FoxgloveView(seen.known, port)
+    now = troubled(seen)
+    got: dict[str, list] = {}
+    place = f"ws://127.0.0.1:{port}"
+    with connect(place, subprotocols=["foxglove.sdk.v1"]) as client:  # type: ignore[list-item]
+        channels: dict[int, dict] = {}
+        while len(channels) < len(foxglove_view.TOPICS):
+            told = json.loads(client.recv(timeout=20))
+            if told["op"] == "advertise":
+                channels |= {channel["id"]: channel for channel in told["channels"]}
+            else:
+                assert told["op"] == "serverInfo" and told["capabilities"] == []
+        wanted = [{"id": number, "channelId": number} for number in channels]
+        client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        feed = threading.Thread(target=_feed, args=(shown, now))
+        feed.start()
+        while len(got) < len(channels):
+            data = client.recv(timeout=20)
+            if isinstance(data, str):
+                continue
+            opcode, number, stamp_ns = struct.unpack_from("<BIQ", data)
+            channel = channels[number]
+            assert opcode == 1 and channel["encoding"] == "cdr"
+            decode = generate_dynamic(channel["schemaName"], channel["schema"])
+            message = decode[channel["schemaName"]](data[13:])
+            got.setdefault(channel["topic"], []).append((stamp_ns, message))
+        feed.join()
+    assert got.keys() == foxglove_view.TOPICS.keys()
+    stamp_ns, state = got["/joint_states"][-1]
+    assert stamp_ns == now.stamp_ns and state.name == list(PANDA.tree.joint_names)
+    np.testing.assert_array_equal(state.position, now.q)
+    np.testing.assert_array_equal(got["/residuals"][-1][1].effort, now.residual)
+    np.testing.assert_array_equal(got["/external_torques"][-1][1].effort, np.arange(7.0) + 10.0)
+    theta = got["/theta"][-1][1]
+    assert [dim.size for dim in theta.layout.dim] == [7, 10] and theta.layout.dim[0].stride == 70
+    np.testing.assert_array_equal(theta.data, now.view.snapshot.theta.ravel())
+    assert got["/load"][-1][1].data == [0.5231, 0.0112]
+    assert got["/state"][-1][1].data == now.headline
+    assert got["/findings"][-1][1].data.startswith("viscous friction (or coulomb")
+    assert got["/robot_description"][-1][1].data.lstrip().startswith("<?xml")
+    _check_transforms(got["/tf"][-1][1].transforms, now)
+
+
+def _feed(shown: FoxgloveView, now: Now) -> None:
+    view = now.view
+    for k in range(40):  # a subscription takes a moment
+        view = replace(view, elapsed_s=view.elapsed_s + 3.0)
+        snapshot = replace(view.snapshot, version=100 + k)
+        shown(replace(now, view=replace(view, snapshot=snapshot)))
+        shown._told.clear()
+        time.sleep(0.05)
+    shown._server.stop()
+
+
+def _check_transforms(transforms: list, now: Now) -> None:
+    """Of both arms, chained up from the base: the hand stands where pinocchio puts it."""
+    import pinocchio as pin
+
+    model = pin.buildModelFromUrdf(str(PANDA_URDF))
+    data = model.createData()
+    pin.forwardKinematics(model, data, now.q)
+    chain = {x.child_frame_id: x for x in transforms}
+    for prefix in ("", "learned/"):
+        place, name = pin.SE3.Identity(), prefix + PANDA.tree.link_names[-1]
+        while name in chain:
+            step = chain[name]
+            turn, shift = step.transform.rotation, step.transform.translation
+            turned = pin.Quaternion(turn.w, turn.x, turn.y, turn.z).matrix()
+            place = pin.SE3(turned, np.array([shift.x, shift.y, shift.z])) * place
+            name = step.header.frame_id
+        assert name == PANDA.tree.base_name
+        np.testing.assert_allclose(place.homogeneous, data.oMi[7].homogeneous, atol=1e-6)
+
+
+def test_a_port_of_foxglove_that_is_taken() -> None:
+    taken = bind(0)
+    port = taken.getsockname()[1]
+    with pytest.raises(Exception, match=rf"port {port} .*--foxglove 0"):
+        free_port(port)
+    taken.close()
