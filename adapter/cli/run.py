@@ -38,11 +38,12 @@ from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
+from adapter.realtime.run_messages import ShownArm
 from adapter.realtime.showing import DisplayJob
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines, contacts_of
-from adapter.runs.live import describe_estimate, learner_job
+from adapter.runs.live import learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
 from adapter.runs.terminal import (
@@ -310,7 +311,7 @@ def _recording(
         metadata,
         attachments,
         overwrite=args.record is None,
-        describe=describe_estimate,
+        arm=ShownArm.of(plan.robot),
     )
 
 
