@@ -24,6 +24,7 @@ FRANKA_STATE = "franka_msgs/msg/FrankaState"  # of ROS 2; that of ROS 1 comes wi
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 STRING = "std_msgs/msg/String"
+FLOAT64_MULTI_ARRAY = "std_msgs/msg/Float64MultiArray"
 TF = "tf2_msgs/msg/TFMessage"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 ESTIMATE = "panda_adapter_msgs/msg/Estimate"
@@ -50,6 +51,9 @@ _FIELDS = {
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec\n",
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id\n",
     "std_msgs/String": "string data\n",
+    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride\n",
+    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset\n",
+    "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout\nfloat64[] data\n",
     "geometry_msgs/Vector3": _XYZ,
     "geometry_msgs/Point": _XYZ,
     "geometry_msgs/Quaternion": _XYZ + "float64 w\n",
@@ -126,6 +130,6 @@ SCHEMAS = {
     name: _schema(name)
     for name in (
         *(JOINT_STATE, JOINT_TRAJECTORY, TWIST_STAMPED, ACCEL_STAMPED, WRENCH_STAMPED, IMU),
-        *(ODOMETRY, STRING, TF, DIAGNOSTICS, ESTIMATE, LOAD, TIMING),
+        *(ODOMETRY, STRING, FLOAT64_MULTI_ARRAY, TF, DIAGNOSTICS, ESTIMATE, LOAD, TIMING),
     )
 }
