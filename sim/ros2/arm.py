@@ -85,6 +85,7 @@ class ServedArm:
         self._order = np.argsort(names)
         self._names = [names[k] for k in self._order]
         self._ticks, self._tick = Ticks(), 0
+        self._driven = 0  # since this tick there are commands
         self._command: np.ndarray | None = None
         self._new_at = 0.0
         self._start_ns = time.time_ns()
@@ -115,6 +116,7 @@ class ServedArm:
                 self._sent["bad commands"] += 1
                 continue
             self._command, self._new_at = np.array(message.data), now
+            self._driven = self._driven or self._tick
         watch_s = self._place.watch_s
         if self._command is not None and watch_s and now - self._new_at > watch_s:
             self._command = None
@@ -146,7 +148,9 @@ class ServedArm:
 
     def _strikes(self, name: str) -> bool:
         fault = self._faults.get(name)
-        if fault is None or self._tick < 1000 * fault.at_s:
+        if fault is None:
+            return False
+        if fault.at_s and (not self._driven or self._tick < self._driven + 1000 * fault.at_s):
             return False
         struck = not fault.value or self._random.random() < fault.value
         self._sent[f"fault {name}"] += int(struck)

@@ -23,7 +23,7 @@ KINDS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe(KINDS)
+    parser.epilog = "faults, NAME[=VALUE][@SECONDS], from the first command on:\n" + describe(KINDS)
     add = parser.add_argument
     domain = int(os.environ.get("ROS_DOMAIN_ID") or DOMAIN)
     add("--domain", type=int, default=domain, metavar="N", help="of DDS; ROS_DOMAIN_ID, else 0")
