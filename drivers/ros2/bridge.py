@@ -44,7 +44,7 @@ from drivers.ros2.settings import Ros2Settings
 from drivers.ros2.wire import Found, Network, Publication, described
 
 DESCRIPTION = "/robot_description"
-FIRST_S = 4.0  # for the first message of the states' topic
+FIRST_S, SLOW_S = 4.0, 15.0  # for the first states; where discovery shows somebody who sends them
 SEEN_S, MEASURED = 1.0, 20  # at least, before others are judged; messages that tell the rate
 SILENCE_S = 0.05  # without a command, of an arm that is driven
 HELD_S = 10.0  # that an arm is held for which nobody asks any more
@@ -174,7 +174,7 @@ class Bridge:
         self._lock, self._gone = threading.Lock(), threading.Event()
         self._sent = int(self._memory.words[SEQUENCE])
         self._taken = False  # from the driver, which has to stop before it drives again
-        self._began = self._heard = time.monotonic()
+        self._heard = time.monotonic()
         self._look_at = self._idle_at = 0.0
 
     def prepare(self) -> None:
@@ -204,20 +204,21 @@ class Bridge:
         say(ready=list(names), effort=self._braker.effort.tolist())
 
     def _first_states(self) -> list[bytes]:
+        """Enough to tell the rate, once others had the time to be discovered. Raises DriverError."""
         found: list[bytes] = []
-        end = time.monotonic() + FIRST_S
-        while len(found) < MEASURED or time.monotonic() < self._began + SEEN_S:
+        topic, begin = self._start.settings.states, time.monotonic()
+        while len(found) < MEASURED or time.monotonic() < begin + SEEN_S:
             found += self._states.take()
-            if time.monotonic() > end:
-                break
+            waited_s = time.monotonic() - begin
+            if waited_s > FIRST_S and len(found) < MEASURED:
+                seen = [x for x in self._network.publishers() if x.schema == JOINT_STATE]
+                if waited_s > SLOW_S or all(x.topic != topic for x in seen):
+                    raise DriverError(
+                        f"{len(found)} joint states on {topic} within {waited_s:.0f} s in domain "
+                        f"{self._start.settings.domain}; topics of joint states that are "
+                        f"published: {described(seen)}"
+                    )
             time.sleep(0.002)
-        if len(found) < MEASURED:
-            topic, seen = self._start.settings.states, self._network.publishers()
-            told = described([x for x in seen if x.schema == JOINT_STATE])
-            raise DriverError(
-                f"{len(found)} joint states on {topic} within {FIRST_S:.0f} s in domain "
-                f"{self._start.settings.domain}; topics of joint states that are published: {told}"
-            )
         return found
 
     def _check_rate(self, first: list[bytes]) -> None:
