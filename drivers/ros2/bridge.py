@@ -204,7 +204,7 @@ class Bridge:
         say(ready=list(names), effort=self._braker.effort.tolist())
 
     def _first_states(self) -> list[bytes]:
-        """Enough to tell the rate, once others had the time to be discovered. Raises DriverError."""
+        """Enough to tell the rate, once others had time to be discovered. Raises DriverError."""
         found: list[bytes] = []
         topic, begin = self._start.settings.states, time.monotonic()
         while len(found) < MEASURED or time.monotonic() < begin + SEEN_S:
