@@ -16,6 +16,7 @@ from adapter.cli.agreement import agree, need_somebody, reading
 from adapter.cli.common import configure, recording_metadata, robot_of, with_motion
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
+from adapter.cli.publishing import publisher_job, together
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.cli.watching import known_run, view_job
@@ -253,6 +254,7 @@ def _go(
     effects = config.pipeline.learner.effects
     known = known_run(args, robot, effects, duration_s)
     # without a terminal (a pipe, CI) there is no table, and who has something to say says it
+    publisher = publisher_job(args.driver, robot, effects)
     display = None
     if console.is_terminal and not args.quiet:
         display = DisplayJob(partial(make_display, known), says=True)
@@ -280,7 +282,7 @@ def _go(
         driver,
         front_end,
         controller,
-        Jobs(learner, recording, display, view_job(args, known)),
+        Jobs(learner, recording, display, together([view_job(args, known), publisher])),
         LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
         say=say,
     )
