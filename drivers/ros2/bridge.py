@@ -361,8 +361,11 @@ class Bridge:
             if doing == Doing.DRIVING:
                 memory.words[STATE] = Doing.BRAKING
         elif doing == Doing.DRIVING:
-            silent_s = now - 1e-9 * int(memory.words[BEAT])
-            if silent_s > SILENCE_S:
+            unheard_s, silent_s = now - self._heard, now - 1e-9 * int(memory.words[BEAT])
+            if silent_s > SILENCE_S and unheard_s > 0.5 * silent_s:  # a command answers a state
+                topic = self._start.settings.states
+                self._take_over(f"{topic} has been silent for {1e3 * unheard_s:.0f} ms")
+            elif silent_s > SILENCE_S:
                 self._take_over(f"no command came for {1e3 * silent_s:.0f} ms")
         if memory.doing in BRAKES and now - self._heard > SILENCE_S:
             self._send(self._braker.blind())

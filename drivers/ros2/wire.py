@@ -56,12 +56,12 @@ class Network:
         try:
             from cyclonedds import builtin
             from cyclonedds.core import DDSException
-            from cyclonedds.domain import Domain, DomainParticipant
+            from cyclonedds.domain import DomainParticipant
         except ImportError as error:
             raise DriverError(MISSING) from error
         try:
-            # Of one domain a process may have one configuration; a second one would be refused.
-            self._domain = Domain(domain, LOCAL) if local else None
+            if local:
+                _domain_of_this_machine(domain)
             self._participant = DomainParticipant(domain)
             readers = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
             self._seen = [builtin.BuiltinDataReader(self._participant, kind) for kind in readers]
@@ -99,6 +99,14 @@ class Network:
     def publish(self, topic: str, schema: str, latched: bool = False) -> Publication:
         """Publish on a topic of ROS; `latched` keeps the last message for who comes later."""
         return Publication(self, topic, schema, latched)
+
+
+@cache
+def _domain_of_this_machine(domain: int) -> Any:
+    """Its configuration, which a process may give a domain once; kept, since it ends with it."""
+    from cyclonedds.domain import Domain
+
+    return Domain(domain, LOCAL)
 
 
 class Subscription:
