@@ -15,7 +15,7 @@ from drivers.files.ros import JointStateEncoder  # noqa: E402
 from drivers.files.ros_types import FLOAT64_MULTI_ARRAY, JOINT_STATE  # noqa: E402
 from drivers.interface import DriverError  # noqa: E402
 from drivers.ros2.arm import Ros2Arm  # noqa: E402
-from drivers.ros2.bridge import States, encode_command  # noqa: E402
+from drivers.ros2.bridge import JUMPS, States, encode_command  # noqa: E402
 from drivers.ros2.holding import Braker  # noqa: E402
 from drivers.ros2.memory import REFUSED, Doing, Memory, Refusal  # noqa: E402
 from drivers.ros2.settings import parse  # noqa: E402
@@ -98,6 +98,8 @@ def test_what_cannot_be_is_refused_and_counted():
     counts = memory.words[REFUSED : REFUSED + len(Refusal)].tolist()
     assert all(counts[why] == 1 for why in bad) and sum(counts) == len(bad)
     assert states.take(message(10**9 + 10**7, (1.2, 2.1))) is not None  # in 10 ms it may have gone
+    far = [states.take(message(2 * 10**9 + k, (40.0, 2.1))) for k in range(JUMPS + 1)]
+    assert far[:JUMPS] == [None] * JUMPS and states.jumps == 0 and far[JUMPS] is not None
 
 
 @pytest.mark.parametrize("period_s", [0.001, 0.01])
@@ -218,22 +220,22 @@ def _silence_of_the_loop_brakes(address):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize(
-    ("fault", "said"),
-    [("silence@0.5", "/joint_states has been silent for"), ("moved@0.5", "beyond a joint's reach")],
-)
-def test_an_arm_that_falls_silent_or_jumps_ends_the_run(fault, said):
-    options = ["--fault", fault, "--fault", "nan=0.02", "--fault", "jump=0.02"]
-    with ros2_arm(*options) as address, connected(address) as arm:
+def test_bad_numbers_are_left_out_and_silence_ends_the_run():
+    faults = ("--fault", "silence@0.5", "--fault", "nan=0.02", "--fault", "jump=0.02")
+    with ros2_arm(*faults) as address, connected(address) as arm:
         refused = {}
         while not {"not_finite", "jump"} <= refused.keys():
             sample = patient_read(arm)
             assert np.isfinite(sample.q).all()
             refused = arm.intake.refused
         assert any("none (NaN)" in note for note in arm.intake.notes)
-        with pytest.raises(DriverError, match=said):
-            push(arm, 0.0, 30_000)
-        arm.stop()
+        said, end = "", time.monotonic() + 60.0
+        while "has been silent" not in said and time.monotonic() < end:
+            with pytest.raises(DriverError) as caught:
+                push(arm, 0.0, 30_000)
+            said = str(caught.value)  # beside busy processes: that no command came
+            arm.stop()
+        assert "/joint_states has been silent for" in said
 
 
 @pytest.mark.alone
