@@ -117,8 +117,7 @@ class Ros2Arm:
             self.intake.commands = CommandCount()
         self._driving, self._fault = False, ""
         self._bridge = self._started()
-        self._next = int(self._bridge.memory.words[HEAD])
-        self._ignored = self._bridge.memory.words[REFUSED : REFUSED + len(Refusal)].copy()
+        self._begin_with(self._bridge)
         self._stamp_ns = 0
 
     def _started(self, rescue: bool = False) -> _Process:
@@ -198,8 +197,13 @@ class Ros2Arm:
         """A new bridge in the place of one that died while the arm was driven."""
         dead.end(0.0)
         bridge = self._started(rescue=True)
-        self._next = int(bridge.memory.words[HEAD])
+        self._begin_with(bridge)
         return bridge
+
+    def _begin_with(self, bridge: _Process) -> None:
+        """Samples and counts begin with what a new bridge hears from now on."""
+        self._next = int(bridge.memory.words[HEAD])
+        self._ignored = bridge.memory.words[REFUSED : REFUSED + len(Refusal)].copy()
 
     def close(self) -> None:
         """Stop, then end the bridge. The controller goes on with the torques that hold the arm."""

@@ -44,7 +44,8 @@ from drivers.ros2.settings import Ros2Settings
 from drivers.ros2.wire import Found, Network, Publication, described
 
 DESCRIPTION = "/robot_description"
-FIRST_S, SLOW_S = 4.0, 15.0  # for the first states; where discovery shows somebody who sends them
+# For the first states, s; where discovery shows somebody who sends them
+FIRST_S, SLOW_S = 4.0, 15.0
 SEEN_S, MEASURED = 1.0, 20  # at least, before others are judged; messages that tell the rate
 SILENCE_S = 0.05  # without a command, of an arm that is driven
 HELD_S = 10.0  # that an arm is held for which nobody asks any more

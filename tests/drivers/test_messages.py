@@ -97,6 +97,13 @@ def test_a_recording_of_them_is_read_by_everybody(tmp_path):
     assert read_log(path).topics["/estimates"].schema == ESTIMATE
 
 
+def test_the_recording_of_the_repository_is_read_by_everybody():
+    (path,) = Path(__file__).parents[2].glob("recordings/*.mcap")
+    assert_read_by_everybody(path, {"/joint_states", "/joint_commands", "/estimates"})
+    last = list(read_estimates(path))[-1]
+    assert last["lambda_converged"] and last["joint_names"][0] == "panda_joint1"
+
+
 def test_estimates_in_json_are_read_and_told_anew(tmp_path, old_recording):
     """Recordings before version 0.2."""
     before = list(read_estimates(old_recording))
