@@ -1,4 +1,6 @@
-"""A driver by its address: `pybullet:panda`, `log:FILE.mcap`, `fci://HOST`, `can://CHANNEL?...`."""
+"""A driver by its address: `pybullet:panda`, `log:FILE.mcap`, `fci://HOST`, `can://CHANNEL?...`,
+`ros2:///TOPIC?...`.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,17 @@ Builder = Callable[[str], "Driver"]
 # wrong is told before anything is loaded.
 LOG = ".files.log:LogArm"  # takes (file, joint names)
 # Behind these an arm may be real; take (address, joint names, whether the arm may be moved).
-HARDWARE = {"fci": ".fci.arm:FciArm", "can": ".damiao.arm:DamiaoArm"}
-COUNT = {"fci": ".fci.arm:joint_count", "can": ".damiao.settings:joint_count"}
-NAMELESS = ("can",)  # of these, arms that cannot tell which robot they are
+HARDWARE = {
+    "fci": ".fci.arm:FciArm",
+    "can": ".damiao.arm:DamiaoArm",
+    "ros2": ".ros2.arm:Ros2Arm",
+}
+COUNT = {
+    "fci": ".fci.arm:joint_count",
+    "can": ".damiao.settings:joint_count",
+    "ros2": ".ros2.settings:joint_count",
+}
+NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
 
 
@@ -28,7 +38,7 @@ def split_address(address: str) -> tuple[str, str]:
     if not colon or not rest:
         raise DriverError(
             f"'{address}' is no driver address; write SCHEME:WHAT, as in pybullet:panda, "
-            "fci://172.16.0.2 or can://can0?interface=socketcan"
+            "fci://172.16.0.2, can://can0?interface=socketcan or ros2:///joint_states"
         )
     return scheme, rest
 

@@ -17,6 +17,7 @@ from adapter.cli.agreement import agree, need_somebody, reading
 from adapter.cli.common import configure, recording_metadata, robot_of, with_motion
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
+from adapter.cli.publishing import publisher_job, together
 from adapter.cli.results import Learned, conclude
 from adapter.cli.run_options import simulated
 from adapter.cli.watching import known_run, view_job
@@ -39,11 +40,12 @@ from adapter.realtime.following import FollowingObserver
 from adapter.realtime.jobs import Jobs, RecordingJob
 from adapter.realtime.learned_feedforward import FeedforwardBound, LearnedFeedforward
 from adapter.realtime.loop import LiveOptions, LiveResult, run_live
+from adapter.realtime.run_messages import ShownArm
 from adapter.realtime.showing import DisplayJob
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines, contacts_of
-from adapter.runs.live import describe_estimate, learner_job
+from adapter.runs.live import learner_job
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.score import Course, figures, reference_from
 from adapter.runs.terminal import (
@@ -254,6 +256,7 @@ def _go(
     effects = config.pipeline.learner.effects
     known = known_run(args, robot, effects, duration_s)
     # without a terminal (a pipe, CI) there is no table, and who has something to say says it
+    publisher = publisher_job(args.driver, robot, effects)
     display = None
     if console.is_terminal and not args.quiet:
         display = DisplayJob(partial(make_display, known), says=True)
@@ -281,7 +284,7 @@ def _go(
         driver,
         front_end,
         controller,
-        Jobs(learner, recording, display, view_job(args, known)),
+        Jobs(learner, recording, display, together([view_job(args, known), publisher])),
         LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
         say=say,
     )
@@ -316,7 +319,7 @@ def _recording(
         metadata,
         attachments,
         overwrite=args.record is None,
-        describe=describe_estimate,
+        arm=ShownArm.of(plan.robot),
     )
 
 

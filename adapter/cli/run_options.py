@@ -30,13 +30,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--driver",
         default="pybullet:panda",
         metavar="ADDRESS",
-        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=...",
+        help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
+        "ros2:///joint_states",
     )
     add(
         "--allow-motion",
         action="store_true",
-        help="leave to move an arm that may be real (fci, can): prints the plan, goes at a tenth "
-        "of the speed for 10 s, stops when this terminal closes. Without it, only listen",
+        help="leave to move an arm that may be real (fci, can, ros2): prints the plan, goes at a "
+        "tenth of the speed for 10 s, stops when this terminal closes. Without it, only listen",
     )
     add("--yes", action="store_true", help="move without being asked after the plan")
     add(

@@ -32,6 +32,11 @@ ARMS = {
         "sim.damiao.options",
         "sim.damiao.command",
     ),
+    "ros2": Served(
+        "an arm behind ros2_control: joint states and an effort controller, over DDS on loopback",
+        "sim.ros2.options",
+        "sim.ros2.command",
+    ),
 }
 
 

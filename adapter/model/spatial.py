@@ -102,10 +102,18 @@ def log_rotation(rotation: ArrayLike) -> Array:
 
 
 def quaternion_from_matrix(rotation: ArrayLike) -> Array:
-    """The unit quaternion [w x y z] (4,) of a rotation (3, 3), w not below zero."""
+    """Unit quaternions [w x y z] (..., 4) of rotations (..., 3, 3), w not below zero."""
     turn = log_rotation(rotation)
-    half = 0.5 * float(np.linalg.norm(turn))
-    return np.r_[np.cos(half), 0.5 * np.sinc(half / np.pi) * turn]
+    half = 0.5 * np.linalg.norm(turn, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * turn], axis=-1)
+
+
+def quaternion_product(a: ArrayLike, b: ArrayLike) -> Array:
+    """Quaternions [w x y z] (..., 4) of the rotation b followed by the rotation a."""
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    w, v, x, u = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    real = w * x - np.sum(v * u, axis=-1, keepdims=True)
+    return np.concatenate([real, w * u + x * v + np.cross(v, u)], axis=-1)
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:

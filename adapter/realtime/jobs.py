@@ -14,23 +14,33 @@ from __future__ import annotations
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from adapter.model.spatial import Array
+from adapter.realtime.loop_board import LoopBoard
 from adapter.realtime.raw_layout import RawLayout
 from adapter.realtime.ring import Ring
+from adapter.realtime.run_messages import RunMessages, ShownArm, estimate_names
 from adapter.realtime.shared import leave
 from adapter.realtime.showing import DisplayJob
-from adapter.realtime.snapshot import Snapshot, SnapshotReader, SnapshotWriter
+from adapter.realtime.snapshot import (
+    ExternalTorque,
+    Snapshot,
+    SnapshotReader,
+    SnapshotWriter,
+)
 from adapter.realtime.worker import IDLE_S, ROWS_AT_ONCE, Port
 from drivers.files.mcap import FLUSH_S, McapWriter
+from drivers.files.messages import Message
 
 UNFINISHED = "next"
+PUSHES = 100  # read from the loop's board before the posture at their instant is known
 HAND_OVER_S = 0.8 * FLUSH_S  # samples are given back to the loop when the system has them
 
 
@@ -81,16 +91,19 @@ class RecordingJob:
         metadata: configuration, version, ...: written at the start.
         attachments: files to put inside, by name.
         overwrite: whether an existing file may be replaced.
-        describe: what of an estimate goes to /estimates; everything where None.
-        estimate_s: how often.
+        arm: told beside the samples, as documented and as learned; None tells no frames.
+        estimate_s, frames_s, timing_s: how often an estimate, the links' places and what the
+            loop's timing was meanwhile are told.
     """
 
     path: Path
     metadata: Mapping[str, Any] = field(default_factory=dict)
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     overwrite: bool = False
-    describe: Callable[[Snapshot], Mapping[str, Any]] | None = None
+    arm: ShownArm | None = None
     estimate_s: float = 0.1
+    frames_s: float = 1.0 / 30.0
+    timing_s: float = 1.0
 
     def part(self, k: int) -> RecordingJob:
         """The same for the k-th successor of a recorder that died: a file of its own."""
@@ -225,6 +238,7 @@ class RecorderTask:
     job: RecordingJob
     ring: str
     snapshot: str | None
+    loop: str | None
     joint_names: tuple[str, ...]
     link_names: tuple[str, ...]
 
@@ -237,6 +251,7 @@ class RecorderTask:
         """
         ring = Ring.attach(self.ring)
         reader = None if self.snapshot is None else SnapshotReader(self.snapshot)
+        board = None if self.loop is None else LoopBoard.attach(self.loop)
         job = self.job
         ring.resume(ring.released)
         try:
@@ -246,21 +261,20 @@ class RecorderTask:
             with writer:
                 for name, data in job.attachments.items():
                     writer.attach(name, data, "application/octet-stream")
+                beside = Beside(writer, job, (reader, board), self.joint_names)
                 port.ready()
-                written = self._drain(writer, ring, reader, port)
+                written = self._drain(writer, ring, beside, port)
             ring.give_back()
             if not written:
                 job.path.unlink(missing_ok=True)
             return written
         finally:
-            leave(port.orphaned, [self.ring], ring, reader)
+            leave(port.orphaned, [self.ring], ring, reader, board)
 
-    def _drain(
-        self, writer: McapWriter, ring: Ring, reader: SnapshotReader | None, port: Port
-    ) -> int:
+    def _drain(self, writer: McapWriter, ring: Ring, beside: Beside, port: Port) -> int:
         layout = RawLayout(len(self.joint_names), len(self.link_names))
-        own, written, version = layout.new(), 0, 0
-        flush_at = estimate_at = time.monotonic()
+        own, written = layout.new(), 0
+        flush_at = time.monotonic()
         while True:
             finished = ring.finished
             rows = ring.peek(ROWS_AT_ONCE)
@@ -273,15 +287,14 @@ class RecorderTask:
                 external = layout.external_torque(own)
                 if external is not None:
                     writer.write_external(sample.stamp_ns, external)
+                beside.sample(sample.stamp_ns, sample.q)
             count = len(rows)
             del rows
             ring.take(count)
             written += count
             now = time.monotonic()
             drained = not count and (finished or port.orphaned)
-            if reader is not None and (now >= estimate_at or drained):
-                version = self._estimate(writer, reader, version)
-                estimate_at = now + self.job.estimate_s
+            beside.look(now, drained)
             if now >= flush_at or 2 * ring.kept > ring.rows:
                 writer.flush()
                 ring.give_back()
@@ -291,10 +304,58 @@ class RecorderTask:
             if not count:
                 time.sleep(IDLE_S)
 
-    def _estimate(self, writer: McapWriter, reader: SnapshotReader, version: int) -> int:
-        snapshot = reader.read()
-        if snapshot.version == version:
-            return version
-        describe = asdict if self.job.describe is None else self.job.describe
-        writer.write_estimate(snapshot.stamp_ns, dict(describe(snapshot)))
-        return snapshot.version
+
+class Beside:
+    """What a recorder writes beside the samples, each at its time.
+
+    Args:
+        writer: of the file.
+        job: what to tell.
+        sources: of the estimate and of the loop's timing; None where there is none.
+        joint_names: of the arm.
+    """
+
+    def __init__(
+        self,
+        writer: McapWriter,
+        job: RecordingJob,
+        sources: tuple[SnapshotReader | None, LoopBoard | None],
+        joint_names: tuple[str, ...],
+    ) -> None:
+        self._writer, self._job = writer, job
+        self._reader, self._board = sources
+        names = estimate_names(joint_names, self._reader, job.arm)
+        self._messages = RunMessages(names, job.arm)
+        self._stamp_ns = self._frames_at_ns = 0
+        self._look_at = self._timing_at = 0.0
+        self._pushes: deque[ExternalTorque] = deque(maxlen=PUSHES)
+
+    def sample(self, stamp_ns: int, q: Array) -> None:
+        """A sample was written."""
+        if not self._stamp_ns:
+            self._write(self._messages.first(stamp_ns))
+        self._stamp_ns = stamp_ns
+        while self._pushes and self._pushes[0].stamp_ns <= stamp_ns:
+            self._write(self._messages.push(self._pushes.popleft(), q))
+        if abs(stamp_ns - self._frames_at_ns) < 1e9 * self._job.frames_s:
+            return
+        self._frames_at_ns = stamp_ns
+        self._write(self._messages.frames(stamp_ns, q))
+        if self._reader is not None:
+            self._pushes.append(self._reader.read_external())
+
+    def look(self, now: float, last: bool) -> None:
+        """Tell what others know, where it is new; `last` when nothing comes any more."""
+        if not self._stamp_ns or not (now >= self._look_at or last):
+            return
+        self._look_at = now + self._job.estimate_s
+        if self._reader is not None:
+            self._write(self._messages.estimate(self._reader.read()))
+            self._write(self._messages.news(self._stamp_ns, self._reader.read_news()))
+        if self._board is not None and (now >= self._timing_at or last):
+            self._timing_at = now + self._job.timing_s
+            self._write(self._messages.timing(self._stamp_ns, self._board.timing()))
+
+    def _write(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            self._writer.write_message(message)

@@ -115,6 +115,8 @@ class Supervisor:
             self.board = self._new_board(jobs.learner)
             self.learner = self._start_learner(jobs.learner, self.states, self.board.name)
         board = None if self.board is None else self.board.name
+        if jobs.recording or jobs.display or jobs.view:
+            self.loop_board = LoopBoard.create()
         if jobs.recording is not None:
             self.samples = Ring.create(self.raw.size, rows)
             self.recorder = self._start_recorder(jobs.recording, self.samples, board)
@@ -127,9 +129,8 @@ class Supervisor:
 
     def _start_displays(self, board: str | None) -> None:
         jobs, shown = self._jobs, self.states or self.samples
-        if shown is None or (jobs.display is None and jobs.view is None):
+        if shown is None or self.loop_board is None:
             return
-        self.loop_board = LoopBoard.create()
         names = shown.name, board, self.loop_board.name
         if jobs.display is not None:
             show = DisplayTask(jobs.display, *names)
@@ -166,9 +167,10 @@ class Supervisor:
         self, job: RecordingJob, ring: Ring, board: str | None
     ) -> RestartableWorker:
         name = "recorder process"
+        loop = None if self.loop_board is None else self.loop_board.name
 
         def build(k: int) -> Worker:
-            task = RecorderTask(job.part(k), ring.name, board, *self._names)
+            task = RecorderTask(job.part(k), ring.name, board, loop, *self._names)
             return Worker(name, task, self._cores, RECORDER_NICE)
 
         return RestartableWorker(name, build, self._policy("nothing more is recorded", RESTARTS))

@@ -167,17 +167,3 @@ def news_of(learner: OnlineLearner) -> dict[str, Any]:
         del findings[0]
     plain: dict[str, Any] = json_ready(news)
     return plain
-
-
-def describe_estimate(snapshot: Snapshot) -> dict[str, Any]:
-    """What of an estimate goes into the recording."""
-    return {
-        "stamp_ns": snapshot.stamp_ns,
-        "learned": snapshot.learned,
-        "lambda_source": snapshot.lambda_source,
-        "lambda_converged": snapshot.lam_converged,
-        "theta_converged": snapshot.theta_converged,
-        "lambda": snapshot.lam.tolist(),
-        "theta": snapshot.theta.tolist(),
-        "effects": snapshot.effects.tolist(),
-    }

@@ -14,7 +14,7 @@ import numpy as np
 from adapter.model.self_model import SelfModel
 from drivers.errors import choices
 from drivers.files.mcap import Carrier, FrameMotion, Log
-from drivers.files.ros import IMU
+from drivers.files.ros_types import IMU
 from drivers.interface import DriverError
 
 NO_IMUS = "none"  # what `--imu` takes where none shall be used

@@ -10,8 +10,9 @@ import pytest
 
 from adapter.cli import main
 from adapter.model.model_file import load_model
-from drivers.files.mcap import read_log
+from drivers.files.mcap import read_log, read_messages
 from tests.helpers.robot_models import PANDA
+from tests.helpers.ros_readers import assert_read_by_everybody, same
 
 pytestmark = pytest.mark.alone
 
@@ -72,6 +73,28 @@ def test_the_recording_holds_everything(run) -> None:
     assert log.metadata["config"]["pipeline"]["learner"]["mode"] == "moments"
     assert {"documented.json"} <= log.attachments.keys()
     assert log.topics["/estimates"].messages > 0  # how often is up to the machine
+
+
+def test_every_program_reads_every_topic_of_it(run) -> None:
+    """rosbags and mcap-ros2-support, without a filter; what they find is what we find."""
+    folder, _ = run
+    path = folder / "recording.mcap"
+    topics = {"/joint_states", "/joint_commands", "/external_torques", "/external_wrench"}
+    topics |= {"/estimates", "/timing", "/tf", "/tf_static", "/robot_description"}
+    found = assert_read_by_everybody(path, topics)
+    for topic, messages in found.items():
+        ours = list(read_messages(path, topic))
+        assert len(ours) == len(messages) == read_log(path).topics[topic].messages
+        for mine, (at, theirs) in zip(ours, messages, strict=True):
+            assert mine.stamp_ns == at and same(mine.fields, theirs)
+    frames = {x["child_frame_id"] for _, m in found["/tf"] for x in m["transforms"]}
+    assert {"documented/panda_link7", "learned/panda_link7"} <= frames
+    model = load_model(folder / "model.json")
+    _, last = found["/estimates"][-1]
+    assert [x["name"] for x in last["joints"]] == list(model.tree.joint_names)
+    ticks = found["/timing"][-1][1]["ticks"]
+    assert 0 < ticks <= len(found["/joint_states"])
+    assert min(m["tick_us"]["p50"] for _, m in found["/timing"]) > 0.0
 
 
 def test_export(run, tmp_path: Path) -> None:

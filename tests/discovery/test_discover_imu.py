@@ -16,7 +16,7 @@ from adapter.cli import main
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from drivers.files.mcap import read_log
-from drivers.files.ros import IMU, JOINT_STATE, SCHEMAS
+from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS
 from drivers.interface import DriverError
 from tests.helpers.discovery_data import Case, Motion, anyhow, panda, record
 from tests.helpers.mcap_tools import START_NS, foreign, payloads, samples

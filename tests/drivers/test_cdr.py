@@ -10,10 +10,6 @@ from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
 from drivers.files.ros import (
-    ACCEL_STAMPED,
-    JOINT_STATE,
-    SCHEMAS,
-    TWIST_STAMPED,
     CdrError,
     JointStateEncoder,
     MotionEncoder,
@@ -21,6 +17,7 @@ from drivers.files.ros import (
     parse_joint_state,
     parse_motion,
 )
+from drivers.files.ros_types import ACCEL_STAMPED, JOINT_STATE, SCHEMAS, TWIST_STAMPED
 
 READ = {name: generate_dynamic(name, text)[name] for name, text in SCHEMAS.items()}
 WRITE = {name: serialize_dynamic(name, text)[name] for name, text in SCHEMAS.items()}

@@ -19,7 +19,7 @@ from drivers.example_arm import ExampleArm  # noqa: E402
 from drivers.faults.driver import with_faults  # noqa: E402
 from drivers.files.log import LogArm  # noqa: E402
 from tests.helpers.contract_suite import CHECKS, Make, Rig, Start, Tapped  # noqa: E402
-from tests.helpers.hardware_rigs import can_line, can_multicast, fci  # noqa: E402
+from tests.helpers.hardware_rigs import can_line, can_multicast, fci, ros2  # noqa: E402
 from tests.helpers.live_tools import simulated_arm  # noqa: E402
 from tests.helpers.mcap_tools import record, samples  # noqa: E402
 from tests.helpers.udp_arm import running  # noqa: E402
@@ -69,6 +69,8 @@ RIGS = [
     Rig("fci_listening", fci(10, False), moves=False, steady=False, wire=True),
     Rig("can_line", can_line),
     Rig("can_multicast", can_multicast, steady=False, wire=True),
+    Rig("ros2", ros2(True), steady=False, wire=True),
+    Rig("ros2_listening", ros2(False), moves=False, steady=False, wire=True),
 ]
 
 
@@ -91,7 +93,9 @@ ALL = [*RIGS, *map(with_trouble, RIGS)]
 
 def marks(rig: Rig) -> list[pytest.MarkDecorator]:
     """Faults are put in alike whatever the driver; of hardware one is enough for every day."""
-    seldom = rig.name.startswith(("faulty_fci", "faulty_can")) and rig.name != FAULTY_WIRE
+    seldom = (
+        rig.name.startswith(("faulty_fci", "faulty_can", "faulty_ros2")) and rig.name != FAULTY_WIRE
+    )
     return [pytest.mark.alone] * rig.wire + [pytest.mark.slow] * seldom
 
 

@@ -6,21 +6,20 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
-from mcap_ros2.decoder import DecoderFactory
 
-from drivers.files.mcap import McapWriter, derive_velocity, read_estimates, read_log, recover
-from drivers.files.ros import TWIST_STAMPED, JointStateEncoder, MotionEncoder
+from drivers.files.mcap import McapWriter, derive_velocity, read_log, recover
+from drivers.files.ros import JointStateEncoder, MotionEncoder
+from drivers.files.ros_types import TWIST_STAMPED
 from drivers.interface import DriverError
 from tests.helpers.mcap_tools import (
     JOINTS,
     LINKS,
-    START_NS,
-    STEP_NS,
     foreign,
     payloads,
     record,
     samples,
 )
+from tests.helpers.ros_readers import assert_read_by_everybody
 
 
 def stacked(items, name):
@@ -50,36 +49,25 @@ def test_what_is_written_is_read(tmp_path):
 def test_other_tools_read_it(tmp_path):
     items = samples(50, links=True)
     path = record(tmp_path / "a.mcap", items)
-    with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        assert reader.get_header().profile == "ros2"
-        found = [m.decoded_message for m in reader.iter_decoded_messages(["/joint_states"])]
-        twists = list(reader.iter_decoded_messages(["/link_twists/hand"]))
-    assert [list(m.position) for m in found] == [s.q.tolist() for s in items]
-    assert twists[7].decoded_message.header.frame_id == "hand"
-    assert twists[7].decoded_message.twist.angular.x == items[7].links.twist[2, 3]
+    topics = {f"/link_{what}/{link}" for what in ("twists", "accels") for link in LINKS}
+    found = assert_read_by_everybody(path, topics | {"/joint_states"})
+    assert [list(m["position"]) for _, m in found["/joint_states"]] == [s.q.tolist() for s in items]
+    _, twist = found["/link_twists/hand"][7]
+    assert twist["header"]["frame_id"] == "hand"
+    assert twist["twist"]["angular"]["x"] == items[7].links.twist[2, 3]
 
 
-def test_commands_estimates_and_attachments(tmp_path):
+def test_commands_and_attachments(tmp_path):
     path = tmp_path / "a.mcap"
     with McapWriter(path, JOINTS) as writer:
         writer.attach("model.json", b"{}")
         for s in samples(5):
             writer.write(s)
             writer.write_command(s.stamp_ns, s.tau + 1)
-            writer.write_estimate(s.stamp_ns, {"lam": s.q, "std": float("nan"), "valid": True})
     log = read_log(path)
     assert log.attachments == {"model.json": b"{}"}
     assert np.array_equal(log.commands.tau, log.tau + 1)
     assert log.commands.stamp_ns.tolist() == log.stamp_ns.tolist()
-    estimates = list(read_estimates(path))
-    assert estimates[2] == {
-        "stamp_ns": START_NS + 2 * STEP_NS,
-        "lam": log.q[2].tolist(),
-        "std": None,
-        "valid": True,
-    }
-    assert log.topics["/estimates"].encoding == "json"
 
 
 def test_a_recording_is_never_overwritten_by_accident(tmp_path):

@@ -10,7 +10,14 @@ from mcap_ros2.writer import Writer
 
 from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array
-from drivers.files.ros import ACCEL_STAMPED, IMU, JOINT_STATE, ODOMETRY, SCHEMAS, TWIST_STAMPED
+from drivers.files.ros_types import (
+    ACCEL_STAMPED,
+    IMU,
+    JOINT_STATE,
+    ODOMETRY,
+    SCHEMAS,
+    TWIST_STAMPED,
+)
 from tests.helpers.ros_messages import header, imu
 
 START_NS = 7_000_000_000

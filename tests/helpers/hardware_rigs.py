@@ -1,16 +1,20 @@
-"""Simulated hardware for the contract: FCI server and CAN boards, each behind its real wire."""
+"""Simulated hardware for the contract, each behind its real wire: FCI server, CAN boards, DDS."""
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
+import numpy as np
+
 from drivers.damiao.arm import DamiaoArm
 from drivers.fci.arm import FciArm
 from drivers.interface import JointSample
+from drivers.ros2.arm import Ros2Arm
 from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
@@ -23,6 +27,9 @@ SERVE_CAN = (
     "from sim.damiao.options import add_arguments; "
     "p = argparse.ArgumentParser(); add_arguments(p); sys.exit(run(p.parse_args()))"
 )
+
+SERVE_ROS2 = SERVE_CAN.replace("sim.damiao", "sim.ros2")
+PANDA_JOINTS = tuple(f"panda_joint{j}" for j in range(1, 8))
 
 # Of a simulated robot with a process that this machine holds up; less than the second after which
 # a driver gives up that waits for a state, as one does that lost the state it owes an answer to.
@@ -120,6 +127,43 @@ def can_line() -> Iterator[Start]:
             return Lockstep(arm, line)
 
         yield make
+
+
+def ros2(allow_motion: bool, *options: str):
+    """An arm behind ros2_control in a process of its own, on DDS over loopback."""
+
+    @contextmanager
+    def start() -> Iterator[Start]:
+        with ros2_arm(*options) as address, closing() as arms:
+
+            def make() -> Ros2Arm:
+                for arm in arms:
+                    arm.close()  # two may not publish commands
+                arms.append(Ros2Arm(address, PANDA_JOINTS, allow_motion))
+                return arms[-1]
+
+            yield make
+
+    return start
+
+
+@contextmanager
+def ros2_arm(*options: str) -> Iterator[str]:
+    """`adapter sim ros2` with these options in a domain of its own; gives its address."""
+    with process("-c", SERVE_ROS2, "--domain", str(free_domain()), *options) as line:
+        yield line.split()[-1]
+
+
+def free_domain() -> int:
+    """A DDS domain that nobody on this machine uses: its first participant's port is free."""
+    for domain in np.random.default_rng().permutation(np.arange(60, 200)).tolist():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", 7410 + 250 * domain))
+            except OSError:
+                continue
+            return int(domain)
+    raise RuntimeError("no DDS domain is free")
 
 
 def _maker(arms: list, address: str) -> Start:

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from adapter.model.spatial import exp_rotation
 from drivers.files.mcap import FrameMotion, Log
-from drivers.files.ros import IMU, JOINT_STATE, SCHEMAS
+from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS
 from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, pin_model, rnea, trajectory

@@ -21,7 +21,7 @@ from adapter.runs.replay import replay
 from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching
 from drivers.files.mcap import McapWriter, read_log
-from drivers.files.ros import IMU
+from drivers.files.ros_types import IMU
 from sim.imus import Imus
 from sim.scenarios import build
 from tests.helpers.imu_data import Parts, record

@@ -2,16 +2,19 @@
 
 `/joint_states` (sensor_msgs/msg/JointState), `/link_twists/<link>` and `/link_accels/<link>`
 (geometry_msgs/msg/TwistStamped and AccelStamped, frame_id the link), `/joint_commands` (JointState
-with effort only; of an arm that takes positions, with position only), `/estimates` (JSON), a
-metadata record with configuration and version. Read only: sensor_msgs/msg/Imu on any topic; of a
-floating base also nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any topic.
+with effort only; of an arm that takes positions, with position only), messages of any other type
+that `ros_types.SCHEMAS` defines (`/estimates`, `/tf`, `/robot_description`, ...), a metadata record
+with configuration and version. Every message is CDR and every channel carries its definition, so
+that programs read a recording that have never heard of this one. Read only: sensor_msgs/msg/Imu on
+any topic; of a floating base also nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any
+topic.
 """
 
 from drivers.files.mcap.bags import is_recording
 from drivers.files.mcap.imus import READERS, FrameMotion
 from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
-from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
+from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, read_messages, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
 from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
@@ -32,6 +35,7 @@ __all__ = [
     "looks_like_degrees",
     "read_estimates",
     "read_log",
+    "read_messages",
     "read_position_log",
     "recover",
     "survey",

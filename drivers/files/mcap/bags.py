@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
 from drivers.files.mcap.series import PARSERS, schema_name
-from drivers.files.ros import FRANKA_STATE, JOINT_STATE, JointStateEncoder
+from drivers.files.ros import JointStateEncoder
+from drivers.files.ros_types import FRANKA_STATE, JOINT_STATE
 from drivers.interface import DriverError
 
 _SQLITE, _ROS1, _ZSTD = b"SQLite format 3\0", b"#ROSBAG", b"\x28\xb5\x2f\xfd"

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.files.mcap.joints import stamps
 from drivers.files.mcap.links import Carrier, Links
 from drivers.files.mcap.series import Series
-from drivers.files.ros import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
+from drivers.files.ros_types import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
 from drivers.interface import Array
 
 _W, _W_UNKNOWN = slice(13, 16), 16  # of the run of doubles, and where its covariance begins

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.mcap.series import JOINT_SCHEMAS, Series
-from drivers.files.ros import JOINT_STATE, Block
+from drivers.files.ros import Block
+from drivers.files.ros_types import JOINT_STATE
 from drivers.interface import Array, DriverError
 
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from drivers.files.mcap.joints import stamps
 from drivers.files.mcap.series import Series
 from drivers.files.mcap.writer import LINK_ACCELS, LINK_TWISTS
-from drivers.files.ros import ACCEL_STAMPED, TWIST_STAMPED
+from drivers.files.ros_types import ACCEL_STAMPED, TWIST_STAMPED
 from drivers.interface import Array
 
 LONGEST_PERIODS = 3.0  # of the sensor; no line is drawn across a longer silence

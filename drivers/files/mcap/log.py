@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from drivers.errors import choices
 from drivers.files.bounded import parse_json
+from drivers.files.estimates import estimate_values, values_of_json
 from drivers.files.html_table import NOTHING, html_table
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
 from drivers.files.mcap.joints import Commands, Joints, assemble_joints, fits, read_commands
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
 from drivers.files.mcap.records import McapScan, Scan
-from drivers.files.mcap.series import JOINT_SCHEMAS, Series, collect
+from drivers.files.mcap.series import JOINT_SCHEMAS, Series, collect, schema_name
 from drivers.files.mcap.writer import (
     ESTIMATES,
     JOINT_COMMANDS,
@@ -27,7 +28,8 @@ from drivers.files.mcap.writer import (
     LINK_TWISTS,
     METADATA,
 )
-from drivers.files.ros import IMU
+from drivers.files.messages import Message, decode
+from drivers.files.ros_types import ESTIMATE, IMU
 from drivers.interface import Array, DriverError
 
 
@@ -246,13 +248,41 @@ def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
 
 
 def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[str, Any]]:
-    """The JSON messages of a topic, in the order of the file. Raises DriverError."""
+    """The estimates in a recording, in the order of the file, as `estimate_values` tells them.
+
+    Those of recordings before version 0.2 are JSON and tell less: no names, no standard
+    deviations. Raises DriverError.
+    """
+    for message in read_messages(path, topic):
+        if message.schema == ESTIMATE:
+            yield estimate_values(message.fields)
+        else:
+            yield values_of_json(message.fields)
+
+
+def read_messages(path: str | Path, topic: str) -> Iterator[Message]:
+    """The messages of a topic of an MCAP file, of whatever type the file defines.
+
+    Raises:
+        DriverError: the file cannot be read, or a message of the topic is damaged.
+    """
     scan = McapScan(Path(path))
     for region in scan.regions():
-        channels = region.channel.tolist()
-        wanted = {c.id for c in scan.channels.values() if c.topic == topic}
-        for i in (i for i, number in enumerate(channels) if number in wanted):
-            yield parse_json(region.data[region.start[i] : region.stop[i]].tobytes())
+        for i, number in enumerate(region.channel.tolist()):
+            channel = scan.channels.get(number)
+            if channel is None or channel.topic != topic:
+                continue
+            data = region.data[region.start[i] : region.stop[i]].tobytes()
+            schema = scan.schemas.get(channel.schema_id)
+            name = schema_name(scan, channel)
+            try:
+                if channel.message_encoding == "json":
+                    fields = parse_json(data)
+                else:
+                    fields = decode(name, data, schema.data.decode() if schema else None)
+            except ValueError as error:
+                raise DriverError(f"{path}: a message on {topic} is damaged: {error}") from error
+            yield Message(topic, name, int(region.times[i, 0]), fields)
 
 
 def _chosen(scan: Scan, topics: Mapping[str, Series], topic: str | None, effort: bool) -> Series:

@@ -11,14 +11,6 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap.records import Region, Scan
 from drivers.files.ros import (
-    ACCEL_STAMPED,
-    DYNAMIC_JOINT_STATE,
-    FRANKA_ROBOT_STATE,
-    FRANKA_STATE,
-    IMU,
-    JOINT_STATE,
-    ODOMETRY,
-    TWIST_STAMPED,
     Block,
     Bytes,
     Layout,
@@ -30,6 +22,16 @@ from drivers.files.ros import (
     parse_joint_state,
     parse_motion,
     parse_odometry,
+)
+from drivers.files.ros_types import (
+    ACCEL_STAMPED,
+    DYNAMIC_JOINT_STATE,
+    FRANKA_ROBOT_STATE,
+    FRANKA_STATE,
+    IMU,
+    JOINT_STATE,
+    ODOMETRY,
+    TWIST_STAMPED,
 )
 
 _JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {

@@ -14,18 +14,21 @@ import numpy as np
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
+from drivers.files.messages import Message, encode
 from drivers.files.ros import (
+    CdrError,
+    ImuEncoder,
+    JointStateEncoder,
+    MotionEncoder,
+    encode_joint_trajectory,
+)
+from drivers.files.ros_types import (
     ACCEL_STAMPED,
     IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
     SCHEMAS,
     TWIST_STAMPED,
-    CdrError,
-    ImuEncoder,
-    JointStateEncoder,
-    MotionEncoder,
-    encode_joint_trajectory,
 )
 from drivers.interface import Array, DriverError, JointSample, LinkMotion
 
@@ -40,12 +43,22 @@ ESTIMATES = "/estimates"
 METADATA = "panda_adapter"  # name of the metadata record with our own settings
 LIBRARY = "panda-adapter"
 FLUSH_S = 0.5  # a killed recorder loses less than this and the chunk being written
-_ESTIMATE = "panda_adapter.Estimate"
-_ESTIMATE_SCHEMA = {
-    "title": _ESTIMATE,
-    "type": "object",
-    "properties": {"stamp_ns": {"type": "integer"}},
-}
+_FOREVER = "    sec: 9223372036\n    nsec: 854775807\n"
+
+
+def _qos(history: int, depth: int, durability: int) -> str:
+    """Quality of service as rosbag2 writes it into a channel, in numbers of ROS's middleware."""
+    lines = (
+        f"- history: {history}\n  depth: {depth}\n  reliability: 1\n  durability: {durability}\n"
+    )
+    spans = "".join(
+        f"  {what}:\n{_FOREVER}" for what in ("deadline", "lifespan", "liveliness_lease_duration")
+    )
+    return f"{lines}{spans}  liveliness: 1\n  avoid_ros_namespace_conventions: false\n"
+
+
+LATCHED_QOS = _qos(history=1, depth=1, durability=1)  # keep last, reliable, transient local
+STREAM_QOS = _qos(history=1, depth=10, durability=2)  # keep last, reliable, volatile
 
 
 def to_json(value: Any) -> str:
@@ -179,10 +192,14 @@ class McapWriter:
         data = self._encode(self._commands, stamp_ns, tau, tau, tau)
         self._add(self._channel(EXTERNAL_TORQUES, JOINT_STATE), stamp_ns, data)
 
-    def write_estimate(self, stamp_ns: int, estimate: Mapping[str, Any]) -> None:
-        """Record an estimate as JSON; arrays become lists, not-a-number null."""
-        data = to_json({"stamp_ns": stamp_ns, **estimate}).encode()
-        self._add(self._channel(ESTIMATES, ""), stamp_ns, data)
+    def write_message(self, message: Message) -> None:
+        """Record a message of any type that `ros_types.SCHEMAS` defines."""
+        try:
+            data = encode(message.schema, message.fields)
+        except CdrError as error:
+            raise DriverError(f"{self.path}: message on {message.topic}: {error}") from error
+        channel = self._channel(message.topic, message.schema, message.latched)
+        self._add(channel, message.stamp_ns, data)
 
     def add_metadata(self, name: str, values: Mapping[str, Any]) -> None:
         """Add a metadata record at once, each value as JSON text."""
@@ -227,22 +244,18 @@ class McapWriter:
         except CdrError as error:
             raise DriverError(f"{self.path}: sample of {stamp_ns} ns: {error}") from error
 
-    def _channel(self, topic: str, schema: str) -> int:
+    def _channel(self, topic: str, schema: str, latched: bool = False) -> int:
         number = self._channels.get(topic)
         if number is None:
-            encoding = "cdr" if schema else "json"
-            number = self._writer.register_channel(topic, encoding, self._schema(schema))
+            offered = {"offered_qos_profiles": LATCHED_QOS if latched else STREAM_QOS}
+            number = self._writer.register_channel(topic, "cdr", self._schema(schema), offered)
             self._channels[topic] = number
         return number
 
     def _schema(self, name: str) -> int:
         if name not in self._schemas:
-            if name:
-                text, encoding = SCHEMAS[name], "ros2msg"
-            else:
-                text, encoding = json.dumps(_ESTIMATE_SCHEMA), "jsonschema"
-            number = self._writer.register_schema(name or _ESTIMATE, encoding, text.encode())
-            self._schemas[name] = number
+            text = SCHEMAS[name].encode()
+            self._schemas[name] = self._writer.register_schema(name, "ros2msg", text)
         return self._schemas[name]
 
     def _add(self, channel: int, stamp_ns: int, data: bytes) -> None:

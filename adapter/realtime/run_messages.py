@@ -1,0 +1,257 @@
+"""What is told of a run beside its samples: ROS 2 messages, for recordings and for whoever listens.
+
+/robot_description   the documented robot, as URDF
+/tf_static, /tf      the links of the documented and of the learned arm, side by side
+/estimates           λ, θ and effects with their standard deviations
+/external_wrench     what pushes the last link
+/load                what a change at the hand brought
+/findings            disagreements with what was learned before
+/timing              of the loop's ticks of the last second
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from adapter.errors import ModelError
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.model.urdf_text import URDF_PLACES, Additions, urdf_text
+from adapter.realtime.arm_frames import ArmFrames, ShownLambda
+from adapter.realtime.loop_board import LoopTiming
+from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader
+from adapter.realtime.timing import COUNTED
+from drivers.files.estimates import EstimateNames, estimate_fields
+from drivers.files.mcap.writer import ESTIMATES
+from drivers.files.messages import Message, header
+from drivers.files.ros import TransformsEncoder
+from drivers.files.ros_types import (
+    DIAGNOSTICS,
+    ESTIMATE,
+    LOAD,
+    SHARE_FIELDS,
+    STRING,
+    TF,
+    TIMING,
+    WRENCH_STAMPED,
+)
+
+DESCRIPTION, TF_MOVING, TF_FIXED = "/robot_description", "/tf", "/tf_static"
+WRENCH, LOAD_TOPIC, FINDINGS, TIMING_TOPIC = "/external_wrench", "/load", "/findings", "/timing"
+DOCUMENTED, LEARNED = "documented", "learned"
+OK, WARN = 0, 1  # levels of a DiagnosticStatus
+
+
+@dataclass(frozen=True)
+class ShownArm:
+    """An arm that is shown as documented and as learned; picklable.
+
+    Attributes:
+        documented: the model.
+        description: URDF text of it; empty where there is none.
+        shown: moves learned frames to where they compare.
+    """
+
+    documented: SelfModel
+    description: str
+    shown: ShownLambda
+
+    @classmethod
+    def of(cls, documented: SelfModel) -> ShownArm:
+        """From the documented model; runs compiled code, some ms."""
+        return cls(documented, description_of(documented), ShownLambda(documented))
+
+
+def description_of(model: SelfModel) -> str:
+    """URDF text of a robot: its own file, or one written from the model; empty where it has
+    bodies that a URDF cannot hold."""
+    if model.source is not None and model.source.text is not None:
+        return model.source.text
+    try:
+        return urdf_text(model, Additions(model.tree.n, model.tree.floating, URDF_PLACES))
+    except ModelError:
+        return ""
+
+
+def estimate_names(
+    joint_names: tuple[str, ...], reader: SnapshotReader | None, arm: ShownArm | None
+) -> EstimateNames:
+    """Names of an estimate's rows; bodies are numbered where no model names them."""
+    bodies = 0 if reader is None else reader.shapes["theta"][0]
+    links = () if arm is None else arm.documented.tree.body_names
+    if len(links) != bodies:
+        links = tuple(f"body{k + 1}" for k in range(bodies))
+    return EstimateNames(joint_names, links, () if reader is None else reader.effect_names)
+
+
+class RunMessages:
+    """Makes the messages of one run, in the process that writes or sends them.
+
+    Args:
+        names: of the estimate's rows.
+        arm: None where no frames are told.
+    """
+
+    def __init__(self, names: EstimateNames, arm: ShownArm | None) -> None:
+        self._names, self._arm = names, arm
+        self._version = self._push_version = 0
+        self._told: dict[str, Any] = {}
+        self._timing: LoopTiming | None = None
+        if arm is None:
+            return
+        self._frames = {x: ArmFrames(arm.documented, x) for x in (DOCUMENTED, LEARNED)}
+        both = self._frames.values()
+        self._one = TransformsEncoder(self._frames[DOCUMENTED].moving)
+        self._both = TransformsEncoder([pair for frames in both for pair in frames.moving])
+
+    def first(self, stamp_ns: int) -> list[Message]:
+        """What is said once, at the beginning."""
+        if self._arm is None:
+            return []
+        both = self._frames.values()
+        fixed = TransformsEncoder([pair for frames in both for pair in frames.fixed])
+        rows = np.concatenate([frames.fixed_rows for frames in both])
+        found = [Message(TF_FIXED, TF, stamp_ns, fixed.encode(stamp_ns, rows), latched=True)]
+        if self._arm.description:
+            text = {"data": self._arm.description}
+            found.append(Message(DESCRIPTION, STRING, stamp_ns, text, latched=True))
+        return found
+
+    def frames(self, stamp_ns: int, q: Array) -> list[Message]:
+        """Where the links are at joint angles q (n,) rad; of the learned arm once there is one."""
+        if self._arm is None or not np.isfinite(q).all():
+            return []
+        encoder, shown = (
+            (self._both, self._frames.values())
+            if self._version
+            else (
+                self._one,
+                [self._frames[DOCUMENTED]],
+            )
+        )
+        rows = np.concatenate([frames.rows(q) for frames in shown])
+        return [Message(TF_MOVING, TF, stamp_ns, encoder.encode(stamp_ns, rows))]
+
+    def estimate(self, snapshot: Snapshot) -> list[Message]:
+        """An estimate, where it is not the one told last; the learned arm is shown by it."""
+        if snapshot.version == self._version:
+            return []
+        self._version = snapshot.version
+        if self._arm is not None:
+            self._frames[LEARNED].place(*self._arm.shown.frames(snapshot.lam))
+        values = {
+            **{key: getattr(snapshot, key) for key in ("learned", "lambda_source")},
+            "lambda_converged": snapshot.lam_converged,
+            "theta_converged": snapshot.theta_converged,
+            "lambda": snapshot.lam,
+            "lambda_std": snapshot.lam_std,
+            "theta": snapshot.theta,
+            "theta_std": snapshot.theta_std,
+            "effects": snapshot.effects,
+            "effects_std": snapshot.effects_std,
+            "effect_shapes": snapshot.effect_shapes,
+            "torque_std": snapshot.torque_std,
+        }
+        fields = estimate_fields(snapshot.stamp_ns, self._names, values)
+        return [Message(ESTIMATES, ESTIMATE, snapshot.stamp_ns, fields)]
+
+    def push(self, push: ExternalTorque, q: Array) -> list[Message]:
+        """The wrench on the last link in its own axes, where it is new; q (n,) at its instant."""
+        if self._arm is None or push.version == self._push_version:
+            return []
+        self._push_version = push.version
+        if not (np.isfinite(push.wrench).all() and np.isfinite(q).all()):
+            return []
+        frames = self._frames[LEARNED if push.learned and self._version else DOCUMENTED]
+        into = frames.orientation_of_last(q).T
+        fields = {
+            "header": header(push.stamp_ns, frames.last),
+            "wrench": {
+                "force": _xyz(into @ push.wrench[:3]),
+                "torque": _xyz(into @ push.wrench[3:]),
+            },
+        }
+        return [Message(WRENCH, WRENCH_STAMPED, push.stamp_ns, fields)]
+
+    def news(self, stamp_ns: int, told: Mapping[str, Any]) -> list[Message]:
+        """What the learner found, where it is not what it told before.
+
+        Args:
+            told: "findings", each with "line", "what", "joints", "since_s", "reported_s", "over_s",
+                "score" and "size"; "load" with "m", "m_std" and perhaps "cx", "cy", "cz", or None.
+        """
+        parts = {key: told.get(key) for key in ("findings", "load")}
+        changed = {key for key, part in parts.items() if part and part != self._told.get(key)}
+        self._told |= {key: parts[key] for key in changed}
+        found = []
+        if "findings" in changed:
+            found.append(self._findings(stamp_ns, parts["findings"] or ()))
+        if "load" in changed:
+            found.append(self._load(stamp_ns, parts["load"] or {}))
+        return found
+
+    def _load(self, stamp_ns: int, load: Mapping[str, float]) -> Message:
+        """What the last link carries, in its frame; the centre not-a-number where not known."""
+        frame = "" if self._arm is None else self._frames[LEARNED].last
+        com = {axis: load.get(f"c{axis}", np.nan) for axis in "xyz"}
+        fields = {"header": header(stamp_ns, frame), "mass": load["m"], "mass_std": load["m_std"]}
+        return Message(LOAD_TOPIC, LOAD, stamp_ns, {**fields, "com": com})
+
+    def timing(self, stamp_ns: int, timing: LoopTiming) -> list[Message]:
+        """Of the loop's ticks since the last one of these; none without a tick."""
+        before, self._timing = self._timing, timing
+        since = timing if before is None else timing.since(before)
+        shares = {what: since.of(what).summary_us() for what in COUNTED}
+        total = timing.of("loop_us").count
+        if not since.of("loop_us").count:
+            return []
+        fields = {
+            "header": header(stamp_ns),
+            "ticks": total,
+            "missed_deadlines": timing.missed,
+            "missed_own": timing.missed_own,
+            **{what: _shares(found) for what, found in shares.items()},
+        }
+        return [Message(TIMING_TOPIC, TIMING, stamp_ns, fields)]
+
+    def _findings(self, stamp_ns: int, findings: Sequence[Mapping[str, Any]]) -> Message:
+        robot = "" if self._arm is None else self._arm.documented.name
+        status = [
+            {
+                "level": WARN if finding["over_s"] is None else OK,
+                "name": f"disagreement {k}: {finding['what']}",
+                "message": finding["line"],
+                "hardware_id": robot,
+                "values": [
+                    {"key": key, "value": _text(finding[key])}
+                    for key in ("what", "joints", "since_s", "reported_s", "over_s", "score")
+                ]
+                + [{"key": key, "value": _text(x)} for key, x in finding["size"].items()],
+            }
+            for k, finding in enumerate(findings, 1)
+        ]
+        fields = {"header": header(stamp_ns), "status": status}
+        return Message(FINDINGS, DIAGNOSTICS, stamp_ns, fields)
+
+
+def _shares(found: Mapping[str, float | None]) -> dict[str, float]:
+    """Shares under names that a message may have; not-a-number where nothing was counted."""
+    values = (np.nan if x is None else x for x in found.values())
+    return dict(zip(SHARE_FIELDS, values, strict=True))
+
+
+def _xyz(vector: Array) -> dict[str, float]:
+    return dict(zip("xyz", vector.tolist(), strict=True))
+
+
+def _text(value: Any) -> str:
+    """A value of a finding; empty for what is not known."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,121 @@
+"""An estimate of λ, θ and effects as one message, and the arrays of it back again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from drivers.files.messages import Fields, header, stamp_of
+from drivers.files.ros_types import LAMBDA_FIELDS, THETA_FIELDS
+from drivers.interface import Array
+
+FLAGS = ("learned", "lambda_source", "lambda_converged", "theta_converged")
+JOINT_TABLES = ("lambda", "lambda_std")
+BODY_TABLES = ("theta", "theta_std")
+EFFECT_TABLES = ("effects", "effects_std", "effect_shapes")
+_NUMBERS = (*JOINT_TABLES, *BODY_TABLES, *EFFECT_TABLES, "torque_std")
+
+
+@dataclass(frozen=True)
+class EstimateNames:
+    """Names of the rows: n joints, b bodies, e effects."""
+
+    joints: tuple[str, ...]
+    bodies: tuple[str, ...]
+    effects: tuple[str, ...]
+
+
+def estimate_fields(stamp_ns: int, names: EstimateNames, values: Mapping[str, Any]) -> Fields:
+    """Fields of a panda_adapter_msgs/Estimate.
+
+    Args:
+        stamp_ns: of the newest state learned from, on the arm's clock.
+        values: `FLAGS`; lambda, lambda_std (n, 6); theta, theta_std (b, 10); effects,
+            effects_std, effect_shapes (e, n); torque_std (n,). A table that is missing is not
+            known: not-a-number.
+    """
+    n, b, e = len(names.joints), len(names.bodies), len(names.effects)
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(JOINT_TABLES, (n, 6)),
+        **dict.fromkeys(BODY_TABLES, (b, 10)),
+        **dict.fromkeys(EFFECT_TABLES, (e, n)),
+        "torque_std": (n,),
+    }
+    tables = {key: _table(values.get(key), shape) for key, shape in shapes.items()}
+    spread = [(k, j) for k in range(e) for j in range(n)]
+    return {
+        "header": header(stamp_ns),
+        **{key: values[key] for key in FLAGS},
+        "joints": [
+            {"name": name, **_rows(tables, JOINT_TABLES, j, LAMBDA_FIELDS)}
+            | {"torque_std": tables["torque_std"][j]}
+            for j, name in enumerate(names.joints)
+        ],
+        "bodies": [
+            {"name": name, **_rows(tables, BODY_TABLES, i, THETA_FIELDS)}
+            for i, name in enumerate(names.bodies)
+        ],
+        "effects": [
+            {"effect": names.effects[k], "joint": names.joints[j]}
+            | {
+                field: tables[key][k, j]
+                for field, key in zip(("value", "std", "shape"), EFFECT_TABLES, strict=True)
+            }
+            for k, j in spread
+        ],
+    }
+
+
+def estimate_values(fields: Fields) -> dict[str, Any]:
+    """The arrays and flags of a message, as `estimate_fields` takes them, with stamp and names."""
+    joints, bodies, effects = fields["joints"], fields["bodies"], fields["effects"]
+    n = len(joints)
+    found: dict[str, Any] = {"stamp_ns": stamp_of(fields), **{key: fields[key] for key in FLAGS}}
+    for tables, rows, names in (
+        (JOINT_TABLES, joints, LAMBDA_FIELDS),
+        (BODY_TABLES, bodies, THETA_FIELDS),
+    ):
+        for table, part in zip(tables, ("value", "std"), strict=True):
+            found[table] = _array(([row[part][name] for name in names] for row in rows), len(names))
+    for table, part in zip(EFFECT_TABLES, ("value", "std", "shape"), strict=True):
+        found[table] = np.array([x[part] for x in effects], dtype=np.float64).reshape(-1, n or 1)
+    found["torque_std"] = np.array([row["torque_std"] for row in joints], dtype=np.float64)
+    found["joint_names"] = tuple(row["name"] for row in joints)
+    found["body_names"] = tuple(row["name"] for row in bodies)
+    found["effect_names"] = tuple(dict.fromkeys(x["effect"] for x in effects))
+    return found
+
+
+def values_of_json(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The same of a JSON estimate, which recordings before version 0.2 hold: fewer of them."""
+    found = dict(entry)
+    for key in _NUMBERS:
+        if key in found:
+            found[key] = np.array(found[key], dtype=np.float64)  # null becomes not-a-number
+    return found
+
+
+def _table(value: Any, shape: tuple[int, ...]) -> Array:
+    if value is None:
+        return np.full(shape, np.nan)
+    table = np.asarray(value, dtype=np.float64)
+    if not table.size and 0 in shape:
+        return np.zeros(shape)
+    if table.shape != shape:
+        raise ValueError(f"a table of an estimate has shape {table.shape}, expected {shape}")
+    return table
+
+
+def _rows(
+    tables: Mapping[str, Array], keys: Sequence[str], row: int, names: Sequence[str]
+) -> dict[str, dict[str, float]]:
+    """A row of a table and of its standard deviations, by the fields' names."""
+    value, std = (dict(zip(names, tables[key][row].tolist(), strict=True)) for key in keys)
+    return {"value": value, "std": std}
+
+
+def _array(rows: Iterable[Sequence[float]], width: int) -> Array:
+    return np.array(list(rows), dtype=np.float64).reshape(-1, width)
