@@ -9,16 +9,19 @@ floating base also nav_msgs/msg/Odometry, TwistStamped and AccelStamped on any t
 
 from drivers.files.mcap.bags import is_recording
 from drivers.files.mcap.imus import READERS, FrameMotion
-from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
+from drivers.files.mcap.joint_rows import derive_velocity, looks_like_degrees
+from drivers.files.mcap.joints import Commands
 from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
+from drivers.files.mcap.stored import AnyLog, StoredCommands, StoredLog, open_log, stored
 from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
 
 __all__ = [
     "FLUSH_S",
     "READERS",
+    "AnyLog",
     "Carrier",
     "Commands",
     "FrameMotion",
@@ -26,14 +29,18 @@ __all__ = [
     "McapWriter",
     "PositionLog",
     "Recovery",
+    "StoredCommands",
+    "StoredLog",
     "Topic",
     "derive_velocity",
     "is_recording",
     "looks_like_degrees",
+    "open_log",
     "read_estimates",
     "read_log",
     "read_position_log",
     "recover",
+    "stored",
     "survey",
     "to_json",
 ]
