@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
 
 from adapter.model.locking import locked
 from adapter.model.self_model import SelfModel
-from drivers.files.mcap import Log
+from drivers.files.mcap import AnyLog, Log, StoredLog
 from drivers.interface import DriverError
 
 
@@ -62,7 +63,15 @@ def counted(documented: SelfModel, source: object, count: int | None) -> tuple[s
     return rows[0]
 
 
-def matching(log: Log, documented: SelfModel) -> Log:
+@overload
+def matching(log: Log, documented: SelfModel) -> Log: ...
+
+
+@overload
+def matching(log: StoredLog, documented: SelfModel) -> StoredLog: ...
+
+
+def matching(log: AnyLog, documented: SelfModel) -> AnyLog:
     """The recording with the robot's joints in the robot's order, and its links' motion.
 
     Names that differ in nothing but what stands before their number (fer_joint3 for

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -12,9 +13,13 @@ from adapter.model.spatial import Array
 
 GRID_S = 1e-3
 EDGE_S = 0.3  # left out at either end, where the filter has no neighbours
+# Of a recording in pieces: what is filtered together, and how much of it at either end is there
+# for the rest only.
+WINDOW_S, MARGIN_S = 60.0, 2.0
 
 # (q, dq, ddq), each (m, n), to torque (m, n)
 TorqueModel = Callable[[Array, Array, Array], Array]
+Signals = tuple[Array, Array, Array, Array]
 
 
 def validation_torque_rmse(
@@ -39,14 +44,60 @@ def validation_torque_rmse(
     return np.sqrt(np.mean(error**2, axis=0))
 
 
-def smooth(stamp_s: Array, q: Array, dq: Array, tau: Array) -> tuple[Array, Array, Array, Array]:
-    """(q, dq, ddq, tau) of a recording on a 1 ms grid, zero-phase; see above."""
+def validation_rmse_of_pieces(pieces: Iterable[Signals], torque: TorqueModel) -> Array:
+    """The same of a recording of any length that comes in pieces (stamp_s, q, dq, tau).
+
+    Filtered are windows with `MARGIN_S` to either side that count for nothing, behind which the
+    filter has forgotten their ends.
+
+    Raises:
+        ValueError: less than a second of data.
+    """
+    square: Array | float = 0.0
+    count = 0
+    for q, dq, ddq, tau in _windows(pieces):
+        error = tau - torque(q, dq, ddq)
+        square = square + (error**2).sum(axis=0)
+        count += len(error)
+    return np.asarray(np.sqrt(square / count))
+
+
+def _windows(pieces: Iterable[Signals]) -> Iterator[Signals]:
+    """q, dq, ddq, tau of `smooth`, a window at a time, without edges and margins."""
+    edge, margin, size = (round(s / GRID_S) for s in (EDGE_S, MARGIN_S, WINDOW_S))
+    held: list[Array] = []
+    begin_s, k, skip = np.nan, 0, edge
+    for piece in pieces:
+        begin_s = begin_s if held else float(piece[0][0])
+        held = [np.concatenate(x) for x in zip(held, piece, strict=True)] if held else [*piece]
+        latest = np.maximum.accumulate(held[0])
+        while latest[-1] > begin_s + GRID_S * (k + size):
+            grid: Array = begin_s + GRID_S * np.arange(k, k + size)
+            last = int(np.searchsorted(latest, grid[-1])) + 1
+            stamp_s, q, dq, tau = (x[:last] for x in held)
+            yield _inner(smooth(stamp_s, q, dq, tau, grid), skip, margin)
+            k, skip = k + size - 2 * margin, margin
+            first = max(int(np.searchsorted(latest, begin_s + GRID_S * k, side="right")) - 1, 0)
+            held, latest = [x[first:] for x in held], latest[first:]
+    stamp_s, q, dq, tau = held
+    grid = begin_s + GRID_S * np.arange(k, math.ceil((stamp_s[-1] - begin_s) / GRID_S))
+    yield _inner(smooth(stamp_s, q, dq, tau, grid), skip, edge)
+
+
+def _inner(signals: Signals, first: int, last: int) -> Signals:
+    q, dq, ddq, tau = (x[first:-last] for x in signals)
+    return q, dq, ddq, tau
+
+
+def smooth(stamp_s: Array, q: Array, dq: Array, tau: Array, grid: Array | None = None) -> Signals:
+    """(q, dq, ddq, tau) of a recording on a 1 ms grid, its own or another one, zero-phase."""
     new = np.ones(len(q), dtype=bool)
     new[1:] = ((np.diff(q, axis=0) != 0) | (np.diff(dq, axis=0) != 0)).any(axis=1)
     new[1:] |= (np.diff(tau, axis=0) != 0).any(axis=1)
     new[1:] &= np.diff(np.maximum.accumulate(stamp_s)) > 0
     stamp_s, table = stamp_s[new], np.concatenate([q, dq, tau], axis=1)[new]
-    grid = np.arange(stamp_s[0], stamp_s[-1], GRID_S)
+    if grid is None:
+        grid = np.arange(stamp_s[0], stamp_s[-1], GRID_S)
     if len(grid) * GRID_S < 1.0:
         raise ValueError(f"validation needs a second of data, got {len(grid) * GRID_S:.2f} s")
     columns = [np.interp(grid, stamp_s, column) for column in table.T]

@@ -15,11 +15,19 @@ from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
-from drivers.files.mcap.stored import AnyLog, StoredCommands, StoredLog, open_log, stored
+from drivers.files.mcap.stored import (
+    IN_MEMORY,
+    AnyLog,
+    StoredCommands,
+    StoredLog,
+    open_log,
+    stored,
+)
 from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
 
 __all__ = [
     "FLUSH_S",
+    "IN_MEMORY",
     "READERS",
     "AnyLog",
     "Carrier",
