@@ -27,7 +27,6 @@ from adapter.runs.replay import (
     from_s,
     held_out_rmse,
     last_s,
-    most_moved,
     noise_levels,
     one_after_other,
 )
@@ -36,7 +35,7 @@ from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
-from adapter.signals.matching import matching, present
+from adapter.signals.matching import matching, most_moved, present
 from drivers.files.mcap import AnyLog, Log, StoredLog, open_log
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}

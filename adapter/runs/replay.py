@@ -26,12 +26,12 @@ from adapter.signals.filters import noise_from_samples
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.settings import FilterSettings
 from adapter.signals.validation import validation_rmse_of_pieces, validation_torque_rmse
-from drivers.files.mcap import IN_MEMORY, AnyLog, Log, StoredLog, stored
+from drivers.files.mcap import AnyLog, Log, StoredLog, stored
 from drivers.interface import DriverError, JointSample, LinkMotion
 
 FEWEST_FOR_NOISE = 50  # samples
 AT_ONCE = 2000  # states that pass the front end in one table: as much as a processor's cache holds
-STRETCHES, STRETCH = 64, 2000  # of a long recording that its rate and noise are told by
+STRETCHES = 64, 2000  # of a long recording, and samples of each, that tell its rate and noise
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
@@ -265,12 +265,12 @@ def filtered_tables(log: AnyLog, stop: int, front_end: FrontEnd) -> Iterator[Arr
 def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
     """Filter settings for the rate of a recording and, where they leave it open, its noise.
 
-    Of a recording in a file both are told by stretches of it, see `sampled`.
+    Of a recording in a file both are told by stretches of it, see `STRETCHES`.
 
     Returns:
         The settings, and a sentence where the recording's rate is not the nominal one.
     """
-    steps = np.concatenate([np.diff(part.stamp_ns) for part in sampled(log)])
+    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread(*STRETCHES)])
     steps = steps[steps > 0]
     changes: dict[str, float] = {}
     warnings = []
@@ -290,32 +290,13 @@ def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, li
     return replace(settings, **changes), warnings
 
 
-def sampled(log: AnyLog) -> list[Log]:
-    """A recording in memory as it is; of one in a file `STRETCHES` of it, evenly spread."""
-    if isinstance(log, Log):
-        return [log]
-    starts = np.linspace(0, len(log) - STRETCH, STRETCHES).astype(int).tolist()
-    return [log.piece(start, start + STRETCH) for start in starts]
-
-
-def most_moved(log: AnyLog) -> Log:
-    """A recording in memory as it is; of one in a file a part in which the arm moves a lot."""
-    if isinstance(log, Log):
-        return log
-    parts = sampled(log)
-    speeds = [float(np.mean(np.nan_to_num(part.dq) ** 2)) for part in parts]
-    middle = int(np.argmax(speeds)) * (len(log) - STRETCH) // (STRETCHES - 1)
-    start = max(min(middle, len(log) - IN_MEMORY // 2) - IN_MEMORY // 2, 0)
-    return log.piece(start, start + IN_MEMORY)
-
-
 def noise_levels(log: AnyLog) -> dict[str, Array]:
     """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies.
 
     Not numbers where there are too few samples, or too few that are not the one before. Of a
-    recording in a file it is that of stretches, see `sampled`.
+    recording in a file it is that of stretches, see `STRETCHES`.
     """
-    found = [_noise_levels(part) for part in sampled(log)]
+    found = [_noise_levels(part) for part in log.spread(*STRETCHES)]
     with np.errstate(invalid="ignore"):
         return {
             name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))

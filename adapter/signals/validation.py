@@ -72,7 +72,7 @@ def _windows(pieces: Iterable[Signals]) -> Iterator[Signals]:
         held = [np.concatenate(x) for x in zip(held, piece, strict=True)] if held else [*piece]
         latest = np.maximum.accumulate(held[0])
         while latest[-1] > begin_s + GRID_S * (k + size):
-            grid: Array = begin_s + GRID_S * np.arange(k, k + size)
+            grid: Array = begin_s + GRID_S * np.arange(k, k + size, dtype=np.float64)
             last = int(np.searchsorted(latest, grid[-1])) + 1
             stamp_s, q, dq, tau = (x[:last] for x in held)
             yield _inner(smooth(stamp_s, q, dq, tau, grid), skip, margin)

@@ -15,6 +15,7 @@ from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
+from drivers.files.mcap.sampled import SampledLog, sample_log
 from drivers.files.mcap.stored import (
     IN_MEMORY,
     AnyLog,
@@ -23,11 +24,12 @@ from drivers.files.mcap.stored import (
     open_log,
     stored,
 )
-from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
+from drivers.files.mcap.writer import FLUSH_S, JOINT_COMMANDS, McapWriter, to_json
 
 __all__ = [
     "FLUSH_S",
     "IN_MEMORY",
+    "JOINT_COMMANDS",
     "READERS",
     "AnyLog",
     "Carrier",
@@ -37,6 +39,7 @@ __all__ = [
     "McapWriter",
     "PositionLog",
     "Recovery",
+    "SampledLog",
     "StoredCommands",
     "StoredLog",
     "Topic",
@@ -48,6 +51,7 @@ __all__ = [
     "read_log",
     "read_position_log",
     "recover",
+    "sample_log",
     "stored",
     "survey",
     "to_json",

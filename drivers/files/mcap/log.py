@@ -118,6 +118,10 @@ class Log:
         for start in range(0, len(self), rows):
             yield self.piece(start, start + rows)
 
+    def spread(self, stretches: int, samples: int) -> list[Log]:
+        """What tells of the whole: of a recording in memory all of it, see `StoredLog.spread`."""
+        return [self]
+
     def changed(self, change: Callable[[Log], Log]) -> Log:
         """What `change` makes of the recording, see `StoredLog.changed`."""
         return change(self)
@@ -221,7 +225,21 @@ def read_log(
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
-    scan = open_scan(Path(path))
+    return assembled(
+        open_scan(Path(path)), joint_names, topic, sensors=sensors, frames=frames, imus=imus
+    )
+
+
+def assembled(
+    scan: Scan,
+    joint_names: Sequence[str] | None = None,
+    topic: str | None = None,
+    *,
+    sensors: bool = False,
+    frames: bool = False,
+    imus: bool = False,
+) -> Log:
+    """What a scan tells, see `read_log`."""
     tell = tuple(READERS) if frames else (IMU,) if imus else ()
     topics = collect(scan, lambda series: is_wanted(series, topic, sensors, tell))
     series = choose_topic(scan, topics, topic, not sensors)

@@ -171,6 +171,11 @@ class StoredLog:
         for start in range(0, len(self), rows):
             yield self.piece(start, start + rows)
 
+    def spread(self, stretches: int, samples: int) -> list[Log]:
+        """So many stretches of so many samples each, from the first to the last, evenly spread."""
+        starts = np.linspace(0, max(len(self) - samples, 0), stretches).astype(int)
+        return [self.piece(start, start + samples) for start in np.unique(starts).tolist()]
+
     def select(
         self, joint_names: Sequence[str], link_names: Sequence[str] | None = None
     ) -> StoredLog:
