@@ -16,7 +16,7 @@ from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
 from drivers.files.mcap.sampled import SampledLog, sample_log
-from drivers.files.mcap.stored import (
+from drivers.files.mcap.stored_log import (
     IN_MEMORY,
     AnyLog,
     StoredCommands,
