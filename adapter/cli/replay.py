@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from rich.progress import Progress
 
 from adapter.cli.common import configure, effort_unit_of, robot_of_log
@@ -17,7 +16,6 @@ from adapter.errors import SettingsError
 from adapter.gap.screen import check_effort_unit
 from adapter.gap.torque_gains import TorqueGains, in_newton_metres
 from adapter.model.self_model import SelfModel
-from adapter.report.worth import rms, spread_of_rms
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
 from adapter.runs.contacts import contact_lines
@@ -26,18 +24,19 @@ from adapter.runs.replay import (
     Replay,
     ReplayOptions,
     fitted_to,
-    held_out_error,
+    from_s,
+    held_out_rms,
+    last_s,
     noise_levels,
     one_after_other,
-    seconds,
 )
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
-from adapter.signals.matching import matching, present
-from drivers.files.mcap import Log, read_log
+from adapter.signals.matching import matching, most_moved, present
+from drivers.files.mcap import AnyLog, Log, StoredLog, open_log
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
@@ -45,7 +44,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     first, *more = args.logs
-    whole = read_log(first, topic=args.topic, frames=args.base is not None, imus=True)
+    whole = open_log(first, topic=args.topic, frames=args.base is not None, imus=True)
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -53,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
     logs = [_joined(args, whole, robot)]
-    logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
+    logs += [matching(open_log(path, topic=args.topic), robot) for path in more]
     logs, gains = _in_newton_metres(args, logs, robot)
     log = one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
-    if args.base is None:
-        log, imus = with_link_imus(log, robot, args.imu)
+    if args.base is None and (isinstance(log, Log) or args.imu):
+        log, imus = with_link_imus(_in_memory(log), robot, args.imu)
     log.warnings.extend(locked)
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
@@ -79,9 +78,9 @@ def run(args: argparse.Namespace) -> int:
     if held_out is not None:
         model = learned_model(result.outcome, robot)
         for key, judged in (("", model), ("documented_", robot)):
-            error = held_out_error(held_out, judged, config.pipeline)
-            numbers["theta"][f"{key}validation_torque_rmse_nm"] = rms(error).tolist()
-            numbers["theta"][f"{key}validation_torque_rmse_std_nm"] = spread_of_rms(error).tolist()
+            error = held_out_rms(held_out, judged, config.pipeline)
+            numbers["theta"][f"{key}validation_torque_rmse_nm"] = error.value.tolist()
+            numbers["theta"][f"{key}validation_torque_rmse_std_nm"] = error.std.tolist()
     folder = results_folder(args.out, "replay")
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, source)
@@ -90,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _figures(
-    args: argparse.Namespace, log: Log, robot: SelfModel, reference: Reference, result: Replay
+    args: argparse.Namespace, log: AnyLog, robot: SelfModel, reference: Reference, result: Replay
 ) -> dict[str, Any]:
     front_end = result.pipeline.front_end
     course = Course(
@@ -127,9 +126,11 @@ def _figures(
 
 
 def _in_newton_metres(
-    args: argparse.Namespace, logs: list[Log], robot: SelfModel
-) -> tuple[list[Log], TorqueGains | None]:
+    args: argparse.Namespace, logs: list[AnyLog], robot: SelfModel
+) -> tuple[list[AnyLog], TorqueGains | None]:
     """Recordings with efforts in N m, and the gains where they were learned.
+
+    Gains are learned from what lies in memory: recordings in a file are brought there for it.
 
     Raises:
         RecordingRefused: nobody says a unit, and efforts are motor currents.
@@ -140,37 +141,45 @@ def _in_newton_metres(
     if unit.learn and robot.tree.floating:
         raise SettingsError("--tau-gain fit needs a fixed base; give --tau-gain G1,G2,...")
     until = args.validate_from
-    taught = logs if until is None else [x.take(seconds(x) < until) for x in logs]
+    taught = logs if until is None else [from_s(x, 0.0, until) for x in logs]
     if unit.learn:
         say("learning the gains of the drives")
-    logs, gains = in_newton_metres(logs, robot, unit, taught)
+        logs = [_in_memory(x) for x in logs]
+    known = [_in_memory(x) for x in taught] if unit.learn else []
+    logs, gains = in_newton_metres(logs, robot, unit, known)
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
     if gains is not None or not unit.is_given:
         for log in logs:
-            check_effort_unit(log, robot)
+            check_effort_unit(most_moved(log), robot)
     return logs, gains
 
 
 def _as_understood(
-    args: argparse.Namespace, log: Log, robot: SelfModel, gains: TorqueGains | None
-) -> Log:
+    args: argparse.Namespace, log: AnyLog, robot: SelfModel, gains: TorqueGains | None
+) -> AnyLog:
     """Another recording with efforts in N m as those that were learned from."""
     factors = effort_unit_of(args).factors(robot.tree.joint_names)
-    return replace(log, tau=log.tau * factors * (1.0 if gains is None else gains.gain))
+    if gains is not None:
+        factors = factors * gains.gain
+    return log.changed(lambda piece: replace(piece, tau=piece.tau * factors))
 
 
-def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:
+def _joined(args: argparse.Namespace, log: AnyLog, robot: SelfModel) -> AnyLog:
     """The recording as the robot has it, with the base's motion where it floats."""
     log = matching(log, robot)
-    return log if args.base is None else with_base_motion(log, robot, args.base)
+    return log if args.base is None else with_base_motion(_in_memory(log), robot, args.base)
 
 
-def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:
-    if args.validate_from is not None and not 0.0 < args.validate_from < seconds(log)[-1]:
+def _in_memory(log: AnyLog) -> Log:
+    return log.in_memory() if isinstance(log, StoredLog) else log
+
+
+def _learn(args: argparse.Namespace, log: AnyLog, robot: SelfModel, config: Config) -> Replay:
+    if args.validate_from is not None and not 0.0 < args.validate_from < last_s(log):
         raise SettingsError(
             f"--validate-from {args.validate_from} is outside the recording "
-            f"(0 to {seconds(log)[-1]:.1f} s)"
+            f"(0 to {last_s(log):.1f} s)"
         )
     shown = nullcontext() if args.quiet else Progress(console=console, transient=True)
     with shown as bar:
@@ -199,18 +208,17 @@ def tell(line: str) -> None:
     labelled("new disagreement:", "yellow", line)
 
 
-def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:
+def _held_out(args: argparse.Namespace, log: AnyLog, robot: SelfModel) -> AnyLog | None:
     """What to score on, or None."""
     if args.validate_from is not None:
-        return log.take(seconds(log) >= args.validate_from)
+        return from_s(log, args.validate_from)
     if args.validate is not None:
-        other = read_log(args.validate, topic=args.topic, frames=args.base is not None)
+        other = open_log(args.validate, topic=args.topic, frames=args.base is not None)
         return _joined(args, other, robot)
     return None
 
 
 def _percentiles(result: Replay) -> dict[str, float | None]:
-    if not len(result.tick_ns):
+    if not result.ticks.count:
         return dict.fromkeys(PERCENTILES)
-    us = 1e-3 * result.tick_ns
-    return {name: float(np.percentile(us, share)) for name, share in PERCENTILES.items()}
+    return {k: 1e-3 * result.ticks.percentile_ns(share) for k, share in PERCENTILES.items()}

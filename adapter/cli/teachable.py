@@ -9,16 +9,18 @@ from adapter.cli.common import robot_of
 from adapter.control.teachable import teachable
 from adapter.gap.screen import RecordingRefused, check_effort_unit
 from adapter.model.self_model import SelfModel
-from adapter.signals.matching import matching, present
-from drivers.files.mcap import Log, read_log
+from adapter.signals.matching import matching, most_moved, present
+from drivers.files.mcap import AnyLog, Log, open_log
 
 
 def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str, Any], list[str]]:
     """What the recording teaches of a robot: figures and lines."""
-    log = log or read_log(args.file, topic=args.topic)
+    whole: AnyLog = log or open_log(args.file, topic=args.topic)
     robot = robot_of(args, args.robot)
-    robot, locked = present(robot, log.joint_names, log.path)
-    log = matching(log, robot)
+    robot, locked = present(robot, whole.joint_names, whole.path)
+    log = matching(most_moved(whole), robot)
+    if len(log) < len(whole):
+        locked.append(f"predicted for {len(log)} of its {len(whole)} samples, where it moves most")
     doubt = _doubt(log, robot)
     told = teachable(log, robot)
     expected = told.expected

@@ -15,17 +15,20 @@ PAUSE = 500  # samples until the next look, where an error was nothing that a ha
 
 
 @jit
-def compare(error, fast, slow, samples, recent, level):
+def compare(error, each, settings, samples, recent, level):
     """Update the recent power and its level (n,); root of the largest and of the mean ratio.
+
+    `each` samples are what an error (n,) stands for, `settings` are `fast` and `slow`.
 
     A level follows its power at most fourfold, so that the start of a change does not hide it.
     """
-    m, n = error.shape
+    rows, n = error.shape
+    (fast, slow), m = settings, rows * each
     most, total = 0.0, 0.0
     for j in range(n):
         power = 0.0
-        for k in range(m):
-            power += error[k, j] * error[k, j] / m
+        for k in range(rows):
+            power += error[k, j] * error[k, j] / rows
         recent[j] += min(1.0, m / fast) * (power - recent[j])
         ratio = recent[j] / max(level[j], 1e-12)
         most = max(most, ratio)
@@ -52,12 +55,13 @@ class ChangeDetector:
 
     Attributes:
         waiting: an alarm is waiting for its confirmation; nothing should be learned meanwhile.
+        each: samples that one whose error is given stands for, where the others are left out.
     """
 
     def __init__(self, n: int, settings: ChangeSettings | None = None) -> None:
         self.settings = settings or ChangeSettings()
         self.recent, self.level = np.zeros(n), np.zeros(n)
-        self.samples = 0
+        self.samples, self.each = 0, 1
         self._peaks, self._block, self._block_samples = np.zeros(2), np.zeros(2), 0
         self._armed_at = self.settings.arm_after
         self._wait = 0
@@ -75,12 +79,13 @@ class ChangeDetector:
         s = self.settings
         if self.waiting:
             return self._confirm(error, explained)
-        self.samples += len(error)
-        most, mean = compare(error, s.fast, s.slow, self.samples, self.recent, self.level)
+        self.samples += self.each * len(error)
+        speeds = s.fast, s.slow
+        most, mean = compare(error, self.each, speeds, self.samples, self.recent, self.level)
         if s.enabled and self.samples >= self._armed_at and self._alarming(most, mean):
             self._wait = s.wait
         else:
-            self._remember_burst(len(error), most, mean)
+            self._remember_burst(self.each * len(error), most, mean)
         return False
 
     def _remember_burst(self, samples: int, most: float, mean: float) -> None:
@@ -105,11 +110,9 @@ class ChangeDetector:
 
     def _confirm(self, error: Array, explained: Callable[[], bool]) -> bool:
         """Look on without touching the level; at the end of the wait the alarm must still hold."""
-        level = self.level.copy()
-        most, mean = compare(
-            error, self.settings.fast, self.settings.slow, self.samples, self.recent, level
-        )
-        self._wait -= len(error)
+        level, speeds = self.level.copy(), (self.settings.fast, self.settings.slow)
+        most, mean = compare(error, self.each, speeds, self.samples, self.recent, level)
+        self._wait -= self.each * len(error)
         if self._wait > 0:
             return False
         if not self._alarming(most, mean):

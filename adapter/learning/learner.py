@@ -297,6 +297,17 @@ class OnlineLearner:
                 self.adam.step()
                 self.theta.after_step(self.theta_converged, self._states_per_update)
 
+    def take_every(self, states: int, triples: Array | None = None) -> None:
+        """Let each state that comes from here on stand for so many, the others being left out.
+
+        Args:
+            triples: (t, 3, w) of neighbours among all states, see `TorqueRates.take_every`.
+        """
+        self.schema.weight = self.theta.weight = float(states)
+        self.change.each = states
+        if self.rates is not None:
+            self.rates.take_every(states, triples)
+
     def set_rate(self, rate: float) -> None:
         """Let ADAM go on at this rate per update."""
         self.adam.rate = rate
@@ -368,7 +379,7 @@ class OnlineLearner:
         if self._shadow is not None:
             self._rebuild_some(len(table))
         self._look_on(table, error)
-        if self.theta.restart_due(len(table)):
+        if self.theta.restart_due(self.theta.weight * len(table)):
             self.theta.restart_spare()
             self._forget_momentum()
         self._judge_theta()
@@ -424,7 +435,7 @@ class OnlineLearner:
         if self.tree.floating:
             return True
         tables, errors = zip(*self._doubted, strict=True)
-        newest = slice(-self.change.settings.fast, None)
+        newest = slice(-max(self.change.settings.fast // self.change.each, 1), None)
         table, error = np.concatenate(tables)[newest], np.concatenate(errors)[newest]
         at, (m, n) = self.layout, error.shape
         motion = JointMotion(*(np.ascontiguousarray(table[:, x]) for x in (at.q, at.dq, at.ddq)))

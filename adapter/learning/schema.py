@@ -89,6 +89,7 @@ class Schema:
         R0 (n, 3, 3), p (n, 3): the frames; `lam` reads λ off them.
         tangent, gradient: (n, 6) what ADAM steps on (zero between steps), and its gradient.
         moments: of all samples so far.
+        weight: samples that one that is given stands for, where the others are left out.
         information: (n, 6, 6) of (phi, d).
         identifiable: (n, 6, 6) projector on the directions the data show, if roughly: ADAM keeps
             to them. rank: their number over all joints.
@@ -131,7 +132,7 @@ class Schema:
         )
         self._moments = tuple(self.moments)
         self._clean = np.zeros_like(self.moments.M)
-        self.updates = 0
+        self.updates, self.weight = 0, 1.0
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
         self._distance = np.zeros((n, 2))
         self.information = np.zeros((n, 6, 6))
@@ -188,7 +189,7 @@ class Schema:
             table = table.copy()
             carry_spin(self._frames, base, table)
         keep = self._keep() if self.settings.forget_s is not None else 1.0
-        absorb(self._parent, base, table, self._moments, float(self.kind), keep)
+        absorb(self._parent, base, table, self._moments, float(self.kind), (keep, self.weight))
 
     def _base_motion(self) -> Array:
         """(12,) motion of a base at rest; empty where the states tell of the base."""

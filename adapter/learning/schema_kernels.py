@@ -209,7 +209,7 @@ def _add_curvature(M, D, R, T, TM, H):
 
 
 @jit
-def absorb(parent, base, table, moments, kind, keep):
+def absorb(parent, base, table, moments, kind, each):
     """Add a table of filtered states to the moments.
 
     Args:
@@ -218,9 +218,9 @@ def absorb(parent, base, table, moments, kind, keep):
         table: (m, size) states, see `records.columns`; only those whose link motion is of this
             `kind` are taken.
         moments: `MotionMoments` as a plain tuple.
-        keep: forgetting factor of a sample, 1 for none.
+        each: forgetting factor of a sample, 1 for none, and its weight.
     """
-    into = MotionMoments(*moments)
+    into, (keep, weight) = MotionMoments(*moments), each
     n, counts = parent.shape[0], into.counts
     at = columns(n, base.shape[0] == 0)
     s, motion = np.zeros((3, 15)), np.zeros((n + 1, 12))
@@ -236,13 +236,15 @@ def absorb(parent, base, table, moments, kind, keep):
         for j in range(n):
             q, dq = table[m, at.motion_q + j], table[m, at.motion_dq + j]
             signals(q, dq, motion[parent[j] + 1], motion[j + 1], s)
+            if weight != 1.0:
+                s *= math.sqrt(weight)
             accumulate(s, keep, into.M[j])
             if counts[Count.VELOCITIES] == 0.0:
                 # w alone would say that no frame has a place (v = w x p = 0)
                 into.M[j, 1, 6:9, 6:9] = 0.0
             if into.newest.shape[0]:
                 accumulate(s, 0.0, into.newest[j])
-        counts[Count.SAMPLES] = keep * counts[Count.SAMPLES] + 1.0
+        counts[Count.SAMPLES] = keep * counts[Count.SAMPLES] + weight
         _look_for_noise(table[m, :1].view(np.int64)[0], motion, into)
 
 

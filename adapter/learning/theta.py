@@ -119,6 +119,7 @@ class Theta:
             links, the spare one), then the effects; `gradient`.
         mean: (P,) the running mean of x that is in use; `th` its values (θ, effects).
         moments: since the last change; `count` samples in them.
+        weight: samples that one that is given stands for, where the others are left out.
         prior, prior_rhs: information (P, P) and (P,) from before: the prior and, after a change,
             all that was known then.
         hand, spare: (slices of P) the hand's body, and the one that stands in for it after a
@@ -158,7 +159,7 @@ class Theta:
         self._places = self.rows.place.copy(), self.rows.base_place.copy()
         self.share = np.where(self.rows.near < 10, 1.0, HANGING_SHARE)
         self.moments, self.newest = self.empty_moments(), self.empty_moments()
-        self.count = 0.0
+        self.count, self.weight = 0.0, 1.0
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
@@ -241,12 +242,12 @@ class Theta:
             (m, rows) errors of the parameters in use, before: measured minus predicted torque,
             the base's wrench first if it floats.
         """
-        error = self._absorb(frames, table, self.moments)
+        error = self._absorb(frames, table, self.moments, self.weight)
         if self.each_sample:
             newest = self.newest
             newest.A[:], newest.C[:] = 0.0, 0.0
             self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL))
-        self.count += len(table)
+        self.count += self.weight * len(table)
         return error
 
     def absorb_again(self, frames: tuple[Array, Array], table: Array, into: Moments) -> None:
@@ -257,11 +258,13 @@ class Theta:
         """Torque errors (m, rows) of the parameters in use; nothing is learned."""
         return self._absorb(frames, table, Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL))
 
-    def _absorb(self, frames: tuple[Array, Array], table: Array, into: Moments) -> Array:
+    def _absorb(
+        self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
+    ) -> Array:
         forget, columns = self.settings.forget_s, self.effect_columns(table)
         rate = 0.0 if forget is None else 1e-3 / forget
         placed = self._parent, *frames
-        return absorb(placed, self._rows, self._given, table, columns, (tuple(into), rate))
+        return absorb(placed, self._rows, self._given, table, columns, (tuple(into), rate, weight))
 
     def replace_moments(self, moments: Moments, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.
@@ -306,7 +309,7 @@ class Theta:
         square = self.moments.base_level.reshape(2, 3).mean(axis=1)
         return self._wrench / (self.noise_gain * (square + self.model_variance))
 
-    def restart_due(self, added: int) -> bool:
+    def restart_due(self, added: float) -> bool:
         """Whether the newest samples reached a restart of the spare body."""
         before = self.count - added
         return self.spare_in_use and any(before < k <= self.count for k in self.settings.restarts)

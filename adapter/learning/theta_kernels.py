@@ -380,8 +380,9 @@ def absorb(frames, rows, given, table, effects, moments):
     """Predict every sample, then add it to the moments; returns the errors.
 
     Args:
-        frames, rows, given, moments: `Frames`, `Rows`, `Given`, and pairs of `Moments` and a rate
-            of directional forgetting per sample (0 for none), as plain tuples.
+        frames, rows, given, moments: `Frames`, `Rows`, `Given`, and `Moments` with a rate of
+            directional forgetting per sample (0 for none) and the weight of a sample, as plain
+            tuples.
         table: (m, size) states, or their part up to the base's motion.
         effects: (m, e, n) columns of the effects.
 
@@ -389,7 +390,7 @@ def absorb(frames, rows, given, table, effects, moments):
         (m, rows) measured minus predicted torque; the base's wrench first if it floats.
     """
     tree, at, use = Frames(*frames), Rows(*rows), Given(*given)
-    into, rate = Moments(*moments[0]), moments[1]
+    into, rate, weight = Moments(*moments[0]), moments[1], moments[2]
     m, n = table.shape[0], tree.parent.shape[0]
     six = 0 if use.base.shape[0] else 6
     error = np.empty((m, six + n))
@@ -399,6 +400,9 @@ def absorb(frames, rows, given, table, effects, moments):
         own = z[k % TOGETHER]
         sample_rows(tree, at, use, table[k], effects[k], (own, base_z))
         row_errors(at, use.th, own, base_z, error[k])
+        if weight != 1.0:
+            own *= math.sqrt(weight)
+            base_z *= math.sqrt(weight)
         if into.A.shape[0]:
             if rate > 0.0:
                 forget_along(at, own, rate, into.A)
@@ -408,10 +412,10 @@ def absorb(frames, rows, given, table, effects, moments):
                 accumulate(at, z[: k % TOGETHER + 1], into.A)
             accumulate_base(at.near, base_z, into.C)
         if into.base_level.shape[0]:
-            into.span[0] = min(into.span[0] + 1.0, into.span[1])
+            into.span[0] = min(into.span[0] + weight, into.span[1])
             for r in range(six):
                 square = error[k, r] * error[k, r]
-                into.base_level[r] += (square - into.base_level[r]) / into.span[0]
+                into.base_level[r] += weight * (square - into.base_level[r]) / into.span[0]
     return error
 
 

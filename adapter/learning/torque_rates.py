@@ -8,7 +8,7 @@ not matter much: friction is left out.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +82,33 @@ def let_go(span_ns, ring, at, out):
 
 
 @jit
+def bend(tau, one, two, step_s, bends):
+    """Add squares of the second differences of torques (n,) over their step to bends (n + 1,)."""
+    for j in range(tau.shape[0]):
+        d = tau[j] - 2.0 * one[j] + two[j]
+        bends[j] += d * d / step_s
+    bends[tau.shape[0]] += 1.0
+
+
+@jit
+def bend_all(arm, triples, bends):
+    """Add those of states (t, 3, w) that follow each other; `arm` as of `follow`."""
+    parent, R0, p, theta, rest = arm
+    frames, n, six = Frames(parent, R0, p), parent.shape[0], 0 if rest.shape[0] else 6
+    at, motion, tau = columns(n, six > 0), np.empty((n, 12)), np.empty((3, n + six))
+    for m in range(triples.shape[0]):
+        for k in range(3):
+            row = triples[m, k]
+            base = row[at.base : at.bent] if six else rest
+            q, dq, ddq = row[at.q : at.dq], row[at.dq : at.ddq], row[at.ddq : at.tau]
+            link_motion(frames, JointMotion(q, dq, ddq), base, motion)
+            inverse_dynamics(frames, theta, q, motion, base, tau[k])
+        first, last = triples[m, 0, :1].view(np.int64)[0], triples[m, 2, :1].view(np.int64)[0]
+        if 0 < last - first <= LONGEST_STEP_NS:
+            bend(tau[2, six:], tau[1, six:], tau[0, six:], 0.5e-9 * (last - first), bends)
+
+
+@jit
 def follow(arm, table, span_ns, waiting, out):
     """Take states (m, w); fill out with those that need not wait any more, and count them.
 
@@ -113,10 +140,7 @@ def follow(arm, table, span_ns, waiting, out):
         if ring.marks[1] > 2:
             one, two = (here - 1) % ROOM, (here - 2) % ROOM
             step_s = 0.5e-9 * (stamp - ring.stamps[two])
-            for j in range(n):
-                bend = tau[six + j] - 2.0 * ring.tau[one, j] + ring.tau[two, j]
-                ring.bends[j] += bend * bend / step_s
-            ring.bends[n] += 1.0
+            bend(tau[six:], ring.tau[one], ring.tau[two], step_s, ring.bends)
         while ring.marks[0] < ring.marks[1] and (
             stamp - ring.stamps[ring.marks[0] % ROOM] >= span_ns
             or 2 * (ring.marks[1] - ring.marks[0]) >= ROOM
@@ -146,8 +170,25 @@ class TorqueRates:
         stamps, marks, bends = np.zeros(ROOM, np.int64), np.zeros(2, np.int64), np.zeros(tree.n + 1)
         self._ring = Waiting(rows, tau, stamps, marks, bends)
         self.rows, self.tau, self.stamps, self.marks, self.bends = self._ring
-        self._delay_s = delay_s
+        self._delay_s, self._span = delay_s, self._span_ns
+        self._triples: Array | None = None
+        self._arm: tuple[Any, ...] | None = None
         self._one = np.empty((ROOM + 1, self._width))
+
+    def take_every(self, states: int, triples: Array | None = None) -> None:
+        """Expect every so-manyth state, the others being left out.
+
+        Differences are then taken over a span of so many whole steps, and the noise is that of
+        triples (t, 3, w) of neighbours among all states; steps are the median of theirs.
+        """
+        if self._triples is not None:
+            self.bends[:] = self._bends()
+        self._span_ns, self._triples = self._span, None
+        if states > 1 and triples is not None and len(triples):
+            stamps = np.ascontiguousarray(triples[:, :, 0]).view(np.int64)
+            step_ns = states * int(np.median(np.diff(stamps, axis=1)))
+            self._span_ns = max(round(self._span / step_ns), 1) * step_ns
+            self._triples = np.ascontiguousarray(triples)
 
     @property
     def noise(self) -> Array:
@@ -156,7 +197,16 @@ class TorqueRates:
         White noise of dq that leaves the filter as ddq bends from sample to sample in a known
         proportion to its size (poles at 45 degrees, k1 = 2 / delay); motion hardly bends there.
         """
-        return np.asarray(self.bends[:-1] / max(self.bends[-1], 1.0) * self._delay_s / 8.0)
+        bends = self._bends()
+        return np.asarray(bends[:-1] / max(bends[-1], 1.0) * self._delay_s / 8.0)
+
+    def _bends(self) -> Array:
+        """(n + 1,) see `Waiting`."""
+        if self._triples is None or self._arm is None:
+            return self.bends
+        bends = np.zeros_like(self.bends)
+        bend_all(self._arm, self._triples, bends)
+        return bends
 
     def follow(self, table: Array, frames: tuple[Array, Array], theta: Array, base: Array) -> Array:
         """States (k, columns `before_links`) that are complete now; the next call may reuse them.
@@ -168,5 +218,5 @@ class TorqueRates:
         """
         table = table[:, : self._width]
         out = self._one if len(table) == 1 else np.empty((ROOM + len(table), self._width))
-        arm = self._parent, *frames, theta, base
+        arm = self._arm = self._parent, *frames, theta, base
         return out[: follow(arm, table, self._span_ns, tuple(self._ring), out)]

@@ -23,9 +23,10 @@ from adapter.report.words import (
     small,
     spread,
 )
-from adapter.report.worth import BLOCK_S, SLOW, rms, slow_share
+from adapter.report.worth import BLOCK_S, SLOW, slow_share
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
+from adapter.signals.validation import rms_of
 
 GOOD, LOOK, BAD = "good", "look", "bad"  # verdicts
 LEFT = "Torque not explained"
@@ -79,7 +80,7 @@ def _left(data: RunData) -> Check | None:
     left = data.figures["theta"].get("torque_rmse_nm")
     if not left or not theta_started(data):
         return None
-    size = rms(data.score_signals()[3])
+    size = rms_of([data.score_signals()[3]]).value
     share = 100.0 * np.array(left) / np.maximum(size, 1e-12)
     said = f"{spread(left, 'N m')} rms by joint, {spread(share, '%')} of the torque that acted"
     slow = slow_share(data)

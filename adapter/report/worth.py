@@ -13,8 +13,8 @@ from adapter.model.spatial import Array
 from adapter.report.skeleton import placed_arm, some_postures
 from adapter.report.torque_panels import change_times, theta_started
 from adapter.runs.run_folder import RunData
+from adapter.signals.validation import rms_of
 
-BLOCKS = 10  # stretches of the recording whose spread tells how sure an error's size is
 FEWEST_ROWS = 50
 BLOCK_S, FEWEST_BLOCKS = 0.5, 8  # what lasts longer than a block is slow
 SLOW = 0.3  # share from which what is left is not called noise
@@ -67,7 +67,7 @@ def torque_fall(data: RunData) -> Fall | None:
         return None
     q, dq, ddq, tau, error = data.score_signals()
     held_out = theta.get("validation_torque_rmse_nm")
-    size = rms(tau)
+    size = rms_of([tau]).value
     if held_out:
         keys = "validation_torque_rmse_nm", "validation_torque_rmse_std_nm"
         before, before_std = (_known(theta.get(f"documented_{key}")) for key in keys)
@@ -77,11 +77,11 @@ def torque_fall(data: RunData) -> Fall | None:
     rows = unseen_rows(data)
     if rows.sum() < FEWEST_ROWS:
         return None
-    after, seen = error[rows], "predicted before it was learned from"
+    after, seen = rms_of([error[rows]]), "predicted before it was learned from"
     if data.documented.tree.floating:  # the base's motion is not kept for the page
-        return Fall(None, rms(after), None, spread_of_rms(after), size, seen)
-    before = (tau - ModelTorque(data.documented)(q, dq, ddq))[rows]
-    return Fall(rms(before), rms(after), spread_of_rms(before), spread_of_rms(after), size, seen)
+        return Fall(None, after.value, None, after.std, size, seen)
+    before = rms_of([(tau - ModelTorque(data.documented)(q, dq, ddq))[rows]])
+    return Fall(before.value, after.value, before.std, after.std, size, seen)
 
 
 def _known(values: Any) -> Array | None:
@@ -100,22 +100,6 @@ def fit_rows(data: RunData) -> Array:
     """(k,) bool: rows of the score that the learned model is of: after the last change."""
     t, changes = data.times(data.score_trace), change_times(data)
     return np.asarray(t >= changes[-1] + SETTLING_S) if changes else np.ones(len(t), dtype=bool)
-
-
-def rms(error: Array) -> Array:
-    """(n,) of an error (k, n)."""
-    return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
-
-
-def spread_of_rms(error: Array) -> Array:
-    """(n,) standard deviation of the rms of an error (k, n), from that of stretches of it.
-
-    Neighbouring rows are alike, so they do not count one by one.
-    """
-    parts = [part for part in np.array_split(error**2, BLOCKS) if len(part)]
-    squares = np.array([part.mean(axis=0) for part in parts])
-    std = squares.std(axis=0, ddof=1) / np.sqrt(len(parts))
-    return np.asarray(0.5 * std / np.maximum(np.sqrt(squares.mean(axis=0)), 1e-12))
 
 
 def slow_share(data: RunData) -> Array | None:

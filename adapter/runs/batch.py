@@ -4,29 +4,56 @@
 without the states before λ had converged. Moments need no steps to be complete, so as many steps
 as live are taken until λ and θ have converged, and few from there on, for many states at once.
 What θ needs of the states waits in a temporary file while λ takes them.
+
+Neighbours behind a filter of some hertz tell the same a thousand times a second. So of states
+whose link motion was synthesized only every k-th is taken, with the weight of k: `PER_SAMPLE`
+for each independent one that the filter lets through (its band and the rate of the states say
+how many states that is). What the rest would add is some percent of a standard deviation.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 
 from adapter.learning.learner import OnlineLearner
+from adapter.learning.settings import Mode
 from adapter.model.spatial import Array
-from adapter.signals.records import stamp_of
+from adapter.signals.records import KIND, LinkMotionKind, stamp_of, stamps_of
 from drivers.files.rows import RowsFile
 
 SCHEMA_STEPS = 2000  # at most, at the end, until λ has converged
 SCHEMA_POLISH = 300  # more of them, to the optimum
-# States taken at once where few steps are; more, and a change at the hand would be seen late.
-SETTLED = 100
+# States taken at once where few steps are; more, and a change at the hand would be seen late. Of a
+# long recording it is one of so many parts, up to another number of states that are taken.
+SETTLED, PARTS, MOST_TAKEN = 100, 2000, 50
 # θ takes as many steps as states at first, at a higher rate, then while that gains more than this
 # share of the joints' error variances, as a look at every so many batches tells; else a few.
 FIRST_STEPS, FIRST_RATE = 2000, 1.75
 GAIN, LOOK_EVERY, FEW_STEPS = 0.003, 4, 4
 # (steps, share of the usual rate) at the end, to the optimum
 THETA_POLISH = ((250, 1.0), (250, 0.3))
+PER_SAMPLE = 10  # states taken for each independent one
+LONGEST_NS = 10_000_000  # between two that are taken
+TRIPLES = 500  # of neighbouring states, which tell the noise of the motion
+
+
+class Waiting(NamedTuple):
+    """What waits for θ.
+
+    Attributes:
+        rows: columns `before_links` of every `every`-th state.
+        before: how many of them came before λ had converged.
+        every: see there.
+        triples: (t, 3, w) the same of neighbouring states, t at most `TRIPLES`.
+    """
+
+    rows: RowsFile
+    before: int
+    every: int
+    triples: Array
 
 
 def learn_batch(
@@ -38,69 +65,94 @@ def learn_batch(
         tables: states (m, size), one table after the other.
         progress: called with the number of states done.
     """
-    torque, waiting = _learn_schema(learner, tables, every)
+    waiting = _learn_schema(learner, tables, every)
     if learner.settings.wait_for_schema and not learner.schema.converged:
         return
     learner.learn_schema(_NO_STATES, SCHEMA_POLISH)
-    if not len(torque):
+    if not len(waiting.rows):
         return
-    learner.start_theta(stamp_of(torque.rows(0, 1)[0]))
-    _learn_theta(learner, torque, every, waiting, progress)
+    learner.start_theta(stamp_of(waiting.rows.rows(0, 1)[0]))
+    learner.take_every(waiting.every, waiting.triples)
+    _learn_theta(learner, waiting, every, progress)
     for steps, share in THETA_POLISH:
         learner.set_rate(share * learner.settings.theta.rate)
         learner.learn_theta(_NO_STATES, steps)
         learner.theta.adapt_prior(None if learner.rates is None else learner.rates.noise)
     learner.follow_convergence()
+    learner.take_every(1)
 
 
-def _learn_schema(
-    learner: OnlineLearner, tables: Iterable[Array], every: int
-) -> tuple[RowsFile, int]:
-    """Let λ take all states.
+def thinning(learner: OnlineLearner, table: Array) -> int:
+    """Of how many states one is enough for a learner that knows nothing yet."""
+    s = learner.settings
+    forgets = s.schema.forget_s is not None or s.theta.forget_s is not None
+    steps_ns = np.diff(stamps_of(table))
+    if learner.tree.floating or learner.learned or forgets or s.mode != Mode.MOMENTS:
+        return 1
+    if not len(steps_ns):
+        return 1
+    longest = LONGEST_NS // max(int(np.median(steps_ns)), 1)
+    return int(max(min(learner.theta.noise_gain // PER_SAMPLE, longest), 1))
 
-    Returns:
-        What θ needs of them (m, columns `before_links`), and how many came before λ had converged.
-    """
-    kept, waiting, before = RowsFile(learner.layout.before_links.stop), 0, 0
+
+def _learn_schema(learner: OnlineLearner, tables: Iterable[Array], every: int) -> Waiting:
+    """Let λ take all states."""
+    at = learner.layout.before_links
+    kept, thin, triples = RowsFile(at.stop), 0, _Triples(at.stop)
+    before = waiting = 0
     for table in tables:
         states = learner.without_known(table)
-        kept.append(states[:, learner.layout.before_links])
-        done = 0
-        while done < len(states):
-            settled = learner.schema.converged
-            batch = states[done : done + (SETTLED if settled else every)]
-            done += len(batch)
-            if not settled:
-                waiting = before + done
-            learner.learn_schema(batch, 1 if settled else every)
+        if not len(states):
+            continue
+        thin = thin or thinning(learner, states)
+        taken = np.ascontiguousarray(states[-before % thin :: thin])
+        kept.append(taken[:, at])
+        triples.take(states[:, at])
+        if (states[:, KIND] == LinkMotionKind.DOCUMENTED).all():
+            _take_for_schema(learner, taken, every, thin)
+            learner.learned += len(states) - len(taken)
+        else:
+            _take_for_schema(learner, states, every, 1)
         before += len(states)
+        if not learner.schema.converged:
+            waiting = len(kept)
+    learner.take_every(1)
     for _ in range(SCHEMA_STEPS):
         if learner.schema.converged:
             break
         learner.learn_schema(_NO_STATES)
-    return kept, waiting
+    return Waiting(kept, waiting, max(thin, 1), triples.rows())
+
+
+def _take_for_schema(learner: OnlineLearner, states: Array, every: int, thin: int) -> None:
+    learner.schema.weight, done = float(thin), 0
+    together = max(every // thin, 1)
+    while done < len(states):
+        settled = learner.schema.converged
+        batch = states[done : done + (SETTLED if settled else together)]
+        done += len(batch)
+        learner.learn_schema(batch, 1 if settled else together * thin)
 
 
 def _learn_theta(
-    learner: OnlineLearner,
-    torque: RowsFile,
-    every: int,
-    waiting: int,
-    progress: Callable[[int], None],
+    learner: OnlineLearner, waiting: Waiting, every: int, progress: Callable[[int], None]
 ) -> None:
-    """Let θ take all states; it begins to step behind the first `waiting` of them, as live."""
+    """Let θ take all states; it begins to step behind those that came before λ, as live."""
     theta, usual = learner.theta, learner.settings.theta.rate
-    for start in range(0, waiting, SETTLED):
-        learner.learn_theta(torque.rows(start, min(start + SETTLED, waiting)), 0)
-    moving, start, number = True, waiting, 0
+    torque, before, thin, _ = waiting
+    together = max(every // thin, 1)
+    settled = max(SETTLED // thin, min(len(torque) // PARTS, MOST_TAKEN))
+    for start in range(0, before, settled):
+        learner.learn_theta(torque.rows(start, min(start + settled, before)), 0)
+    moving, start, number = True, before, 0
     while start < len(torque):
-        progress(start)
-        batch = torque.rows(start, start + (every if moving else SETTLED))
+        progress(thin * start)
+        batch = torque.rows(start, start + (together if moving else settled))
         learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
-        before = theta.th.copy()
-        learner.learn_theta(batch, every if moving else FEW_STEPS)
+        before_step = theta.th.copy()
+        learner.learn_theta(batch, together * thin if moving else FEW_STEPS)
         if not moving or number % LOOK_EVERY == 0:
-            moving = theta.updates < FIRST_STEPS or _gain(learner, before) > GAIN
+            moving = theta.updates < FIRST_STEPS or _gain(learner, before_step) > GAIN
         start, number = start + len(batch), number + 1
 
 
@@ -108,6 +160,28 @@ def _gain(learner: OnlineLearner, before: Array) -> float:
     """Mean share of the joints' error variances that went, on all samples, from `before` (P,)."""
     theta = learner.theta
     return float(np.mean(1.0 - theta.variance() / theta.variance(before)))
+
+
+class _Triples:
+    """Three neighbouring states of every table, and of ever fewer tables the more there are."""
+
+    def __init__(self, width: int) -> None:
+        self._kept: list[Array] = [np.zeros((0, 3, width))]
+        self._stride, self._tables = 1, 0
+
+    def take(self, table: Array) -> None:
+        """Take states (m, w) that follow."""
+        self._tables += 1
+        if len(table) < 3 or self._tables % self._stride:
+            return
+        middle = len(table) // 2
+        self._kept.append(table[middle - 1 : middle + 2][None].copy())
+        if len(self._kept) > TRIPLES:
+            self._kept, self._stride = self._kept[:1] + self._kept[1::2], 2 * self._stride
+
+    def rows(self) -> Array:
+        """(t, 3, w)."""
+        return np.concatenate(self._kept)
 
 
 _NO_STATES = np.empty((0, 0))

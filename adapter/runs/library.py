@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,16 +30,16 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
-from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
+from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
 from adapter.signals.matching import matching, present
-from adapter.signals.validation import validation_torque_rmse
 from drivers.files.html_table import html_table, plus_minus
-from drivers.files.mcap import Log
+from drivers.files.mcap import AnyLog, Log, open_log
 from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
 
 HELD_OUT_SHARE = 0.25  # of a recording, at its end
 EXPORTED = (".urdf", ".xml", ".json")
+_AnyLog = TypeVar("_AnyLog", bound=AnyLog)
 
 
 def load_model(
@@ -185,7 +185,7 @@ def learn(
     """Learn λ and θ of a fixed-base arm from a recording, as `adapter replay` does.
 
     Args:
-        log: a file, or what `read_log` or `make_log` returned.
+        log: a file, of any length (see `open_log`), or what `read_log` or `make_log` returned.
         model: the documented arm; the learner gets its topology, gravity, tool and limits.
         effects: names learned beside θ, () for none; those of a real arm where None.
         every: samples per update; 1 is what the live process does, up to 50 is faster.
@@ -203,8 +203,8 @@ def learn(
     >>> bool((found.held_out_rmse_nm < 0.2).all())
     True
     """
-    arm, own = _fitting(model, log)
-    end_s = float(seconds(own)[-1]) if len(own) else 0.0
+    arm, own = _fitting(model, log if isinstance(log, Log) else open_log(log))
+    end_s = last_s(own) if len(own) else 0.0
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
@@ -213,10 +213,7 @@ def learn(
     settings = PipelineSettings(filter=filter_settings, learner=LearnerSettings(effects=names))
     outcome = replay(own, arm, settings, ReplayOptions(every, split_s)).outcome
     learned = learned_model(outcome, arm)
-    late = seconds(own) >= split_s
-    rmse = validation_torque_rmse(
-        seconds(own)[late], own.q[late], own.dq[late], own.tau[late], ModelTorque(learned)
-    )
+    rmse = held_out_rms(from_s(own, split_s), learned, settings).value
     values = dict(zip(names, outcome.effects.copy(), strict=True))
     started = outcome.theta_started_ns is not None
     return LearnResult(learned, values, outcome.lam_converged, started, rmse)
@@ -381,7 +378,7 @@ def filtered(log: Log | str | Path, model: SelfModel | str | Path = "panda") -> 
     >>> adapter.filtered("recordings/panda_nominal_6s.mcap")
     FilteredSignals(5777 instants of 7 joints)
     """
-    arm, own = _fitting(model, log)
+    arm, own = _fitting(model, _log(log))
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)
     front_end = make_front_end(arm, PipelineSettings(filter=filter_settings))
     states = front_end.step_table(own.stamp_ns, own.q, own.dq, own.tau)
@@ -486,13 +483,13 @@ def _model(model: SelfModel | str | Path) -> SelfModel:
     return model if isinstance(model, SelfModel) else read_robot(model)
 
 
-def _fitting(model: SelfModel | str | Path, log: Log | str | Path) -> tuple[SelfModel, Log]:
+def _fitting(model: SelfModel | str | Path, log: _AnyLog) -> tuple[SelfModel, _AnyLog]:
     """Model and recording with the same joints; a warning where the recording lacks some."""
-    whole = _log(log)
-    arm, locked = present(_model(model), whole.joint_names, whole.path)
+    arm, locked = present(_model(model), log.joint_names, log.path)
     for sentence in locked:
         warnings.warn(sentence, ModelWarning, stacklevel=3)
-    return arm, matching(whole, arm)
+    own: AnyLog = matching(cast(Log, log), arm)
+    return arm, cast(_AnyLog, own)
 
 
 def _log(log: Log | str | Path) -> Log:

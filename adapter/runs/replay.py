@@ -25,16 +25,48 @@ from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.settings import FilterSettings
-from adapter.signals.validation import validation_error
-from drivers.files.mcap import Log
+from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation_error
+from drivers.files.mcap import AnyLog, Log, StoredLog, stored
 from drivers.interface import DriverError, JointSample, LinkMotion
 
 FEWEST_FOR_NOISE = 50  # samples
 AT_ONCE = 2000  # states that pass the front end in one table: as much as a processor's cache holds
+STRETCHES = 64, 2000  # of a long recording, and samples of each, that tell its rate and noise
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
 Progress = Callable[[int], None]
+
+
+class TickTimes:
+    """How long ticks took, in bins that are `BIN` of their size wide, however many there were.
+
+    Attributes:
+        count: of ticks; longest_ns: of them.
+    """
+
+    BIN = 0.01
+
+    def __init__(self) -> None:
+        self.count, self.longest_ns = 0, 0
+        self._bins = np.zeros(0, dtype=np.int64)
+
+    def add(self, tick_ns: NDArray[np.int64]) -> None:
+        """Count (k,) times."""
+        if not len(tick_ns):
+            return
+        places = np.floor(np.log(np.maximum(tick_ns, 1)) / np.log1p(self.BIN)).astype(int)
+        found = np.bincount(places, minlength=len(self._bins))
+        found[: len(self._bins)] += self._bins
+        self._bins, self.count = found, self.count + len(tick_ns)
+        self.longest_ns = max(self.longest_ns, int(tick_ns.max()))
+
+    def percentile_ns(self, share: float) -> float:
+        """The time that `share` percent of the ticks did not exceed; the longest one exactly."""
+        if share >= 100.0:
+            return float(self.longest_ns)
+        place = np.searchsorted(np.cumsum(self._bins), 0.01 * share * self.count)
+        return float((1.0 + self.BIN) ** (place + 0.5))
 
 
 @dataclass(frozen=True)
@@ -45,7 +77,7 @@ class Replay:
         outcome: of the learner.
         pipeline: its front end has the counts of refused samples.
         samples: read from the recording.
-        tick_ns: compute time of the front end by sample (exact mode only).
+        ticks: compute times of the front end by sample (exact mode only).
         wall_s: time spent on learning, without reading the file.
         span_s: time that the samples span in the recording.
         contacts: see `contacts.contacts_of`; of the exact mode and a fixed base only.
@@ -54,17 +86,17 @@ class Replay:
     outcome: Outcome
     pipeline: Pipeline
     samples: int
-    tick_ns: NDArray[np.int64]
+    ticks: TickTimes
     wall_s: float
     span_s: float
     contacts: list[dict[str, Any]] = field(default_factory=list)
 
 
-def one_after_other(logs: Sequence[Log]) -> Log:
+def one_after_other(logs: Sequence[AnyLog]) -> AnyLog:
     """Recordings of one arm as one, in the order given, with a hole between them.
 
     The filter starts anew behind the hole, and what the hand carries may have changed in it; all
-    that is learned goes on. What links say is kept where every recording has it.
+    that is learned goes on. What links say is kept where every recording has it in memory.
 
     Args:
         logs: as `matching.matching` returns them, at least one.
@@ -72,22 +104,35 @@ def one_after_other(logs: Sequence[Log]) -> Log:
     Raises:
         DriverError: one of them holds no samples.
     """
-    stamps: list[NDArray[np.int64]] = []
+    later_ns: list[int] = []
+    end_ns = 0
     for log in logs:
         if not len(log):
             raise DriverError(f"{log.path}: no samples to learn from")
-        first = int(log.stamp_ns.min())
-        begin = int(stamps[-1].max()) + BETWEEN_NS if stamps else first
-        stamps.append(log.stamp_ns - first + begin)
+        later_ns.append(end_ns + BETWEEN_NS - log.begin_ns if later_ns else 0)
+        end_ns = log.end_ns + later_ns[-1]
+    warnings = [text for log in logs for text in log.warnings]
+    in_memory = [log for log in logs if isinstance(log, Log)]
+    if len(in_memory) == len(logs):
+        return replace(_joined(in_memory, later_ns), warnings=warnings)
+    pieces = (
+        replace(piece, stamp_ns=piece.stamp_ns + later)
+        for log, later in zip(logs, later_ns, strict=True)
+        for piece in log.pieces()
+    )
+    return replace(stored(logs[0], pieces), warnings=warnings)
+
+
+def _joined(logs: Sequence[Log], later_ns: Sequence[int]) -> Log:
+    """The same of recordings in memory, each so much later than it was."""
+    stamps = [log.stamp_ns + later for log, later in zip(logs, later_ns, strict=True)]
     kept = {key: [getattr(log, key) for log in logs] for key in ("q", "dq", "tau")}
     alike = len({log.link_names for log in logs}) == 1
     for key in ("twists", "accels"):
         own = [getattr(log, key) for log in logs]
         kept[key] = own if alike and all(x is not None for x in own) else []
     tables: dict[str, Any] = {key: np.concatenate(x) if x else None for key, x in kept.items()}
-    warnings = [text for log in logs for text in log.warnings]
-    left: dict[str, Any] = {"frames": (), "commands": None, "warnings": warnings}
-    return replace(logs[0], stamp_ns=np.concatenate(stamps), **tables, **left)
+    return replace(logs[0], stamp_ns=np.concatenate(stamps), **tables, frames=(), commands=None)
 
 
 class ReplayOptions(NamedTuple):
@@ -110,7 +155,7 @@ class ReplayOptions(NamedTuple):
 
 
 def replay(
-    log: Log,
+    log: AnyLog,
     documented: SelfModel,
     settings: PipelineSettings,
     options: ReplayOptions | None = None,
@@ -126,7 +171,8 @@ def replay(
         raise SettingsError(f"--every takes 1 to {MOST_PER_UPDATE} samples, got {every}")
     stop = len(log)
     if until_s is not None and stop:
-        stop = int(np.sum(log.stamp_ns < log.stamp_ns[0] + round(1e9 * until_s)))
+        until_ns = log.first_ns + round(1e9 * until_s)
+        stop = sum(int(np.sum(piece.stamp_ns < until_ns)) for piece in log.pieces())
     if stop == 0:
         raise DriverError(f"{log.path}: no samples to learn from")
     if documented.tree.floating and log.base is None:
@@ -148,33 +194,46 @@ def replay(
         observer = ReplayObserver(documented, pipeline.learner)
     started = time.perf_counter()
     progress = progress or (lambda done: None)
+    ticks = TickTimes()
     if every == 1:
-        tick_ns = _exact(log, stop, pipeline, progress, observer)
+        ticks = _exact(log, stop, pipeline, progress, observer)
     else:
-        tick_ns = _batch(log, stop, pipeline, every, progress)
+        tables = filtered_tables(log, stop, pipeline.front_end)
+        learn_batch(pipeline.learner, tables, every, progress)
     wall_s = time.perf_counter() - started
-    span_s = 1e-9 * float(log.stamp_ns[stop - 1] - log.stamp_ns[0])
+    span_s = 1e-9 * float(log.piece(stop - 1, stop).first_ns - log.first_ns)
     contacts = [] if observer is None else contacts_of(observer.observer, documented)
-    return Replay(collect(pipeline.learner), pipeline, stop, tick_ns, wall_s, span_s, contacts)
+    return Replay(collect(pipeline.learner), pipeline, stop, ticks, wall_s, span_s, contacts)
 
 
 def _exact(
-    log: Log,
+    log: AnyLog,
     stop: int,
     pipeline: Pipeline,
     progress: Progress,
     observer: ReplayObserver | None,
-) -> NDArray[np.int64]:
-    tick_ns = np.zeros(stop, dtype=np.int64)
+) -> TickTimes:
+    ticks = TickTimes()
+    for start in range(0, stop, AT_ONCE):
+        progress(start)
+        piece = log.piece(start, min(start + AT_ONCE, stop))
+        _exact_piece(piece, pipeline, observer, ticks)
+    return ticks
+
+
+def _exact_piece(
+    log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
+) -> None:
+    tick_ns = np.zeros(len(log), dtype=np.int64)
     front_end, learner = pipeline.front_end, pipeline.learner
     heard = _heard(log)
-    for i in range(stop):
+    stamps = log.stamp_ns.tolist()
+    for i, stamp_ns in enumerate(stamps):
         links = None
         if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
             links = LinkMotion(log.twists[i], log.accels[i])
-        joints = log.q[i], log.dq[i], log.tau[i]
         base = None if log.base is None else log.base[i]
-        sample = JointSample(int(log.stamp_ns[i]), *joints, links, base)
+        sample = JointSample(stamp_ns, log.q[i], log.dq[i], log.tau[i], links, base)
         before = time.perf_counter_ns()
         states = front_end.step(sample)
         tick_ns[i] = time.perf_counter_ns() - before
@@ -182,9 +241,7 @@ def _exact(
             learner.step(state)
         if observer is not None:
             observer.step(sample)
-        if i % 500 == 0:
-            progress(i)
-    return tick_ns
+    ticks.add(tick_ns)
 
 
 def _heard(log: Log) -> NDArray[np.bool_] | None:
@@ -194,33 +251,27 @@ def _heard(log: Log) -> NDArray[np.bool_] | None:
     return np.asarray(~silent)
 
 
-def _batch(
-    log: Log, stop: int, pipeline: Pipeline, every: int, progress: Progress
-) -> NDArray[np.int64]:
-    learn_batch(pipeline.learner, filtered_tables(log, stop, pipeline.front_end), every, progress)
-    return np.zeros(0, dtype=np.int64)
-
-
-def filtered_tables(log: Log, stop: int, front_end: FrontEnd) -> Iterator[Array]:
+def filtered_tables(log: AnyLog, stop: int, front_end: FrontEnd) -> Iterator[Array]:
     """Filtered states (m, size) of the first `stop` samples of a recording, a table at a time."""
     at_once = max(AT_ONCE // front_end.filter.settings.states_per_sample, 1)
     for start in range(0, stop, at_once):
-        part = slice(start, min(start + at_once, stop))
+        part = log.piece(start, min(start + at_once, stop))
         links = None
-        if log.twists is not None and log.accels is not None:
-            links = log.twists[part], log.accels[part]
-        joints = log.stamp_ns[part], log.q[part], log.dq[part], log.tau[part]
-        base = None if log.base is None else log.base[part]
-        yield front_end.step_table(*joints, links, base)
+        if part.twists is not None and part.accels is not None:
+            links = part.twists, part.accels
+        joints = part.stamp_ns, part.q, part.dq, part.tau
+        yield front_end.step_table(*joints, links, part.base)
 
 
-def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
+def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
     """Filter settings for the rate of a recording and, where they leave it open, its noise.
+
+    Of a recording in a file both are told by stretches of it, see `STRETCHES`.
 
     Returns:
         The settings, and a sentence where the recording's rate is not the nominal one.
     """
-    steps = np.diff(log.stamp_ns)
+    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread(*STRETCHES)])
     steps = steps[steps > 0]
     changes: dict[str, float] = {}
     warnings = []
@@ -240,11 +291,27 @@ def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[
     return replace(settings, **changes), warnings
 
 
-def noise_levels(log: Log) -> dict[str, Array]:
+def noise_levels(log: AnyLog) -> dict[str, Array]:
     """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies.
 
-    Not numbers where there are too few samples, or too few that are not the one before.
+    Not numbers where there are too few samples, or too few that are not the one before. Of a
+    recording in a file it is that of stretches, see `STRETCHES`.
     """
+    found = [_noise_levels(part) for part in log.spread(*STRETCHES)]
+    with np.errstate(invalid="ignore"):
+        return {
+            name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))
+            for name in ("q", "dq", "tau")
+        }
+
+
+def _known(levels: list[Array]) -> Array:
+    """(k, n) those of (n,) that are numbers; where none are, one that is not."""
+    known = [x for x in levels if np.isfinite(x).all()]
+    return np.stack(known or levels[:1])
+
+
+def _noise_levels(log: Log) -> dict[str, Array]:
     new = np.ones(len(log), dtype=bool)
     new[1:] = (np.diff(log.dq, axis=0) != 0).any(axis=1)
     if new.sum() < FEWEST_FOR_NOISE:
@@ -255,23 +322,42 @@ def noise_levels(log: Log) -> dict[str, Array]:
     }
 
 
-def held_out_error(log: Log, model: SelfModel, settings: PipelineSettings) -> Array:
-    """Torque error (k, n) of a model on a recording it has not seen, N m.
+def held_out_rms(log: AnyLog, model: SelfModel, settings: PipelineSettings) -> Rms:
+    """Torque error of a model on a recording it has not seen, N m.
 
     Of a base that floats, on the states that the front end makes of the recording; else by the
     recipe of `validation`.
     """
+    if isinstance(log, StoredLog):
+        signals = ((seconds(x, log.first_ns), x.q, x.dq, x.tau) for x in log.pieces())
+        return rms_of(errors_of_pieces(signals, ModelTorque(model)))
     if not model.tree.floating:
         signals = seconds(log), log.q, log.dq, log.tau
-        return validation_error(*signals, ModelTorque(model))
+        return rms_of([validation_error(*signals, ModelTorque(model))])
     front_end = make_front_end(model, settings)
     states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
     at = front_end.layout
     q, dq, ddq = (states[:, part] for part in (at.q, at.dq, at.ddq))
     error = states[:, at.joint_tau] - ModelTorque(model, states[:, at.base])(q, dq, ddq)
-    return np.asarray(error)
+    return rms_of([error])
 
 
-def seconds(log: Log) -> Array:
-    """(m,) seconds since the first stamp."""
-    return 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+def seconds(log: Log, since_ns: int | None = None) -> Array:
+    """(m,) seconds since the first stamp, or since another one."""
+    return 1e-9 * (log.stamp_ns - (log.stamp_ns[0] if since_ns is None else since_ns))
+
+
+def last_s(log: AnyLog) -> float:
+    """Seconds from the first sample of a recording to the last one."""
+    return float(seconds(log.piece(len(log) - 1, len(log)), log.first_ns)[0])
+
+
+def from_s(log: AnyLog, begin_s: float, end_s: float = np.inf) -> AnyLog:
+    """Samples of a recording from a time after its first one to another (not included), s."""
+    first_ns = log.first_ns
+
+    def part(piece: Log) -> Log:
+        at_s = seconds(piece, first_ns)
+        return piece.take((at_s >= begin_s) & (at_s < end_s))
+
+    return log.changed(part)

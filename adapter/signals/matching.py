@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import overload
+
+import numpy as np
 
 from adapter.model.locking import locked
 from adapter.model.self_model import SelfModel
-from drivers.files.mcap import Log
+from drivers.files.mcap import IN_MEMORY, AnyLog, Log, StoredLog
 from drivers.interface import DriverError
+
+_LOOKS = 64, 2000  # at a recording, and samples of each, for where the arm moves
 
 
 def present(
@@ -62,7 +67,15 @@ def counted(documented: SelfModel, source: object, count: int | None) -> tuple[s
     return rows[0]
 
 
-def matching(log: Log, documented: SelfModel) -> Log:
+@overload
+def matching(log: Log, documented: SelfModel) -> Log: ...
+
+
+@overload
+def matching(log: StoredLog, documented: SelfModel) -> StoredLog: ...
+
+
+def matching(log: AnyLog, documented: SelfModel) -> AnyLog:
     """The recording with the robot's joints in the robot's order, and its links' motion.
 
     Names that differ in nothing but what stands before their number (fer_joint3 for
@@ -114,3 +127,14 @@ def corresponding(
 
 def _number(name: str) -> str:
     return name[len(name.rstrip("0123456789")) :]
+
+
+def most_moved(log: AnyLog) -> Log:
+    """A recording in memory as it is; of one in a file a part in which the arm moves a lot."""
+    if isinstance(log, Log):
+        return log
+    parts = log.spread(*_LOOKS)
+    speeds = [float(np.mean(np.nan_to_num(part.dq) ** 2)) for part in parts]
+    middle = int(np.argmax(speeds)) * len(log) // len(parts)
+    start = max(min(middle - IN_MEMORY // 2, len(log) - IN_MEMORY), 0)
+    return log.piece(start, start + IN_MEMORY)

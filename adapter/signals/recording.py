@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap import Log, derive_velocity, looks_like_degrees, read_log, survey
+from drivers.files.mcap import (
+    JOINT_COMMANDS,
+    Log,
+    Topic,
+    derive_velocity,
+    looks_like_degrees,
+    open_log,
+    sample_log,
+    survey,
+)
 from drivers.interface import DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
+_LOOKS = 64, 2000  # at a long recording that must be read whole, and samples of each
 _LISTED = 10  # gaps and topics that are listed one by one
 _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
@@ -24,7 +34,8 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     Of a file without usable joint states only its topics are told, and `problem` says what is
     missing. Keys: file, bytes, truncated, problem, topics, warnings; with joint states also
     joints, source (topic or columns of the joint states), units, teaches, links, frames (topics
-    that tell the motion of others), samples, start_s, duration_s,
+    that tell the motion of others), samples, samples_judged (of a long recording content is
+    judged from a sample, and a warning says so), start_s, duration_s,
     rate_hz, period_ms, jitter_ms, repeated_samples, repeated_stamps, backward_steps, not_finite,
     gaps, range, metadata, attachments.
 
@@ -33,13 +44,13 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     """
     path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
     try:
-        log = log or read_log(path, topic=topic, frames=True)
+        looked = _Looked.at(path, topic) if log is None else _Looked.whole(log)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
     else:
-        topics, warnings, truncated = log.topics, log.warnings, log.truncated
-        facts = {"problem": None, **_joint_facts(log), **_timing(log)}
+        topics, warnings, truncated = looked.topics, looked.warnings, looked.parts[0].truncated
+        facts = {"problem": None, **_joint_facts(looked), **_timing(looked)}
     return {
         "file": str(path),
         "bytes": sum(p.stat().st_size for p in (path, *path.rglob("*")) if p.is_file()),
@@ -48,6 +59,57 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
         "warnings": warnings,
         **facts,
     }
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What of a recording was looked at.
+
+    Attributes:
+        parts: all of it, or stretches in the order of time.
+        samples, commands: of the whole.
+        topics, warnings: of the whole.
+        holes: (s since the first sample, s) that are known beside those in the parts.
+    """
+
+    parts: list[Log]
+    samples: int
+    commands: int
+    topics: dict[str, Topic]
+    warnings: list[str]
+    holes: list[tuple[float, float]] = field(default_factory=list)
+
+    @classmethod
+    def whole(cls, log: Log) -> _Looked:
+        """A recording in memory."""
+        commands = 0 if log.commands is None else len(log.commands.stamp_ns)
+        return cls([log], len(log), commands, log.topics, log.warnings)
+
+    @classmethod
+    def at(cls, path: Path, topic: str | None) -> _Looked:
+        """A recording, a long one by a sample. Raises DriverError."""
+        sample = sample_log(path, topic, frames=True)
+        if sample is not None:
+            told = sample.topics.get(JOINT_COMMANDS)
+            commands = 0 if told is None or sample.parts[0].commands is None else told.messages
+            said = [*sample.warnings, _judged(sample.parts, sample.samples)]
+            about = sample.samples, commands, sample.topics, said, sample.holes
+            return cls(sample.parts, *about)
+        log = open_log(path, topic=topic, frames=True)
+        if isinstance(log, Log):
+            return cls.whole(log)
+        parts = log.spread(*_LOOKS)
+        said = [*log.warnings, _judged(parts, len(log))]
+        return cls(parts, len(log), len(log.commands or ()), log.topics, said)
+
+
+def _judged(parts: list[Log], samples: int) -> str:
+    """What a sample says of itself."""
+    return (
+        f"judged from {sum(map(len, parts))} of {samples} samples, in {len(parts)} stretches from "
+        "the first to the last: ranges, units, steps, repeats, holes and what is no number; count "
+        "and duration are of the whole"
+    )
 
 
 def summary(facts: dict[str, Any]) -> list[str]:
@@ -98,51 +160,60 @@ def _range_line(name: str, found: dict[str, list[float]]) -> str:
     return f"{name}: " + "  ".join(f"{low:.3g}..{high:.3g}" for low, high in pairs)
 
 
-def _units(log: Log) -> str:
+def _units(parts: list[Log]) -> str:
     """What the numbers look like; a joint's torque has no size that all arms share."""
-    said = ["positions look like degrees" if looks_like_degrees(log.q) else "positions rad"]
+    q = np.concatenate([part.q for part in parts])
+    said = ["positions look like degrees" if looks_like_degrees(q) else "positions rad"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope = np.abs(derive_velocity(log.stamp_ns, log.q))
+        slopes = [np.abs(derive_velocity(part.stamp_ns, part.q)) for part in parts]
+        slope, speed = np.concatenate(slopes), np.abs(np.concatenate([x.dq for x in parts]))
         fast = slope > _FAST
-        ratio = float(np.median((np.abs(log.dq) / slope)[fast])) if fast.any() else np.nan
+        ratio = float(np.median((speed / slope)[fast])) if fast.any() else np.nan
     if not np.isfinite(ratio):
         said.append("velocities cannot be judged")
     elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
         said.append("velocities rad/s")
     else:
         said.append(f"velocities {ratio:.3g} times the slope of the positions")
-    most = np.nanmax(np.abs(log.tau), initial=0.0)
+    most = max(float(np.nanmax(np.abs(part.tau), initial=0.0)) for part in parts)
     return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m"])
 
 
-def _teaches(log: Log) -> str:
+def _teaches(looked: _Looked) -> str:
+    log = looked.parts[0]
     with np.errstate(invalid="ignore"):
-        moving = np.asarray(np.abs(log.dq) > _REST)
+        moving = np.concatenate([np.abs(part.dq) > _REST for part in looked.parts])
     resting = [n for j, n in enumerate(log.joint_names) if not moving[:, j].any()]
-    seconds = float(moving.any(axis=1).mean()) * float(np.ptp(log.stamp_ns)) * 1e-9
+    seconds = float(moving.any(axis=1).mean()) * _duration_s(looked)
     said = [f"{seconds:.3g} s of motion"]
     if resting:
         said.append(f"at rest: {', '.join(resting)}")
-    if not np.any(np.nan_to_num(log.tau)):
+    if not any(np.any(np.nan_to_num(part.tau)) for part in looked.parts):
         said.append("no torques: nothing of inertias and friction")
     if log.twists is None and not log.frames:
         said.append("no link motion is recorded: it is synthesized from the documented lengths")
     return "; ".join([*said, "--robot NAME|FILE predicts the parameters"])
 
 
-def _joint_facts(log: Log) -> dict[str, Any]:
-    signals = {"q_rad": log.q, "dq_rad_s": log.dq, "tau_nm": log.tau}
+def _joint_facts(looked: _Looked) -> dict[str, Any]:
+    log, parts = looked.parts[0], looked.parts
+    signals = {
+        "q_rad": np.concatenate([part.q for part in parts]),
+        "dq_rad_s": np.concatenate([part.dq for part in parts]),
+        "tau_nm": np.concatenate([part.tau for part in parts]),
+    }
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
         "joints": list(log.joint_names),
         "source": log.topic,
-        "units": _units(log),
-        "teaches": _teaches(log),
+        "units": _units(parts),
+        "teaches": _teaches(looked),
         "links": list(log.link_names),
         "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],
-        "samples": len(log),
-        "commands": 0 if log.commands is None else len(log.commands.stamp_ns),
-        "repeated_samples": int(_repeated(log).sum()),
+        "samples": looked.samples,
+        "samples_judged": sum(map(len, parts)),
+        "commands": looked.commands,
+        "repeated_samples": sum(int(_repeated(part).sum()) for part in parts),
         "not_finite": int((~finite).sum()),
         "range": {
             name: {"min": _listed(v[finite].min(axis=0)), "max": _listed(v[finite].max(axis=0))}
@@ -161,20 +232,24 @@ def _repeated(log: Log) -> NDArray[np.bool_]:
     return repeated
 
 
-def _timing(log: Log) -> dict[str, Any]:
-    stamps = log.stamp_ns
-    steps_ms = np.diff(stamps) * 1e-6
+def _duration_s(looked: _Looked) -> float:
+    stamps = [part.stamp_ns for part in looked.parts]
+    return 1e-9 * float(max(x.max() for x in stamps) - min(x.min() for x in stamps))
+
+
+def _timing(looked: _Looked) -> dict[str, Any]:
+    steps_ms = np.concatenate([np.diff(part.stamp_ns) for part in looked.parts]) * 1e-6
     forward = steps_ms[steps_ms > 0]
-    duration_s = float(np.ptp(stamps)) * 1e-9
+    duration_s = _duration_s(looked)
     facts: dict[str, Any] = {
-        "start_s": float(stamps[0]) * 1e-9,
+        "start_s": float(looked.parts[0].stamp_ns[0]) * 1e-9,
         "duration_s": duration_s,
-        "rate_hz": (len(stamps) - 1) / duration_s if duration_s > 0 else None,
+        "rate_hz": (looked.samples - 1) / duration_s if duration_s > 0 else None,
         "repeated_stamps": int((steps_ms == 0).sum()),
         "backward_steps": int((steps_ms < 0).sum()),
         "period_ms": None,
         "jitter_ms": None,
-        "gaps": _gaps(stamps),
+        "gaps": _gaps(looked),
     }
     if forward.size:
         shares = {"min": 0, "p50": 50, "p99": 99, "max": 100}
@@ -183,14 +258,18 @@ def _timing(log: Log) -> dict[str, Any]:
     return facts
 
 
-def _gaps(stamps: NDArray[np.int64]) -> dict[str, Any]:
-    steps_s = np.diff(stamps) * 1e-9
+def _gaps(looked: _Looked) -> dict[str, Any]:
+    first = looked.parts[0].stamp_ns[0]
+    steps_s = np.concatenate([np.diff(part.stamp_ns) for part in looked.parts]) * 1e-9
+    after_s = np.concatenate([part.stamp_ns[:-1] - first for part in looked.parts]) * 1e-9
     forward = steps_s[steps_s > 0]
     hole_s = max(GAP_S, _HOLE * float(np.median(forward))) if forward.size else GAP_S
+    between = np.array(looked.holes).reshape(-1, 2)
+    steps_s, after_s = np.r_[steps_s, between[:, 1]], np.r_[after_s, between[:, 0]]
     places = np.flatnonzero(steps_s >= hole_s)
+    places = places[np.argsort(after_s[places], kind="stable")]
     listed = [
-        {"after_s": float(stamps[i] - stamps[0]) * 1e-9, "length_s": float(steps_s[i])}
-        for i in places[:_LISTED]
+        {"after_s": float(after_s[i]), "length_s": float(steps_s[i])} for i in places[:_LISTED]
     ]
     return {
         "longer_than_s": hole_s,

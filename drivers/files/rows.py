@@ -18,12 +18,13 @@ class RowsFile:
 
     Args:
         width: numbers per row.
+        in_memory: bytes up to which there is no file yet.
     """
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, in_memory: int = IN_MEMORY) -> None:
         self.width, self._count = width, 0
         # The file lives as long as this object, which closes it.
-        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY)  # noqa: SIM115
+        self._file = tempfile.SpooledTemporaryFile(max_size=in_memory)  # noqa: SIM115
 
     def __len__(self) -> int:
         return self._count

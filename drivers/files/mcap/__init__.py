@@ -12,16 +12,29 @@ topic.
 
 from drivers.files.mcap.bags import is_recording
 from drivers.files.mcap.imus import READERS, FrameMotion
-from drivers.files.mcap.joints import Commands, derive_velocity, looks_like_degrees
+from drivers.files.mcap.joint_rows import derive_velocity, looks_like_degrees
+from drivers.files.mcap.joints import Commands
 from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, read_messages, survey
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
-from drivers.files.mcap.writer import FLUSH_S, McapWriter, to_json
+from drivers.files.mcap.sampled import SampledLog, sample_log
+from drivers.files.mcap.stored_log import (
+    IN_MEMORY,
+    AnyLog,
+    StoredCommands,
+    StoredLog,
+    open_log,
+    stored,
+)
+from drivers.files.mcap.writer import FLUSH_S, JOINT_COMMANDS, McapWriter, to_json
 
 __all__ = [
     "FLUSH_S",
+    "IN_MEMORY",
+    "JOINT_COMMANDS",
     "READERS",
+    "AnyLog",
     "Carrier",
     "Commands",
     "FrameMotion",
@@ -29,15 +42,21 @@ __all__ = [
     "McapWriter",
     "PositionLog",
     "Recovery",
+    "SampledLog",
+    "StoredCommands",
+    "StoredLog",
     "Topic",
     "derive_velocity",
     "is_recording",
     "looks_like_degrees",
+    "open_log",
     "read_estimates",
     "read_log",
     "read_messages",
     "read_position_log",
     "recover",
+    "sample_log",
+    "stored",
     "survey",
     "to_json",
 ]

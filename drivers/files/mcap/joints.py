@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +9,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.files.mcap.joint_rows import (
+    Clock,
+    CommandRows,
+    JointRows,
+    States,
+    stamps_told,
+    topic_at,
+)
 from drivers.files.mcap.series import JOINT_SCHEMAS, Series
 from drivers.files.ros import Block
 from drivers.files.ros_types import JOINT_STATE
 from drivers.interface import Array, DriverError
 
-_RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
-_DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
+MOST_SETS = 32  # of joints of one topic that are taken part by part
 _NEED = "learning needs positions and measured joint torques (effort)"
 _NEED_POSITION = "discovery needs the positions of the joints"
+
+
+class TooManySetsError(ValueError):
+    """Messages are of so many sets of joints that they cannot be told apart part by part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,36 +68,12 @@ def assemble_joints(
     Raises:
         DriverError: no message has the joints asked for, or none has positions (and efforts).
     """
-    where = f"{path}: {series.topic}"
     check_type(series, path)
-    warnings = _unreadable(series, where)
-    series = _one_set_of_joints(series, where, want, warnings)
-    names = series.blocks[0].layout.names
-    series = _complete(series, where, warnings, effort)
-    stamp_ns = stamps(series, where, warnings)
-    q, dq, tau = (_column(series, run, names) for run in range(3))
-    if np.isnan(tau).all():
-        if effort:
-            raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
-        warnings.append(f"{where} has no efforts: nothing is learned from torques")
-    absent: NDArray[np.bool_] = np.all(np.isnan(dq), axis=1)
-    if not effort and (absent.all() or not np.any(dq)) and np.any(q != q[:1]):
-        dq = np.full_like(q, np.nan)
-        warnings.append(f"{where} has no velocities: they are those of the filtered positions")
-    elif absent.any():
-        dq = np.where(absent[:, None], derive_velocity(stamp_ns, q), dq)
-        warnings.append(
-            f"{where}: {int(absent.sum())} of {len(q)} messages have no velocity; "
-            "derived from the positions"
-        )
-    if len(tau) > 1 and not np.any(tau):
-        warnings.append(f"{where}: all efforts are 0; does this arm measure torque?")
-    if looks_like_degrees(q):
-        warnings.append(
-            f"{where}: positions reach {np.nanmax(np.abs(q)):.0f} rad; are these degrees? "
-            "Recordings hold radians (`adapter import` converts)"
-        )
-    return Joints(names, stamp_ns, q, dq, tau, warnings)
+    told = ToldJoints(effort)
+    told.take(series)
+    rows = told.chosen(series, path, want)
+    stamp_ns, q, dq, tau = rows.tables(0, len(rows))
+    return Joints(rows.names, stamp_ns, q, dq, tau, rows.warnings)
 
 
 def check_type(series: Series, path: Path) -> None:
@@ -117,67 +103,8 @@ def _unreadable(series: Series, where: str) -> list[str]:
     return [f"{where}: {len(series.bad)} messages are unreadable, first number {place}: {reason}"]
 
 
-def _one_set_of_joints(
-    series: Series, where: str, want: Sequence[str] | None, warnings: list[str]
-) -> Series:
-    sets: Counter[frozenset[str]] = Counter()
-    for block in series.blocks:
-        names = block.layout.names
-        if names and len(set(names)) == len(names):
-            sets[frozenset(names)] += len(block.index)
-    if not sets:
-        raise DriverError(f"{where} has no readable message that names joints")
-    fitting = [s for s in sets if want is None or s.issuperset(want)]
-    if not fitting:
-        have = "; ".join(", ".join(_natural(s)) for s in sets)
-        missing = [n for n in want or () if not any(n in s for s in sets)]
-        lack = f"has no joint {', '.join(missing)}" if missing else "never has these together"
-        raise DriverError(f"{where} {lack}; have: {have}")
-    chosen = max(fitting, key=lambda s: sets[s])
-    part = series.only(
-        lambda b: frozenset(b.layout.names) == chosen and len(b.layout.names) == len(chosen)
-    )
-    left_out = sum(len(b.index) for b in series.blocks) - part.count
-    if left_out:
-        others = sorted({n for b in series.blocks for n in b.layout.names} - chosen)
-        warnings.append(
-            f"{where}: {left_out} messages are of other joints "
-            f"({', '.join(others) or 'a part of these, or twice'}); left out"
-        )
-    return part
-
-
 def _natural(names: frozenset[str]) -> list[str]:
     return sorted(names, key=lambda n: (len(n), n))
-
-
-def _run(block: Block, run: int) -> Array | None:
-    """A run of doubles with one value for each joint; None where it is absent."""
-    values = block.values[run]
-    return values if values.shape[1] == len(block.layout.names) else None
-
-
-def _complete(series: Series, where: str, warnings: list[str], effort: bool) -> Series:
-    """Messages with positions (and efforts); what else has another length counts as absent."""
-    needed, need = ((0, 2), _NEED) if effort else ((0,), _NEED_POSITION)
-    what_of = {0: "position", 2: "effort"}
-    for run in needed:
-        if all(_run(block, run) is None for block in series.blocks):
-            lengths = sorted({block.values[run].shape[1] for block in series.blocks})
-            count = len(series.blocks[0].layout.names)
-            raise DriverError(
-                f"{where} has no {what_of[run]} ({', '.join(map(str, lengths))} values for "
-                f"{count} joints); {need}"
-            )
-    part = series.only(lambda b: all(_run(b, run) is not None for run in needed))
-    if not part.blocks:
-        raise DriverError(f"{where} has no message with both position and effort; {_NEED}")
-    if part.count < series.count:
-        warnings.append(
-            f"{where}: {series.count - part.count} messages lack "
-            f"{' or '.join(what_of[run] for run in needed)}; left out"
-        )
-    return part
 
 
 def _column(series: Series, run: int, names: tuple[str, ...]) -> Array:
@@ -192,39 +119,172 @@ def _column(series: Series, run: int, names: tuple[str, ...]) -> Array:
     return np.ascontiguousarray(series.in_order(parts))
 
 
+def _run(block: Block, run: int) -> Array | None:
+    """A run of doubles with one value for each joint; None where it is absent."""
+    values = block.values[run]
+    return values if values.shape[1] == len(block.layout.names) else None
+
+
 def stamps(series: Series, where: str, warnings: list[str]) -> NDArray[np.int64]:
     """(m,) header stamps; log times where every header stamp is 0."""
-    stamp_ns = series.in_order([block.stamp_ns for block in series.blocks])
-    if len(stamp_ns) > 1 and not np.any(stamp_ns):
-        stamp_ns = series.in_order(series.log_ns)
-        warnings.append(f"{where}: header stamps are 0; the recorder's log times are used")
-    back = np.flatnonzero(np.diff(stamp_ns) < 0)
-    if back.size:
-        step_ms = (stamp_ns[back[0]] - stamp_ns[back[0] + 1]) / 1e6
-        warnings.append(
-            f"{where}: time runs backwards {back.size} times, first by {step_ms:.3f} ms at "
-            f"sample {back[0] + 1}"
-        )
-    return stamp_ns
+    clocks = Clock(), Clock()
+    times = [series.in_order([block.stamp_ns for block in series.blocks])]
+    clocks[0].take(times[0])
+    if clocks[0].silent:
+        times.append(series.in_order(series.log_ns))
+        clocks[1].take(times[1])
+    which, said = stamps_told(*clocks, len(times[0]), where)
+    warnings += said
+    return times[which]
 
 
-def derive_velocity(stamp_ns: NDArray[np.int64], q: Array) -> Array:
-    """(m, n) central differences of the positions, over times that move forward."""
-    latest = np.maximum.accumulate(stamp_ns)
-    forward = np.concatenate([[True], latest[1:] > latest[:-1]])
-    if forward.sum() < 2:
-        return np.zeros_like(q)
-    seconds = (stamp_ns[forward] - stamp_ns[0]) * 1e-9
-    derived = np.gradient(q[forward], seconds, axis=0)
-    return derived[np.cumsum(forward) - 1]
+class ToldJoints:
+    """What a topic tells of joints, part by part, by the set of joints that messages are of.
+
+    Args:
+        effort: whether messages without efforts are of no use, see `assemble_joints`.
+        most_sets: more of them are refused; None for any number.
+    """
+
+    def __init__(self, effort: bool = True, most_sets: int | None = None) -> None:
+        self._sets: dict[frozenset[str], _Set] = {}
+        self._most_sets = most_sets
+        self._effort, self._messages, self._names = effort, 0, set[str]()
+        self._needed = (0, 2) if effort else (0,)
+
+    def take(self, series: Series) -> None:
+        """Take messages that follow in the file. Raises TooManySets."""
+        found: dict[frozenset[str], list[int]] = {}
+        for i, block in enumerate(series.blocks):
+            names = block.layout.names
+            self._messages += len(block.index)
+            self._names.update(names)
+            if names and len(set(names)) == len(names):
+                found.setdefault(frozenset(names), []).append(i)
+        for key, places in found.items():
+            own = self._sets.get(key)
+            if own is None:
+                if len(self._sets) == self._most_sets:
+                    raise TooManySetsError(f"{series.topic}: messages of ever other joints")
+                own = self._sets[key] = _Set(series.blocks[places[0]].layout.names)
+            own.take(series, places, self._needed)
+
+    def chosen(self, series: Series, path: Path, want: Sequence[str] | None) -> JointRows:
+        """The states of the chosen joints, with sentences on what was left out or looks wrong.
+
+        Raises:
+            DriverError: see `assemble_joints`.
+        """
+        where = topic_at(path, series.topic)
+        warnings = _unreadable(series, where)
+        own = self._one_set(where, want, warnings)
+        self._check_complete(own, where, warnings)
+        rows = own.rows
+        if rows.no_torque and self._effort:
+            raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
+        rows.warnings = warnings
+        return rows.judge(where, self._effort)
+
+    def _one_set(self, where: str, want: Sequence[str] | None, warnings: list[str]) -> _Set:
+        sets = self._sets
+        if not sets:
+            raise DriverError(f"{where} has no readable message that names joints")
+        fitting = [s for s in sets if want is None or s.issuperset(want)]
+        if not fitting:
+            have = "; ".join(", ".join(_natural(s)) for s in sets)
+            missing = [n for n in want or () if not any(n in s for s in sets)]
+            lack = f"has no joint {', '.join(missing)}" if missing else "never has these together"
+            raise DriverError(f"{where} {lack}; have: {have}")
+        chosen = max(fitting, key=lambda s: sets[s].messages)
+        left_out = self._messages - sets[chosen].messages
+        if left_out:
+            others = ", ".join(sorted(self._names - chosen))
+            warnings.append(
+                f"{where}: {left_out} messages are of other joints "
+                f"({others or 'a part of these, or twice'}); left out"
+            )
+        return sets[chosen]
+
+    def _check_complete(self, own: _Set, where: str, warnings: list[str]) -> None:
+        """Say which messages lack positions (or efforts). Raises DriverError where all do."""
+        need = _NEED if self._effort else _NEED_POSITION
+        what_of = {0: "position", 2: "effort"}
+        for run in self._needed:
+            if run not in own.present:
+                lengths = ", ".join(map(str, sorted(own.lengths[run])))
+                raise DriverError(
+                    f"{where} has no {what_of[run]} ({lengths} values for "
+                    f"{len(own.rows.names)} joints); {need}"
+                )
+        if not len(own.rows):
+            raise DriverError(f"{where} has no message with both position and effort; {_NEED}")
+        if len(own.rows) < own.messages:
+            warnings.append(
+                f"{where}: {own.messages - len(own.rows)} messages lack "
+                f"{' or '.join(what_of[run] for run in self._needed)}; left out"
+            )
 
 
-def looks_like_degrees(q: Array) -> bool:
-    """Whether a third of the joints stay long beyond what an arm can turn in radians."""
-    if len(q) == 0:
-        return False
-    beyond = (np.abs(q) > _RAD_MAX).mean(axis=0) > _DEGREE_SHARE
-    return bool(beyond.sum() >= max(1, len(beyond) // 3))
+class _Set:
+    """Messages of one set of joints.
+
+    Attributes:
+        rows: those with all that is needed.
+        messages: how many there were.
+        present: runs (0 q, 1 dq, 2 tau) that any message has; lengths: of each, any of all.
+    """
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        self.rows, self.messages = JointRows(names), 0
+        self.present: set[int] = set()
+        self.lengths: dict[int, set[int]] = {0: set(), 1: set(), 2: set()}
+
+    def take(self, series: Series, places: list[int], needed: tuple[int, ...]) -> None:
+        """Take the blocks at these places."""
+        kept = []
+        for i in places:
+            block = series.blocks[i]
+            self.messages += len(block.index)
+            runs = {run for run in range(3) if _run(block, run) is not None}
+            self.present |= runs
+            for run in range(3):
+                self.lengths[run].add(block.values[run].shape[1])
+            if runs >= set(needed):
+                kept.append(i)
+        if not kept:
+            return
+        part = series.at(kept)
+        stamp_ns = part.in_order([block.stamp_ns for block in part.blocks])
+        q, dq, tau = (_column(part, run, self.rows.names) for run in range(3))
+        self.rows.append(States(stamp_ns, q, dq, tau), part.in_order(part.log_ns))
+
+
+class ToldCommands:
+    """Commanded torques that a topic tells, part by part.
+
+    Raises:
+        TooManySetsError: from `take`, where messages command several sets of joints in turn.
+    """
+
+    def __init__(self) -> None:
+        self.rows: CommandRows | None = None
+
+    def take(self, series: Series) -> None:
+        """Take messages that follow in the file."""
+        places = [
+            i
+            for i, block in enumerate(series.blocks)
+            if block.layout.names and _run(block, 2) is not None
+        ]
+        if not places:
+            return
+        names = series.blocks[places[0]].layout.names
+        rows = self.rows = self.rows or CommandRows(names)
+        if any({*series.blocks[i].layout.names} != {*rows.names} for i in places):
+            raise TooManySetsError(f"{series.topic}: commands of several sets of joints")
+        part = series.at(places)
+        stamp_ns = part.in_order([block.stamp_ns for block in part.blocks])
+        rows.append(stamp_ns, part.in_order(part.log_ns), _column(part, 2, rows.names))
 
 
 def read_commands(
@@ -235,7 +295,7 @@ def read_commands(
     check_type(series, path)
     part = series.only(lambda b: _run(b, 2) is not None and bool(set(names) & set(b.layout.names)))
     if not part.blocks:
-        warnings.append(f"{where}: no message commands a torque of these joints; left out")
+        warnings.append(no_commands(where))
         return None
     parts = []
     for block in part.blocks:
@@ -245,3 +305,8 @@ def read_commands(
                 tau[:, i] = block.values[2][:, block.layout.names.index(name)]
         parts.append(tau)
     return Commands(stamps(part, where, warnings), part.in_order(parts))
+
+
+def no_commands(where: str) -> str:
+    """A sentence on a topic of commands that are of no use."""
+    return f"{where}: no message commands a torque of these joints; left out"

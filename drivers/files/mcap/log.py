@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from drivers.files.estimates import estimate_values, values_of_json
 from drivers.files.html_table import NOTHING, html_table
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.imus import READERS, FrameMotion, frame_motions, with_imus
+from drivers.files.mcap.joint_rows import AT_ONCE
 from drivers.files.mcap.joints import Commands, Joints, assemble_joints, fits, read_commands
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
 from drivers.files.mcap.records import McapScan, Scan
@@ -94,6 +95,41 @@ class Log:
         count = f"{len(self)} samples of {len(self.joint_names)} joints"
         return f"Log({self.path.name}: {count}, {span_s:.1f} s)"
 
+    @property
+    def first_ns(self) -> int:
+        """Stamp of the first sample."""
+        return int(self.stamp_ns[0])
+
+    @property
+    def begin_ns(self) -> int:
+        """The earliest stamp."""
+        return int(self.stamp_ns.min())
+
+    @property
+    def end_ns(self) -> int:
+        """The latest stamp."""
+        return int(self.stamp_ns.max())
+
+    def piece(self, start: int, stop: int) -> Log:
+        """Samples `start` to `stop` (not included), as far as there are such.
+
+        The arrays are views; commands stay whole, warnings with the whole recording.
+        """
+        return replace(self.take(slice(start, stop)), warnings=[])
+
+    def pieces(self, rows: int = AT_ONCE) -> Iterator[Log]:
+        """All samples, so many at a time."""
+        for start in range(0, len(self), rows):
+            yield self.piece(start, start + rows)
+
+    def spread(self, stretches: int, samples: int) -> list[Log]:
+        """What tells of the whole: of a recording in memory all of it, see `StoredLog.spread`."""
+        return [self]
+
+    def changed(self, change: Callable[[Log], Log]) -> Log:
+        """What `change` makes of the recording, see `StoredLog.changed`."""
+        return change(self)
+
     def _repr_html_(self) -> str:
         """Ranges of each joint, for notebooks."""
         tables = (self.q, self.dq, self.tau)
@@ -111,7 +147,7 @@ class Log:
         that are left out are named in a warning. Raises DriverError for a joint or link that the
         recording doesn't have.
         """
-        columns = _places(self.joint_names, joint_names, f"{self.path}: has no joint")
+        columns = places_of(self.joint_names, joint_names, f"{self.path}: has no joint")
         extra = [name for name in self.joint_names if name not in joint_names]
         warnings = list(self.warnings)
         if extra:
@@ -131,7 +167,7 @@ class Log:
             link_names = self._links_moved_by(joint_names)
         return log if link_names is None else log._select_links(link_names)
 
-    def take(self, rows: NDArray[np.bool_]) -> Log:
+    def take(self, rows: NDArray[np.bool_] | slice) -> Log:
         """The same recording with these samples only."""
         links = (None if x is None else x[rows] for x in (self.twists, self.accels, self.base))
         twists, accels, base = links
@@ -156,7 +192,7 @@ class Log:
     def _select_links(self, link_names: Sequence[str]) -> Log:
         if not self.link_names:
             return self
-        rows = _places(self.link_names, link_names, f"{self.path}: has no motion of link")
+        rows = places_of(self.link_names, link_names, f"{self.path}: has no motion of link")
         return replace(
             self,
             link_names=tuple(link_names),
@@ -170,7 +206,7 @@ def _columns(values: Array, columns: list[int]) -> Array:
     return np.ascontiguousarray(values[:, columns])
 
 
-def _places(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[int]:
+def places_of(have: tuple[str, ...], want: Sequence[str], trouble: str) -> list[int]:
     missing = [name for name in want if name not in have]
     if missing:
         raise DriverError(f"{trouble} {', '.join(missing)}; {choices(missing[0], have)}")
@@ -203,14 +239,28 @@ def read_log(
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
-    scan = open_scan(Path(path))
+    return assembled(
+        open_scan(Path(path)), joint_names, topic, sensors=sensors, frames=frames, imus=imus
+    )
+
+
+def assembled(
+    scan: Scan,
+    joint_names: Sequence[str] | None = None,
+    topic: str | None = None,
+    *,
+    sensors: bool = False,
+    frames: bool = False,
+    imus: bool = False,
+) -> Log:
+    """What a scan tells, see `read_log`."""
     tell = tuple(READERS) if frames else (IMU,) if imus else ()
-    topics = collect(scan, lambda series: _wanted(series, topic, sensors, tell))
-    series = _chosen(scan, topics, topic, not sensors)
+    topics = collect(scan, lambda series: is_wanted(series, topic, sensors, tell))
+    series = choose_topic(scan, topics, topic, not sensors)
     with np.errstate(invalid="ignore"):  # not-a-number is counted, not computed with
         joints = assemble_joints(series, scan.path, joint_names, effort=not sensors)
     warnings = scan.warnings + joints.warnings
-    metadata = _metadata(scan)
+    metadata = decoded_metadata(scan)
     links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
     found: list[FrameMotion] = []
     if tell:
@@ -233,7 +283,7 @@ def read_log(
         commands=commands,
         metadata=metadata,
         attachments={a.name: bytes(a.data) for a in scan.attachments},
-        topics=_summary(topics),
+        topics=topics_told(topics),
         topic=series.topic,
         truncated=scan.truncated,
         warnings=warnings,
@@ -244,7 +294,7 @@ def read_log(
 def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
     """Topics, warnings and whether the file is cut, of any recording. Raises DriverError."""
     scan = open_scan(Path(path))
-    return _summary(collect(scan, lambda series: False)), scan.warnings, scan.truncated
+    return topics_told(collect(scan, lambda series: False)), scan.warnings, scan.truncated
 
 
 def read_estimates(path: str | Path, topic: str = ESTIMATES) -> Iterator[dict[str, Any]]:
@@ -285,7 +335,9 @@ def read_messages(path: str | Path, topic: str) -> Iterator[Message]:
             yield Message(topic, name, int(region.times[i, 0]), fields)
 
 
-def _chosen(scan: Scan, topics: Mapping[str, Series], topic: str | None, effort: bool) -> Series:
+def choose_topic(
+    scan: Scan, topics: Mapping[str, Series], topic: str | None, effort: bool
+) -> Series:
     """The topic that was named, or `/joint_states`, or the only one of use."""
     series = topics.get(topic or JOINT_STATES)
     if topic is not None:
@@ -314,7 +366,7 @@ def _chosen(scan: Scan, topics: Mapping[str, Series], topic: str | None, effort:
     return series
 
 
-def _wanted(series: Series, topic: str | None, sensors: bool, tell: Sequence[str]) -> bool:
+def is_wanted(series: Series, topic: str | None, sensors: bool, tell: Sequence[str]) -> bool:
     """Whether the messages of a topic are decoded."""
     if series.topic in (topic, JOINT_COMMANDS) or series.schema in tell:
         return True
@@ -345,7 +397,7 @@ def _links(
     return links
 
 
-def _summary(topics: Mapping[str, Series]) -> dict[str, Topic]:
+def topics_told(topics: Mapping[str, Series]) -> dict[str, Topic]:
     return {k: Topic(s.schema, s.encoding, s.count) for k, s in sorted(topics.items())}
 
 
@@ -360,7 +412,7 @@ def _nothing_found(scan: Scan, topics: Mapping[str, Series], topic: str) -> str:
     )
 
 
-def _metadata(scan: Scan) -> dict[str, Any]:
+def decoded_metadata(scan: Scan) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for record in scan.metadata:
         if record.name == METADATA:

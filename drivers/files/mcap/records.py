@@ -32,6 +32,8 @@ from drivers.interface import DriverError
 _COMPRESSIONS = ("", "zstd", "lz4")
 _MOST_OTHERS = 2**18  # records of a stretch that are no messages; channel numbers have 16 bits
 _MOST_WARNINGS = 50
+_TOGETHER = 2**16  # messages of a region where they lie in no chunk
+_KEPT_PAGES = 2**25  # bytes of the file that stay mapped behind what was read
 HEAD = 9  # opcode and length
 RECORD = struct.Struct("<BQ")
 _MESSAGE_HEAD = 22  # channel, sequence, log time, publish time
@@ -133,16 +135,22 @@ class Region:
 
 @dataclass
 class Walk:
-    """What one pass over a stretch of records found; `end` is where it stopped."""
+    """What one pass over a stretch of records found.
+
+    Attributes:
+        start, stop: of the messages' payloads; others: opcode, first and last byte.
+        end: where it stopped; full: because there were as many messages as were asked for.
+    """
 
     start: list[int] = field(default_factory=list)
     stop: list[int] = field(default_factory=list)
     others: list[tuple[int, int, int]] = field(default_factory=list)  # opcode, first, last byte
     end: int = 0
+    full: bool = False
 
 
-def walk(data: memoryview, at: int, until: frozenset[int]) -> Walk:
-    """Note all complete records from `at` on; stop before an opcode of `until` or a cut."""
+def walk(data: memoryview, at: int, until: frozenset[int], most: int | None = None) -> Walk:
+    """Note complete records from `at` on, up to `most` messages, an opcode of `until` or a cut."""
     found = Walk()
     note_start, note_stop, unpack = found.start.append, found.stop.append, RECORD.unpack_from
     message, size = int(Opcode.MESSAGE), len(data)
@@ -159,6 +167,9 @@ def walk(data: memoryview, at: int, until: frozenset[int]) -> Walk:
         elif length < _MESSAGE_HEAD:
             break
         else:
+            if len(found.start) == most:
+                found.full = True
+                break
             note_start(at + HEAD + _MESSAGE_HEAD)
             note_stop(stop)
         at = stop
@@ -220,7 +231,7 @@ class McapScan(Scan):
         self._data = _open(path)
         self.size = len(self._data)
         self.lost_bytes = 0
-        self._rescued = self._made = 0
+        self._rescued = self._made = self._given_back = 0
         self._chunks: list[int] = []
         self._read_index()
 
@@ -228,11 +239,12 @@ class McapScan(Scan):
         """All complete messages, in the order of the file; damaged chunks are passed over."""
         at = len(MAGIC)
         while True:
+            self._give_back(at)
             bound = self._next_chunk(at)
-            found = walk(self._data[:bound], at, _IN_FILE)
+            found = walk(self._data[:bound], at, _IN_FILE, _TOGETHER)
             yield from self._use(found, self._data)
             at = found.end
-            if at == bound < self.size:
+            if found.full or at == bound < self.size:
                 continue
             is_chunk = at + HEAD <= self.size and self._data[at] == Opcode.CHUNK
             stop = at + HEAD + RECORD.unpack_from(self._data, at)[1] if is_chunk else bound + 1
@@ -248,6 +260,15 @@ class McapScan(Scan):
                     yield from self._cut_chunk(at)
                 break
         self._judge_end(at)
+
+    def _give_back(self, at: int) -> None:
+        """Let go of mapped pages before `at`, which would count as memory in use."""
+        whole = at // _KEPT_PAGES * _KEPT_PAGES
+        mapped = self._data.obj
+        if whole > self._given_back and hasattr(mmap, "MADV_DONTNEED"):
+            assert isinstance(mapped, mmap.mmap)
+            mapped.madvise(mmap.MADV_DONTNEED, self._given_back, whole - self._given_back)
+            self._given_back = whole
 
     def _next_chunk(self, at: int) -> int:
         """Where the next chunk behind `at` begins, as far as the index knows, else the end."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from mcap.records import Channel
@@ -97,9 +98,24 @@ class Series:
             return joined
         return joined[np.argsort(places, kind="stable")]
 
+    def forget(self) -> None:
+        """Drop messages that were taken; an empty block of each kind stays and tells its layout."""
+        kinds: dict[Any, Block] = {}
+        for block in self.blocks:
+            widths = tuple(values.shape[1] for values in block.values)
+            empty = tuple(values[:0].copy() for values in block.values)
+            none = np.zeros(0, dtype=np.int64)
+            kinds[block.layout.names, widths] = Block(none, none, block.layout, empty)
+        self.blocks = list(kinds.values())
+        self.places = [np.zeros(0, dtype=np.int64)] * len(kinds)
+        self.log_ns = list(self.places)
+
     def only(self, keep: Callable[[Block], bool]) -> Series:
         """The blocks that satisfy `keep`."""
-        chosen = [i for i, block in enumerate(self.blocks) if keep(block)]
+        return self.at([i for i, block in enumerate(self.blocks) if keep(block)])
+
+    def at(self, chosen: Sequence[int]) -> Series:
+        """The blocks at these places."""
         part = Series(self.topic, self.schema, self.encoding)
         part.places = [self.places[i] for i in chosen]
         part.log_ns = [self.log_ns[i] for i in chosen]
@@ -117,8 +133,16 @@ def schema_name(scan: Scan, channel: Channel) -> str:
     return "/".join((parts[0], "msg", parts[1])) if len(parts) == 2 else schema.name
 
 
-def collect(scan: Scan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
-    """Every topic of the file by name; those `wanted` are decoded, the others counted."""
+def collect(
+    scan: Scan,
+    wanted: Callable[[Series], bool],
+    take: Callable[[Series], None] | None = None,
+) -> dict[str, Series]:
+    """Every topic of the file by name; those `wanted` are decoded, the others counted.
+
+    Args:
+        take: is given a topic of `wanted` each time that it has decoded some messages more.
+    """
     topics: dict[str, Series] = {}
     unknown = 0
     for region in scan.regions():
@@ -132,6 +156,8 @@ def collect(scan: Scan, wanted: Callable[[Series], bool]) -> dict[str, Series]:
             series = _series(topics, scan, scan.channels[numbers[0]])
             if wanted(series) and series.encoding == "cdr" and series.schema in PARSERS:
                 series.add(region, which, times)
+                if take is not None:
+                    take(series)
             else:
                 series.count += len(which)
     if unknown:

@@ -1,0 +1,161 @@
+"""A sample of a long MCAP file: stretches spread over it, and what its index says of the whole.
+
+Nothing but the index and some chunks is read, however large the file is.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap.summary import Summary
+
+from drivers.files.mcap.log import Log, Topic, assembled
+from drivers.files.mcap.records import HEAD, MAGIC, RECORD, McapScan, Region
+from drivers.files.mcap.series import schema_name
+from drivers.interface import DriverError
+
+SAMPLED_FROM = 2**26  # bytes; a smaller file is read whole
+_OTHERS = (Opcode.METADATA, Opcode.ATTACHMENT)
+STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
+
+
+@dataclass(frozen=True)
+class SampledLog:
+    """A sample of a recording.
+
+    Attributes:
+        parts: stretches of it in the order of time, of the same joints and topic.
+        topics: all topics of the file, with the counts of the whole.
+        holes: (s since the first sample, s) between chunks, outside of the parts.
+        warnings: a sentence each.
+    """
+
+    parts: list[Log]
+    topics: dict[str, Topic]
+    holes: list[tuple[float, float]]
+    warnings: list[str]
+
+    @property
+    def samples(self) -> int:
+        """Of the whole, as the index counts them."""
+        return self.topics[self.parts[0].topic].messages
+
+
+def sample_log(path: str | Path, topic: str | None = None, **read: Any) -> SampledLog | None:
+    """A sample of a long MCAP file with an index; None of every other recording.
+
+    Args:
+        path: of the file; topic: of the joint states; read: as `read_log` takes it.
+    """
+    file = Path(path)
+    if not file.is_file() or file.stat().st_size < SAMPLED_FROM:
+        return None
+    summary = _summary(file)
+    if summary is None or summary.statistics is None or not summary.chunk_indexes:
+        return None
+    chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    stretches = _stretches(chunks)
+    if sum(map(len, stretches)) > len(chunks) // 2:
+        return None
+    scan = _Part(file)
+    scan.note_others(summary)
+    found = []
+    for stretch in stretches:
+        scan.chosen = [chunks[i].chunk_start_offset for i in stretch]
+        try:
+            found.append(assembled(scan, topic=topic, **read))
+        except DriverError:  # this stretch has no joint states, others may
+            continue
+    if not found or not scan.sound:
+        return None
+    first = found[0]
+    parts = [x for x in found if (x.joint_names, x.topic) == (first.joint_names, first.topic)]
+    warnings = list(dict.fromkeys(text for part in found for text in part.warnings))
+    return SampledLog(parts, _topics(scan, summary), _holes(chunks, stretches), warnings)
+
+
+def _summary(path: Path) -> Summary | None:
+    try:
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                return None
+            file.seek(0)
+            return make_reader(file).get_summary()
+    except (McapError, OSError, ValueError, struct.error, MemoryError):
+        return None  # the scan that reads all says what is wrong
+
+
+def _stretches(chunks: Sequence[ChunkIndex]) -> list[range]:
+    """Places of chunks, some in a row, spread evenly from the first to the last."""
+    size = float(np.median([c.uncompressed_size for c in chunks]))
+    together = max(round(STRETCH_BYTES / max(size, 1.0)), 1)
+    last = max(len(chunks) - together, 0)
+    starts = np.unique(np.linspace(0, last, STRETCHES).astype(int)).tolist()
+    return [range(start, min(start + together, len(chunks))) for start in starts]
+
+
+def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[float, float]]:
+    inside = {i for stretch in stretches for i in stretch[1:]}
+    begin = chunks[0].message_start_time
+    found = []
+    for i in range(1, len(chunks)):
+        before, behind = chunks[i - 1].message_end_time, chunks[i].message_start_time
+        if i not in inside and behind > before:
+            found.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
+    return found
+
+
+def _topics(scan: McapScan, summary: Summary) -> dict[str, Topic]:
+    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+    found: dict[str, Topic] = {}
+    for channel in scan.channels.values():
+        before = found[channel.topic].messages if channel.topic in found else 0
+        kind = schema_name(scan, channel)
+        messages = before + counts.get(channel.id, 0)
+        found[channel.topic] = Topic(kind, channel.message_encoding, messages)
+    return dict(sorted(found.items()))
+
+
+class _Part(McapScan):
+    """Some chunks of a file, with the channels that its index knows.
+
+    Attributes:
+        chosen: places of the chunks that `regions` reads.
+        sound: whether they were chunks.
+    """
+
+    chosen: Sequence[int] = ()
+    sound = True
+
+    def regions(self) -> Iterator[Region]:
+        """The messages of the chosen chunks."""
+        self._made = 0
+        for place in self.chosen:
+            size = self.size - place
+            if size < HEAD or self._data[place] != Opcode.CHUNK:
+                self.sound = False
+                return
+            stop = place + HEAD + RECORD.unpack_from(self._data, place)[1]
+            if stop > self.size:
+                self.sound = False
+                return
+            yield from self._chunk(place, stop)
+
+    def note_others(self, summary: Summary) -> None:
+        """Read metadata and attachments, which the index has the places of."""
+        for kind in (summary.metadata_indexes, summary.attachment_indexes):
+            for index in kind:
+                if 0 < index.offset <= self.size - HEAD:
+                    opcode, length = RECORD.unpack_from(self._data, index.offset)
+                    first = index.offset + HEAD
+                    if opcode in _OTHERS and first + length <= self.size:
+                        self._note(opcode, self._data[first : first + length])

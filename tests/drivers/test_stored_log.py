@@ -1,0 +1,92 @@
+"""Recordings that wait in a file are those in memory, to the last bit and word."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.files.mcap import Log, McapWriter, StoredLog, open_log, read_log
+
+NAMES = ("a", "b", "c")
+
+
+def write(path: Path, samples: int, seed: int = 3) -> Path:
+    """States with commands, some of them late, silent or of a second set of joints."""
+    rng = np.random.default_rng(seed)
+    with McapWriter(path, NAMES, metadata={"arm": "left"}) as writer:
+        for i in range(samples):
+            q, dq, tau = rng.standard_normal((3, 3))
+            stamp_ns = 10**9 + 10**6 * (i - 5 * (i == 700))
+            writer.write_joint_state(stamp_ns, q, dq if i % 5 else np.full(3, np.nan), tau)
+            if i % 2:
+                writer.write_command(stamp_ns + 300, tau + 1.0)
+    return path
+
+
+def assert_same(stored: Log | StoredLog, log: Log) -> None:
+    """All that a recording tells."""
+    whole = stored.in_memory() if isinstance(stored, StoredLog) else stored
+    for name in ("stamp_ns", "q", "dq", "tau"):
+        assert np.array_equal(getattr(whole, name), getattr(log, name), equal_nan=True), name
+    assert whole.commands is not None and log.commands is not None
+    assert np.array_equal(whole.commands.stamp_ns, log.commands.stamp_ns)
+    assert np.array_equal(whole.commands.tau, log.commands.tau, equal_nan=True)
+    for name in ("joint_names", "metadata", "topics", "topic", "truncated", "warnings"):
+        assert getattr(whole, name) == getattr(log, name), name
+
+
+def test_a_stored_recording_is_the_one_in_memory(tmp_path: Path) -> None:
+    path = write(tmp_path / "log.mcap", 40_000)
+    log, stored = read_log(path), open_log(path, in_memory=0)
+    assert isinstance(stored, StoredLog) and isinstance(open_log(path), Log)
+    assert any("backwards 1 times, first by 4.000 ms at sample 700" in w for w in log.warnings)
+    assert any("8000 of 40000 messages have no velocity" in w for w in log.warnings)
+    assert_same(stored, log)
+    assert (stored.begin_ns, stored.end_ns) == (log.begin_ns, log.end_ns)
+    turned = ("c", "a")
+    assert_same(stored.select(turned), log.select(turned))
+    pieces = list(stored.pieces(7_000))
+    assert np.array_equal(np.concatenate([p.q for p in pieces]), log.q)
+    assert np.array_equal(np.concatenate([p.q for p in log.pieces(7_000)]), log.q)
+    late = stored.changed(lambda piece: piece.take(piece.stamp_ns > 2 * 10**10))
+    assert np.array_equal(late.piece(0, 10).q, log.take(log.stamp_ns > 2 * 10**10).q[:10])
+
+
+def test_a_piece_has_the_commands_of_its_time_and_one_to_either_side(tmp_path: Path) -> None:
+    stored = open_log(write(tmp_path / "log.mcap", 600), in_memory=0)
+    piece = stored.piece(100, 200)
+    assert piece.commands is not None and stored.commands is not None
+    every = stored.commands.all().stamp_ns
+    inside = (every >= piece.begin_ns) & (every <= piece.end_ns)
+    first, last = np.flatnonzero(inside)[[0, -1]]
+    assert np.array_equal(piece.commands.stamp_ns, every[first - 1 : last + 2])
+    assert len(stored.piece(0, 3).commands.stamp_ns) == 2  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("cut", [0, 5_000])
+def test_others_joints_and_a_cut_are_told_alike(tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "log.mcap"
+    rng = np.random.default_rng(1)
+    with McapWriter(path, NAMES) as writer, McapWriter(tmp_path / "x.mcap", ("g",)) as other:
+        for i in range(3_000):
+            writer.write_joint_state(i * 10**6, *rng.standard_normal((3, 3)))
+            if i % 3 == 0:
+                writer._states, own = other._states, writer._states
+                writer.write_joint_state(i * 10**6, *np.zeros((3, 1)))
+                writer._states = own
+        writer.write_command(0, np.zeros(3))
+    path.write_bytes(path.read_bytes()[: -cut or None])
+    log, stored = read_log(path), open_log(path, in_memory=0)
+    assert isinstance(stored, StoredLog) and log.truncated == bool(cut)
+    assert any("messages are of other joints (g)" in w for w in log.warnings)
+    whole = stored.in_memory()
+    assert np.array_equal(whole.q, log.q) and whole.warnings == log.warnings
+
+
+def test_commands_that_run_backwards_come_in_memory(tmp_path: Path) -> None:
+    path = tmp_path / "log.mcap"
+    with McapWriter(path, NAMES) as writer:
+        for i in (1, 2, 3):
+            writer.write_joint_state(i, *np.zeros((3, 3)))
+            writer.write_command(-i + 10, np.ones(3))
+    assert isinstance(open_log(path, in_memory=0), Log)

@@ -1,0 +1,147 @@
+"""Recordings in a file: what is learned from them piece by piece, and from every k-th state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.torque import ModelTorque
+from adapter.learning.settings import LearnerSettings
+from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
+from adapter.runs import batch
+from adapter.runs.config import PipelineSettings
+from adapter.runs.replay import (
+    Replay,
+    ReplayOptions,
+    TickTimes,
+    from_s,
+    held_out_rms,
+    last_s,
+    noise_levels,
+    one_after_other,
+    replay,
+)
+from adapter.signals import validation
+from adapter.signals.matching import matching, most_moved
+from drivers.files.mcap import Log, StoredLog, stored
+from drivers.interface import Array
+
+SETTINGS = PipelineSettings(learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
+
+
+@cache
+def panda() -> SelfModel:
+    return documented("panda")
+
+
+@cache
+def moving(seconds: float, seed: int) -> Log:
+    """The documented arm with friction on three sines a joint, and the sensors' noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(round(1000 * seconds)) * 1e-3
+    signals = np.zeros((3, len(t), 7))
+    signals[0] = (0.0, -0.6, 0.0, -1.9, 0.0, 1.7, 0.7)
+    for cycles in (2, 5, 11):
+        w, size = 2.0 * np.pi * cycles / 10.0, 0.3 / cycles * rng.uniform(0.6, 1.0, 7)
+        phase = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 7)
+        signals += np.array([np.sin(phase), w * np.cos(phase), -(w**2) * np.sin(phase)]) * size
+    q, dq, ddq = signals
+    tau = ModelTorque(panda())(q, dq, ddq) + 0.3 * dq + 0.6 * np.tanh(dq / 0.01)
+    noisy = (x + s * rng.standard_normal(x.shape) for x, s in ((q, 1e-5), (dq, 1e-3), (tau, 0.02)))
+    stamps = 10**9 + np.arange(len(t)) * 10**6
+    return Log(Path("arm.mcap"), panda().tree.joint_names, stamps, *noisy)
+
+
+def in_file(log: Log) -> StoredLog:
+    return stored(log, log.pieces(3_000))
+
+
+def information(found: Replay) -> tuple[Array, Array]:
+    """Of the parameters in use, and their values."""
+    theta = found.pipeline.learner.theta
+    known = theta.known()
+    return theta.information()[0][np.ix_(known, known)], theta.th[known]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_every_kth_state_tells_what_all_tell(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """θ, its standard deviations and the noise, against all states of the same recording."""
+    log = moving(12.0, seed)
+    thin = replay(log, panda(), SETTINGS, ReplayOptions(every=50))
+    monkeypatch.setattr(batch, "PER_SAMPLE", 10**6)
+    dense = replay(log, panda(), SETTINGS, ReplayOptions(every=50))
+    assert thin.outcome.learned == dense.outcome.learned
+    (H, th), (G, other) = information(dense), information(thin)
+    weights, vectors = np.linalg.eigh(H)
+    off = np.sqrt(weights) * (vectors.T @ (other - th))  # standard deviations
+    assert np.sqrt(np.mean(off**2)) < 0.3 and np.abs(off).max() < 1.0
+    share = scipy.linalg.eigvalsh(G, H)
+    assert abs(np.median(share) - 1.0) < 0.1
+    assert thin.outcome.variance == pytest.approx(dense.outcome.variance, rel=0.15)
+    assert np.abs(thin.outcome.theta - dense.outcome.theta).max() < 0.5
+    assert thin.pipeline.learner.theta.weight == 1.0  # what comes next counts for itself
+
+
+@pytest.mark.parametrize("every", [1, 50])
+def test_a_recording_in_a_file_teaches_what_it_teaches_in_memory(every: int) -> None:
+    log = moving(3.0, 1)
+    options = ReplayOptions(every, until_s=2.5)
+    ours = replay(in_file(log), panda(), SETTINGS, options)
+    theirs = replay(log, panda(), SETTINGS, options)
+    assert (ours.samples, ours.span_s) == (theirs.samples, theirs.span_s)
+    for name in ("lam", "theta", "effects", "covariance", "score_trace"):
+        assert np.array_equal(getattr(ours.outcome, name), getattr(theirs.outcome, name)), name
+
+
+def test_held_out_error_by_windows_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validation, "WINDOW_S", 5.3)
+    log = moving(12.0, 1)
+    rng = np.random.default_rng(5)
+    kept = rng.random(len(log)) > 0.05  # samples are missing, one repeats, one is late
+    kept[4_000:4_700] = False
+    log = log.take(kept)
+    log.q[900], log.dq[900], log.tau[900] = log.q[899], log.dq[899], log.tau[899]
+    log.stamp_ns[2_000] -= 5_000_000
+    ours = held_out_rms(in_file(log), panda(), SETTINGS)
+    theirs = held_out_rms(log, panda(), SETTINGS)
+    assert ours.value == pytest.approx(theirs.value, rel=1e-9)
+
+
+def test_parts_of_a_recording_in_a_file() -> None:
+    log = moving(12.0, 1)
+    whole = in_file(log)
+    assert last_s(whole) == last_s(log) == pytest.approx(11.999)
+    late, theirs = from_s(whole, 8.0), from_s(log, 8.0)
+    assert isinstance(late, StoredLog) and isinstance(theirs, Log)
+    assert np.array_equal(late.in_memory().tau, theirs.tau)
+    for name, level in noise_levels(whole).items():
+        assert level == pytest.approx(noise_levels(log)[name], rel=0.1)
+    assert len(most_moved(whole)) == len(log)
+    mixed = replace(log, joint_names=tuple(reversed(log.joint_names)))
+    assert np.array_equal(matching(in_file(mixed), panda()).in_memory().q, log.q[:, ::-1])
+
+
+def test_recordings_one_after_the_other_in_a_file() -> None:
+    log = moving(3.0, 1)
+    ours, theirs = one_after_other([in_file(log), log]), one_after_other([log, log])
+    assert isinstance(ours, StoredLog) and isinstance(theirs, Log)
+    whole = ours.in_memory()
+    assert np.array_equal(whole.stamp_ns, theirs.stamp_ns) and np.array_equal(whole.q, theirs.q)
+
+
+def test_tick_times_in_bins() -> None:
+    rng, ticks = np.random.default_rng(1), TickTimes()
+    times = (1e4 * np.exp(rng.standard_normal(20_000))).astype(int)
+    for part in np.split(times, 10):
+        ticks.add(part)
+    for share in (50.0, 99.0, 99.9):
+        expected = float(np.percentile(times, share))
+        assert ticks.percentile_ns(share) == pytest.approx(expected, rel=0.02)
+    assert ticks.percentile_ns(100.0) == times.max() and ticks.count == len(times)
