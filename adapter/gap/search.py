@@ -171,8 +171,9 @@ def _unless_trusted(
 def _total(found: Found) -> float:
     """ln of what the data are worth under what was found and its own noise, its names paid."""
     fit, known, width = found.fit, found.carried, 0.0
-    for noise, weight in zip(fit.noise, fit.weights, strict=True):
-        rows = weight[ORDER:]  # around dates none counts: as if they were as usual
+    for noise, weight, own in zip(fit.noise, fit.weights, fit.recordings, strict=True):
+        # around dates and seams none counts: as if they were as usual
+        rows = (weight if len(own.begins) == 1 else weight * own.counted)[ORDER:]
         width += float(np.log(np.where(rows > 0.0, rows, USUAL) / noise.sigma).sum())
     fits = score(known.G, known.g, known.prior_std).log_evidence - 0.5 * known.data @ known.data
     return float(width + fits + sum(price(e) for e in fit.named if not e.assumed))
