@@ -78,13 +78,21 @@ class Screened:
         log: joints in the model's order; strictly increasing stamps, finite, without repeats.
         timing: of the recording as it was.
         moving: joints (from 0) that move enough to tell anything of them.
-        notes: what to report beside the findings, a sentence each.
+        beyond, standing, silent: what to report of joints beyond their limits, of joints that do
+            not move and of torques that never change, a sentence each.
     """
 
     log: Log
     timing: RecordingClock
     moving: tuple[int, ...]
-    notes: list[str]
+    beyond: list[str]
+    standing: list[str]
+    silent: list[str]
+
+    @property
+    def notes(self) -> list[str]:
+        """What to report beside the findings, a sentence each."""
+        return [*self.timing.words(), *self.beyond, *self.standing, *self.silent]
 
 
 def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) -> Screened:
@@ -107,8 +115,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) 
     _check_motion(log, names, q, dq, moving)
     silent = _silent(log, names)
     judge_torque(log, model, arm, (q, dq, ddq, tau), recorded if renamed else (), unit_known)
-    notes = [*timing.words(), *outside, *_standing(names, moving, q, dq), *silent]
-    return Screened(log, timing, moving, notes)
+    return Screened(log, timing, moving, outside, standing(names, moving, q, dq), silent)
 
 
 def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]:
@@ -128,7 +135,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
-    log, timing, said = _at_source(log, timing)
+    log, timing, said = at_source(log, timing)
     if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
             RecordingFault.DATA,
@@ -140,7 +147,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     return log, timing, [*said, *_outside_limits(log, model, recorded, renamed)]
 
 
-def _at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
+def at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
     """Samples of `uniform` at the times of their states, where a publisher showed some twice."""
     stamps = source_stamps(log.stamp_ns, log.q, log.dq)
     moved_s = 1e-9 * float(np.abs(stamps - log.stamp_ns).max(initial=0))
@@ -273,7 +280,8 @@ def _check_motion(
     )
 
 
-def _standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:
+def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:
+    """Notes on joints that move too little, or not at all; q, dq (m, n) rad, rad/s, smoothed."""
     still = [name for j, name in enumerate(names) if j not in moving]
     wide, fast = _extent(q, dq)
     little = [names[j] for j in moving if wide[j] < WANTED_RAD or fast[j] < WANTED_DQ]

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -29,6 +29,9 @@ from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
+
+if TYPE_CHECKING:
+    from adapter.gap.long_recording import LongRecording
 
 # The band.
 RATE_HZ = 250.0  # of the models
@@ -108,7 +111,7 @@ class Signals:
         Where a joint jumped and its link did not, it is the link's torques that count.
         """
         parts = [motion_rows(links, rows) for rows in self.stretches]
-        return replace(links, bands_hz=np.max([_bands_of(x, self.noise) for x in parts], axis=0))
+        return replace(links, bands_hz=np.max([bands_of(x, self.noise) for x in parts], axis=0))
 
     @property
     def stretches(self) -> list[slice]:
@@ -237,12 +240,12 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     q, dq, ddq = smoothed.at(grid)
     noise = 2.0 * float(np.median(np.diff(source.t))) * smoothed.dq_noise**2
     motion = Motion(grid, q, dq, ddq, arm)
-    motion = replace(motion, bands_hz=_bands_of(motion, noise))
+    motion = replace(motion, bands_hz=bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
-    return Signals(motion, noise, low(_at(grid, t, recording.tau)), band_t)
+    return Signals(motion, noise, low(on_grid(grid, t, recording.tau)), band_t)
 
 
-def _bands_of(motion: Motion, noise: Array) -> Array:
+def bands_of(motion: Motion, noise: Array) -> Array:
     """(n,) Hz above which a joint's torque does not stand out of the noise of the motion.
 
     Infinite where it does as far as torques are compared. `noise` is (n,) rad²/s²/Hz, of dq.
@@ -265,7 +268,7 @@ def _bands_of(motion: Motion, noise: Array) -> Array:
     return np.where(clear.any(axis=0), band, 0.0)
 
 
-def _at(grid: Array, t: Array, tau: Array) -> Array:
+def on_grid(grid: Array, t: Array, tau: Array) -> Array:
     """Torque (m, n) at the grid's instants, without what lies above 100 Hz."""
     pad = (len(_ANTI_ALIAS) // 2) / RAW_HZ
     factor = round(RAW_HZ / RATE_HZ)
@@ -283,6 +286,8 @@ class Recorded:
         t: (m,) s since its first sample, increasing; q, dq, tau: (m, n).
         command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
         dq_late_s: how much later dq is than q.
+        begins: rows at which its stretches begin; between these time is left out.
+        whole: of which it holds some stretches; None where it is all there is.
     """
 
     name: str
@@ -293,11 +298,13 @@ class Recorded:
     command_t: Array | None = None
     commands: Array | None = None
     dq_late_s: float = 0.0
+    begins: tuple[int, ...] = (0,)
+    whole: LongRecording | None = None
 
     @classmethod
-    def of(cls, log: Log, dq_late_s: float = 0.0) -> Recorded:
-        """From a screened log."""
-        start = log.stamp_ns[0]
+    def of(cls, log: Log, dq_late_s: float = 0.0, begin_ns: int | None = None) -> Recorded:
+        """From a screened log; times count from `begin_ns`, its first sample where None."""
+        start = log.stamp_ns[0] if begin_ns is None else begin_ns
         command_t = commands = None
         if log.commands is not None and len(log.commands.stamp_ns) > 1:
             stamps, first = np.unique(log.commands.stamp_ns, return_index=True)
@@ -312,11 +319,25 @@ class Recorded:
         kept = {key: getattr(self, key)[rows] for key in ("t", "q", "dq", "tau")}
         return replace(self, **kept)
 
+    @property
+    def end_s(self) -> float:
+        """When the recording ends."""
+        return float(self.t[-1]) if self.whole is None else self.whole.span[1]
+
+    def stretches(self) -> list[Recorded]:
+        """Each stretch for itself."""
+        if len(self.begins) == 1:
+            return [self]
+        cuts = pairwise((*self.begins, len(self.t)))
+        return [replace(self.part(slice(a, b)), begins=(0,)) for a, b in cuts]
+
     def repeated_in(self, others: Sequence[Recorded]) -> Recorded | None:
         """Another recording of the same motion, if one of these is."""
         return next((x for x in others if x is not self and self._repeats(x)), None)
 
     def _repeats(self, other: Recorded) -> bool:
+        if self.whole is not None or other.whole is not None:
+            return False
         if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
             return False
         span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])
