@@ -120,6 +120,26 @@ class Carried(Normal):
         return self.reduced(X @ X.T, X @ self.N.T, X @ self.data)
 
 
+class Moments(Normal):
+    """What is known of a fit's coefficients by a whole recording, by products alone.
+
+    Attributes:
+        folds: (f, c, c), (f, c), (f,): products of the white signatures with one
+            another and with the data, and of the data, by blocks of time.
+        seconds: (c, c) products of the gradients of single seconds with one another.
+    """
+
+    def __init__(
+        self, folds: tuple[Array, Array, Array], prior_std: Array, seconds: Array
+    ) -> None:
+        self.folds, self.seconds = folds, seconds
+        super().__init__(folds[0].sum(axis=0), folds[1].sum(axis=0), prior_std)
+
+    def under(self, prior_std: Array) -> Moments:
+        """The same data under another prior."""
+        return Moments(self.folds, prior_std, self.seconds)
+
+
 ORDER = 6  # at 25 Hz
 AT_ONCE = 8  # signatures that are whitened together
 WHITE = 0.02  # share of white noise added: edges of models are not known any better

@@ -21,7 +21,7 @@ from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
 from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
-from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of
+from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Moments, Noise, Score, noise_of
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
@@ -464,21 +464,27 @@ def _jumps(torque: Array) -> Array:
     return np.asarray(high - minimum_filter1d(torque, size, axis=0, origin=shift))
 
 
-def honest_covariance(fit: Fit, known: Carried) -> Array:
+def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
     """Of all coefficients: by the noise, and no less than by what seconds of the log disagree.
 
     What a model gets wrong does not average out as noise does. The information of the rows is
     replaced by the spread of the gradients of whole seconds (White 1980, by clusters).
     """
     plain = known.covariance()
+    seconds = known.seconds if isinstance(known, Moments) else _by_seconds(fit, known)
+    robust = plain @ (seconds + np.diag(known.prior_std**-2.0)) @ plain
+    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
+    return plain * np.outer(wider, wider)
+
+
+def _by_seconds(fit: Fit, known: Carried) -> Array:
+    """(c, c) products of the gradients of whole seconds with one another."""
     white = known.data - known.x @ known.N
     ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
     size = BLOCK * fit.n
     cuts = [np.arange(a, b, size) for a, b in pairwise([0, *ends])]
     scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
-    robust = plain @ (scores @ scores.T + np.diag(known.prior_std**-2.0)) @ plain
-    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
-    return plain * np.outer(wider, wider)
+    return np.asarray(scores @ scores.T)
 
 
 def worth(fit: Fit, carried: Carried, place: int) -> Score:

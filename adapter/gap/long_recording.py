@@ -95,12 +95,13 @@ class Survey:
                 chosen.append(int(usable[best]))
         return [(float(a), float(b)) for a, b in self.windows[sorted(set(chosen))]]
 
-    def busiest(self, seconds: float) -> tuple[int, int]:
-        """Rows of so many seconds, in one, in which joints move most."""
+    def busiest(self, seconds: float, end_s: float | None = None) -> tuple[int, int]:
+        """Rows of so many seconds, in one and before an end, in which joints move most."""
         n = (self.moments.shape[1] - 1) // 2
         speed = np.nan_to_num(np.diagonal(self.moments, axis1=1, axis2=2)[:, 1 + n :])
         moved = np.sqrt(speed / np.maximum(speed.max(axis=0), 1e-12)).sum(axis=1)
         step = float(np.median(np.diff(self.windows[:, 0]))) if len(moved) > 1 else STRETCH_S
+        moved = moved[self.windows[:, 1] <= (self.end_s if end_s is None else end_s)]
         count = min(max(int(seconds / step), 1), len(moved))
         sums = np.convolve(moved, np.ones(count), "valid")
         begin = int(self.rows[int(np.argmax(sums)), 0])
@@ -183,18 +184,21 @@ class LongRecording:
         """
         size = round(PIECE_S * RATE_HZ / DECIMATION)
         for run in self.runs:
-            for begin in range(before, run.samples, size):
-                end = min(begin + size, run.samples)
+            last = min(run.samples, run.sample(self.span[1]))
+            for begin in range(max(before, run.sample(self.span[0])), last, size):
+                end = min(begin + size, last)
                 motion, tau = self._motion(run.rows(begin - before, end), run, like.motion.arm)
                 motion = replace(motion, bands_hz=like.motion.bands_hz)
                 yield _banded(motion, tau, like.noise, (0,))
 
     def recorded(self, spans: Sequence[Span], name: str) -> Recorded:
         """Samples of some stretches, as they were recorded."""
-        parts = [self._raw(begin - SCORED_EDGE_S, end + SCORED_EDGE_S) for begin, end in spans]
+        spans = self.near(spans)
+        parts = [self.samples(begin - SCORED_EDGE_S, end + SCORED_EDGE_S) for begin, end in spans]
         begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
         whole = {k: np.concatenate([getattr(x, k) for x in parts]) for k in ("t", "q", "dq", "tau")}
         own = replace(parts[0], name=name, begins=tuple(map(int, begins)), whole=self, **whole)
+        own = replace(own, spans=tuple(spans))
         if all(x.commands is not None for x in parts):
             for key in ("command_t", "commands"):
                 own = replace(own, **{key: np.concatenate([getattr(x, key) for x in parts])})
@@ -211,7 +215,8 @@ class LongRecording:
         out: list[tuple[Run, int, int]] = []
         for begin, end in sorted(spans):
             run = max(self.runs, key=lambda r: min(r.t(r.samples), end) - max(r.t(0), begin))
-            a, b = max(run.sample(begin), 0), min(run.sample(end), run.samples)
+            a = max(run.sample(max(begin, self.span[0])), 0)
+            b = min(run.sample(min(end, self.span[1])), run.samples)
             if b - a < LEAST_SAMPLES:
                 continue
             if out and out[-1][0] is run and a - out[-1][2] < APART:
@@ -225,7 +230,8 @@ class LongRecording:
         t = run.begin_s + np.arange(rows[0] - run.first, rows[1] - run.first) / RATE_HZ
         return Motion(t, *(np.ascontiguousarray(x) for x in (q, dq, ddq)), arm=arm), tau
 
-    def _raw(self, begin_s: float, end_s: float) -> Recorded:
+    def samples(self, begin_s: float, end_s: float) -> Recorded:
+        """Samples of a time, as they were recorded."""
         parts = []
         for k, (first, last) in enumerate(self.survey.pieces):
             if last >= begin_s and first <= end_s:
@@ -351,8 +357,8 @@ def _piece(log: AnyLog, k: int, begin_ns: int) -> Log:
     return at_source(own, check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau))[0]
 
 
-def _pieces(log: AnyLog, survey: Survey, span: Span) -> Iterator[tuple[Array, Array, Array, Array]]:
-    """t, q, dq, tau of usable samples in a time, in order and cut at holes."""
+def _pieces(log: AnyLog, survey: Survey) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """t, q, dq, tau of usable samples, in order."""
     last = -np.inf
     for k in range(_count(log)):
         raw, rows = _read(log, k)
@@ -361,12 +367,10 @@ def _pieces(log: AnyLog, survey: Survey, span: Span) -> Iterator[tuple[Array, Ar
             continue
         own = at_source(own, check_timing(own.stamp_ns, own.q, own.dq, own.tau))[0]
         t = 1e-9 * (own.stamp_ns - survey.begin_ns)
-        kept = (t > last) & (t >= span[0]) & (t <= span[1])
-        if not kept.any():
-            continue
-        t, q, dq, tau = t[kept], own.q[kept], own.dq[kept], own.tau[kept]
-        last = t[-1]
-        yield t, q, dq, tau
+        kept = t > last
+        if kept.any():
+            last = float(t[-1])
+            yield t[kept], own.q[kept], own.dq[kept], own.tau[kept]
 
 
 class _Smoother:
@@ -435,25 +439,19 @@ class _Smoother:
         self._kept = [tuple(x[keep:] for x in (t, q, dq, tau))]
 
 
-def long_recording(log: AnyLog, survey: Survey, span: Span | None = None) -> LongRecording:
+def long_recording(log: AnyLog, survey: Survey) -> LongRecording:
     """Smooth a recording.
 
     Args:
         log: with the joints of the model; survey: of it.
-        span: the time that is used, s; all where None.
     """
-    span = span or (0.0, survey.end_s)
-    late = lateness(survey.clock)
-    raw = LongRecording(log, survey, span, _NOT_YET, late, RowsFile(1), ())
-    probes = [raw._raw(*x) for x in survey.spread(span)]
+    late, span = lateness(survey.clock), (0.0, survey.end_s)
+    nothing = Smoothness(np.zeros(0), np.zeros(0), np.zeros(0))
+    raw = LongRecording(log, survey, span, nothing, late, RowsFile(1), ())
+    probes = [raw.samples(*x) for x in survey.spread(span)]
     smoothness = smoothness_of([Splines.through(x.t, x.q, x.dq, late) for x in probes])
     smoother = _Smoother(smoothness, late, len(log.joint_names))
-    for rows in _pieces(log, survey, span):
+    for rows in _pieces(log, survey):
         smoother.take(rows)
     smoother.finish()
-    return replace(
-        raw, smoothness=smoothness, table=smoother.table, runs=tuple(smoother.runs)
-    )
-
-
-_NOT_YET = Smoothness(np.zeros(0), np.zeros(0), np.zeros(0))
+    return replace(raw, smoothness=smoothness, table=smoother.table, runs=tuple(smoother.runs))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import Log
+from drivers.files.mcap import Log, StoredLog
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
@@ -35,6 +36,9 @@ FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias
 NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
 EDGE = 300  # ms at either end, where the filter has no neighbours
+
+
+LogOrStored = TypeVar("LogOrStored", Log, StoredLog)
 
 
 class RecordingFault(StrEnum):
@@ -131,7 +135,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         Refusal: another robot, too few samples, units or sign of velocities or positions.
     """
     recorded = log.joint_names
-    log = _of_this_robot(log, model)
+    log = of_this_robot(log, model)
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
@@ -176,7 +180,8 @@ def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
     )
 
 
-def _of_this_robot(log: Log, model: SelfModel) -> Log:
+def of_this_robot(log: LogOrStored, model: SelfModel) -> LogOrStored:
+    """A recording with the joints of the model in its order. Raises Refusal: another robot."""
     try:
         return matching(log, model)
     except DriverError:

@@ -288,6 +288,7 @@ class Recorded:
         dq_late_s: how much later dq is than q.
         begins: rows at which its stretches begin; between these time is left out.
         whole: of which it holds some stretches; None where it is all there is.
+        spans: (begin, end) s of the stretches.
     """
 
     name: str
@@ -300,6 +301,7 @@ class Recorded:
     dq_late_s: float = 0.0
     begins: tuple[int, ...] = (0,)
     whole: LongRecording | None = None
+    spans: tuple[tuple[float, float], ...] = ()
 
     @classmethod
     def of(cls, log: Log, dq_late_s: float = 0.0, begin_ns: int | None = None) -> Recorded:
@@ -323,6 +325,11 @@ class Recorded:
     def end_s(self) -> float:
         """When the recording ends."""
         return float(self.t[-1]) if self.whole is None else self.whole.span[1]
+
+    @property
+    def seconds(self) -> float:
+        """How much of it there is in memory."""
+        return float(self.t[-1]) if self.whole is None else sum(b - a for a, b in self.spans)
 
     def stretches(self) -> list[Recorded]:
         """Each stretch for itself."""
