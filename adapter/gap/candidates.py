@@ -170,10 +170,10 @@ def signatures(
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
         those of θ.
     """
-    n = at.links.arm.n
+    n, seconds = at.links.arm.n, float(np.ptp(at.links.t))
     tables, candidates, size = [at.low_regressor()], [], 10 * n
     ways = [
-        (effect, joint, template)
+        (effect.over(seconds), joint, template)
         for effect in CATALOGUE.values()
         for joint in places(effect, n)
         if joint < 0 or effect.scope == LINK or joint in joints

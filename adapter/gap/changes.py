@@ -9,20 +9,27 @@ The search then gets rows around these times, and decides what it was and when.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, LinearEffect
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.evidence import ORDER
-from adapter.gap.fit import Fit
+from adapter.gap.fit import EDGE_S, Fit
 from adapter.gap.long_recording import STRETCH_S, LongRecording, Span
+from adapter.gap.real_arm import load_in, loaded_arm
 from adapter.gap.weighed import pieces_of
 from adapter.model.spatial import Array
 
 WINDOW_S, MOST_WINDOWS = 2.0, 2048
+BY_LOAD = 0.7  # of what a change explains: it is one of the load
+DATED = 2  # rounds in which the date of a load is sought
 CHANGES, LOUD = 3, 2  # stretches that are added at most: around changes, where it is loud
 LEAST_CHI2 = 200.0  # of a change, times what windows scatter more than noise does
 LOUDER = 4.0  # times the usual power
@@ -67,12 +74,33 @@ class Windows:
                 rows[w] += float(at.sum())
         return cls(every_s, G, g, power, rows, std)
 
+    @property
+    def usual(self) -> float:
+        """Power of a row in the middle one of the windows."""
+        told = self.rows > 0.0
+        return float(np.median(self.power[told] / self.rows[told]))
+
+    @cached_property
+    def changes(self) -> list[int]:
+        """First windows behind a change, those that explain most first."""
+        return self._changes(LEAST_CHI2 * max(self.usual, 1.0))
+
+    @property
+    def loads_s(self) -> list[float]:
+        """About when the hand picked something up or put it down, s."""
+        body, ends = np.arange(10), sorted([0, *self.changes, len(self.rows)])
+        out = []
+        for begin, k, end in zip(ends, ends[1:], ends[2:], strict=False):
+            whole, alone = (self._gain(begin, end, [k], at)[0] for at in (slice(None), body))
+            if alone > BY_LOAD * whole:
+                out.append(self.every_s * k)
+        return out
+
     def stretches(self) -> list[Span]:
         """Around changes, and where it is loud."""
-        told = self.rows > 0.0
-        usual = float(np.median(self.power[told] / self.rows[told]))
-        loud = np.where(told, self.power / np.maximum(self.rows, 1.0), 0.0)
-        out = [self._around(k) for k in self._changes(LEAST_CHI2 * max(usual, 1.0))]
+        usual = self.usual
+        loud = np.where(self.rows > 0.0, self.power / np.maximum(self.rows, 1.0), 0.0)
+        out = [self._around(k) for k in self.changes]
         while len(out) < CHANGES + LOUD and loud.max() > LOUDER * usual:
             k = int(np.argmax(loud))
             middle = self.every_s * (k + 0.5)
@@ -86,7 +114,6 @@ class Windows:
         return max(middle - 0.5 * STRETCH_S, 0.0), middle + 0.5 * STRETCH_S
 
     def _changes(self, least: float) -> list[int]:
-        """First windows behind a change, those that explain most first."""
         found: list[int] = []
         spans = [(0, len(self.rows))]
         while spans and len(found) < CHANGES:
@@ -101,21 +128,69 @@ class Windows:
 
     def _best(self, begin: int, end: int) -> tuple[float, int]:
         """What a change explains between two windows, and before which window it is."""
-        G, g = np.cumsum(self.G[begin:end], axis=0), np.cumsum(self.g[begin:end], axis=0)
-        if len(G) < 2 * MARGIN + 1:
+        if end - begin < 2 * MARGIN + 1:
             return 0.0, begin
-        at = np.arange(MARGIN - 1, len(G) - MARGIN)
-        before = self._chi2(G[at], g[at])
-        behind = self._chi2(G[-1] - G[at], g[-1] - g[at])
-        gain = before + behind - self._chi2(G[-1:], g[-1:])
+        places = np.arange(begin + MARGIN, end - MARGIN + 1)
+        gain = self._gain(begin, end, places)
         best = int(np.argmax(gain))
-        return float(gain[best]), begin + int(at[best]) + 1
+        return float(gain[best]), int(places[best])
 
-    def _chi2(self, G: Array, g: Array) -> Array:
-        """(b,) what constant changes explain, with their prior."""
-        A = G * np.outer(self.prior_std, self.prior_std) + np.eye(len(self.prior_std))
-        b = g * self.prior_std
-        return np.asarray(np.einsum("bi,bi->b", b, np.linalg.solve(A, b[..., None])[..., 0]))
+    def _gain(self, begin: int, end: int, places: Sequence[int], at: Any = slice(None)) -> Array:
+        """What changes before some of the windows from `begin` to `end` explain, each alone.
+
+        Args:
+            at: which of the signatures may change.
+        """
+        G = np.cumsum(self.G[begin:end, at][:, :, at], axis=0)
+        g, std = np.cumsum(self.g[begin:end, at], axis=0), self.prior_std[at]
+        k = np.asarray(places) - begin - 1
+        both = _chi2(G[k], g[k], std) + _chi2(G[-1] - G[k], g[-1] - g[k], std)
+        return np.asarray(both - _chi2(G[-1:], g[-1:], std))
+
+
+def _chi2(G: Array, g: Array, prior_std: Array) -> Array:
+    """(b,) what signatures with products G (b, c, c), with the data g (b, c), explain."""
+    A = G * np.outer(prior_std, prior_std) + np.eye(len(prior_std))
+    b = g * prior_std
+    return np.asarray(np.einsum("bi,bi->b", b, np.linalg.solve(A, b[..., None])[..., 0]))
+
+
+def loaded(nominal: Fit, joints: Sequence[int], times_s: Sequence[float]) -> Fit:
+    """The nominal model with the loads that its hand has from some times on.
+
+    Args:
+        nominal: on stretches of a long recording, some of them around these times.
+        joints: (from 0) that move; times_s: about when the load changed.
+    """
+    load = load_in(nominal, None)
+    loads = [load, *(replace(load, interval_s=(t, np.inf)) for t in times_s)]
+    for _ in range(DATED):
+        arm = loaded_arm(nominal, joints, loads)
+        loads = [replace(e, interval_s=_dated(arm.fit, k)) for k, e in enumerate(loads)]
+    arm = loaded_arm(nominal, joints, loads)
+    there = [k for k in range(len(loads)) if k > 0 or arm.is_there(k)]
+    return nominal.with_named([arm.fit.named[k] for k in there])
+
+
+def _dated(fit: Fit, k: int) -> Span:
+    """The interval of a load, its beginning where the rows around like it best."""
+    begin, end = fit.named[k].interval_s
+    if not np.isfinite(begin):
+        return begin, end
+    named = fit.named[k]
+    bare = replace(fit, weights=())
+    with_it = bare.instead(k, replace(named, interval_s=WHOLE))
+    sizes = []
+    for trial in (bare.without(k), with_it):
+        white = trial.whiten(trial.model.residuals())
+        sizes.append(np.square(white).reshape(-1, fit.n).sum(axis=1))
+    t = fit.recordings[0].t[ORDER:]
+    near = np.flatnonzero(np.abs(t - begin) < STRETCH_S)
+    if not len(near):
+        return begin, end
+    # of each row being the first with the load: those before it are without
+    cost = np.cumsum(sizes[0][near] - sizes[1][near]) - (sizes[0][near] - sizes[1][near])
+    return float(t[near[int(np.argmin(cost))]]) - EDGE_S, end
 
 
 def _of_joints() -> list[Effect]:

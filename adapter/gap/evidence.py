@@ -129,9 +129,7 @@ class Moments(Normal):
         seconds: (c, c) products of the gradients of single seconds with one another.
     """
 
-    def __init__(
-        self, folds: tuple[Array, Array, Array], prior_std: Array, seconds: Array
-    ) -> None:
+    def __init__(self, folds: tuple[Array, Array, Array], prior_std: Array, seconds: Array) -> None:
         self.folds, self.seconds = folds, seconds
         super().__init__(folds[0].sum(axis=0), folds[1].sum(axis=0), prior_std)
 

@@ -422,9 +422,7 @@ class Fit:
         if self.weights:
             white = [x * w[ORDER:] for x, w in zip(white, self.weights, strict=True)]
         if any(len(own.begins) > 1 for own in self.recordings):
-            white = [
-                x * own.counted[ORDER:] for x, own in zip(white, self.recordings, strict=True)
-            ]
+            white = [x * own.counted[ORDER:] for x, own in zip(white, self.recordings, strict=True)]
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
         return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 
@@ -487,7 +485,7 @@ def _by_seconds(fit: Fit, known: Carried) -> Array:
     return np.asarray(scores @ scores.T)
 
 
-def worth(fit: Fit, carried: Carried, place: int) -> Score:
+def worth(fit: Fit, carried: Carried | Moments, place: int) -> Score:
     """Evidence of one of the named effects, what is carried with it eliminated."""
     return carried.worth(*beside(fit, place))
 

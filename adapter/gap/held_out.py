@@ -45,7 +45,9 @@ def model_of(model: SelfModel, fit: Fit, recording: int | None = None) -> SelfMo
     return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording)))
 
 
-def held_out_models(model: SelfModel, fit: Fit, carried: Carried | Moments) -> list[list[SelfModel]]:
+def held_out_models(
+    model: SelfModel, fit: Fit, carried: Carried | Moments
+) -> list[list[SelfModel]]:
     """Of each recording one model per fold: refitted without that fold's blocks of time."""
     models: list[list[SelfModel]] = [[] for _ in fit.recordings]
     for known in Folds.of(fit, carried).known():

@@ -65,7 +65,9 @@ class DoubtedNoise(Noise):
     @property
     def _rows(self) -> list[slice]:
         ends = pairwise([*self.seams, len(self.doubt)])
-        return [slice(a, min(a + SPAN, end)) for begin, end in ends for a in range(begin, end, SPAN)]
+        return [
+            slice(a, min(a + SPAN, end)) for begin, end in ends for a in range(begin, end, SPAN)
+        ]
 
     def whiten(self, x: Array) -> Array:
         """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""

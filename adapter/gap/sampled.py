@@ -1,4 +1,4 @@
-"""A long recording as `gap` and `load` take it: screened where most moves, searched in stretches."""
+"""A long recording as `gap` and `load` take it: screened in a part, searched in stretches."""
 
 from __future__ import annotations
 
@@ -32,12 +32,14 @@ class Sampled:
     Attributes:
         name: of it; whole: clean and smooth; model: of the arm.
         spans: the stretches, s.
+        loads_s: about when what the hand holds changed, s.
     """
 
     name: str
     whole: LongRecording
     model: SelfModel
     spans: tuple[Span, ...]
+    loads_s: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, log: AnyLog, name: str, model: SelfModel) -> Sampled:
@@ -61,20 +63,25 @@ class Sampled:
 
     def recorded(self) -> Recorded:
         """Its stretches."""
-        return self.whole.recorded(self.spans, self.name)
+        return replace(self.whole.recorded(self.spans, self.name), loads_s=self.loads_s)
 
     def with_changes(self, inertia_prior: float) -> Sampled:
         """With stretches where something changes or is loud, see `changes`."""
         period_s, own = self.survey.clock.period_s, self.recorded()
         nominal = nominal_fit([own], self.model, inertia_prior, period_s)
         fit = real_arm(nominal, self.moving(), (0,)).fit.with_noise()
-        more = Windows.of(fit, self.whole).stretches()
-        return replace(self, spans=tuple(sorted([*self.spans, *more])))
+        windows = Windows.of(fit, self.whole)
+        spans = tuple(sorted([*self.spans, *windows.stretches()]))
+        return replace(self, spans=spans, loads_s=tuple(windows.loads_s))
 
     def moving(self) -> tuple[int, ...]:
         """Joints (from 0) that move enough in its stretches."""
         motion = self.whole.signals(self.spans, RigidArm.of(self.model)).motion
         return moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ)
+
+    def busiest(self, log: AnyLog) -> Log:
+        """The part in one piece in which most moves, of the recording as it was read."""
+        return log.piece(*self.survey.busiest(SCREENED_S))
 
     def screened(self, log: AnyLog, unit_known: bool) -> Screened:
         """Let the recording pass, as `screen.refuse` does. Raises RecordingRefused.
@@ -82,8 +89,7 @@ class Sampled:
         Args:
             log: as it was read.
         """
-        part = log.piece(*self.survey.busiest(SCREENED_S))
-        seen = refuse(part, self.model, RigidArm.of(self.model), unit_known)
+        seen = refuse(self.busiest(log), self.model, RigidArm.of(self.model), unit_known)
         motion = self.whole.signals(self.spans, RigidArm.of(self.model)).motion
         moving = self.moving() or seen.moving
         said = standing(self.model.tree.joint_names, moving, motion.q, motion.dq)

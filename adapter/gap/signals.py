@@ -289,6 +289,7 @@ class Recorded:
         begins: rows at which its stretches begin; between these time is left out.
         whole: of which it holds some stretches; None where it is all there is.
         spans: (begin, end) s of the stretches.
+        loads_s: about when what the hand holds changed, where that is known already.
     """
 
     name: str
@@ -302,6 +303,7 @@ class Recorded:
     begins: tuple[int, ...] = (0,)
     whole: LongRecording | None = None
     spans: tuple[tuple[float, float], ...] = ()
+    loads_s: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, log: Log, dq_late_s: float = 0.0, begin_ns: int | None = None) -> Recorded:
@@ -450,8 +452,7 @@ def smoothness_of(parts: Sequence[Splines]) -> Smoothness:
     q_noise, dq_noise = noise("q", Q_NOISE_FLOOR), noise("dq", DQ_NOISE_FLOOR)
     penalties = []
     for j in range(len(q_noise)):
-        known = [part.known(j, q_noise[j], dq_noise[j]) for part in parts]
-        costs = [_cost_of(data, right, part.rough) for part, (data, right) in zip(parts, known)]
+        costs = [_cost_of(*part.known(j, q_noise[j], dq_noise[j]), part.rough) for part in parts]
         best = minimize_scalar(
             lambda x, costs=costs: sum(cost(x) for cost in costs),
             bounds=STIFFNESS,

@@ -138,7 +138,9 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         begins_s: when each piece begins, since the recording began.
     """
     samples = np.array([c.samples for c in clocks], dtype=float)
-    late, std = (np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s"))
+    late, std = (
+        np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
+    )
     told = np.isfinite(late) & np.isfinite(std)
     weight = np.maximum(std[told], LEAST_STD_S) ** -2.0
     gains = np.array([c.velocity_gain for c in clocks])

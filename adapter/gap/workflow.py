@@ -21,6 +21,7 @@ import numpy as np
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
 from adapter.gap.at_rest import held_at_rest
+from adapter.gap.changes import loaded
 from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
 from adapter.gap.fit import Fit, theta_prior
 from adapter.gap.folds import holds_out
@@ -131,6 +132,9 @@ def find_gap(
         progress("weighing what each recording carries")
         several = Several.of(fit, [r.name for r in task.fitted], hand_frame(nominal))
         task, fit = _searched(task, several.started(fit), [x.recording for x in several.odd])
+    elif task.fitted[0].loads_s:
+        progress("weighing what the hand picked up or put down")
+        fit = loaded(fit, task.moving[0], task.fitted[0].loads_s)
     progress("searching")
     moving = sorted({j for joints in task.moving for j in joints})
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
