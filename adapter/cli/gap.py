@@ -37,7 +37,7 @@ from adapter.runs.terminal import (
     write_json,
 )
 from adapter.simulate import Rollouts
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import AnyLog, open_log
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,11 +76,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _opened(
     args: argparse.Namespace,
-) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
+) -> tuple[Sequence[Path | AnyLog], tuple[Path | AnyLog, ...]]:
     """The recordings and those held out; read here where a topic was named. Raises DriverError."""
     if args.topic is None:
         return args.logs, tuple(args.hold_out)
-    read = {path: read_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
+    read = {path: open_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
     return [read[path] for path in args.logs], tuple(read[path] for path in args.hold_out)
 
 

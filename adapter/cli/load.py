@@ -10,14 +10,14 @@ from adapter.gap.load_words import as_json, robot_lines, sentence
 from adapter.gap.torque_gains import in_newton_metres
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
-from drivers.files.mcap import read_log
+from drivers.files.mcap import open_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = read_log(args.log, topic=args.topic)
-    empty = None if args.empty is None else read_log(args.empty, topic=args.topic)
+    log = open_log(args.log, topic=args.topic)
+    empty = None if args.empty is None else open_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
     given = [log] if empty is None else [log, empty]
     (log, *others), gains = in_newton_metres(given, robot, effort_unit_of(args), given[1:])

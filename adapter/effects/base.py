@@ -296,6 +296,10 @@ class Effect(ABC):
         """A template with the nonlinear setting in `values` times `ratio`; None without one."""
         return None
 
+    def over(self, seconds: float) -> Effect:
+        """The effect as it is looked for in a recording that lasts so long."""
+        return self
+
     def possible(self, values: Values) -> bool:
         """Whether physics allows these parameters; a fit may ask for others."""
         return all(float(values[key]) > 0.0 for key in self.positive)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 from adapter.effects.base import (
     Array,
     Motion,
@@ -13,7 +15,7 @@ from adapter.effects.base import (
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LATER, STILL
 
-SLOWEST = 0.008  # N m/s
+SLOWEST, WITHIN_S = 0.008, 60.0  # N m/s, in so many seconds; in longer ones it may be slower
 
 
 class FrictionDrift(TorqueEffect):
@@ -31,9 +33,19 @@ class FrictionDrift(TorqueEffect):
     )
     shows = ((STILL, "fades or changes sign"), (LATER, "has gone on"))
 
+    slowest = SLOWEST
+
+    def over(self, seconds: float) -> FrictionDrift:
+        """Over an hour much less shows than over a minute."""
+        if seconds <= WITHIN_S:
+            return self
+        slower = copy(self)
+        slower.slowest = SLOWEST * WITHIN_S / seconds
+        return slower
+
     def possible(self, values: Values) -> bool:
         """What drifts more slowly is not told from a velocity signal that is not quite right."""
-        return abs(float(values["dFc"])) > SLOWEST
+        return abs(float(values["dFc"])) > self.slowest
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """dFc t sign(dq), t since the effect began, or the recording."""

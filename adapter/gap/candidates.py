@@ -170,10 +170,10 @@ def signatures(
         (c, k, n) N m per unit of the coefficient; candidates. The first 10 n signatures are
         those of θ.
     """
-    n = at.links.arm.n
+    n, seconds = at.links.arm.n, float(np.ptp(at.links.t))
     tables, candidates, size = [at.low_regressor()], [], 10 * n
     ways = [
-        (effect, joint, template)
+        (effect.over(seconds), joint, template)
         for effect in CATALOGUE.values()
         for joint in places(effect, n)
         if joint < 0 or effect.scope == LINK or joint in joints
@@ -237,6 +237,7 @@ SLOW_PIECES = 10  # over time
 SIZE_NM = 0.3
 LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
+SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
 
 
 class Pattern(TorqueEffect):
@@ -301,8 +302,13 @@ def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
     return tuple(own)
 
 
-def line(residual: Array, rate_hz: float) -> Pattern | None:
-    """A sine in time at the frequency that stands out of a residual (k,), if one does."""
+def line(hz: float) -> Pattern:
+    """A sine in time."""
+    return Pattern(f"t at {hz:.2f} Hz", ("t",), _sine(hz), 2, -7.0)
+
+
+def line_hz(residual: Array, rate_hz: float) -> float | None:
+    """The frequency of a sine in time that stands out of a residual (k,), if one does."""
     power = np.abs(np.fft.rfft(residual * np.hanning(len(residual)))) ** 2
     f = np.fft.rfftfreq(len(residual), 1.0 / rate_hz)
     inside = (f > LINE_HZ[0]) & (f < LINE_HZ[1])
@@ -312,8 +318,23 @@ def line(residual: Array, rate_hz: float) -> Pattern | None:
         return None
     # the top of the parabola through the peak's logarithms
     a, b, c = np.log(power[peak - 1 : peak + 2] + 1e-300)
-    hz = float(f[peak] + 0.5 * (a - c) / (a - 2 * b + c) * (f[1] - f[0]))
-    return Pattern(f"t at {hz:.2f} Hz", ("t",), _sine(hz), 2, -7.0)
+    return float(f[peak] + 0.5 * (a - c) / (a - 2 * b + c) * (f[1] - f[0]))
+
+
+def sharpened(hz: float, residual: Array, t: Array, width_hz: float) -> float:
+    """A frequency as well as all stretches of a residual (k,) at t (k,) s tell it together.
+
+    Args:
+        width_hz: within which it is looked for, first in steps that the neighbouring stretches
+            bridge, then in finer and finer ones.
+    """
+    for span_s in np.geomspace(4.0 / width_hz, max(float(np.ptp(t)), 4.0 / width_hz), SHARPENED):
+        used = t <= t[0] + span_s
+        near = hz + width_hz * np.linspace(-1.0, 1.0, 2 * FINE + 1)
+        phase = np.exp(-2j * np.pi * np.outer(near, t[used]))
+        hz = float(near[np.argmax(np.abs(phase @ residual[used]))])
+        width_hz = min(width_hz, 1.0 / span_s)
+    return hz
 
 
 def _signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:

@@ -9,7 +9,9 @@ eliminated by a Schur complement, which takes away from each signature what thos
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
@@ -118,6 +120,24 @@ class Carried(Normal):
         return self.reduced(X @ X.T, X @ self.N.T, X @ self.data)
 
 
+class Moments(Normal):
+    """What is known of a fit's coefficients by a whole recording, by products alone.
+
+    Attributes:
+        folds: (f, c, c), (f, c), (f,): products of the white signatures with one
+            another and with the data, and of the data, by blocks of time.
+        seconds: (c, c) products of the gradients of single seconds with one another.
+    """
+
+    def __init__(self, folds: tuple[Array, Array, Array], prior_std: Array, seconds: Array) -> None:
+        self.folds, self.seconds = folds, seconds
+        super().__init__(folds[0].sum(axis=0), folds[1].sum(axis=0), prior_std)
+
+    def under(self, prior_std: Array) -> Moments:
+        """The same data under another prior."""
+        return Moments(self.folds, prior_std, self.seconds)
+
+
 ORDER = 6  # at 25 Hz
 AT_ONCE = 8  # signatures that are whitened together
 WHITE = 0.02  # share of white noise added: edges of models are not known any better
@@ -161,7 +181,12 @@ class Noise:
         return np.asarray(out.reshape(*x.shape[:-2], k, n))
 
 
-def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> Noise:
+def noise_of(
+    residual: Array,
+    floor: float = LEAST_NM,
+    windows: int = PLAIN,
+    seams: Sequence[int] = (0,),
+) -> Noise:
     """Noise model of a residual (k, n), N m.
 
     The spectrum is the median over windows of 5 s, so that what happens but once, a contact or
@@ -170,7 +195,22 @@ def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> 
     Args:
         floor: least standard deviation, N m.
         windows: at least so many; the more, the less does slow noise count in short recordings.
+        seams: rows at which stretches begin, between which time is left out.
     """
+    power = _spectrum(residual, windows) if len(seams) == 1 else _of_stretches(residual, seams)
+    covariance = np.fft.ifft(power, axis=0).real[: ORDER + 1]
+    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + WHITE * covariance[0]
+    n = residual.shape[1]
+    ar, sigma = np.zeros((n, ORDER)), np.empty(n)
+    for j in range(n):
+        r = covariance[:, j]
+        ar[j] = solve_toeplitz(r[:-1], r[1:])
+        sigma[j] = np.sqrt(r[0] - ar[j] @ r[1:])
+    return Noise(ar, sigma, np.sqrt(covariance[0]))
+
+
+def _spectrum(residual: Array, windows: int) -> Array:
+    """(f, n) power of a residual (k, n)."""
     from scipy.signal import welch  # takes a second; the learner's monitor has no use for it
 
     window = min(NOISE_WINDOW, max(len(residual) // windows, SHORTEST_WINDOW))
@@ -183,12 +223,29 @@ def noise_of(residual: Array, floor: float = LEAST_NM, windows: int = PLAIN) -> 
         detrend="constant",
         return_onesided=False,
     )
-    covariance = np.fft.ifft(power, axis=0).real[: ORDER + 1]
-    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + WHITE * covariance[0]
-    n = residual.shape[1]
-    ar, sigma = np.zeros((n, ORDER)), np.empty(n)
-    for j in range(n):
-        r = covariance[:, j]
-        ar[j] = solve_toeplitz(r[:-1], r[1:])
-        sigma[j] = np.sqrt(r[0] - ar[j] @ r[1:])
-    return Noise(ar, sigma, np.sqrt(covariance[0]))
+    return np.asarray(power)
+
+
+def _of_stretches(residual: Array, seams: Sequence[int]) -> Array:
+    """(f, n) power of a residual (k, n), as Welch has it, by windows within its stretches."""
+    from scipy.signal import spectrogram
+
+    parts = [residual[a:b] for a, b in pairwise([*seams, len(residual)])]
+    window = min(NOISE_WINDOW, *(len(part) for part in parts))
+    powers = [
+        spectrogram(
+            part,
+            window="hann",
+            nperseg=window,
+            noverlap=window // 2,
+            axis=0,
+            detrend="constant",
+            return_onesided=False,
+        )[2]
+        for part in parts
+    ]
+    power = np.concatenate(powers, axis=-1)
+    # what the median of so many exponential variables is to their mean
+    even = 2.0 * np.arange(1.0, (power.shape[-1] - 1) // 2 + 1)
+    bias = 1.0 + float(np.sum(1.0 / (even + 1.0) - 1.0 / even))
+    return np.asarray(np.median(power, axis=-1) / bias)

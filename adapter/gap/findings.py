@@ -14,7 +14,7 @@ from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
 from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds
-from adapter.gap.evidence import Carried, score
+from adapter.gap.evidence import Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
@@ -130,7 +130,7 @@ def corrected_links(found: Found, end_s: float, trusted: Array) -> list[Finding]
     return [f for f in told if f.evidence > SINGLED_OUT]
 
 
-def _gain_of_link(fit: Fit, known: Carried, k: int, trusted: Array) -> float:
+def _gain_of_link(fit: Fit, known: Carried | Moments, k: int, trusted: Array) -> float:
     """nats by which the data want the k-th link's correction, before the odds of its name."""
     own, std = np.arange(10 * k, 10 * k + 10), known.prior_std.copy()
     std[own] = trusted[k]
@@ -140,7 +140,9 @@ def _gain_of_link(fit: Fit, known: Carried, k: int, trusted: Array) -> float:
     return float(gain / np.max(covariance / np.diagonal(known.covariance())[own]))
 
 
-def _wrong_link(fit: Fit, known: Carried, k: int, end_s: float, log_odds: float) -> Finding:
+def _wrong_link(
+    fit: Fit, known: Carried | Moments, k: int, end_s: float, log_odds: float
+) -> Finding:
     """The correction of the k-th link as a finding."""
     own, size = np.arange(10 * k, 10 * k + 10), len(known.prior_std)
     covariance = honest_covariance(fit, known)[np.ix_(own, own)]

@@ -21,7 +21,7 @@ from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
 from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
-from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, Score, noise_of
+from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Moments, Noise, Score, noise_of
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
@@ -118,7 +118,8 @@ class Model:
         named: effects named so far.
         known: effects that the nominal model has already.
         hand: where a load is.
-        start_nm: (recordings, n) friction that each joint held at the first sample, N m.
+        start_nm: (stretches, n) friction that each joint held at the first sample of each stretch
+            of each recording, N m.
     """
 
     recordings: tuple[Signals, ...]
@@ -132,7 +133,7 @@ class Model:
 
     def __post_init__(self) -> None:
         if not self.start_nm.size:
-            size = len(self.recordings), len(self.dtheta)
+            size = sum(len(r.begins) for r in self.recordings), len(self.dtheta)
             object.__setattr__(self, "start_nm", np.zeros(size))
 
     @cached_property
@@ -140,6 +141,11 @@ class Model:
         """With its corrections."""
         nominal = self.recordings[0].motion.arm
         return nominal.changed(nominal.theta + self.dtheta)
+
+    def starts(self, recording: int) -> slice:
+        """Rows of `start_nm` that are a recording's."""
+        begin = sum(len(r.begins) for r in self.recordings[:recording])
+        return slice(begin, begin + len(self.recordings[recording].begins))
 
     @property
     def coefficients(self) -> Array:
@@ -187,7 +193,7 @@ class Model:
         return np.asarray(self._once(("low", recording), lambda: self._predicted(recording)))
 
     def _predicted(self, recording: int) -> Array:
-        own, held = self.recordings[recording], self.start_nm[recording]
+        own, held = self.recordings[recording], self.start_nm[self.starts(recording)].ravel()
         return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
 
     def residual(self, recording: int) -> Array:
@@ -223,7 +229,7 @@ class Model:
     def _signatures(self, recording: int) -> Array:
         own, at = self.recordings[recording], self.stages(recording)
         starts = np.zeros((*self.start_nm.shape, *own.tau.shape))
-        starts[recording] = own.low_start
+        starts[self.starts(recording)] = own.low_start.reshape(len(own.begins), -1, *own.tau.shape)
         tables = [at.low_regressor(), -own.low(own.motion.rate(at.sensed))[None]]
         tables.append(starts.reshape(-1, *own.tau.shape))
         for place, e in enumerate(self.named):
@@ -299,7 +305,7 @@ class Fit:
         prior: (n, 10) standard deviation of the nominal inertias.
         noise: one model per recording.
         timing_std_s: how far the torques' timing may be off without being an effect.
-        start_std: (n,) N m, what static friction may hold at the first sample.
+        start_std: (n,) N m, what static friction may hold at the first sample of a stretch.
         caution: nats that what is rare must be worth beside all else, where the inertias are those
             of another unit.
         hand_judged: whether it is settled what the hand held from the first sample on.
@@ -385,7 +391,8 @@ class Fit:
 
     def own_noise(self) -> tuple[Noise, ...]:
         """Noise that its residuals show."""
-        return tuple(noise_of(r, LEAST_NM) for r in self.model.residuals())
+        parts = zip(self.model.residuals(), self.recordings, strict=True)
+        return tuple(noise_of(r, LEAST_NM, seams=own.seams) for r, own in parts)
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
@@ -414,6 +421,8 @@ class Fit:
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
         if self.weights:
             white = [x * w[ORDER:] for x, w in zip(white, self.weights, strict=True)]
+        if any(len(own.begins) > 1 for own in self.recordings):
+            white = [x * own.counted[ORDER:] for x, own in zip(white, self.recordings, strict=True)]
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
         return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 
@@ -453,24 +462,30 @@ def _jumps(torque: Array) -> Array:
     return np.asarray(high - minimum_filter1d(torque, size, axis=0, origin=shift))
 
 
-def honest_covariance(fit: Fit, known: Carried) -> Array:
+def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
     """Of all coefficients: by the noise, and no less than by what seconds of the log disagree.
 
     What a model gets wrong does not average out as noise does. The information of the rows is
     replaced by the spread of the gradients of whole seconds (White 1980, by clusters).
     """
     plain = known.covariance()
+    seconds = known.seconds if isinstance(known, Moments) else _by_seconds(fit, known)
+    robust = plain @ (seconds + np.diag(known.prior_std**-2.0)) @ plain
+    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
+    return plain * np.outer(wider, wider)
+
+
+def _by_seconds(fit: Fit, known: Carried) -> Array:
+    """(c, c) products of the gradients of whole seconds with one another."""
     white = known.data - known.x @ known.N
     ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
     size = BLOCK * fit.n
     cuts = [np.arange(a, b, size) for a, b in pairwise([0, *ends])]
     scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
-    robust = plain @ (scores @ scores.T + np.diag(known.prior_std**-2.0)) @ plain
-    wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
-    return plain * np.outer(wider, wider)
+    return np.asarray(scores @ scores.T)
 
 
-def worth(fit: Fit, carried: Carried, place: int) -> Score:
+def worth(fit: Fit, carried: Carried | Moments, place: int) -> Score:
     """Evidence of one of the named effects, what is carried with it eliminated."""
     return carried.worth(*beside(fit, place))
 

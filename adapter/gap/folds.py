@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.effects.catalogue import LATENESS
-from adapter.gap.evidence import ORDER, Carried, Normal
+from adapter.gap.evidence import ORDER, Carried, Moments, Normal
 from adapter.gap.fit import Fit, beside
 from adapter.model.spatial import Array
 
@@ -63,8 +63,10 @@ class Folds:
     prior_std: Array
 
     @classmethod
-    def of(cls, fit: Fit, carried: Carried) -> Folds:
+    def of(cls, fit: Fit, carried: Carried | Moments) -> Folds:
         """What is known of a fit's coefficients, by folds."""
+        if isinstance(carried, Moments):
+            return cls(*carried.folds, carried.prior_std)
         fold = fold_rows(fit)
         parts = [(carried.N[:, fold == f], carried.data[fold == f]) for f in range(FOLDS)]
         return cls(

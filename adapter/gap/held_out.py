@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
-from adapter.gap.evidence import Carried
+from adapter.gap.evidence import Carried, Moments
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
@@ -20,6 +20,7 @@ from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
+from adapter.gap.weighed import weighed
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
@@ -44,7 +45,9 @@ def model_of(model: SelfModel, fit: Fit, recording: int | None = None) -> SelfMo
     return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording)))
 
 
-def held_out_models(model: SelfModel, fit: Fit, carried: Carried) -> list[list[SelfModel]]:
+def held_out_models(
+    model: SelfModel, fit: Fit, carried: Carried | Moments
+) -> list[list[SelfModel]]:
     """Of each recording one model per fold: refitted without that fold's blocks of time."""
     models: list[list[SelfModel]] = [[] for _ in fit.recordings]
     for known in Folds.of(fit, carried).known():
@@ -70,6 +73,10 @@ def torque_errors(
     recording: Recorded, before: SelfModel, after: Sequence[SelfModel], block: float = FOLD_S
 ) -> ErrorsOverTime:
     """Measured less predicted torque; `after` has one model per fold of `block` s, or one."""
+    if len(recording.begins) > 1:
+        parts = [torque_errors(x, before, after, block) for x in recording.stretches()]
+        columns = ([getattr(x, key) for x in parts] for key in ("t", "before", "after"))
+        return ErrorsOverTime(*map(np.concatenate, columns))
     q, dq, ddq, tau = smooth(recording.t, recording.q, recording.dq, recording.tau)
     t = recording.t[0] + 1e-3 * np.arange(len(q))
     sharp, _, _ = recording.smoothed().at(t)
@@ -116,6 +123,10 @@ def rollout_errors(
 
     Each segment goes by the model of the fold that it starts in (blocks of `block` s).
     """
+    if len(recording.begins) > 1:
+        parts = [rollout_errors(x, before, after, simulate, block) for x in recording.stretches()]
+        errors = (np.concatenate([x[k] for x in parts]) for k in range(4))
+        return RolloutErrors(*errors, curves=_in_turn([x.curves for x in parts]))
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
@@ -135,6 +146,12 @@ def rollout_errors(
         _off(new_dq, dq)[told],
         curves,
     )
+
+
+def _in_turn(parts: Sequence[RolloutCurves]) -> RolloutCurves:
+    """Curves of stretches behind one another."""
+    columns = ([getattr(x, f.name) for x in parts] for f in fields(RolloutCurves))
+    return RolloutCurves(*map(np.concatenate, columns))
 
 
 def _segments(rows: int) -> list[tuple[int, int]]:
@@ -220,6 +237,10 @@ def measure(
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
     searched, found = found.fit, _paying(task, refined(found))
+    whole = task.fitted[0].whole
+    if whole is not None and len(task.fitted) == 1:
+        progress("weighing it on the whole recording")
+        found = weighed(found, whole)
     fit = possible(found.fit, found.carried)
     found = replace(found, fit=replace(fit, noise=searched.noise, weights=searched.weights))
     block = block_s(found.fit)
@@ -319,6 +340,7 @@ def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
             standings = found.standings[:k] + found.standings[k + 1 :]
             weak = frozenset(i - (i > k) for i in found.weak if i != k)
             less = replace(found, fit=rest, carried=carried, standings=standings, weak=weak)
+            less = replace(less, under=None, even=False)
             out.append(uncorrected(less) if not fit.dtheta.any() else replace(less, known=None))
     return out
 
@@ -332,7 +354,7 @@ def uncorrected(found: Found) -> Found:
     fit, carried = refitted(replace(found.fit, prior=NO_PRIOR * found.fit.prior))
     model = replace(fit.model, dtheta=np.zeros_like(fit.dtheta))
     kept = replace(fit, model=model, prior=found.fit.prior)
-    return replace(found, fit=kept, carried=carried, known=kept.carried())
+    return replace(found, fit=kept, carried=carried, known=kept.carried(), under=fit)
 
 
 def evenly(found: Found) -> Found:
@@ -347,7 +369,8 @@ def evenly(found: Found) -> Found:
         flat = [noise.flat() for noise in fit.own_noise()]
         fit, carried = refitted(replace(fit, noise=tuple(flat), weights=()))
     kept = replace(fit, noise=found.fit.noise, weights=found.fit.weights)
-    return replace(found, fit=fit, carried=carried, known=kept.carried())
+    known = kept.carried()
+    return replace(found, fit=fit, carried=carried, known=known, under=fit, even=True)
 
 
 def _curves(name: str, found: Found, i: int) -> Curves:

@@ -9,6 +9,7 @@ common to both, so that the arm's own errors cancel.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,18 +18,21 @@ from adapter.gap.fit import (
     place_of,
 )
 from adapter.gap.hand import hand_frame
+from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import SHARES, real_arm
+from adapter.gap.sampled import Sampled, sampling_words
 from adapter.gap.screen import MOVES_DQ, cleaned, judge_torque, moving_joints
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.timing import lateness
+from adapter.gap.weighed import moments_of
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import Log
+from drivers.files.mcap import AnyLog, Log
 
 DOCUMENTED_STD, SHARED_STD = 0.02, 0.2  # of the inertias: alone, and with a log without the load
 MOVES_S = 1.0  # of motion, or the arm hardly moves
@@ -78,9 +82,9 @@ class HandLoad:
 
 
 def find_load(
-    log: Log,
+    log: AnyLog,
     model: SelfModel,
-    empty: Log | None = None,
+    empty: AnyLog | None = None,
     frame: str | None = None,
     inertia_prior: float | None = None,
 ) -> HandLoad:
@@ -106,24 +110,45 @@ def find_load(
         inertia_prior, shares = (DOCUMENTED_STD, SHARES) if empty is None else (SHARED_STD, (1.0,))
     else:
         shares = (1.0,)
-    cleaned_logs = [cleaned(one, model) for one in logs]
-    notes += [note for *_, said in cleaned_logs for note in said]
+    taken = [_taken(one, model) for one in logs]
+    notes += [note for x in taken for note in x.notes]
     start = nominal_fit(
-        [Recorded.of(one, lateness(clock)) for one, clock, _ in cleaned_logs],
-        model,
-        inertia_prior,
-        max(clock.period_s for _, clock, _ in cleaned_logs),
+        [x.recorded for x in taken], model, inertia_prior, max(x.period_s for x in taken)
     )
     moving = {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq, STEP_S)}
     arm = real_arm(start, sorted(moving), (0,), shares)
+    whole = taken[0].recorded.whole
+    if whole is not None and empty is None:
+        known = moments_of(arm.fit, whole)
+        arm = replace(arm, fit=arm.fit.at(known.x), known=known)
     fit, at = arm.fit, place_of(arm.fit, 0)
     turn = fit.named[0].candidate.theta
     theta = fit.coefficients[at] @ turn
     covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
-    notes += _judged(cleaned_logs[0][0], model, theta)
+    notes += _judged(taken[0].judged, model, theta)
+    notes += sampling_words([x.recorded for x in taken])
     before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
     found = load_of(theta, covariance, riding)
     return replace(found, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes)))
+
+
+class _Taken(NamedTuple):
+    """A recording as it is fitted, the part in which its units are judged, and notes."""
+
+    recorded: Recorded
+    judged: Log
+    period_s: float
+    notes: list[str]
+
+
+def _taken(log: AnyLog, model: SelfModel) -> _Taken:
+    """Raises RecordingRefused."""
+    if is_long(log):
+        long = Sampled.of(log, log.path.name, model)
+        part, _, said = cleaned(long.busiest(log), model)
+        return _Taken(long.recorded(), part, long.survey.clock.period_s, said)
+    own, clock, said = cleaned(log if isinstance(log, Log) else log.in_memory(), model)
+    return _Taken(Recorded.of(own, lateness(clock)), own, clock.period_s, said)
 
 
 def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:

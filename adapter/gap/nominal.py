@@ -31,7 +31,10 @@ def nominal_fit(
     """
     arm = RigidArm.of(model)
     every = tuple(dict.fromkeys((*recordings, *others)))
-    signals = tuple(prepare(r, arm, r.repeated_in(every)) for r in recordings)
+    signals = tuple(
+        prepare(r, arm, r.repeated_in(every)) if r.whole is None else r.whole.signals(r.spans, arm)
+        for r in recordings
+    )
     known = active_effects(model.effects, arm.n)
     return Fit(
         Model(signals, np.zeros_like(arm.theta), known=known, hand=hand_of(model)),

@@ -16,7 +16,7 @@ import numpy as np
 from adapter.effects.base import Effect, Template
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.candidates import Candidate
-from adapter.gap.evidence import Carried, score
+from adapter.gap.evidence import Carried, Moments, score
 from adapter.gap.fit import (
     Fit,
     Named,
@@ -65,7 +65,7 @@ class RealArm:
     """
 
     fit: Fit
-    known: Carried
+    known: Carried | Moments
     loads: int
 
     @cached_property
@@ -95,6 +95,13 @@ def real_arm(
         shares: times the prior of the inertias that are tried, least first.
     """
     loads = [load_in(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
+    return loaded_arm(fit, joints, loads, shares)
+
+
+def loaded_arm(
+    fit: Fit, joints: Sequence[int], loads: Sequence[Named], shares: Sequence[float] = SHARES
+) -> RealArm:
+    """The nominal model with these loads, and all that any arm may have; see `real_arm`."""
     trial = _beside(fit.with_named(loads), joints)
     for _ in range(WAY_ROUNDS):
         found, known = _as_wide_as_open(trial, shares)

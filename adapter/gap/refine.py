@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular, toeplitz
@@ -37,14 +38,16 @@ class DoubtedNoise(Noise):
 
     Attributes:
         doubt: (k, n) standard deviation of that error, N m.
+        seams: rows at which stretches begin.
     """
 
     doubt: Array
+    seams: tuple[int, ...] = (0,)
 
     @classmethod
-    def of(cls, noise: Noise, doubt: Array) -> DoubtedNoise:
+    def of(cls, noise: Noise, doubt: Array, seams: tuple[int, ...] = (0,)) -> DoubtedNoise:
         """Doubt beside a noise."""
-        return cls(noise.ar, noise.sigma, noise.level, doubt)
+        return cls(noise.ar, noise.sigma, noise.level, doubt, seams)
 
     @cached_property
     def _spans(self) -> list[tuple[int, slice, Array, Array]]:
@@ -53,12 +56,18 @@ class DoubtedNoise(Noise):
         for j, (ar, sigma) in enumerate(zip(self.ar, self.sigma, strict=True)):
             answer = lfilter([sigma], np.append(1.0, -ar), np.eye(1, MEMORY)[0])
             known = np.correlate(answer, answer, "full")[MEMORY - 1 : MEMORY - 1 + SPAN]
-            for first in range(0, len(self.doubt), SPAN):
-                rows = slice(first, first + SPAN)
+            for rows in self._rows:
                 own = self.doubt[rows, j]
                 noise = toeplitz(known[: len(own)])
                 out.append((j, rows, cholesky(noise + np.diag(own**2), lower=True), noise))
         return out
+
+    @property
+    def _rows(self) -> list[slice]:
+        ends = pairwise([*self.seams, len(self.doubt)])
+        return [
+            slice(a, min(a + SPAN, end)) for begin, end in ends for a in range(begin, end, SPAN)
+        ]
 
     def whiten(self, x: Array) -> Array:
         """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""
@@ -105,24 +114,25 @@ def _refitted(fit: Fit, counted: Sequence[Array]) -> tuple[Fit, Carried]:
     """A fit under doubted noise; `counted` (k, n) by recording is zero where nothing is known."""
     noise: Sequence[Noise] = fit.own_noise()
     for _ in range(ROUNDS):
-        doubts = [_doubt(fit, i, counted[i]) for i in range(len(fit.recordings))]
+        doubts = [doubt_of(fit, i, counted[i]) for i in range(len(fit.recordings))]
+        seams = [own.seams for own in fit.recordings]
         for _ in range(NOISE_ROUNDS):
-            parts = zip(noise, doubts, fit.model.residuals(), strict=True)
-            noise = [_noise(own, doubt, residual) for own, doubt, residual in parts]
-        fit = replace(fit, noise=tuple(map(DoubtedNoise.of, noise, doubts)), weights=())
+            noise = list(map(_noise, noise, doubts, fit.model.residuals(), seams))
+        fit = replace(fit, noise=tuple(map(DoubtedNoise.of, noise, doubts, seams)), weights=())
         fit = refitted(fit)[0]
         for k in range(len(fit.named)):
             fit = shaped(fit, k)
     return refitted(fit)
 
 
-def _noise(before: Noise, doubt: Array, residual: Array) -> Noise:
+def _noise(before: Noise, doubt: Array, residual: Array, seams: tuple[int, ...]) -> Noise:
     """Noise of a residual (k, n), where doubt is large as its neighbours have it."""
     large = np.where(doubt > LARGE * before.level, doubt, 0.0)
-    return noise_of(DoubtedNoise.of(before, large).smooth(residual), LEAST_NM)
+    smooth = DoubtedNoise.of(before, large, seams).smooth(residual)
+    return noise_of(smooth, LEAST_NM, seams=seams)
 
 
-def _doubt(fit: Fit, recording: int, counted: Array) -> Array:
+def doubt_of(fit: Fit, recording: int, counted: Array) -> Array:
     """(k, n) N m by which the named effects may be wrong; `counted` (k, n) is zero where all is."""
     own = fit.recordings[recording]
     square = np.where(counted > 0.0, 0.0, NOT_COUNTED_NM**2)

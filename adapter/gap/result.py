@@ -33,6 +33,7 @@ IN_FILE = (
     "joint_names",
     "wall_s",
     "torque_gains",
+    "sampled",
 )
 
 
@@ -226,6 +227,7 @@ class GapResult:
         stopped_after_rounds: the search had to stop then, and might have found more; None where
             it came to its end.
         wall_s: how long all that took.
+        sampled: of recordings that are too long to be searched whole, the stretches that were.
         torque_gains: of the drives, where they were learned (`torque_gains.TorqueGains`).
     """
 
@@ -254,6 +256,7 @@ class GapResult:
     contradictions: tuple[str, ...] = ()
     in_sample: bool = False
     torque_gains: dict[str, Any] | None = None
+    sampled: tuple[dict[str, Any], ...] = ()
 
     def __repr__(self) -> str:
         if self.problem is not None:

@@ -20,8 +20,10 @@ from adapter.gap.candidates import (
     Candidate,
     Pattern,
     line,
+    line_hz,
     log_odds,
     patterns,
+    sharpened,
     signatures,
     simpler_wins,
 )
@@ -37,6 +39,7 @@ from adapter.gap.evidence import (
     scores,
 )
 from adapter.gap.fit import BAND_HZ, Fit
+from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
 CATALOGUED, PATTERNS = "catalogued", "patterns"
@@ -80,8 +83,15 @@ class Lead:
     odds: float = 0.0
 
 
-def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> Noise:
-    """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it."""
+def rich_noise(
+    X: Array, candidates: Sequence[Candidate], residual: Array, own: Signals | None = None
+) -> Noise:
+    """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it.
+
+    Args:
+        own: the recording; None where it is in one stretch.
+    """
+    seams, counted = ((0,), 1.0) if own is None else (own.seams, own.counted[ORDER:])
     prior = np.zeros(len(X))
     for c in candidates:
         # patterns are so many that they would explain noise, but for a line that stands out
@@ -95,8 +105,11 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array) -> No
         information = white[0] @ white[0].T
         information[np.diag_indices(len(X))] += prior**-2.0
         x = cho_solve(cho_factor(information, lower=True), white[0] @ white[1])
-        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM, ROBUST)
-        white = noise.whiten(X).reshape(len(X), -1), noise.whiten(residual).ravel()
+        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM, ROBUST, seams)
+        white = (
+            (counted * noise.whiten(X)).reshape(len(X), -1),
+            (counted * noise.whiten(residual)).ravel(),
+        )
     return noise
 
 
@@ -123,7 +136,8 @@ class SignatureTable:
             table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                noise.append(rich_noise(table, self.candidates, fit.model.residual(i)))
+                own = fit.recordings[i] if len(fit.recordings[i].begins) > 1 else None
+                noise.append(rich_noise(table, self.candidates, fit.model.residual(i), own))
         if kind == PATTERNS:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
         self.fit = fit.with_noise(noise) if rich else fit
@@ -141,11 +155,16 @@ class SignatureTable:
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
         """What no effect of the catalogue has: patterns of each joint, and lines in time."""
         found: list[tuple[Effect, int]] = [(p, j) for j in joints for p in patterns(fit.n, j)]
-        longest = max(fit.model.residuals(), key=len)
+        residuals = fit.model.residuals()
+        i = int(np.argmax([len(x) for x in residuals]))
+        own, residual = fit.recordings[i], residuals[i]
+        begin, end = max(pairwise([*own.seams, len(residual)]), key=lambda x: x[1] - x[0])
         for j in joints:
-            peak = line(longest[:, j], BAND_HZ)
-            if peak is not None:
-                found.append((peak, j))
+            hz = line_hz(residual[begin:end, j], BAND_HZ)
+            if hz is not None:
+                if end - begin < len(residual):
+                    hz = sharpened(hz, residual[:, j], own.t, BAND_HZ / (end - begin))
+                found.append((line(hz), j))
         return found
 
     def gated(self, lead: Lead) -> list[Array]:
@@ -213,7 +232,9 @@ class SignatureTable:
             for target, N, table in zip(self.targets, self.carried_tables, tables, strict=True)
         ]
         quiet = [r * (w > 0.0) for r, w in zip(left, weights, strict=True)]
-        fit = replace(fit, noise=tuple(noise_of(r) for r in quiet))
+        seams = [own.seams for own in fit.recordings]
+        noise = (noise_of(r, seams=own) for r, own in zip(quiet, seams, strict=True))
+        fit = replace(fit, noise=tuple(noise))
         others = Carried(fit.whiten(self.carried_tables), fit.prior_std, fit.whiten(self.targets))
         return score(*others.without(fit.whiten(tables)), own_std)
 
@@ -267,6 +288,8 @@ class SignatureTable:
             last = len(_edges(t)) - 1
             ends = [(a, min(a + longest, last - 1)) for a in range(1, last)]
             pairs = [(a, b) for a, end in ends for b in range(a + FEWEST_BLOCKS, end + 1)]
+            edges = _edges(t)  # no push lasts for what was left out between two stretches
+            pairs = [(a, b) for a, b in pairs if edges[b] - edges[a] < LONGEST_CONTACT_S + BLOCK_S]
             leads += self._best_intervals(i, candidates, pairs, passing=True)
         return leads
 
@@ -320,8 +343,14 @@ class SignatureTable:
 
 
 def _edges(t: Array) -> Array:
-    """(b,) edges of the blocks of a recording's instants, the last one behind its end."""
-    return np.append(np.arange(t[0], t[-1], BLOCK_S), t[-1] + 1.0)
+    """(b,) edges of the blocks of a recording's instants, the last one behind its end.
+
+    Where time is left out, the block before lasts all that time.
+    """
+    cuts = np.flatnonzero(np.diff(t) > BLOCK_S)
+    begins, ends = t[np.append(0, cuts + 1)], t[np.append(cuts, len(t) - 1)]
+    parts = [np.arange(a, b, BLOCK_S) for a, b in zip(begins, ends, strict=True)]
+    return np.append(np.concatenate(parts), t[-1] + 1.0)
 
 
 def _from_the_end(parts: Sequence[Array]) -> Array:

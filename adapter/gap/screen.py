@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import Log
+from drivers.files.mcap import Log, StoredLog
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
@@ -35,6 +36,9 @@ FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias
 NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
 EDGE = 300  # ms at either end, where the filter has no neighbours
+
+
+LogOrStored = TypeVar("LogOrStored", Log, StoredLog)
 
 
 class RecordingFault(StrEnum):
@@ -78,13 +82,21 @@ class Screened:
         log: joints in the model's order; strictly increasing stamps, finite, without repeats.
         timing: of the recording as it was.
         moving: joints (from 0) that move enough to tell anything of them.
-        notes: what to report beside the findings, a sentence each.
+        beyond, standing, silent: what to report of joints beyond their limits, of joints that do
+            not move and of torques that never change, a sentence each.
     """
 
     log: Log
     timing: RecordingClock
     moving: tuple[int, ...]
-    notes: list[str]
+    beyond: list[str]
+    standing: list[str]
+    silent: list[str]
+
+    @property
+    def notes(self) -> list[str]:
+        """What to report beside the findings, a sentence each."""
+        return [*self.timing.words(), *self.beyond, *self.standing, *self.silent]
 
 
 def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) -> Screened:
@@ -107,8 +119,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) 
     _check_motion(log, names, q, dq, moving)
     silent = _silent(log, names)
     judge_torque(log, model, arm, (q, dq, ddq, tau), recorded if renamed else (), unit_known)
-    notes = [*timing.words(), *outside, *_standing(names, moving, q, dq), *silent]
-    return Screened(log, timing, moving, notes)
+    return Screened(log, timing, moving, outside, standing(names, moving, q, dq), silent)
 
 
 def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]:
@@ -124,11 +135,11 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         Refusal: another robot, too few samples, units or sign of velocities or positions.
     """
     recorded = log.joint_names
-    log = _of_this_robot(log, model)
+    log = of_this_robot(log, model)
     signals = (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
-    log, timing, said = _at_source(log, timing)
+    log, timing, said = at_source(log, timing)
     if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
             RecordingFault.DATA,
@@ -140,7 +151,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     return log, timing, [*said, *_outside_limits(log, model, recorded, renamed)]
 
 
-def _at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
+def at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:
     """Samples of `uniform` at the times of their states, where a publisher showed some twice."""
     stamps = source_stamps(log.stamp_ns, log.q, log.dq)
     moved_s = 1e-9 * float(np.abs(stamps - log.stamp_ns).max(initial=0))
@@ -169,7 +180,8 @@ def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
     )
 
 
-def _of_this_robot(log: Log, model: SelfModel) -> Log:
+def of_this_robot(log: LogOrStored, model: SelfModel) -> LogOrStored:
+    """A recording with the joints of the model in its order. Raises Refusal: another robot."""
     try:
         return matching(log, model)
     except DriverError:
@@ -273,7 +285,8 @@ def _check_motion(
     )
 
 
-def _standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:
+def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -> list[str]:
+    """Notes on joints that move too little, or not at all; q, dq (m, n) rad, rad/s, smoothed."""
     still = [name for j, name in enumerate(names) if j not in moving]
     wide, fast = _extent(q, dq)
     little = [names[j] for j in moving if wide[j] < WANTED_RAD or fast[j] < WANTED_DQ]

@@ -11,7 +11,7 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, TorqueEffect
 from adapter.effects.catalogue import HELD
 from adapter.gap.candidates import PATTERN_SHARE, Pattern
-from adapter.gap.evidence import ORDER, Carried, Noise, score
+from adapter.gap.evidence import ORDER, Carried, Moments, Noise, score
 from adapter.gap.fit import (
     Fit,
     Named,
@@ -65,13 +65,17 @@ class Found:
         weak: places of named effects that any arm has and these data do not single out.
         known: what is known of them with the inertias free within their prior, where `carried`
             holds these fast.
+        under: the fit whose noise and prior `carried` is of, where these are not those of `fit`.
+        even: whether all frequencies count alike in `carried`.
         rounds: that were made; ran_out: and there was none left where one was wanted.
     """
 
     fit: Fit
-    carried: Carried
+    carried: Carried | Moments
     standings: tuple[Standing, ...]
-    known: Carried | None = None
+    known: Carried | Moments | None = None
+    under: Fit | None = None
+    even: bool = False
     weak: frozenset[int] = frozenset()
     rounds: int = 0
     ran_out: bool = False
@@ -171,8 +175,9 @@ def _unless_trusted(
 def _total(found: Found) -> float:
     """ln of what the data are worth under what was found and its own noise, its names paid."""
     fit, known, width = found.fit, found.carried, 0.0
-    for noise, weight in zip(fit.noise, fit.weights, strict=True):
-        rows = weight[ORDER:]  # around dates none counts: as if they were as usual
+    for noise, weight, own in zip(fit.noise, fit.weights, fit.recordings, strict=True):
+        # around dates and seams none counts: as if they were as usual
+        rows = (weight if len(own.begins) == 1 else weight * own.counted)[ORDER:]
         width += float(np.log(np.where(rows > 0.0, rows, USUAL) / noise.sigma).sum())
     fits = score(known.G, known.g, known.prior_std).log_evidence - 0.5 * known.data @ known.data
     return float(width + fits + sum(price(e) for e in fit.named if not e.assumed))

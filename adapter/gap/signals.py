@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -23,10 +24,14 @@ from scipy.sparse import diags
 from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
+from adapter.gap.evidence import ORDER
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
+
+if TYPE_CHECKING:
+    from adapter.gap.long_recording import LongRecording
 
 # The band.
 RATE_HZ = 250.0  # of the models
@@ -65,7 +70,7 @@ ROLLOUT_EDGE_S = 0.3
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat = x.reshape(len(x), -1)
-    whole = (len(x) - TAPS) // DECIMATION + 1
+    whole = _size_of_low(len(x))
     # output k DECIMATION + TAPS - 1 of the causal filter is the first that knows all its neighbours
     padded = upfirdn(_LOW, flat[(TAPS - 1) % DECIMATION :], down=DECIMATION, axis=0)
     first = (TAPS - 1) // DECIMATION
@@ -81,12 +86,17 @@ class Signals:
         noise: (n,) of its velocities, rad²/s²/Hz.
         tau: (k, n) measured torque in the band, N m.
         t: (k,) s, its instants.
+        begins: rows of the motion at which its stretches begin; between these time is left out.
+        trim: samples of the band that are left out at either end of each stretch, since what
+            depends on the motion before (a filter, a rate) is not known there.
     """
 
     motion: Motion
     noise: Array
     tau: Array
     t: Array
+    begins: tuple[int, ...] = (0,)
+    trim: int = 0
     _kept: dict[Hashable, Array] = field(default_factory=dict, init=False, repr=False)
 
     def once(self, key: Hashable, compute: Callable[[], Array]) -> Array:
@@ -100,24 +110,54 @@ class Signals:
 
         Where a joint jumped and its link did not, it is the link's torques that count.
         """
-        return replace(links, bands_hz=_bands_of(links, self.noise))
+        parts = [motion_rows(links, rows) for rows in self.stretches]
+        return replace(links, bands_hz=np.max([bands_of(x, self.noise) for x in parts], axis=0))
+
+    @property
+    def stretches(self) -> list[slice]:
+        """Rows of the motion, stretch by stretch."""
+        return [slice(*rows) for rows in pairwise((*self.begins, len(self.motion.t)))]
+
+    @property
+    def seams(self) -> tuple[int, ...]:
+        """Rows of the band at which stretches begin."""
+        if len(self.begins) == 1:
+            return (0,)
+        sizes = [_size_of_low(x.stop - x.start) - 2 * self.trim for x in self.stretches]
+        return tuple(int(x) for x in np.cumsum([0, *sizes[:-1]]))
+
+    @property
+    def counted(self) -> Array:
+        """(k, 1) zero for the first samples of each stretch, whose past is not known; else one."""
+        return self.once("counted", self._counted)
+
+    def _counted(self) -> Array:
+        out = np.ones((len(self.tau), 1))
+        for begin in self.seams:
+            out[begin : begin + ORDER] = 0.0
+        return out
 
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
-        return low(x)
+        if len(self.begins) == 1:
+            return self._trimmed(low(x))
+        return np.concatenate([self._trimmed(low(x[rows])) for rows in self.stretches])
+
+    def _trimmed(self, x: Array) -> Array:
+        return x[self.trim : len(x) - self.trim] if self.trim else x
 
     def low_on(self, x: Array, joint: int) -> Array:
         """A torque (m, n) that acts on one joint (-1: on all) in the band (k, n)."""
         if joint < 0:
-            return low(x)
+            return self.low(x)
         out = np.zeros_like(self.tau)
-        out[:, joint] = low(x[:, joint])
+        out[:, joint] = self.low(x[:, joint])
         return out
 
     def low_basis(self, basis: Array, joint: int) -> Array:
         """Torques (m, c) on one joint in the band (c, k, n)."""
         out = np.zeros((basis.shape[1], *self.tau.shape))
-        out[:, :, joint] = low(basis).T
+        out[:, :, joint] = self.low(basis).T
         return out
 
     @property
@@ -127,9 +167,10 @@ class Signals:
 
     @property
     def low_start(self) -> Array:
-        """(n, k, n) what is left of a unit of friction that a joint held at the first sample.
+        """(s n, k, n) what is left of a unit of friction that a joint held at the first sample.
 
-        A joint that rests holds what static friction lets it, and forgets it as it slides.
+        Of each joint in each of s stretches. A joint that rests holds what static friction lets
+        it, and forgets it as it slides.
         """
         return self.once("start", self._low_start)
 
@@ -142,7 +183,7 @@ class Signals:
         return self.once("slowness", self._slowness)
 
     def _slowness(self) -> Array:
-        dq = np.abs(low(self.motion.dq))
+        dq = np.abs(self.low(self.motion.dq))
         out = np.exp(-np.square(dq / STRIBECK_SPEED))
         for j, rests in enumerate(dq.T < SMOOTHING_DQ):
             begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
@@ -152,12 +193,31 @@ class Signals:
 
     def _low_start(self) -> Array:
         q = self.motion.q
-        left = low(np.column_stack([bending(column, SLIDE_RAD)[1] for column in q.T]))
-        return np.asarray(left.T[:, :, None] * np.eye(q.shape[1])[:, None])
+        out = np.zeros((len(self.begins), q.shape[1], *self.tau.shape))
+        cuts = pairwise((*self.seams, len(self.tau)))
+        for own, rows, (begin, end) in zip(out, self.stretches, cuts, strict=True):
+            shares = np.column_stack([bending(column, SLIDE_RAD)[1] for column in q[rows].T])
+            left = self._trimmed(low(shares))
+            own[:, begin:end] = left.T[:, :, None] * np.eye(q.shape[1])[:, None]
+        return out.reshape(-1, *self.tau.shape)
 
     def _low_regressor(self) -> Array:
-        m = self.motion
-        return np.ascontiguousarray(np.moveaxis(low(m.arm.regressor(m.q, m.dq, m.ddq)), 2, 0))
+        parts = []
+        for rows in self.stretches:  # one after the other: at the motion's rate they are large
+            m = motion_rows(self.motion, rows)
+            parts.append(self._trimmed(low(m.arm.regressor(m.q, m.dq, m.ddq))))
+        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
+
+
+def motion_rows(motion: Motion, rows: slice) -> Motion:
+    """Some instants of a motion."""
+    return replace(motion, **{key: getattr(motion, key)[rows] for key in ("t", "q", "dq", "ddq")})
+
+
+def _size_of_low(rows: int) -> int:
+    """Samples of the band in so many rows at 250 Hz."""
+    return (rows - TAPS) // DECIMATION + 1
 
 
 def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) -> Signals:
@@ -180,12 +240,12 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     q, dq, ddq = smoothed.at(grid)
     noise = 2.0 * float(np.median(np.diff(source.t))) * smoothed.dq_noise**2
     motion = Motion(grid, q, dq, ddq, arm)
-    motion = replace(motion, bands_hz=_bands_of(motion, noise))
+    motion = replace(motion, bands_hz=bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
-    return Signals(motion, noise, low(_at(grid, t, recording.tau)), band_t)
+    return Signals(motion, noise, low(on_grid(grid, t, recording.tau)), band_t)
 
 
-def _bands_of(motion: Motion, noise: Array) -> Array:
+def bands_of(motion: Motion, noise: Array) -> Array:
     """(n,) Hz above which a joint's torque does not stand out of the noise of the motion.
 
     Infinite where it does as far as torques are compared. `noise` is (n,) rad²/s²/Hz, of dq.
@@ -208,7 +268,7 @@ def _bands_of(motion: Motion, noise: Array) -> Array:
     return np.where(clear.any(axis=0), band, 0.0)
 
 
-def _at(grid: Array, t: Array, tau: Array) -> Array:
+def on_grid(grid: Array, t: Array, tau: Array) -> Array:
     """Torque (m, n) at the grid's instants, without what lies above 100 Hz."""
     pad = (len(_ANTI_ALIAS) // 2) / RAW_HZ
     factor = round(RAW_HZ / RATE_HZ)
@@ -226,6 +286,10 @@ class Recorded:
         t: (m,) s since its first sample, increasing; q, dq, tau: (m, n).
         command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
         dq_late_s: how much later dq is than q.
+        begins: rows at which its stretches begin; between these time is left out.
+        whole: of which it holds some stretches; None where it is all there is.
+        spans: (begin, end) s of the stretches.
+        loads_s: about when what the hand holds changed, where that is known already.
     """
 
     name: str
@@ -236,11 +300,15 @@ class Recorded:
     command_t: Array | None = None
     commands: Array | None = None
     dq_late_s: float = 0.0
+    begins: tuple[int, ...] = (0,)
+    whole: LongRecording | None = None
+    spans: tuple[tuple[float, float], ...] = ()
+    loads_s: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, log: Log, dq_late_s: float = 0.0) -> Recorded:
-        """From a screened log."""
-        start = log.stamp_ns[0]
+    def of(cls, log: Log, dq_late_s: float = 0.0, begin_ns: int | None = None) -> Recorded:
+        """From a screened log; times count from `begin_ns`, its first sample where None."""
+        start = log.stamp_ns[0] if begin_ns is None else begin_ns
         command_t = commands = None
         if log.commands is not None and len(log.commands.stamp_ns) > 1:
             stamps, first = np.unique(log.commands.stamp_ns, return_index=True)
@@ -255,11 +323,30 @@ class Recorded:
         kept = {key: getattr(self, key)[rows] for key in ("t", "q", "dq", "tau")}
         return replace(self, **kept)
 
+    @property
+    def end_s(self) -> float:
+        """When the recording ends."""
+        return float(self.t[-1]) if self.whole is None else self.whole.span[1]
+
+    @property
+    def seconds(self) -> float:
+        """How much of it there is in memory."""
+        return float(self.t[-1]) if self.whole is None else sum(b - a for a, b in self.spans)
+
+    def stretches(self) -> list[Recorded]:
+        """Each stretch for itself."""
+        if len(self.begins) == 1:
+            return [self]
+        cuts = pairwise((*self.begins, len(self.t)))
+        return [replace(self.part(slice(a, b)), begins=(0,)) for a, b in cuts]
+
     def repeated_in(self, others: Sequence[Recorded]) -> Recorded | None:
         """Another recording of the same motion, if one of these is."""
         return next((x for x in others if x is not self and self._repeats(x)), None)
 
     def _repeats(self, other: Recorded) -> bool:
+        if self.whole is not None or other.whole is not None:
+            return False
         if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
             return False
         span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])
@@ -328,6 +415,20 @@ class Smoothed:
         return tuple(np.asarray(self.spline(t, nu)) for nu in range(3))  # type: ignore[return-value]
 
 
+@dataclass(frozen=True, eq=False)
+class Smoothness:
+    """What splines through a motion assume.
+
+    Attributes:
+        q_noise, dq_noise: (n,) noise levels, rad and rad/s.
+        log_penalty: (n,) ln of what the squared third derivative costs.
+    """
+
+    q_noise: Array
+    dq_noise: Array
+    log_penalty: Array
+
+
 def smooth_motion(t: Array, q: Array, dq: Array, dq_late_s: float = 0.0) -> Smoothed:
     """Splines through q and dq.
 
@@ -335,28 +436,35 @@ def smooth_motion(t: Array, q: Array, dq: Array, dq_late_s: float = 0.0) -> Smoo
         t: (m,) s, increasing; q, dq: (m, n) rad, rad/s.
         dq_late_s: how much later dq is than q.
     """
-    count = max(2, int(np.ceil((t[-1] - t[0]) / KNOT_S)))
-    inner = np.linspace(t[0], t[-1], count + 1)
-    knots = np.concatenate([np.full(SPLINE_DEGREE, t[0]), inner, np.full(SPLINE_DEGREE, t[-1])])
-    level = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
-    when = np.clip(t - dq_late_s, t[0], t[-1])
-    first, inner_knots = _differentiated(knots, 1)
-    slope = BSpline.design_matrix(when, inner_knots, SPLINE_DEGREE - 1) @ first
-    q_noise = np.maximum(noise_from_samples(q), Q_NOISE_FLOOR)
-    dq_noise = np.maximum(noise_from_samples(dq), DQ_NOISE_FLOOR)
-    rough = _roughness(knots)
-    bands_q, bands_dq, bands_rough = (_bands(x) for x in (level.T @ level, slope.T @ slope, rough))
-    coefficients = np.empty((level.shape[1], q.shape[1]))
-    for j in range(q.shape[1]):
-        wq, wdq = q_noise[j] ** -2, dq_noise[j] ** -2
-        data = wq * bands_q + wdq * bands_dq
-        right = wq * (level.T @ q[:, j]) + wdq * (slope.T @ dq[:, j])
-        coefficients[:, j] = _stiffest(data, right, bands_rough)
-    return Smoothed(BSpline(knots, coefficients, SPLINE_DEGREE), q_noise, dq_noise)
+    splines = Splines.through(t, q, dq, dq_late_s)
+    return splines.smoothed(smoothness_of([splines]))
 
 
-def _stiffest(data: Array, right: Array, rough: Array) -> Array:
-    """Coefficients at the penalty with the highest marginal likelihood."""
+def smoothness_of(parts: Sequence[Splines]) -> Smoothness:
+    """Noise of some parts of a motion, and the penalties under which they are most probable."""
+    sizes = [len(part.t) for part in parts]
+
+    def noise(key: str, floor: float) -> Array:
+        own = [noise_from_samples(getattr(part, key)) for part in parts]
+        pooled = np.sqrt(np.average(np.square(own), axis=0, weights=sizes))
+        return np.maximum(own[0] if len(own) == 1 else pooled, floor)
+
+    q_noise, dq_noise = noise("q", Q_NOISE_FLOOR), noise("dq", DQ_NOISE_FLOOR)
+    penalties = []
+    for j in range(len(q_noise)):
+        costs = [_cost_of(*part.known(j, q_noise[j], dq_noise[j]), part.rough) for part in parts]
+        best = minimize_scalar(
+            lambda x, costs=costs: sum(cost(x) for cost in costs),
+            bounds=STIFFNESS,
+            method="bounded",
+            options={"xatol": 0.2},
+        )
+        penalties.append(float(best.x))
+    return Smoothness(q_noise, dq_noise, np.array(penalties))
+
+
+def _cost_of(data: Array, right: Array, rough: Array) -> Callable[[float], float]:
+    """-2 ln of the marginal likelihood of splines, but for a constant, by ln of the penalty."""
     rank = data.shape[1] - 3
 
     def cost(log_penalty: float) -> float:
@@ -364,9 +472,68 @@ def _stiffest(data: Array, right: Array, rough: Array) -> Array:
         solution = cho_solve_banded((factor, True), right)
         return float(2.0 * np.log(factor[0]).sum() - rank * log_penalty - right @ solution)
 
-    best = minimize_scalar(cost, bounds=STIFFNESS, method="bounded", options={"xatol": 0.2})
-    factor = cholesky_banded(data + np.exp(best.x) * rough, lower=True)
-    return np.asarray(cho_solve_banded((factor, True), right))
+    return cost
+
+
+@dataclass(frozen=True, eq=False)
+class Splines:
+    """A motion and the splines that may go through it.
+
+    Attributes:
+        t: (m,) s; q, dq: (m, n) rad, rad/s; knots: (k,) s.
+        level, slope: sparse, from coefficients to q and to dq at the samples.
+        bands_q, bands_dq, rough: lower bands of their products, and of the roughness.
+    """
+
+    t: Array
+    q: Array
+    dq: Array
+    knots: Array
+    level: Any
+    slope: Any
+    bands_q: Array
+    bands_dq: Array
+    rough: Array
+
+    @classmethod
+    def through(
+        cls, t: Array, q: Array, dq: Array, dq_late_s: float = 0.0, inner: Array | None = None
+    ) -> Splines:
+        """Of samples at t (m,) s, q and dq (m, n).
+
+        Args:
+            dq_late_s: how much later dq is than q.
+            inner: knots from before the first sample to behind the last, even ones where None.
+        """
+        if inner is None:
+            count = max(2, int(np.ceil((t[-1] - t[0]) / KNOT_S)))
+            inner = np.linspace(t[0], t[-1], count + 1)
+        begin, end = inner[0], inner[-1]
+        knots = np.concatenate([np.full(SPLINE_DEGREE, begin), inner, np.full(SPLINE_DEGREE, end)])
+        level = BSpline.design_matrix(t, knots, SPLINE_DEGREE)
+        when = np.clip(t - dq_late_s, begin, end)
+        first, inner_knots = _differentiated(knots, 1)
+        slope = BSpline.design_matrix(when, inner_knots, SPLINE_DEGREE - 1) @ first
+        rough = _roughness(knots)
+        bands = (_bands(x) for x in (level.T @ level, slope.T @ slope, rough))
+        return cls(t, q, dq, knots, level, slope, *bands)
+
+    def known(self, j: int, q_noise: float, dq_noise: float) -> tuple[Array, Array]:
+        """Information (bands) and right side of a joint's coefficients, by its samples."""
+        wq, wdq = q_noise**-2, dq_noise**-2
+        data = wq * self.bands_q + wdq * self.bands_dq
+        right = wq * (self.level.T @ self.q[:, j]) + wdq * (self.slope.T @ self.dq[:, j])
+        return data, right
+
+    def smoothed(self, by: Smoothness) -> Smoothed:
+        """The most probable ones."""
+        coefficients = np.empty((self.level.shape[1], self.q.shape[1]))
+        for j, log_penalty in enumerate(by.log_penalty):
+            data, right = self.known(j, by.q_noise[j], by.dq_noise[j])
+            factor = cholesky_banded(data + np.exp(log_penalty) * self.rough, lower=True)
+            coefficients[:, j] = cho_solve_banded((factor, True), right)
+        spline = BSpline(self.knots, coefficients, SPLINE_DEGREE)
+        return Smoothed(spline, by.q_noise, by.dq_noise)
 
 
 def _differentiated(knots: Array, order: int) -> tuple[Any, Array]:

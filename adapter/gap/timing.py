@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,7 @@ FEWEST_COMPARED = 100  # points of 10 ms; fewer say nothing about lateness
 STEPS_OF_LATENESS = 3  # each repeats the linearised fit about the last one
 SIGNIFICANT = 3.0  # standard deviations
 TIMING_SHARE = 0.25  # of a sample period: a hold of half a sample, two of these, is no effect
+LEAST_STD_S = 1e-6  # of a lateness; no clock is better
 BLOCKS = 16  # of the recording, left out in turn: how sure the lateness is
 
 Index = NDArray[np.int64]
@@ -127,6 +129,48 @@ class RecordingClock:
         if abs(abs(late) / self.period_s - 0.5) < 0.1 and std < 0.1 * self.period_s:
             sentence += ", half a sample: the mark of a simulator that holds torque over its step"
         return [*said, sentence + "."]
+
+
+def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> RecordingClock:
+    """The clock of a recording by those of its pieces.
+
+    Args:
+        begins_s: when each piece begins, since the recording began.
+    """
+    samples = np.array([c.samples for c in clocks], dtype=float)
+    late, std = (
+        np.array([getattr(c, k) for c in clocks]) for k in ("lateness_s", "lateness_std_s")
+    )
+    told = np.isfinite(late) & np.isfinite(std)
+    weight = np.maximum(std[told], LEAST_STD_S) ** -2.0
+    gains = np.array([c.velocity_gain for c in clocks])
+    seen = np.isfinite(gains).any(axis=0)
+
+    def moved(key: str) -> tuple[tuple[float, float], ...]:
+        own = zip(clocks, begins_s, strict=True)
+        return tuple((begin + t, length) for c, begin in own for t, length in getattr(c, key))
+
+    def mean(values: Sequence[float]) -> float:
+        return float(np.average(values, weights=samples))
+
+    gain = np.full(gains.shape[1], np.nan)
+    gain[seen] = np.nanmedian(gains[:, seen], axis=0)
+    return RecordingClock(
+        samples=int(samples.sum()),
+        kept=sum(c.kept for c in clocks),
+        span_s=begins_s[-1] + clocks[-1].span_s - begins_s[0],
+        rate_hz=float(np.median([c.rate_hz for c in clocks])),
+        jitter_s=float(np.sqrt(mean([c.jitter_s**2 for c in clocks]))),
+        holes=moved("holes"),
+        frozen=moved("frozen"),
+        repeated=mean([c.repeated for c in clocks]),
+        held={key: mean([c.held[key] for c in clocks]) for key in clocks[0].held},
+        out_of_order=sum(c.out_of_order for c in clocks),
+        not_finite=sum(c.not_finite for c in clocks),
+        lateness_s=float(np.average(late[told], weights=weight)) if told.any() else float("nan"),
+        lateness_std_s=float(weight.sum() ** -0.5) if told.any() else float("nan"),
+        velocity_gain=gain,
+    )
 
 
 def lateness(clock: RecordingClock) -> float:

@@ -14,19 +14,23 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
 from adapter.gap.at_rest import held_at_rest
+from adapter.gap.changes import loaded
 from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
 from adapter.gap.fit import Fit, theta_prior
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
+from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.result import Finding, GapResult
+from adapter.gap.sampled import Sampled, part_of, sampling, sampling_words
 from adapter.gap.screen import RecordingFault, RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
@@ -37,7 +41,7 @@ from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import AnyLog, Log, open_log
 
 SEARCHED_S = 20.0  # of several recordings
 NO_NAME = 0.5  # probability below which an effect is not told by name
@@ -70,7 +74,7 @@ class GapSettings:
 
     inertia_prior: float = 0.02
     validate_from_s: float | None = None
-    hold_out: tuple[Path | str | Log, ...] = ()
+    hold_out: tuple[Path | str | AnyLog, ...] = ()
     rounds: int = ROUNDS
     unit: EffortUnit = field(default_factory=EffortUnit)
 
@@ -84,7 +88,7 @@ class GapSettings:
 
 
 def find_gap(
-    logs: Sequence[Path | str | Log],
+    logs: Sequence[Path | str | AnyLog],
     model: Path | str | SelfModel,
     settings: GapSettings | None = None,
     simulate: Simulate | None = None,
@@ -128,6 +132,9 @@ def find_gap(
         progress("weighing what each recording carries")
         several = Several.of(fit, [r.name for r in task.fitted], hand_frame(nominal))
         task, fit = _searched(task, several.started(fit), [x.recording for x in several.odd])
+    elif task.fitted[0].loads_s:
+        progress("weighing what the hand picked up or put down")
+        fit = loaded(fit, task.moving[0], task.fitted[0].loads_s)
     progress("searching")
     moving = sorted({j for joints in task.moving for j in joints})
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
@@ -144,10 +151,11 @@ def find_gap(
 
 
 def _with_what_is_held(
-    untold: GapResult, log: Path | str | Log, model: SelfModel, inertia_prior: float
+    untold: GapResult, log: Path | str | AnyLog, model: SelfModel, inertia_prior: float
 ) -> GapResult:
     """A load at the hand shows in an arm at rest as well."""
-    own = log if isinstance(log, Log) else read_log(Path(log))
+    whole = log if isinstance(log, AnyLog) else open_log(Path(log))
+    own = part_of(whole, present(model, whole.joint_names, whole.path.name)[0])
     load = held_at_rest(own, model, inertia_prior)
     if load is None:
         return untold
@@ -156,7 +164,7 @@ def _with_what_is_held(
 
 
 def _task(
-    logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
+    logs: Sequence[Path | str | AnyLog], model: SelfModel, settings: GapSettings, progress: Progress
 ) -> tuple[GapTask, TorqueGains | None]:
     """Read, convert and screen. Raises Refusal."""
     held = settings.hold_out
@@ -168,24 +176,28 @@ def _task(
     read, locked, names = [], [], names_of([*kept, *held])
     for log, name in zip([*kept, *held], names, strict=True):
         progress(f"reading {name}")
-        read.append(log if isinstance(log, Log) else read_log(Path(log)))
+        read.append(log if isinstance(log, AnyLog) else open_log(Path(log)))
         model, said = present(model, read[-1].joint_names, name)
         locked += said
     if settings.unit.learn:
         progress("learning the gains of the drives")
-    learned_from = [_until(log, settings.validate_from_s) for log in read[: len(kept)]]
-    read, gains = in_newton_metres(read, model, settings.unit, learned_from)
-    arm, unit_known = RigidArm.of(model), settings.unit.is_given and gains is None
-    screened: list[Screened] = [refuse(log, model, arm, unit_known) for log in read]
-    recordings = tuple(
-        replace(Recorded.of(x.log, lateness(x.timing)), name=name)
-        for x, name in zip(screened, names, strict=True)
-    )
-    fitted = scored = recordings
-    if held:
-        fitted, scored = recordings[: len(kept)], recordings[len(kept) :]
-    elif settings.validate_from_s is not None:
-        fitted, scored = _split(recordings[0], settings.validate_from_s)
+        taught = [part_of(log, model, settings.validate_from_s) for log in read[: len(kept)]]
+    else:
+        taught = []
+    read, gains = in_newton_metres(read, model, settings.unit, taught)
+    unit_known = settings.unit.is_given and gains is None
+    taken = []
+    for log, name in zip(read, names, strict=True):
+        if is_long(log):
+            progress(f"reading {name} in pieces")
+        taken.append(_taken(log, name, model, unit_known))
+    if len(kept) == 1:
+        taken[0] = _divided(taken[0], settings, progress)
+    fitted = tuple(x.fitted for x in taken[: len(kept)])
+    scored = tuple(x.fitted for x in taken[len(kept) :]) if held else fitted
+    if taken[0].scored is not None:
+        scored = (taken[0].scored,)
+    screened = [x.screened for x in taken]
     said_of = zip(names, (x.notes for x in screened), strict=True)
     notes = (f"{name}: {x}" if len(names) > 1 else x for name, own in said_of for x in own)
     task = GapTask(
@@ -195,42 +207,70 @@ def _task(
         moving=tuple(x.moving for x in screened[: len(fitted)]),
         period_s=max(x.timing.period_s for x in screened),
         one_clock=not held,
-        notes=(*dict.fromkeys(locked), *notes),
+        notes=(*dict.fromkeys(locked), *notes, *sampling_words(fitted)),
     )
     return task, gains
 
 
-def _until(log: Log, end_s: float | None) -> Log:
-    """A recording before a second of it; all of it where None."""
-    if end_s is None:
-        return log
-    return log.take(log.stamp_ns < log.stamp_ns[0] + round(1e9 * end_s))
+class _Taken(NamedTuple):
+    """A recording, screened, and what of it is fitted; what is scored where that is another part.
+
+    `sampled` is None where all of it is in memory.
+    """
+
+    screened: Screened
+    fitted: Recorded
+    sampled: Sampled | None
+    scored: Recorded | None = None
 
 
-def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
+def _taken(log: AnyLog, name: str, model: SelfModel, unit_known: bool) -> _Taken:
+    """Raises RecordingRefused."""
+    if is_long(log):
+        sampled = Sampled.of(log, name, model)
+        return _Taken(sampled.screened(log, unit_known), sampled.recorded(), sampled)
+    own = log if isinstance(log, Log) else log.in_memory()
+    seen = refuse(own, model, RigidArm.of(model), unit_known)
+    fitted = replace(Recorded.of(seen.log, lateness(seen.timing)), name=name)
+    return _Taken(seen, fitted, None)
+
+
+def _divided(taken: _Taken, settings: GapSettings, progress: Progress) -> _Taken:
+    """The only recording, with what is fitted and what is scored of it."""
+    at_s, whole, sampled = settings.validate_from_s, taken.fitted, taken.sampled
+    if at_s is not None:
+        if not whole.t[0] + FIT_S < at_s < whole.end_s - SCORE_S:
+            raise ValueError(
+                f"validation from {at_s} s needs {FIT_S:g} s before and {SCORE_S:g} s after it; "
+                f"{whole.name} has {whole.end_s:.1f} s"
+            )
+        if sampled is None:
+            cut = int(np.searchsorted(whole.t, at_s))
+            rest = whole.part(slice(cut, None))
+            return taken._replace(fitted=whole.part(slice(cut)), scored=rest)
+        rest = sampled.within((at_s, whole.end_s)).recorded()
+        sampled = sampled.within((0.0, at_s))
+        taken = taken._replace(scored=rest)
+    if sampled is None:
+        return taken
+    progress("looking for changes in all of it")
+    return taken._replace(fitted=sampled.with_changes(settings.inertia_prior).recorded())
+
+
+def names_of(logs: Sequence[Path | str | AnyLog]) -> list[str]:
     """What recordings are called: their files' names, with folders where two have the same."""
-    paths = [log.path if isinstance(log, Log) else Path(log) for log in logs]
+    paths = [log.path if isinstance(log, AnyLog) else Path(log) for log in logs]
     short = [path.name for path in paths]
     names = [str(p) if short.count(p.name) > 1 else p.name for p in paths]
     again = [names[:k].count(name) for k, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, again, strict=True)]
 
 
-def _same(one: Path | str | Log, other: Path | str | Log) -> bool:
+def _same(one: Path | str | AnyLog, other: Path | str | AnyLog) -> bool:
     """Whether two stand for one recording."""
-    if isinstance(one, Log) or isinstance(other, Log):
+    if isinstance(one, AnyLog) or isinstance(other, AnyLog):
         return one is other
     return Path(one).resolve() == Path(other).resolve()
-
-
-def _split(whole: Recorded, at_s: float) -> tuple[tuple[Recorded], tuple[Recorded]]:
-    if not whole.t[0] + FIT_S < at_s < whole.t[-1] - SCORE_S:
-        raise ValueError(
-            f"validation from {at_s} s needs {FIT_S:g} s before and {SCORE_S:g} s after it; "
-            f"{whole.name} has {whole.t[-1]:.1f} s"
-        )
-    cut = int(np.searchsorted(whole.t, at_s))
-    return (whole.part(slice(cut)),), (whole.part(slice(cut, None)),)
 
 
 def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit]:
@@ -243,7 +283,7 @@ def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit
     """
     moved = [float(np.abs(r.motion.dq).sum()) for r in fit.recordings]
     order = [int(i) for i in np.argsort(moved)[::-1] if i not in odd]
-    lengths = np.cumsum([task.fitted[i].t[-1] for i in order])
+    lengths = np.cumsum([task.fitted[i].seconds for i in order])
     chosen = sorted(order[: max(int(np.searchsorted(lengths, SEARCHED_S)) + 1, 2)])
     if len(chosen) == len(task.fitted):
         return task, fit
@@ -270,7 +310,7 @@ def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit
 def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResult:
     """All that was found and measured."""
     found, floor = measured.found, noise_floor(measured.found.fit)
-    ends = {r.name: float(r.t[-1]) for r in task.fitted}
+    ends = {r.name: r.end_s for r in task.fitted}
     trusted = theta_prior(RigidArm.of(task.model).theta, settings.inertia_prior)
     told, left = told_of(found, ends, trusted)
     findings = tuple(f for f in told if f.evidence >= NO_NAME)
@@ -298,6 +338,7 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
         curves=measured.curves,
         rollouts=measured.rollouts,
         what_next=tuple(dict.fromkeys(splits)),
+        sampled=sampling(task.fitted),
         in_sample=task.folds and not holds_out(found.fit),
     )
 

@@ -33,6 +33,7 @@ MOST_DOTS = 500  # of one cloud; a panel shows no more
 BINS, FEWEST_IN_BIN = 24, 4
 WIDEST = 99.5  # percentile of |residual| that a panel still holds
 SHOWN_ROLLOUT_S = 10.0
+LEFT_OUT_S = 1.0  # between two points of a line: it breaks
 LEFT = 0.17  # of a small panel, where "−0.050" must fit
 SIGNATURES = (
     ("dq", "Against velocity", "velocity, rad/s"),
@@ -176,10 +177,17 @@ def _over_time(result: GapResult, j: int) -> Panel:
     _limits(ax, curves.t, [curves.before[:, j], curves.after[:, j]])
     _noise_band(ax, result.noise_floor_nm[j])
     _spans(ax, result, j)
-    ax.plot(*thin(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
-    ax.plot(*thin(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
+    ax.plot(*_line(curves.t, curves.before[:, j]), color=GOAL, linewidth=0.9)
+    ax.plot(*_line(curves.t, curves.after[:, j]), color=ACCENT, linewidth=0.9)
     time_axis(drawing, "time, s")
     return drawing.panel("Over time", "N m", f"of {curves.recording}")
+
+
+def _line(t: Array, y: Array) -> tuple[Array, Array]:
+    """A line over time, thinned, with a break where time is left out."""
+    t, y = thin(t, y)
+    breaks = np.flatnonzero(np.diff(t) > LEFT_OUT_S) + 1
+    return np.insert(t, breaks, t[breaks]), np.insert(y, breaks, np.nan)
 
 
 def _spans(ax: Axes, result: GapResult, j: int) -> None:
@@ -199,9 +207,9 @@ def _motion(result: GapResult, j: int) -> Panel:
     curves = time_curves(result)
     drawing = Drawing("half")
     ax, tau = drawing.axes[0], curves.tau[:, j]
-    ax.plot(*thin(curves.t, tau), color=INK, linewidth=2.2, alpha=0.3)
+    ax.plot(*_line(curves.t, tau), color=INK, linewidth=2.2, alpha=0.3)
     for left, color in ((curves.before, GOAL), (curves.after, ACCENT)):
-        ax.plot(*thin(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
+        ax.plot(*_line(curves.t, tau - left[:, j]), color=color, linewidth=0.9)
     time_axis(drawing, "time, s")
     return drawing.panel("Torque, measured and predicted", "N m", f"of {curves.recording}")
 
