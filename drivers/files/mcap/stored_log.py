@@ -43,7 +43,7 @@ from drivers.files.mcap.log import (
 from drivers.files.mcap.records import Scan
 from drivers.files.mcap.series import JOINT_SCHEMAS, Series, collect, schema_name
 from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES, LINK_ACCELS, LINK_TWISTS
-from drivers.files.ros import IMU
+from drivers.files.ros_types import IMU
 
 IN_MEMORY = 2**17  # samples; a shorter recording is a `Log`
 
