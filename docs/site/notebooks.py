@@ -26,9 +26,9 @@ def execute(source: Path) -> nbformat.NotebookNode:
     resources = {"metadata": {"path": str(source.parent)}}
     with tempfile.TemporaryDirectory() as folder:  # of sockets: no port is opened
         kernel = {"KernelManager": {"transport": "ipc", "ip": f"{folder}/kernel"}}
-        NotebookClient(
-            notebook, timeout=LONGEST_S, resources=resources, config=Config(kernel)
-        ).execute()
+        waits = {"timeout": LONGEST_S, "startup_timeout": LONGEST_S}
+        client = NotebookClient(notebook, resources=resources, config=Config(kernel), **waits)
+        client.execute()
     return notebook
 
 
