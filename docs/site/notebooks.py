@@ -26,8 +26,13 @@ def execute(source: Path) -> nbformat.NotebookNode:
     resources = {"metadata": {"path": str(source.parent)}}
     with tempfile.TemporaryDirectory() as folder:  # of sockets: no port is opened
         kernel = {"KernelManager": {"transport": "ipc", "ip": f"{folder}/kernel"}}
-        waits = {"timeout": LONGEST_S, "startup_timeout": LONGEST_S}
-        client = NotebookClient(notebook, resources=resources, config=Config(kernel), **waits)
+        client = NotebookClient(
+            notebook,
+            timeout=LONGEST_S,
+            startup_timeout=LONGEST_S,  # a busy machine
+            resources=resources,
+            config=Config(kernel),
+        )
         client.execute()
     return notebook
 
