@@ -26,9 +26,14 @@ def execute(source: Path) -> nbformat.NotebookNode:
     resources = {"metadata": {"path": str(source.parent)}}
     with tempfile.TemporaryDirectory() as folder:  # of sockets: no port is opened
         kernel = {"KernelManager": {"transport": "ipc", "ip": f"{folder}/kernel"}}
-        NotebookClient(
-            notebook, timeout=LONGEST_S, resources=resources, config=Config(kernel)
-        ).execute()
+        client = NotebookClient(
+            notebook,
+            timeout=LONGEST_S,
+            startup_timeout=LONGEST_S,  # a busy machine
+            resources=resources,
+            config=Config(kernel),
+        )
+        client.execute()
     return notebook
 
 
