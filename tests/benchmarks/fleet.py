@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from adapter.effects.export import robot_mjcf, robot_urdf
 from adapter.effects.robots import documented
@@ -116,7 +117,8 @@ def mujoco_sysid(logs: list[str]) -> dict[str, float]:
     parameters = sysid.ParameterDict()
     for name in model.tree.joint_names:
         body = compiled.body(compiled.joint(name).bodyid[0]).name
-        parameters.add(sysid.body_inertia_param(spec, compiled, body, sysid.InertiaType.Pseudo))
+        kind, change = sysid.InertiaType.Pseudo, partial(_set_of_body, body)
+        parameters.add(sysid.body_inertia_param(spec, compiled, body, kind, modifier=change))
         for effect, most in (("damping", 5.0), ("frictionloss", 5.0)):
             change = partial(_set_of_joint, name, effect)
             own = sysid.Parameter(f"{name}_{effect}", 0.1, 0.0, most, modifier=change)
@@ -141,6 +143,20 @@ def mujoco_sysid(logs: list[str]) -> dict[str, float]:
     first, last = (float(np.sqrt(np.mean(np.concatenate(x) ** 2))) for x in (begin, end))
     damping = [best[f"{name}_damping"].value[0] for name in model.tree.joint_names]
     return {"residual_before": first, "after": last, "damping": float(np.median(damping))}
+
+
+def _set_of_body(name: str, spec: Any, parameter: Any) -> None:
+    """Its own function for this takes bodies without geometries for empty."""
+    from mujoco import sysid
+
+    pi = sysid.model_modifier.pi_from_theta(parameter.value)
+    body, centre = spec.body(name), pi[1:4] / pi[0]
+    about = pi[4:].reshape(3, 3) - pi[0] * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    sizes, axes = np.linalg.eigh(about)
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    body.mass, body.ipos, body.inertia = float(pi[0]), centre, sizes
+    body.iquat = np.roll(Rotation.from_matrix(axes).as_quat(), 1)
+    body.explicitinertial = True
 
 
 def _set_of_joint(name: str, effect: str, spec: Any, parameter: Any) -> None:

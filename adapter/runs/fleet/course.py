@@ -121,7 +121,7 @@ def _drifts(series: Sequence[Series], columns: Mapping[str, Array], use: Used) -
         fits = [_fit(*each) for each in zip(series, [[x]] * len(series), on, strict=True)]
         usual = Usual.of(fits)
         for one, ours, fit, own in zip(series, on, fits, found, strict=True):
-            if fit is None:
+            if fit is None or len(fit.left) < FEWEST:
                 continue
             chance = len(series) * len(columns) * float(usual.chances(fit)[1])
             if chance < CHANCE:
