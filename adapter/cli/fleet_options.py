@@ -67,12 +67,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
+    locks_of(args)
+    check_robot(args.model)
     if not args.logs and args.out is None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")
     if args.forget and args.out is None:
         raise UsageError("--forget needs --out, the folder of the fleet that knows the LOG")
     if args.workers < 0:
         raise UsageError(f"--workers takes 0 or more, got {args.workers}")
-    locks_of(args)
-    check_robot(args.model)
     check_files(args.manifest)
