@@ -71,6 +71,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
+    locks_of(args)
+    check_robot(args.model)
     if not args.logs and args.out is None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")
     for option in ("forget", "remember"):
@@ -78,6 +80,4 @@ def _check(args: argparse.Namespace) -> None:
             raise UsageError(f"--{option} needs --out, the folder of the fleet that knows the LOG")
     if args.workers < 0:
         raise UsageError(f"--workers takes 0 or more, got {args.workers}")
-    locks_of(args)
-    check_robot(args.model)
     check_files(args.manifest)

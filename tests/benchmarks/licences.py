@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -45,7 +46,7 @@ def needed(requirements: Iterable[Requirement]) -> set[str]:
 def licence(name: str) -> str:
     """What a distribution says its licence is."""
     try:
-        told = metadata.metadata(name)
+        told: Any = metadata.metadata(name)  # a message, as of e-mail
     except metadata.PackageNotFoundError:
         return UNKNOWN
     classified = [

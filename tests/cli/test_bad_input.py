@@ -277,7 +277,7 @@ def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> 
         (["export", "panda", "--urdf", "x.urdf"], "give a model file (.json)"),
         (["export", "m.json", "--urdf", "x.xml"], "--mjcf FILE.xml"),
         (["export", "m.json", "--mjcf", "x.urdf"], "--urdf FILE.urdf"),
-        (["diff", "panda", "arm.xacro"], "a .urdf file"),
+        (["diff", "panda", "arm.xacro"], "xacro arm.xacro > arm.urdf"),
         (["diff", "panda", "nowhere.urdf"], "nowhere.urdf: cannot be read"),
         (["info", "nowhere.mcap"], "nowhere.mcap"),
         (["recover", "nowhere.mcap"], "nowhere.mcap"),
