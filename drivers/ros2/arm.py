@@ -249,7 +249,8 @@ class Ros2Arm:
 
     def _refused(self, why: Refusal, count: int) -> None:
         self.intake.refused[WORDS_OF[why]] += count
-        self._note(why)
+        if self._driving:  # before that it only says that somebody took a while to begin
+            self._note(why)
 
     def _note(self, why: Refusal) -> None:
         if NOTES[why] not in self.intake.notes:

@@ -11,6 +11,7 @@ to standard output, one JSON object a line: {"ready": ...}, {"fault": ...}, {"no
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import json
 import os
@@ -53,6 +54,7 @@ LOOK_S = 0.25  # between two looks at who else commands
 FASTEST, JUMP_RAD = 30.0, 0.05  # rad/s, rad: no joint is further on than that
 JUMPS = 20  # in a row are no disturbance: the arm is somewhere else
 RATE_SHARE = 0.1
+PRIORITY = 75  # SCHED_FIFO; above the loop, which waits for what is delivered here
 BRAKES = (Doing.BRAKING, Doing.HOLDING)
 
 
@@ -413,6 +415,8 @@ def say(**what: Any) -> None:
 def main() -> None:
     """Run by the driver."""
     start = Start.of(sys.argv[1])
+    with contextlib.suppress(OSError):  # the threads of DDS begin later and inherit it
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
     try:
         bridge = Bridge(start)
         bridge.prepare()

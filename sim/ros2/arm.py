@@ -9,9 +9,11 @@ unless it is 0.
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,7 +27,7 @@ from cyclonedds.util import duration
 
 from drivers.interface import DriverError
 from sim.faults import Fault
-from sim.fci.clock import Ticks, undisturbed
+from sim.fci.clock import PRIORITY, Ticks, undisturbed
 from sim.ros2.messages import Float64MultiArray, Header, JointState, String, Time
 from sim.scenarios import Scenario
 from sim.truth import Truth, to_rpy
@@ -73,6 +75,8 @@ class ServedArm:
         self._place, self._faults = place, {fault.name: fault for fault in faults}
         self._plant = scenario.plant(substeps=SUBSTEPS)
         self._random = np.random.default_rng([scenario.seed, 5])
+        with suppress(OSError):  # the threads of DDS inherit it: a machine that is busy delays them
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         self._domain = Domain(place.domain, LOOPBACK)
         self._participant = DomainParticipant(place.domain)
         self._states = self._writer(place.states, JointState, latched=False)
