@@ -15,7 +15,8 @@ from adapter.effects.base import (
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LATER, STILL
 
-SLOWEST, WITHIN_S = 0.008, 60.0  # N m/s, in so many seconds; in longer ones it may be slower
+SLOWEST = 0.008  # N m/s
+LONG_S, RISE_NM = 60.0, 0.16  # in a longer recording: what it rises by in all, as within 20 s
 
 
 class FrictionDrift(TorqueEffect):
@@ -37,10 +38,10 @@ class FrictionDrift(TorqueEffect):
 
     def over(self, seconds: float) -> FrictionDrift:
         """Over an hour much less shows than over a minute."""
-        if seconds <= WITHIN_S:
+        if seconds <= LONG_S:
             return self
         slower = copy(self)
-        slower.slowest = SLOWEST * WITHIN_S / seconds
+        slower.slowest = RISE_NM / seconds
         return slower
 
     def possible(self, values: Values) -> bool:

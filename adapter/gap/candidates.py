@@ -39,7 +39,7 @@ from adapter.effects.catalogue import HELD
 from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
-from adapter.gap.signals import Signals
+from adapter.gap.signals import Signals, regressor_of
 from adapter.model.spatial import Array
 
 PATTERN_SHARE = 0.7  # of what a pattern explains: an effect that explains so much goes first
@@ -118,12 +118,15 @@ class Stages:
 
     def low_regressor(self, link: int | None = None, gate: Array | None = None) -> Array:
         """(c, k, n) regressor in the band: of one link (from 0) or all, while a gate is open."""
-        rows = slice(None) if link is None else slice(10 * link, 10 * link + 10)
+        own = slice(None) if link is None else slice(10 * link, 10 * link + 10)
         if self.unmoved and gate is None:
-            return self.signals.low_regressor[rows]
-        Y = self.links.arm.regressor(self.links.q, self.links.dq, self.links.ddq)
-        Y = Y[:, :, rows] if gate is None else Y[:, :, rows] * gate[:, :, None]
-        return np.moveaxis(self.signals.low(Y), 2, 0)
+            return self.signals.low_regressor[own]
+
+        def made(rows: slice) -> Array:
+            Y = regressor_of(self.links, rows)[:, :, own]
+            return Y if gate is None else Y * gate[rows, :, None]
+
+        return np.moveaxis(self.signals.low_of(made), 2, 0)
 
 
 def stages_of(

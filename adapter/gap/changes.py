@@ -22,7 +22,7 @@ from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.evidence import ORDER
 from adapter.gap.fit import EDGE_S, Fit
-from adapter.gap.long_recording import STRETCH_S, LongRecording, Span
+from adapter.gap.long_recording import LongRecording, Span
 from adapter.gap.real_arm import load_in, loaded_arm
 from adapter.gap.weighed import pieces_of
 from adapter.model.spatial import Array
@@ -30,7 +30,8 @@ from adapter.model.spatial import Array
 WINDOW_S, MOST_WINDOWS = 2.0, 2048
 BY_LOAD = 0.7  # of what a change explains: it is one of the load
 DATED = 2  # rounds in which the date of a load is sought
-CHANGES, LOUD = 3, 2  # stretches that are added at most: around changes, where it is loud
+CHANGES, LOUD = 3, 1  # stretches that are added at most: around changes, where it is loud
+AROUND_S = 4.0  # length of one
 LEAST_CHI2 = 200.0  # of a change, times what windows scatter more than noise does
 LOUDER = 4.0  # times the usual power
 MARGIN = 2  # windows at either end
@@ -111,7 +112,7 @@ class Windows:
 
     def _around(self, k: float) -> Span:
         middle = self.every_s * k
-        return max(middle - 0.5 * STRETCH_S, 0.0), middle + 0.5 * STRETCH_S
+        return max(middle - 0.5 * AROUND_S, 0.0), middle + 0.5 * AROUND_S
 
     def _changes(self, least: float) -> list[int]:
         found: list[int] = []
@@ -185,7 +186,7 @@ def _dated(fit: Fit, k: int) -> Span:
         white = trial.whiten(trial.model.residuals())
         sizes.append(np.square(white).reshape(-1, fit.n).sum(axis=1))
     t = fit.recordings[0].t[ORDER:]
-    near = np.flatnonzero(np.abs(t - begin) < STRETCH_S)
+    near = np.flatnonzero(np.abs(t - begin) < AROUND_S)
     if not len(near):
         return begin, end
     # of each row being the first with the load: those before it are without

@@ -139,9 +139,12 @@ class Signals:
 
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
-        if len(self.begins) == 1:
-            return self._trimmed(low(x))
-        return np.concatenate([self._trimmed(low(x[rows])) for rows in self.stretches])
+        return self.low_of(lambda rows: x[rows])
+
+    def low_of(self, make: Callable[[slice], Array]) -> Array:
+        """The same of what is made stretch by stretch: at the motion's rate it may be large."""
+        parts = [self._trimmed(low(make(rows))) for rows in self.stretches]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _trimmed(self, x: Array) -> Array:
         return x[self.trim : len(x) - self.trim] if self.trim else x
@@ -202,12 +205,13 @@ class Signals:
         return out.reshape(-1, *self.tau.shape)
 
     def _low_regressor(self) -> Array:
-        parts = []
-        for rows in self.stretches:  # one after the other: at the motion's rate they are large
-            m = motion_rows(self.motion, rows)
-            parts.append(self._trimmed(low(m.arm.regressor(m.q, m.dq, m.ddq))))
-        whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        whole = self.low_of(lambda rows: regressor_of(self.motion, rows))
         return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
+
+
+def regressor_of(motion: Motion, rows: slice) -> Array:
+    """(k, n, 10 n) regressor at some instants of a motion."""
+    return motion.arm.regressor(motion.q[rows], motion.dq[rows], motion.ddq[rows])
 
 
 def motion_rows(motion: Motion, rows: slice) -> Motion:

@@ -19,113 +19,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from adapter.effects.torque import ModelTorque
-from adapter.model.inertia import theta_from_body
 from adapter.model.robots import documented
-from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import McapWriter
+from tests.helpers.long_arm import RATE_HZ, Hidden, samples
 
-RATE_HZ = 1000
-PERIOD_S = 20.0  # of the motion
-SINES = (2, 5, 11)  # cycles in it
-AMPLITUDE = 0.25  # rad, of the slowest sine; the others by their frequency less
-CENTRE = (0.0, -0.6, 0.0, -1.9, 0.0, 1.7, 0.7)  # rad, middle of the Panda's ranges
-VISCOUS, DRY = 0.3, 0.6  # N m s/rad, N m
-NOISE = (1e-5, 1e-3, 0.02)  # rad, rad/s, N m
-SEED = 7
-LOAD_KG, LOAD_AT_M, LOAD_SIZE = 1.0, (0.0, 0.0, 0.2), 2e-3  # in the last link's axes; kg m²
-PUSH_N, PUSH_LASTS_S = (0.0, 15.0, 0.0), 3.0
-DRIFTING, RISES_NM = 2, 0.3  # joint (from 0), N m over the whole recording
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """What happens in a recording of so many seconds besides friction."""
-
-    seconds: float
-
-    @property
-    def picked_up_s(self) -> float:
-        """When the hand picks up LOAD_KG."""
-        return round(2.0 * self.seconds / 3.0, 1) + 0.03
-
-    @property
-    def pushed_s(self) -> float:
-        """When PUSH_N begins to act on the hand, for PUSH_LASTS_S."""
-        return round(self.seconds / 3.0, 1) + 0.21
-
-    @property
-    def drift(self) -> float:
-        """By how much the friction of joint DRIFTING rises, N m/s."""
-        return RISES_NM / self.seconds
-
-
-def one_period() -> tuple[Array, Array, Array]:
-    """q, dq, tau (m, 7) of one period without noise."""
-    q, dq, ddq = motion()
-    tau = ModelTorque(documented("panda"))(q, dq, ddq)
-    return q, dq, tau + VISCOUS * dq + DRY * rubs(dq)
-
-
-def rubs(dq: Array) -> Array:
-    """Direction (m, 7) of dry friction."""
-    return np.asarray(np.tanh(dq / 0.01))
-
-
-def motion() -> tuple[Array, Array, Array]:
-    """q, dq, ddq (m, 7) of one period."""
-    rng = np.random.default_rng(SEED)
-    t = np.arange(round(PERIOD_S * RATE_HZ)) / RATE_HZ
-    q = np.tile(np.array(CENTRE), (len(t), 1))
-    dq, ddq = np.zeros_like(q), np.zeros_like(q)
-    for cycles in SINES:
-        w = 2.0 * np.pi * cycles / PERIOD_S
-        size = AMPLITUDE * SINES[0] / cycles * rng.uniform(0.6, 1.0, 7)
-        phase = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, 7)
-        q += size * np.sin(phase)
-        dq += size * w * np.cos(phase)
-        ddq -= size * w**2 * np.sin(phase)
-    return q, dq, ddq
-
-
-def extra_torque() -> tuple[Array, Array]:
-    """(m, 7) N m of the load and of the push, along one period."""
-    q, dq, ddq = motion()
-    model = documented("panda")
-    theta = model.theta.copy()
-    theta[-1] += theta_from_body(LOAD_KG, LOAD_AT_M, LOAD_SIZE * np.eye(3))
-    loaded = ModelTorque(replace(model, theta=theta))(q, dq, ddq)
-    arm = RigidArm.of(model)
-    push = arm.wrench_torque(q, np.array([*PUSH_N, 0.0, 0.0, 0.0]))
-    return loaded - ModelTorque(model)(q, dq, ddq), -push
-
-
-def samples(seconds: float, hidden: Hidden | None = None) -> Iterator[tuple[Array, ...]]:
-    """t, q, dq, tau of a recording of so many seconds, period by period."""
-    tables, rng = one_period(), np.random.default_rng(SEED)
-    load, push = extra_torque()
-    for first in range(0, round(seconds * RATE_HZ), len(load)):
-        rows = min(len(load), round(seconds * RATE_HZ) - first)
-        t = (first + np.arange(rows)) / RATE_HZ
-        q, dq, tau = (
-            x[:rows] + s * rng.standard_normal((rows, 7))
-            for x, s in zip(tables, NOISE, strict=True)
-        )
-        if hidden is not None:
-            tau[t >= hidden.picked_up_s] += load[:rows][t >= hidden.picked_up_s]
-            pushed = (t >= hidden.pushed_s) & (t < hidden.pushed_s + PUSH_LASTS_S)
-            tau[pushed] += push[:rows][pushed]
-            tau[:, DRIFTING] += hidden.drift * t * rubs(tables[1][:rows, DRIFTING])
-        yield t, q, dq, tau
 
 
 def write_log(path: Path, seconds: float, hidden: Hidden | None = None) -> None:
