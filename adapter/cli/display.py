@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Group
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -17,7 +17,7 @@ from rich.text import Text
 from adapter.gap.monitor_judge import sentence
 from adapter.realtime.showing import View
 from adapter.runs.live import disagreement
-from adapter.runs.terminal import PatientConsole, console
+from adapter.runs.terminal import console
 from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker
 
 GOOD, LOUD, DIM = "green", "yellow", "dim"
@@ -36,7 +36,7 @@ class LiveTable:
         shown_on: a terminal.
     """
 
-    def __init__(self, known: KnownRun, shown_on: PatientConsole) -> None:
+    def __init__(self, known: KnownRun, shown_on: Console) -> None:
         self._known, self._console = known, shown_on
         self._onlooker = Onlooker(known)
         self._live: Live | None = None
