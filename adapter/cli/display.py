@@ -67,7 +67,7 @@ class LiveTable:
             key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
             if key not in self._told:
                 self._told.add(key)
-                lines.append(disagreement(sentence(found)))
+                lines.append(disagreement(sentence(found, 0.0)))
         for line in lines:
             self._console.print(line, soft_wrap=True)
 

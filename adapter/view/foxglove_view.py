@@ -252,7 +252,7 @@ class FoxgloveView:
             key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
             if key not in self._told:
                 self._told.add(key)
-                due["/findings"] = made.text(sentence(found))
+                due["/findings"] = made.text(sentence(found, 0.0))
                 break  # the next one with the next frame
         return due
 
