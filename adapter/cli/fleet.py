@@ -15,7 +15,7 @@ from adapter.effects.export import robot_urdf
 from adapter.errors import MeansError, ModelError
 from adapter.model.model_file import save_model
 from adapter.report.fleet_page import write_fleet_page
-from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary
+from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
 from adapter.runs.fleet.arm import FleetArm
 from adapter.runs.fleet.fleet import (
     Fleet,
@@ -59,6 +59,9 @@ def run(args: argparse.Namespace) -> int:
 
         found = learn_fleet(given, robot, settings._replace(progress=progress))
     warn([f"{x.path}: left out: {x.why}" for x in found.broken])
+    told = {*manifest.arms, *manifest.told}
+    if told and not told & {*given, *(x.moments.path for a in found.arms for x in a.logs)}:
+        warn([f"{args.manifest}: tells of none of these recordings (paths are as in its folder)"])
     warn([f"{path}: the same recording as {other}; it counts once" for path, other in found.alike])
     figures = as_json(found)
     for arm, names in zip(found.arms, figures["arms"], strict=True):
@@ -96,9 +99,7 @@ def _table(found: Fleet, folder: Path) -> Path:
 
 
 def _print(arm: FleetArm) -> None:
-    worth_saying = {x.number for x in arm.standing_out}
-    worth_saying |= {k for k, x in enumerate(arm.logs) if x.load is not None or x.disagrees}
-    shown = range(len(arm.logs)) if len(arm.logs) <= MOST_ROWS else sorted(worth_saying)
+    shown = to_be_shown(arm, MOST_ROWS)
     table = Table(box=None, pad_edge=False, title=arm.name, title_justify="left")
     for number, head in enumerate(HEADS):
         table.add_column(head, no_wrap=number > 0, overflow="fold")

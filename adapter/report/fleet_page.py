@@ -9,15 +9,24 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
-from adapter.report.fleet_words import EPOCH_S, HEADS, effect_std, log_cells, sentences, summary
+from adapter.report.fleet_words import (
+    EPOCH_S,
+    HEADS,
+    effect_std,
+    log_cells,
+    sentences,
+    summary,
+    to_be_shown,
+)
 from adapter.report.html import fill, write_whole
 from adapter.report.style import MUTED, Drawing, Panel, joint_color
 from adapter.report.tables import Table
 from adapter.report.words import plus_minus
-from adapter.runs.fleet.arm import DAY_S, FleetArm
+from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
 TEMPLATE = "fleet.html"
+MOST_ROWS = 300  # of recordings; of more those that there is something to say of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 
 
@@ -44,8 +53,14 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
 
 
 def _arm(arm: FleetArm) -> ArmOnPage:
-    logs = Table(HEADS, [log_cells(log) for log in arm.logs])
-    panels = _courses(arm) if len(arm.logs) > 1 else []
+    numbers = to_be_shown(arm, MOST_ROWS)
+    left = len(arm.logs) - len(numbers)
+    note = f"{left} more in the table file; here are those there is something to say of" * (
+        left > 0
+    )
+    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note)
+    used = [x for x in arm.logs if x.used]
+    panels = _courses(arm, used) if len(used) > 1 else []
     return ArmOnPage(arm.name, sentences(arm), _parameters(arm), panels, logs)
 
 
@@ -67,18 +82,18 @@ def _parameters(arm: FleetArm) -> Table:
     return Table(heads, rows, units, note)
 
 
-def _courses(arm: FleetArm) -> list[Panel]:
+def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
     """What each recording alone says of friction and offsets, joint by joint, over their begins."""
-    begin = np.array([log.moments.begin_s for log in arm.logs])
+    begin = np.array([log.moments.begin_s for log in used])
     days = (begin - begin.min()) / DAY_S
     label = "days after the first recording" if begin.min() > EPOCH_S else "days on the arm's clock"
     panels = []
     for k, name in enumerate(arm.effects):
         drawing = Drawing("half")
         ax = drawing.axes[0]
-        for j in range(arm.logs[0].effects.shape[1]):
+        for j in range(used[0].effects.shape[1]):
             y, std = (
-                np.array([getattr(log, key)[k, j] for log in arm.logs])
+                np.array([getattr(log, key)[k, j] for log in used])
                 for key in ("effects", "effects_std")
             )
             look = ax.errorbar(days, y, std, color=joint_color(j), linewidth=1.0, elinewidth=0.6)

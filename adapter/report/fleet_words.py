@@ -35,6 +35,15 @@ def log_cells(log: OfLog) -> tuple[str, ...]:
     )
 
 
+def to_be_shown(arm: FleetArm, most: int) -> list[int]:
+    """Numbers of an arm's recordings: all, or of more than `most` those to say something of."""
+    if len(arm.logs) <= most:
+        return list(range(len(arm.logs)))
+    out = {x.number for x in arm.standing_out}
+    out |= {k for k, x in enumerate(arm.logs) if x.load is not None or x.disagrees}
+    return sorted(out)[:most]
+
+
 def begin_words(begin_s: float) -> str:
     """A date, or s where a clock counts from something else."""
     if begin_s < EPOCH_S:
@@ -55,7 +64,7 @@ def drift_words(drift: Drift) -> str:
     or_ = "".join(f" or {x}" for x in drift.rivals)
     doubt = "; these recordings cannot tell which" if drift.rivals else ""
     return (
-        f"{effect.title.lower()} of joint {drift.joint} follows {drift.follows}{or_}: "
+        f"{effect.title.capitalize()} of joint {drift.joint} follows {drift.follows}{or_}: "
         f"{drift.slope:+.3g} ± {drift.std:.2g} {unit} {per}, {drift.span:.3g} {unit} over all"
         f"{share}{doubt}"
     )
@@ -92,7 +101,7 @@ def sentences(arm: FleetArm) -> list[str]:
     if len(used) > 1:
         best = max(used, key=lambda x: x.worth)
         found.append(
-            f"the motion of {Path(best.moments.path).name} would teach most if repeated: standard "
+            f"The motion of {Path(best.moments.path).name} would teach most if repeated: standard "
             f"deviations would be {_less(best.worth)} less (geometric mean)"
         )
     return found

@@ -175,9 +175,9 @@ def test_sums_are_those_of_one_pass(fleet: Fleet, logs: Path, tmp_path: Path) ->
     std = np.sqrt(np.einsum("ab,ac,cb->b", shown, ours.outcome.covariance, shown))
     apart = np.abs(shown.T @ (ours.solution - once.solution)) / std
     assert np.max(apart) < 1e-9
-    known = ours.model.theta_std > 1e-9
-    apart = np.abs(ours.model.theta - once.model.theta)[known] / ours.model.theta_std[known]
-    assert np.max(apart) < 1e-8
+    sure = ours.model.theta_std > 1e-6  # below that is what rounding leaves of a zero
+    apart = np.abs(ours.model.theta - once.model.theta)[sure] / ours.model.theta_std[sure]
+    assert np.max(apart) < 1e-5  # a conic solver has looked for possible bodies
 
 
 def test_information_is_the_learners() -> None:
