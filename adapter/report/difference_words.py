@@ -29,7 +29,9 @@ def difference_matrix(found: ModelDifference) -> list[tuple[str, ...]]:
     """Rows under `MATRIX_HEADS`, a joint each, in order: what differs of its frame and of its link;
     none where nothing of these is listed."""
     cells = {(change.joint, change.what): _cell(change) for change in found.changes}
-    rows = [(joint, *(cells.get((joint, k), "") for k in (FRAME, BODY))) for joint in found.joints]
+    rows: list[tuple[str, ...]] = [
+        (joint, *(cells.get((joint, k), "") for k in (FRAME, BODY))) for joint in found.joints
+    ]
     return [row for row in rows if any(row[1:])]
 
 
@@ -51,7 +53,7 @@ def effect_rows(found: ModelDifference) -> list[tuple[str, ...]]:
         if change.what not in (FRAME, BODY) and _listed(change):
             groups.setdefault(change.what, []).append(change)
     order = {joint: k for k, joint in enumerate(found.joints)}
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for what, changes in groups.items():
         changes.sort(key=lambda change: order.get(change.joint, -1))
         said = "\n".join(f"{c.joint + ': ' if c.joint else ''}{_change_words(c)}" for c in changes)

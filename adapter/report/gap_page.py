@@ -20,6 +20,7 @@ from adapter.report.gap_tables import (
     correction_table,
     error_table,
     finding_rows,
+    joint_matrix,
     rival_rows,
     tied,
 )
@@ -76,6 +77,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "tiles": shown,
         "columns": max(len(shown), 1),
         "findings": finding_rows(result),
+        "matrix": joint_matrix(result),
         "carried": carried_table(result),
         "contradictions": [_first_capital(text) for text in result.contradictions],
         "told": told,

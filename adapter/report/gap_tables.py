@@ -8,7 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.gap.phrases import DASH, THETA, THETA_UNITS, parameter_lines, plain, who
+from adapter.gap.phrases import (
+    DASH,
+    THETA,
+    THETA_UNITS,
+    parameter_lines,
+    plain,
+    plus_minus,
+    shown_unit,
+    who,
+)
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
 from adapter.model.spatial import Array
@@ -61,10 +70,68 @@ def _row(findings: Sequence[Finding]) -> FindingRow:
         what=_first_capital(first.title),
         where=who(first.effect, joints),
         when=when,
-        values=[line for f in ordered for line in _values(f, alone)],
-        evidence=sure if alone or sure.startswith(">") else f"{sure} and more",
+        values=[RANGES.format(_ranges(ordered))]
+        if in_matrix(ordered)
+        else [line for f in ordered for line in _values(f, alone)],
+        evidence=sure if alone or least >= 0.999 else f"{sure} and more",
         worth=_worth(ordered),
     )
+
+
+RANGES = "{}; joint by joint below"
+
+
+def in_matrix(findings: Sequence[Finding]) -> bool:
+    """Whether findings of one effect stand joint by joint: numbers, one set for each of several
+    joints of the whole recording."""
+    joints = [f.joints[0] for f in findings if len(f.joints) == 1 and not f.recording]
+    numbers = all(np.ndim(value) == 0 for f in findings for value in f.parameters.values())
+    alike = len({tuple(f.parameters) for f in findings}) == 1
+    return numbers and alike and len(findings) > 1 and len(set(joints)) == len(findings)
+
+
+def _ranges(findings: Sequence[Finding]) -> str:
+    """Each parameter from its smallest to its largest."""
+    said = []
+    for key in findings[0].parameters:
+        factor, unit = _unit(findings, key)
+        values = [factor * float(f.parameters[key]) for f in findings]
+        low, high = plain(min(values), 2), plain(max(values), 2)
+        said.append(f"{key} = {low if low == high else f'{low} to {high}'} {unit}")
+    return tied(", ".join(said))
+
+
+def _unit(findings: Sequence[Finding], key: str) -> tuple[float, str]:
+    """(factor, name) of the unit in which a parameter of all of them is shown."""
+    largest = max((float(f.parameters[key]) for f in findings), key=abs)
+    return shown_unit(largest, findings[0].units.get(key, ""))
+
+
+def joint_matrix(result: GapResult) -> Table | None:
+    """What several joints have, a row per joint and a column per parameter of an effect; None
+    where no effect is of several."""
+    heads, units, columns = ["Joint"], [""], []
+    for findings in by_kind(result.findings):
+        if not in_matrix(findings):
+            continue
+        of = {f.joints[0]: f for f in findings}
+        for key in findings[0].parameters:
+            factor, unit = _unit(findings, key)
+            heads.append(_first_capital(findings[0].title))
+            units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
+            columns.append({j: _scaled_value(f, key, factor) for j, f in of.items()})
+    if not columns:
+        return None
+    rows = [
+        [name, *(column.get(j, DASH) for column in columns)]
+        for j, name in enumerate(result.joint_names, start=1)
+    ]
+    return Table(heads, rows, units)
+
+
+def _scaled_value(finding: Finding, key: str, factor: float) -> str:
+    value, std = finding.parameters[key], finding.std.get(key)
+    return tied(plus_minus(factor * value, None if std is None else factor * std))
 
 
 def _values(finding: Finding, alone: bool) -> list[str]:

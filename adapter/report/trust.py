@@ -187,7 +187,7 @@ def _feedforward(figures: Mapping[str, Any]) -> Check | None:
     helped = (tracking.get("feedforward") or {}).get("samples")
     if figures.get("feedforward") != "learned" or helped or "feedforward" not in tracking:
         return None
-    said = "asked for, but the learned model was not sure enough before the run ended"
+    said = "asked for, but no converged estimate reached the controller before the run ended"
     return Check(LOOK, "Feed-forward", said)
 
 

@@ -134,7 +134,9 @@ def test_page_tells_the_finding(pages: dict[str, str]) -> None:
 def test_findings_of_one_effect_are_one_row_and_one_line(pages: dict[str, str]) -> None:
     text = text_of(pages["many"])
     assert text.count("Coulomb friction joints 1 to 7 throughout") == 1
-    assert "joint 4: Fc = 0.450 ± 0.011 N m" in text
+    assert "Fc = 0.14 to 0.45 N m; joint by joint below" in text
+    assert "panda_joint4 0.450 ± 0.011 0.400 ± 0.020" in text  # a joint a row, an effect a column
+    assert "panda_joint3 0.140 ± 0.011 –" in text
     lines = console_summary(result_of("many"))
     assert sum("Coulomb friction" in line and "•" in line for line in lines) == 1
     assert any("joint 4: Fc = 0.450 ± 0.011 N m" in line for line in lines)
