@@ -17,7 +17,7 @@ from adapter.cli.common import effort_unit_of, robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_robot
 from adapter.effects.export import robot_urdf
-from adapter.errors import ModelError, UsageError
+from adapter.errors import MeansError, ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
 from adapter.gap.screen import RecordingRefused
 from adapter.gap.words import as_json, console_summary
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     nominal = robot_of(args, args.model)
     folder = results_folder(args.out, "gap")
     model_out = _new_model(folder, args.model)
-    rollouts = None if args.no_simulation else Rollouts(args.simulator)
+    rollouts = _rollouts(args)
     try:
         with _progress(args.quiet) as tell:
             result = find_gap(logs, nominal, settings, rollouts, model_out, tell)
@@ -69,9 +69,22 @@ def run(args: argparse.Namespace) -> int:
     result = replace(result, model_in=args.model)
     if rollouts is not None:
         notes = (*result.notes, *rollouts.troubles)
-        result = replace(_without_empty_rollouts(result), notes=notes, simulator=args.simulator)
+        result = replace(_without_empty_rollouts(result), notes=notes, simulator=rollouts.simulator)
     _conclude(args, folder, result)
     return 0
+
+
+def _rollouts(args: argparse.Namespace) -> Rollouts | None:
+    """What simulates, where it is wanted and there. Raises MeansError for one that was named."""
+    if args.no_simulation:
+        return None
+    try:
+        return Rollouts(args.simulator or "pybullet")
+    except MeansError as error:
+        if args.simulator is not None:
+            raise
+        warn([f"torques are compared, and nothing is simulated: {error}"])
+        return None
 
 
 def _opened(

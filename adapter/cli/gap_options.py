@@ -72,9 +72,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     add(
         "--simulator",
-        default="pybullet",
         choices=("pybullet", "mujoco"),
-        help="of the forward simulation (default pybullet; mujoco is the extra [mujoco])",
+        help="of the forward simulation (default pybullet where it is installed, extra [sim]; "
+        "mujoco is the extra [mujoco])",
     )
     add("--no-simulation", action="store_true", help="compare torques only")
     add_results(parser)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from adapter import optional
 from adapter.errors import ModelError, SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -67,6 +68,8 @@ class Rollouts:
             raise SettingsError(f"no simulator '{simulator}'; {choices(simulator, SIMULATORS)}")
         if simulator == "mujoco":
             library()
+        else:
+            optional.load("pybullet")
         self.simulator, self.troubles = simulator, list[str]()
 
     def __call__(

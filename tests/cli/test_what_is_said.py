@@ -66,7 +66,7 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
     piped = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **piped) as process:
         process.stdout.close()
-        assert process.stderr.read() == ""
+        assert process.stderr.read() == "reading m.json ...\n"
         assert process.wait(60) == 0
 
 
