@@ -192,22 +192,25 @@ class Onlooker:
         findings = [self._on_run_clock(found, view) for found in news.get("findings", [])]
         load = news.get("load")
         stamp_ns = max(self._stamp_ns, 0 if view.push is None else view.push.stamp_ns)
+        q, dq, tau = self._last
         return Now(
-            view,
-            stamp_ns,
-            1e-9 * (stamp_ns - view.began_ns) if stamp_ns and view.began_ns else 0.0,
-            *self._last,
-            residual,
-            rms,
-            noise,
-            self._learned_frames(snapshot),
-            lam,
-            theta,
-            None if load is None else self._on_run_clock(load, view),
-            findings,
-            joint_words(view, findings, (rms, noise), theta),
-            headline(view, (lam, theta), self.known.documented.tree),
-            self._lately(view),
+            view=view,
+            stamp_ns=stamp_ns,
+            t_s=1e-9 * (stamp_ns - view.began_ns) if stamp_ns and view.began_ns else 0.0,
+            q=q,
+            dq=dq,
+            tau=tau,
+            residual=residual,
+            rms=rms,
+            noise=noise,
+            frames=self._learned_frames(snapshot),
+            lam_state=lam,
+            theta_state=theta,
+            load=None if load is None else self._on_run_clock(load, view),
+            findings=findings,
+            joint_states=joint_words(view, findings, (rms, noise), theta),
+            headline=headline(view, (lam, theta), self.known.documented.tree),
+            lately=self._lately(view),
         )
 
     def _on_run_clock(self, told: dict[str, Any], view: View) -> dict[str, Any]:

@@ -151,7 +151,10 @@ def added(parts: list[LoopTiming]) -> LoopTiming:
 
 
 def wake(pid: int) -> None:
-    """Give all threads of a process ordinary priority."""
+    """Give all threads of a view ordinary priority, once it has given its own away."""
+    end = time.monotonic() + START_S
+    while os.sched_getscheduler(pid) != os.SCHED_IDLE and time.monotonic() < end:
+        time.sleep(0.05)
     for thread in Path(f"/proc/{pid}/task").iterdir():
         os.sched_setscheduler(int(thread.name), os.SCHED_OTHER, os.sched_param(0))
         os.setpriority(os.PRIO_PROCESS, int(thread.name), 0)
