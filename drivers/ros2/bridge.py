@@ -54,6 +54,7 @@ LOOK_S = 0.25  # between two looks at who else commands
 FASTEST, JUMP_RAD = 30.0, 0.05  # rad/s, rad: no joint is further on than that
 JUMPS = 20  # in a row are no disturbance: the arm is somewhere else
 RATE_SHARE = 0.1
+LEAST_HZ = 800  # below, what brakes the arm (`holding`) does not hold it against its weight
 PRIORITY = 75  # SCHED_FIFO; above the loop, which waits for what is delivered here
 BRAKES = (Doing.BRAKING, Doing.HOLDING)
 
@@ -255,7 +256,13 @@ class Bridge:
         return np.array([limits.get(name, np.inf) for name in joints])
 
     def _check_command(self, commands: Publication) -> None:
-        topic = self._start.settings.command
+        topic, where = self._start.settings.command, self._start.settings
+        if where.hz < LEAST_HZ and not where.gravity:
+            raise DriverError(
+                f"at {where.hz:.0f} Hz an arm cannot be held by torques that carry its weight: "
+                f"controller_manager's update_rate has to be {LEAST_HZ} or more, or the arm has to "
+                "carry its own weight (gravity=1)"
+            )
         others = self._others(commands)
         if others:
             raise DriverError(
@@ -347,7 +354,7 @@ class Bridge:
         with self._lock:
             doing = self._memory.doing
             if doing not in BRAKES:
-                self._braker.listen(values[2])
+                self._braker.listen(values[1], values[2])
                 return
             self._send(self._braker.torques(*values))
             if self._braker.standing:

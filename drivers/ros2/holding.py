@@ -1,13 +1,15 @@
 """How a moving arm is braked and then held by torques alone.
 
 A controller of ros2_control that takes efforts goes on with the last one it was given, for ever,
-and knows no brake. So whoever commands it has to bring the arm to a stand: its weight is carried
-by the torque measured last, speed is damped, and once it is slow its place is held by a soft
-spring. What the spring then holds up becomes part of the torque that carries.
+and knows no brake. So whoever commands it has to bring the arm to a stand: from the speeds that it
+has its joints follow a path that slows down evenly to zero, and then stay where it ends. The torque
+measured last carries the arm's weight; what the weight has become on the way is found by a spring
+and its integral. Once the arm stands, the torque that carries is measured anew, and the spring is
+soft: an arm that is kept away is not pushed for good.
 
 Gains go by each joint's largest torque and by how often the arm is heard: a joint that its drive
-can accelerate by some 2500 rad/s² and more has no more than a 2500th of it as inertia, and damping
-that takes away a fifth of the speed in one period is stable with a period or two of delay.
+could accelerate by `MOST_ACCELERATION` has that much less inertia, and damping that takes away
+`DAMPED_SHARE` of the speed in one period is stable with a delay of a few periods.
 """
 
 from __future__ import annotations
@@ -17,12 +19,13 @@ import numpy as np
 from drivers.interface import Array
 
 MOST_ACCELERATION = 2500.0  # rad/s² that the largest torque gives to the lightest joint
-DAMPED_SHARE = 0.2  # of the speed, in one period
-SPRING_RATE = 5.0  # 1/s: stiffness over damping
-SPRING_SHARE = 0.15  # of the largest torque: an arm that is kept away is not pushed for good
+DAMPED_SHARE = 0.3  # of the speed, in one period
+SPRING_RATE, INTEGRAL_RATE = 10.0, 1.5  # 1/s: stiffness over damping, integral over stiffness
+BRAKE_S = 0.25  # from the speed it has to a stand
+SOFT_SHARE = 0.15  # of the largest torque, that the spring of an arm at rest may have
 SLOW, SLOW_S = 0.05, 0.1  # rad/s, s: then it stands
-DAMP_AT_MOST_S = 1.0  # an arm that still drifts then is held nevertheless
-CARRY_S = 0.02  # torques measured are averaged over so long
+SETTLE_AT_MOST_S = 2.0  # an arm that still moves then is held nevertheless
+CARRY_S = 0.02  # speeds and torques measured are averaged over so long
 
 
 class Braker:
@@ -41,51 +44,63 @@ class Braker:
         self.effort, self._period_s, self._gravity = effort, period_s, gravity
         self._kd = DAMPED_SHARE * effort / MOST_ACCELERATION / max(period_s, 1e-3)
         self._kp = SPRING_RATE * self._kd
-        self._mean: Array | None = None
+        self._mean: Array | None = None  # [dq, tau] (2, n)
         self._begin()
 
     def _begin(self) -> None:
-        self._hold: Array | None = None
-        self._carry: Array | None = None
+        self._goal: Array | None = None  # (n,) where the joints should be, rad
+        self._integral = self._speed = self._carry = np.zeros(len(self.effort))
+        self._standing = False
         self._braked_s = self._slow_s = 0.0
 
     @property
     def standing(self) -> bool:
         """Whether it holds its place."""
-        return self._hold is not None
+        return self._standing
 
     def release(self) -> None:
         """Somebody else drives the arm from here on."""
         self._begin()
 
-    def listen(self, tau: Array) -> None:
-        """Torques (n,) measured while somebody else drives."""
-        share = min(self._period_s / CARRY_S, 1.0)
-        before = tau if self._mean is None else self._mean
-        self._mean = before + share * (tau - before)
+    def listen(self, dq: Array, tau: Array) -> None:
+        """Speeds and torques (n,) measured; while somebody else drives, too."""
+        now, share = np.stack([dq, tau]), min(self._period_s / CARRY_S, 1.0)
+        self._mean = now if self._mean is None else self._mean + share * (now - self._mean)
 
     def blind(self) -> Array:
         """Torques (n,) for an arm that is not heard any more: what carried it."""
-        carried = self._mean if self._carry is None else self._carry
-        if self._gravity or carried is None:
+        if self._gravity or self._mean is None:
             return np.zeros(len(self.effort))
-        return np.clip(carried, -self.effort, self.effort)
+        return np.clip(self._mean[1], -self.effort, self.effort)
 
     def torques(self, q: Array, dq: Array, tau: Array) -> Array:
         """The next torques (n,) N m; one call for each state (n,) rad, rad/s, N m."""
-        if self._carry is None:
-            measured = tau if self._mean is None else self._mean
-            self._carry = np.zeros_like(q) if self._gravity else measured
-        self.listen(tau)
+        if self._goal is None:
+            self._goal = q
+            self._speed, carry = (dq, tau) if self._mean is None else self._mean
+            self._carry = np.zeros_like(q) if self._gravity else carry
+        self.listen(dq, tau)
         self._braked_s += self._period_s
+        speed = max(1.0 - self._braked_s / BRAKE_S, 0.0) * self._speed
+        self._goal = self._goal + speed * self._period_s
+        self._look_whether_it_stands(q, dq)
+        away, most = self._goal - q, self.effort
+        if self._standing:
+            most = SOFT_SHARE * self.effort
+        self._integral = np.clip(
+            self._integral + INTEGRAL_RATE * self._kp * away * self._period_s, -most, most
+        )
+        spring = np.clip(self._kp * away + self._integral, -most, most)
+        wanted = self._carry + spring + self._kd * (speed - dq)
+        return np.clip(wanted, -self.effort, self.effort)
+
+    def _look_whether_it_stands(self, q: Array, dq: Array) -> None:
         slow = bool((np.abs(dq) < SLOW).all())
         self._slow_s = self._slow_s + self._period_s if slow else 0.0
-        if self._hold is None and (self._slow_s >= SLOW_S or self._braked_s >= DAMP_AT_MOST_S):
-            self._hold = q
-            if slow and not self._gravity and self._mean is not None:
-                self._carry = self._mean  # what stands is carried by what is measured
-        wanted = self._carry - self._kd * dq
-        if self._hold is not None:
-            most = SPRING_SHARE * self.effort
-            wanted = wanted + np.clip(self._kp * (self._hold - q), -most, most)
-        return np.clip(wanted, -self.effort, self.effort)
+        if self._standing or self._braked_s < BRAKE_S:
+            return
+        if self._slow_s >= SLOW_S or self._braked_s >= SETTLE_AT_MOST_S:
+            self._standing = True
+            if slow and self._mean is not None:
+                self._goal, self._integral = q, np.zeros(len(q))
+                self._carry = np.zeros_like(q) if self._gravity else self._mean[1]

@@ -20,6 +20,7 @@ from drivers.ros2.holding import Braker  # noqa: E402
 from drivers.ros2.memory import REFUSED, Doing, Memory, Refusal  # noqa: E402
 from drivers.ros2.settings import parse  # noqa: E402
 from sim.ros2.messages import Float64MultiArray, Header, JointState, Layout, Time  # noqa: E402
+from sim.scenarios import build  # noqa: E402
 from tests.helpers.hardware_rigs import PANDA_JOINTS, free_domain, ros2_arm  # noqa: E402
 from tests.helpers.patience import patient_read, patiently  # noqa: E402
 
@@ -102,26 +103,30 @@ def test_what_cannot_be_is_refused_and_counted():
     assert far[:JUMPS] == [None] * JUMPS and states.jumps == 0 and far[JUMPS] is not None
 
 
-@pytest.mark.parametrize("period_s", [0.001, 0.01])
-@pytest.mark.parametrize("gravity", [True, False])
-def test_the_brake_holds_light_and_heavy_joints(period_s, gravity):
-    """Flywheels with a weight, a command late by one period and a half."""
-    inertia, effort = np.array([1.5, 0.006]), np.array([87.0, 12.0])
-    weight = np.zeros(2) if gravity else np.array([20.0, 1.0])
-    q, dq = np.zeros(2), np.array([1.0, -2.0])
-    braker = Braker(effort, period_s, gravity)
-    braker.listen(weight)
-    pending = [weight, weight]
-    step, late = period_s / 4, weight
-    for k in range(round(3.0 / step)):
-        if k % 4 == 0:
-            pending.append(braker.torques(q.copy(), dq.copy(), late))
-        if k % 4 == 2:
-            late = pending.pop(0)
-        dq = dq + step * (late - weight) / inertia
-        q = q + step * dq
-    # At 100 Hz damping is a tenth, so that the light joint stays stable: the heavy one takes long.
-    assert np.abs(dq).max() < (0.02 if period_s == 0.001 else 0.5) and (np.abs(q) < 2.0).all()
+@pytest.mark.parametrize(("seed", "delay"), [(1, 3), (3, 1)])
+def test_a_moving_arm_is_braked_and_held(seed, delay):
+    """The simulated arm without a wire: torques act some periods late, its weight shifts."""
+    plant, rng = build("nominal", seed).plant(substeps=2), np.random.default_rng(seed)
+    sample, speed = plant.read(), rng.uniform(-0.6, 0.6, 7)
+    start, stiff = sample.q, np.array([100, 100, 80, 80, 20, 15, 5.0])
+    braker = Braker(plant.truth.limits.effort, 1e-3, gravity=False)
+    for k in range(600):
+        weight = plant._engine.drive_for(sample.q, sample.dq, np.zeros(7))
+        away = start + 1e-3 * k * speed - sample.q
+        plant.command(weight + stiff * away + 0.15 * stiff * (speed - sample.dq))
+        sample = plant.read()
+        braker.listen(sample.dq, sample.tau)
+    assert np.abs(sample.dq).max() > 0.4
+    begun, standing, pending = sample.q, sample.q, [sample.tau] * delay
+    for k in range(3000):
+        pending.append(braker.torques(sample.q, sample.dq, sample.tau))
+        plant.command(pending.pop(0))
+        sample = plant.read()
+        standing = sample.q if k == 1500 else standing
+    assert plant.fault is None and braker.standing
+    assert np.abs(standing - begun).max() < 0.15
+    assert np.abs(sample.q - standing).max() < 0.005 and np.abs(sample.dq).max() < 0.05
+    plant.close()
 
 
 @pytest.mark.alone
@@ -244,8 +249,13 @@ def test_without_limits_nothing_moves():
         arm = Ros2Arm(address, PANDA_JOINTS, True)
         with pytest.raises(DriverError, match=r"no largest torque is known .*say effort=87"):
             arm.connect()
-        with connected(address + "&effort=87,87,87,87,12,12,12") as told:
-            assert told.period_ns == 4_000_000 and told.read().q.shape == (7,)
+        told = Ros2Arm(address + "&effort=87,87,87,87,12,12,12", PANDA_JOINTS, True)
+        with pytest.raises(DriverError, match="at 250 Hz an arm cannot be held by torques"):
+            told.connect()
+        listener = Ros2Arm(address, PANDA_JOINTS, False)
+        patiently(listener.connect, listener.close)
+        assert listener.period_ns == 4_000_000 and listener.read().q.shape == (7,)
+        listener.close()
 
 
 def test_nobody_is_there():
