@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
-from drivers.files.mcap import Log, McapWriter, StoredLog, open_log, read_log
+from drivers.files.mcap import Log, McapWriter, StoredLog, open_log, read_log, records
 
 NAMES = ("a", "b", "c")
 
@@ -90,3 +92,25 @@ def test_commands_that_run_backwards_come_in_memory(tmp_path: Path) -> None:
             writer.write_joint_state(i, *np.zeros((3, 3)))
             writer.write_command(-i + 10, np.ones(3))
     assert isinstance(open_log(path, in_memory=0), Log)
+
+
+def test_messages_outside_of_chunks_come_in_several_regions(tmp_path: Path, monkeypatch) -> None:
+    chunked, flat = write(tmp_path / "log.mcap", 2_000), tmp_path / "flat.mcap"
+    with chunked.open("rb") as source, flat.open("wb") as out:
+        writer = Writer(out, use_chunking=False)
+        writer.start(profile="ros2")
+        numbers: dict[int, int] = {}
+        for schema, channel, message in make_reader(source).iter_messages(log_time_order=False):
+            if channel.id not in numbers:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+            number = numbers[channel.id]
+            writer.add_message(number, message.log_time, message.data, message.publish_time)
+        writer.finish()
+    monkeypatch.setattr(records, "_TOGETHER", 700)
+    assert len(list(records.McapScan(flat).regions())) == 5  # 3000 messages
+    ours, theirs = read_log(flat), read_log(chunked)
+    assert np.array_equal(ours.q, theirs.q) and ours.warnings == [
+        text.replace(str(chunked), str(flat)) for text in theirs.warnings
+    ]

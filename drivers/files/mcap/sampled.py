@@ -140,6 +140,7 @@ class _Part(McapScan):
         """The messages of the chosen chunks."""
         self._made = 0
         for place in self.chosen:
+            self._give_back(place)
             size = self.size - place
             if size < HEAD or self._data[place] != Opcode.CHUNK:
                 self.sound = False
