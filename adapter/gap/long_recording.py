@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.base import Motion
-from adapter.gap.screen import at_source, rows_of
+from adapter.gap.screen import RecordingFault, RecordingRefused, at_source, rows_of
 from adapter.gap.signals import (
     DECIMATION,
     EDGE_S,
@@ -42,6 +42,7 @@ from drivers.files.rows import RowsFile
 
 LONG_S = 60.0  # what is longer is searched in stretches
 PIECE_S = 30.0  # of a recording that is worked on at once
+FEWEST, FIRST = 1000, 4096  # samples of a piece; by which the usual step is told
 AHEAD = 200  # samples behind a piece that are looked at: is the last stamp one far ahead?
 OVERLAP_S = 2.0  # by which splines reach over a piece; their memory is some 0.1 s
 HOLE_S = 0.5  # without samples: nobody knows how the arm moved, the motion is cut there
@@ -261,14 +262,22 @@ def _banded(motion: Motion, tau: Array, noise: Array, begins: tuple[int, ...]) -
 
 
 def is_long(log: AnyLog) -> bool:
-    """Whether a recording is searched in stretches."""
-    return len(log) > 0 and 1e-9 * (log.end_ns - log.begin_ns) > LONG_S
+    """Whether a recording is searched in stretches: by its samples, for one stamp may be wrong."""
+    if len(log) < FEWEST or 1e-9 * (log.end_ns - log.begin_ns) <= LONG_S:
+        return False
+    return len(log) * _step_s(log) > LONG_S
 
 
 def surveyed(log: AnyLog) -> Survey:
-    """A first look at a recording with the joints of its model."""
-    clocks, pieces, windows = [], [], None
-    begin_ns = None
+    """A first look at a recording with the joints of its model.
+
+    Raises:
+        RecordingRefused: no sample of it is usable.
+    """
+    clocks: list[RecordingClock] = []
+    pieces: list[Span] = []
+    begin_ns, end_ns = _ends(log)
+    windows = _Windows(1e-9 * (end_ns - begin_ns), len(log.joint_names))
     for k in range(_count(log)):
         raw, rows = _read(log, k)
         clock = check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau)
@@ -276,9 +285,6 @@ def surveyed(log: AnyLog) -> Survey:
             continue
         own = rows_of(raw, rows)
         own, clock, _ = at_source(own, clock)
-        if begin_ns is None:
-            begin_ns = int(own.stamp_ns[0])
-            windows = _Windows(begin_ns, 1e-9 * (log.end_ns - begin_ns), len(log.joint_names))
         t = 1e-9 * (own.stamp_ns - begin_ns)
         clocks.append(clock)
         pieces.append((float(t[0]), float(t[-1])))
@@ -293,8 +299,7 @@ def surveyed(log: AnyLog) -> Survey:
 class _Windows:
     """Windows of a recording and what moves in them."""
 
-    def __init__(self, begin_ns: int, seconds: float, n: int) -> None:
-        self.begin_ns = begin_ns
+    def __init__(self, seconds: float, n: int) -> None:
         self.every = max(STRETCH_S, seconds / MOST_WINDOWS)
         count = max(int(seconds / self.every), 1)
         self.moments = np.zeros((count, 2 * n + 1, 2 * n + 1))
@@ -306,7 +311,7 @@ class _Windows:
     def take(self, t: Array, log: Log, rows: np.ndarray, period_s: float) -> None:
         """Take a piece: t (m,) s, and which rows of the whole its samples are."""
         place = (t // self.every).astype(int)
-        inside = (place < len(self.seen)) & (t - place * self.every < STRETCH_S)
+        inside = (place >= 0) & (place < len(self.seen)) & (t - place * self.every < STRETCH_S)
         step = max(round(EVERY_S / period_s), 1)
         for w in np.unique(place[inside]):
             own = np.flatnonzero(inside & (place == w))
@@ -326,20 +331,38 @@ class _Windows:
         there = self.rows[:, 0] >= 0
         counts = np.maximum(self.moments[:, :1, :1], 1.0)
         moments = self.moments / counts
-        moments[self.seen < WHOLE_SHARE * STRETCH_S] = np.nan
+        moments[self.seen < WHOLE_SHARE * self.seen.max()] = np.nan
         begin = self.every * np.arange(len(self.seen))
         windows = np.column_stack([begin, begin + STRETCH_S])
         return windows[there], self.rows[there], moments[there]
 
 
+def _step_s(log: AnyLog) -> float:
+    """The usual step between stamps."""
+    steps = np.diff(log.piece(0, FIRST).stamp_ns)
+    return 1e-9 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+
+
 def _size(log: AnyLog) -> int:
     """Samples of a piece."""
-    seconds = 1e-9 * (log.end_ns - log.begin_ns)
-    return max(int(PIECE_S * len(log) / seconds), 1000)
+    return max(round(PIECE_S / _step_s(log)), FEWEST)
 
 
 def _count(log: AnyLog) -> int:
     return int(np.ceil(len(log) / _size(log)))
+
+
+def _ends(log: AnyLog) -> tuple[int, int]:
+    """The first usable stamp and the last, ns. Raises RecordingRefused."""
+    kept = (raw.stamp_ns[rows] for raw, rows in (_read(log, k) for k in range(_count(log))))
+    first = next((x for x in kept if len(x)), None)
+    back = (_read(log, k) for k in reversed(range(_count(log))))
+    last = next((raw.stamp_ns[rows] for raw, rows in back if len(rows)), None)
+    if first is None or last is None:
+        raise RecordingRefused(
+            RecordingFault.DATA, f"{log.path}: none of its {len(log)} samples is usable"
+        )
+    return int(first[0]), int(last[-1])
 
 
 def _read(log: AnyLog, k: int) -> tuple[Log, np.ndarray]:
