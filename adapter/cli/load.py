@@ -10,7 +10,7 @@ from adapter.gap.load_words import as_json, robot_lines, sentence
 from adapter.gap.torque_gains import in_newton_metres
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
-from drivers.files.mcap import open_log
+from drivers.files.mcap import Log, open_log
 
 
 def run(args: argparse.Namespace) -> int:
@@ -19,8 +19,12 @@ def run(args: argparse.Namespace) -> int:
     log = open_log(args.log, topic=args.topic)
     empty = None if args.empty is None else open_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
+    unit = effort_unit_of(args)
     given = [log] if empty is None else [log, empty]
-    (log, *others), gains = in_newton_metres(given, robot, effort_unit_of(args), given[1:])
+    if unit.learn:  # from all samples at once
+        given = [x if isinstance(x, Log) else x.in_memory() for x in given]
+    taught = [x for x in given[1:] if isinstance(x, Log)]
+    (log, *others), gains = in_newton_metres(given, robot, unit, taught)
     warn([] if gains is None else [*gains.notes, *gains.words()])
     empty = others[0] if others else None
     load = find_load(log, robot, empty, args.frame, args.inertia_prior)

@@ -136,7 +136,9 @@ class Windows:
         best = int(np.argmax(gain))
         return float(gain[best]), int(places[best])
 
-    def _gain(self, begin: int, end: int, places: Sequence[int], at: Any = slice(None)) -> Array:
+    def _gain(
+        self, begin: int, end: int, places: Sequence[int] | np.ndarray, at: Any = slice(None)
+    ) -> Array:
         """What changes before some of the windows from `begin` to `end` explain, each alone.
 
         Args:

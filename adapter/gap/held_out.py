@@ -125,8 +125,8 @@ def rollout_errors(
     """
     if len(recording.begins) > 1:
         parts = [rollout_errors(x, before, after, simulate, block) for x in recording.stretches()]
-        errors = (np.concatenate([x[k] for x in parts]) for k in range(4))
-        return RolloutErrors(*errors, curves=_in_turn([x.curves for x in parts]))
+        first, second, third, fourth = (np.concatenate([x[k] for x in parts]) for k in range(4))
+        return RolloutErrors(first, second, third, fourth, _in_turn([x.curves for x in parts]))
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.effects.base import Motion
+from adapter.effects.base import ArmDynamics, Motion
 from adapter.gap.screen import RecordingFault, RecordingRefused, at_source, rows_of
 from adapter.gap.signals import (
     DECIMATION,
@@ -36,7 +36,6 @@ from adapter.gap.signals import (
 )
 from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import AnyLog, Log
 from drivers.files.rows import RowsFile
 
@@ -113,17 +112,17 @@ class Run(NamedTuple):
     """Smooth motion without a hole.
 
     Attributes:
-        begin_s: of its first row; first: row in the file; count: rows.
+        begin_s: of its first row; first: row in the file; length: rows.
     """
 
     begin_s: float
     first: int
-    count: int
+    length: int
 
     @property
     def samples(self) -> int:
         """Samples of the band in it, trimmed at its ends."""
-        return (self.count - TAPS) // DECIMATION + 1 - 2 * TRIM
+        return (self.length - TAPS) // DECIMATION + 1 - 2 * TRIM
 
     def t(self, sample: int) -> float:
         """When a sample of the band is, s."""
@@ -163,7 +162,7 @@ class LongRecording:
         """How much of it there is."""
         return sum(max(run.samples, 0) for run in self.runs) * DECIMATION / RATE_HZ
 
-    def signals(self, spans: Sequence[Span], arm: RigidArm) -> Signals:
+    def signals(self, spans: Sequence[Span], arm: ArmDynamics) -> Signals:
         """Some stretches of it, as the search sees a recording."""
         motions, tau = [], []
         for run, begin, end in self._samples(spans):
@@ -172,9 +171,9 @@ class LongRecording:
             tau.append(torque)
         noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
         bands = np.max([bands_of(motion, noise) for motion in motions], axis=0)
-        whole = {k: np.concatenate([getattr(m, k) for m in motions]) for k in _MOTION}
+        t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in _MOTION)
         begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
-        motion = Motion(**whole, arm=arm, bands_hz=bands)
+        motion = Motion(t, q, dq, ddq, arm, bands_hz=bands)
         return _banded(motion, np.concatenate(tau), noise, begins)
 
     def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
@@ -197,15 +196,14 @@ class LongRecording:
         spans = self.near(spans)
         parts = [self.samples(begin - SCORED_EDGE_S, end + SCORED_EDGE_S) for begin, end in spans]
         begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
-        whole = {k: np.concatenate([getattr(x, k) for x in parts]) for k in ("t", "q", "dq", "tau")}
-        own = replace(parts[0], name=name, begins=tuple(map(int, begins)), whole=self, **whole)
-        own = replace(own, spans=tuple(spans))
-        if all(x.commands is not None for x in parts):
-            for key in ("command_t", "commands"):
-                own = replace(own, **{key: np.concatenate([getattr(x, key) for x in parts])})
-            _, first = np.unique(own.command_t, return_index=True)
-            own = replace(own, command_t=own.command_t[first], commands=own.commands[first])
-        return own
+        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in parts]) for k in _RAW)
+        own = replace(parts[0], name=name, t=t, q=q, dq=dq, tau=tau, whole=self)
+        own = replace(own, begins=tuple(map(int, begins)), spans=tuple(spans))
+        if any(x.commands is None for x in parts):
+            return own
+        at, commands = (np.concatenate([getattr(x, k) for x in parts]) for k in _COMMANDS)
+        _, first = np.unique(at, return_index=True)
+        return replace(own, command_t=at[first], commands=commands[first])
 
     def near(self, spans: Sequence[Span]) -> list[Span]:
         """Stretches as they are in the motion: cut at its holes, those that touch in one."""
@@ -226,10 +224,10 @@ class LongRecording:
                 out.append((run, a, b))
         return out
 
-    def _motion(self, rows: tuple[int, int], run: Run, arm: RigidArm) -> tuple[Motion, Array]:
-        q, dq, ddq, tau = np.split(self.table.rows(*rows), 4, axis=1)
+    def _motion(self, rows: tuple[int, int], run: Run, arm: ArmDynamics) -> tuple[Motion, Array]:
+        q, dq, ddq, tau = map(np.ascontiguousarray, np.split(self.table.rows(*rows), 4, axis=1))
         t = run.begin_s + np.arange(rows[0] - run.first, rows[1] - run.first) / RATE_HZ
-        return Motion(t, *(np.ascontiguousarray(x) for x in (q, dq, ddq)), arm=arm), tau
+        return Motion(t, q, dq, ddq, arm), tau
 
     def samples(self, begin_s: float, end_s: float) -> Recorded:
         """Samples of a time, as they were recorded."""
@@ -240,18 +238,18 @@ class LongRecording:
         whole = [Recorded.of(x, self.dq_late_s, self.survey.begin_ns) for x in parts]
         t = np.concatenate([x.t for x in whole])
         rows = np.flatnonzero((t >= begin_s) & (t <= end_s) & np.append(True, np.diff(t) > 0))
-        kept = {k: np.concatenate([getattr(x, k) for x in whole])[rows] for k in _RAW}
-        own = replace(whole[0], **kept)
-        if all(x.commands is not None for x in whole):
-            at = np.concatenate([x.command_t for x in whole])
-            inside = (at >= begin_s - HOLE_S) & (at <= end_s + HOLE_S)
-            commands = np.concatenate([x.commands for x in whole])[inside]
-            return replace(own, command_t=at[inside], commands=commands)
-        return replace(own, command_t=None, commands=None)
+        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in whole])[rows] for k in _RAW)
+        own = replace(whole[0], t=t, q=q, dq=dq, tau=tau)
+        if any(x.commands is None for x in whole):
+            return replace(own, command_t=None, commands=None)
+        at, commands = (np.concatenate([getattr(x, k) for x in whole]) for k in _COMMANDS)
+        inside = (at >= begin_s - HOLE_S) & (at <= end_s + HOLE_S)
+        return replace(own, command_t=at[inside], commands=commands[inside])
 
 
 LEAST_SAMPLES = round(LEAST_S * RATE_HZ / DECIMATION)
 _MOTION, _RAW = ("t", "q", "dq", "ddq"), ("t", "q", "dq", "tau")
+_COMMANDS = "command_t", "commands"
 
 
 def _banded(motion: Motion, tau: Array, noise: Array, begins: tuple[int, ...]) -> Signals:
@@ -285,7 +283,7 @@ def surveyed(log: AnyLog) -> Survey:
             continue
         own = rows_of(raw, rows)
         own, clock, _ = at_source(own, clock)
-        t = 1e-9 * (own.stamp_ns - begin_ns)
+        t = 1e-9 * (own.stamp_ns - begin_ns).astype(np.float64)
         clocks.append(clock)
         pieces.append((float(t[0]), float(t[-1])))
         windows.take(t, own, rows + k * _size(log), clock.period_s)
@@ -389,7 +387,7 @@ def _pieces(log: AnyLog, survey: Survey) -> Iterator[tuple[Array, Array, Array, 
         if not len(own):
             continue
         own = at_source(own, check_timing(own.stamp_ns, own.q, own.dq, own.tau))[0]
-        t = 1e-9 * (own.stamp_ns - survey.begin_ns)
+        t = 1e-9 * (own.stamp_ns - survey.begin_ns).astype(np.float64)
         kept = t > last
         if kept.any():
             last = float(t[-1])
@@ -405,7 +403,8 @@ class _Smoother:
 
     def __init__(self, smoothness: Smoothness, dq_late_s: float, n: int) -> None:
         self.smoothness, self.late = smoothness, dq_late_s
-        self.table, self.runs = RowsFile(4 * n), []
+        self.table = RowsFile(4 * n)
+        self.runs: list[Run] = []
         self._kept: list[tuple[Array, ...]] = []
         self._begin, self._done, self._first = 0.0, 0, 0
 
@@ -452,7 +451,8 @@ class _Smoother:
             int(np.floor((part[0] - self._begin) / KNOT_S)),
             int(np.ceil((part[-1] - self._begin) / KNOT_S)) + 1,
         )
-        splines = Splines.through(part, q[used], dq[used], self.late, self._begin + KNOT_S * knots)
+        inner = self._begin + KNOT_S * knots.astype(np.float64)
+        splines = Splines.through(part, q[used], dq[used], self.late, inner)
         count = int(np.ceil((end_s - self._next()) * RATE_HZ - 1e-9))
         grid = self._begin + EDGE_S + (self._done + np.arange(count)) / RATE_HZ
         told = splines.smoothed(self.smoothness).at(grid)

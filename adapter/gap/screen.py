@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TypeVar
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import Log, StoredLog
+from drivers.files.mcap import AnyLog, Log, StoredLog
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
@@ -36,9 +36,6 @@ FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias
 NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
 EDGE = 300  # ms at either end, where the filter has no neighbours
-
-
-LogOrStored = TypeVar("LogOrStored", Log, StoredLog)
 
 
 class RecordingFault(StrEnum):
@@ -180,7 +177,15 @@ def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
     )
 
 
-def of_this_robot(log: LogOrStored, model: SelfModel) -> LogOrStored:
+@overload
+def of_this_robot(log: Log, model: SelfModel) -> Log: ...
+
+
+@overload
+def of_this_robot(log: StoredLog, model: SelfModel) -> StoredLog: ...
+
+
+def of_this_robot(log: AnyLog, model: SelfModel) -> AnyLog:
     """A recording with the joints of the model in its order. Raises Refusal: another robot."""
     try:
         return matching(log, model)
@@ -192,7 +197,7 @@ def of_this_robot(log: LogOrStored, model: SelfModel) -> LogOrStored:
 
 
 def _another_robot(
-    log: Log, model: SelfModel, recorded: Sequence[str], why: str
+    log: AnyLog, model: SelfModel, recorded: Sequence[str], why: str
 ) -> RecordingRefused:
     return RecordingRefused(
         RecordingFault.ROBOT,

@@ -175,6 +175,7 @@ def _unless_trusted(
 def _total(found: Found) -> float:
     """ln of what the data are worth under what was found and its own noise, its names paid."""
     fit, known, width = found.fit, found.carried, 0.0
+    assert isinstance(known, Carried)  # while it is searched; moments come after it
     for noise, weight, own in zip(fit.noise, fit.weights, fit.recordings, strict=True):
         # around dates and seams none counts: as if they were as usual
         rows = (weight if len(own.begins) == 1 else weight * own.counted)[ORDER:]

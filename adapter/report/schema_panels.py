@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
@@ -21,7 +23,11 @@ from adapter.report.style import (
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
-DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.3)))  # x, y, z
+DASHES: tuple[tuple[float, Sequence[float]], ...] = (  # x, y, z
+    (0, ()),
+    (0, (4, 1.5)),
+    (0, (1, 1.3)),
+)
 SHOWN_S, SHOWN_FACTOR = 3.0, 2.5  # values: so long, or so many times the time to converge
 FIRST_S = 0.05  # left end of a logarithmic time axis
 LOWEST = {"rad": 1e-5, "m": 1e-5}  # of an error that is shown; below it a line leaves the panel
@@ -82,8 +88,8 @@ def _components(t: Array, values: Array, converged: float | None) -> Drawing:
     for j in range(values.shape[1]):
         for axis, dashes in enumerate(DASHES):
             name = named(f"joint {j + 1} {'xyz'[axis]}")
-            style = {"color": joint_color(j), "linewidth": 1.0, "linestyle": dashes}
-            ax.plot(t, values[:, j, axis], gid=name, **style)
+            (line,) = ax.plot(t, values[:, j, axis], gid=name, color=joint_color(j), linewidth=1.0)
+            line.set_linestyle(dashes)
     ax.set_xlim(min(0.0, t[0]), t[-1])
     ax.margins(y=0.12)  # room for the words of the mark
     if converged is not None:

@@ -90,7 +90,7 @@ def _left(data: RunData) -> Check | None:
     most = f"{100.0 * slow[j]:.0f} % of it on joint {j + 1}"
     if slow[j] <= SLOW:
         return Check(GOOD, LEFT, f"{said}; like noise: at most {most} lasts over {BLOCK_S:g} s")
-    which = [k + 1 for k in np.flatnonzero(slow > SLOW)]
+    which = [int(k) + 1 for k in np.flatnonzero(slow > SLOW)]
     joints = f"joint{'s' if len(which) > 1 else ''} {numbered(which)}"
     most = f"{'up to ' if len(which) > 1 else ''}{most}"
     why = "something acts that no learned effect explains"

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adapter.model.spatial import Array
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
@@ -68,7 +69,7 @@ def quantity(value: Any, unit: str, digits: int = 3) -> str:
     return f"{number(value, digits)} {unit}".replace(" ", NARROW)
 
 
-def spread(values: Sequence[float], unit: str) -> str:
+def spread(values: Sequence[float] | Array, unit: str) -> str:
     """Smallest to largest, with the unit, on one line."""
     low, high = number(min(values), 2), number(max(values), 2)
     size = low if low == high else f"{low}{JOIN}–{JOIN}{high}"

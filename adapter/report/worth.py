@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
 from adapter.model.spatial import Array
@@ -72,23 +73,23 @@ def torque_fall(data: RunData) -> Fall | None:
         keys = "validation_torque_rmse_nm", "validation_torque_rmse_std_nm"
         before, before_std = (_known(theta.get(f"documented_{key}")) for key in keys)
         after_std = _known(theta.get(keys[1]))
-        after = np.array(held_out, float)
-        return Fall(before, after, before_std, after_std, size, "on data held out")
+        seen = "on data held out"
+        return Fall(before, np.array(held_out, float), before_std, after_std, size, seen)
     rows = unseen_rows(data)
     if rows.sum() < FEWEST_ROWS:
         return None
     after, seen = rms_of([error[rows]]), "predicted before it was learned from"
     if data.documented.tree.floating:  # the base's motion is not kept for the page
         return Fall(None, after.value, None, after.std, size, seen)
-    before = rms_of([(tau - ModelTorque(data.documented)(q, dq, ddq))[rows]])
-    return Fall(before.value, after.value, before.std, after.std, size, seen)
+    first = rms_of([(tau - ModelTorque(data.documented)(q, dq, ddq))[rows]])
+    return Fall(first.value, after.value, first.std, after.std, size, seen)
 
 
 def _known(values: Any) -> Array | None:
     return None if values is None else np.array(values, float)
 
 
-def unseen_rows(data: RunData) -> Array:
+def unseen_rows(data: RunData) -> NDArray[np.bool_]:
     """(k,) bool: rows of the score that were predicted by what had been learned well before."""
     t = data.times(data.score_trace)
     converged = data.converged_s("theta")
@@ -96,7 +97,7 @@ def unseen_rows(data: RunData) -> Array:
     return np.asarray(t >= start) & fit_rows(data)
 
 
-def fit_rows(data: RunData) -> Array:
+def fit_rows(data: RunData) -> NDArray[np.bool_]:
     """(k,) bool: rows of the score that the learned model is of: after the last change."""
     t, changes = data.times(data.score_trace), change_times(data)
     return np.asarray(t >= changes[-1] + SETTLING_S) if changes else np.ones(len(t), dtype=bool)

@@ -185,7 +185,7 @@ def replay(
         tool = None if documented.tool is None else documented.tool.theta()
         delay_s = pipeline.front_end.delay_s
         if not documented.tree.floating:  # what it knows of disagreements is of a base that rests
-            start_s = 1e-9 * float(log.stamp_ns[0])
+            start_s = 1e-9 * float(log.first_ns)
             pipeline.learner.watch = Monitor(documented.tree.n, tool, delay_s, say, start_s)
     if resume is not None:
         load_checkpoint(pipeline.learner, resume)
@@ -332,8 +332,8 @@ def held_out_rms(log: AnyLog, model: SelfModel, settings: PipelineSettings) -> R
         signals = ((seconds(x, log.first_ns), x.q, x.dq, x.tau) for x in log.pieces())
         return rms_of(errors_of_pieces(signals, ModelTorque(model)))
     if not model.tree.floating:
-        signals = seconds(log), log.q, log.dq, log.tau
-        return rms_of([validation_error(*signals, ModelTorque(model))])
+        error = validation_error(seconds(log), log.q, log.dq, log.tau, ModelTorque(model))
+        return rms_of([error])
     front_end = make_front_end(model, settings)
     states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
     at = front_end.layout

@@ -165,7 +165,7 @@ def _set_of_joint(name: str, effect: str, spec: Any, parameter: Any) -> None:
     setattr(joint, effect, np.r_[value, 0.0 * as_now[1:]] if len(as_now) > 1 else value)
 
 
-def in_a_process(arguments: list[str]) -> dict[str, float]:
+def in_a_process(arguments: list[str]) -> dict[str, Any]:
     """Wall and processor time, s, and most memory, MB, of this file in a process of its own."""
     started = time.perf_counter()
     command = [sys.executable, __file__, *arguments]

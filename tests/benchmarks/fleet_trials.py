@@ -158,7 +158,7 @@ def main() -> None:
             shares = dict(zip(names, np.mean(told, axis=0).round(4).tolist(), strict=True))
             tell(kind="drawn", logs=size, drift=drift, off=off, heavy_tails=tails, **shares)
     fleets = Fleets(args.logs, args.seconds) if args.fleets else None
-    for size in (6, 12, 30) if fleets else ():
+    for size in (6, 12, 30):
         for kind, change, scatter in (
             ("nothing", drifting(0.0), 0.0),
             ("nothing", drifting(0.0), 0.05),
@@ -166,6 +166,8 @@ def main() -> None:
             ("drift of 0.3", drifting(0.3), 0.05),
             ("first log off by 0.3", first_off(0.3), 0.0),
         ):
+            if fleets is None:
+                continue
             arms = [fleets.one(size, seed, change, scatter) for seed in range(args.fleets)]
             tell(kind=kind, logs=size, scatter=scatter, **counted(arms))
     if args.json is not None:

@@ -24,6 +24,7 @@ def size_of(path: Path, topics: set[str]) -> int:
             writer, channels, flushed = Writer(file), {}, 0
             writer.start(profile="ros2", library="size")
             for schema, channel, message in make_reader(source).iter_messages(list(topics)):
+                assert schema is not None
                 if channel.topic not in channels:
                     number = writer.register_schema(schema.name, schema.encoding, schema.data)
                     channels[channel.topic] = writer.register_channel(

@@ -33,6 +33,7 @@ TITLES = (
     ("(a) λ: orientation of the joint frames", "rad", slice(0, 3)),
     ("(a) λ: position of the joint frames", "m", slice(3, 6)),
 )
+THETA_TITLES = "mass", "first moments mX mY mZ", "inertia XX to ZZ"
 
 
 def lambda_panels(panda: PandaResults) -> list[Panel]:
@@ -69,12 +70,12 @@ def theta_panels(panda: PandaResults) -> list[Panel]:
     if len(t) < 2:
         return []
     panels = []
-    for title, unit, part in GROUPS:
+    for title, (unit, parts) in zip(THETA_TITLES, GROUPS, strict=True):
         drawing = Drawing("half")
         for j in range(panda.tree.n):
-            drawing.axes[0].plot(t, theta[:, j, part], color=joint_color(j), linewidth=1.0)
+            drawing.axes[0].plot(t, theta[:, j, parts], color=joint_color(j), linewidth=1.0)
         _finish(drawing, t, panda)
-        panels.append(drawing.panel(f"(b) θ: {title[:1].lower()}{title[1:]}", unit))
+        panels.append(drawing.panel(f"(b) θ: {title}", unit))
     return panels
 
 
