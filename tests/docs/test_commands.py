@@ -21,6 +21,7 @@ from tests.helpers.pages import PATIENCE_S, ROOT, blocks, give, given
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(2 * PATIENCE_S)]
 
 LANES = 2  # commands at a time
+SHORT = ROOT / "recordings" / "panda_nominal_6s.mcap"
 
 # What of the tour is done for a shorter time here, for it takes as long as it says
 BRIEFLY = {
@@ -87,8 +88,7 @@ def test_the_gap(toured: Path) -> None:
 
 def test_finding_the_gap_from_python() -> None:
     code = next(block for block in blocks("python") if "find_gap" in block)
-    short = ROOT / "recordings" / "panda_nominal_6s.mcap"
-    exec(code.replace("runs/friction/recording.mcap", str(short)), {})
+    exec(code.replace("runs/friction/recording.mcap", str(SHORT)), {})
 
 
 def test_the_tree_is_found(toured: Path) -> None:
@@ -119,11 +119,20 @@ def test_settings(tmp_path: Path) -> None:
 def test_learning_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     code = next(block for block in blocks("python") if "adapter.learn(" in block)
-    short = ROOT / "recordings" / "panda_nominal_6s.mcap"
     found: dict[str, Any] = {}
-    exec(code.replace("runs/tour/recording.mcap", str(short)), found)
+    exec(code.replace("runs/tour/recording.mcap", str(SHORT)), found)
     assert np.abs(found["tau"] - found["state"].tau).max() < 1.0
     assert (tmp_path / "learned.urdf").exists()
+
+
+@pytest.mark.parametrize("call", ["open_log", "AnyReader"])
+def test_reading_a_recording_from_python(call: str) -> None:
+    code = next(block for block in blocks("python") if call in block)
+    for said in ("hour.mcap", "runs/tour/recording.mcap"):
+        code = code.replace(said, str(SHORT))
+    names: dict[str, Any] = {}
+    exec(code, names)
+    assert len(names["log"]) > 1000 if call == "open_log" else names["message"] is not None
 
 
 def test_simulating_with_the_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
