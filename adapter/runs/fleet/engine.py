@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import multiprocessing
 import os
 from collections import deque
@@ -28,7 +29,8 @@ Done = Iterator[tuple[Task, Result | Broken]]
 TRIES = 2  # of a task whose process died, in a process of its own
 AT_HAND = 2  # tasks of each process: one that it does, and the next
 ON_CLUSTER = 1000  # tasks that the scheduler knows of at once
-ANSWER_S, WORKER_S = 5.0, 60.0  # until nobody is there; until no worker is
+ANSWER_S, WORKER_S = 10.0, 60.0  # until nobody is there; until no worker is
+CONNECTIONS = 3  # with a scheduler that is lost again and again
 DIED = f"the process that read it died, {TRIES + 1} times"
 LOADED_ONCE = "adapter.runs.fleet.moments"  # for all processes, where the system can fork
 
@@ -138,22 +140,35 @@ def on_cluster(
         raise MeansError(
             "--cluster needs Dask distributed: pip install 'panda-adapter[cluster]'"
         ) from None
-    try:
-        client = distributed.Client(address, timeout=ANSWER_S)
-    except (OSError, ValueError, ImportError) as error:
-        raise MeansError(f"--cluster {address}: no Dask scheduler there ({error})") from None
-    with client:
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said here
+    left = dict.fromkeys(tasks)
+    for number in range(CONNECTIONS):
         try:
-            client.wait_for_workers(1, timeout=WORKER_S)
-        except TimeoutError:
-            raise MeansError(f"--cluster {address}: no worker came in {WORKER_S:.0f} s") from None
-        yield from _sent(function, tasks, client, distributed)
+            client = distributed.Client(address, timeout=ANSWER_S)
+        except (OSError, ValueError, ImportError) as error:
+            if number:
+                break
+            raise MeansError(f"--cluster {address}: no Dask scheduler there ({error})") from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=WORKER_S)
+            except TimeoutError:
+                said = f"--cluster {address}: no worker came in {WORKER_S:.0f} s"
+                raise MeansError(said) from None
+            for task, result in _sent(function, list(left), client, distributed):
+                del left[task]
+                yield task, result
+        if not left:
+            return
+    raise MeansError(
+        f"--cluster {address}: the scheduler was lost; the same command goes on from what is done"
+    )
 
 
 def _sent(
     function: Callable[[Task], Result], tasks: Sequence[Task], client: Any, distributed: Any
 ) -> Done[Result]:
-    """Keep some tasks with the scheduler until all are done."""
+    """Keep some tasks with the scheduler until all are done, or it is lost."""
     left = iter(tasks)
 
     def send(task: Task) -> Any:
@@ -169,11 +184,8 @@ def _sent(
             yield task, future.result()
         elif future.status == "error":
             yield task, Broken(task.path, f"the cluster gave it up: {future.exception()}")
-        else:
-            raise MeansError(
-                f"--cluster {client.scheduler.address}: the scheduler was lost; the same command "
-                "goes on from what is done"
-            )
+        else:  # the scheduler is gone, and all that it knew
+            return
         future.release()
         for following in islice(left, 1):
             waiting.add(send(following))
