@@ -10,16 +10,17 @@ import subprocess
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from adapter.cli.common import recording_metadata
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import main
 from adapter.realtime.jobs import Jobs
 from adapter.realtime.loop import run_live
-from adapter.runs.live import describe_estimate
 from drivers.files.mcap import read_log
 from tests.helpers import live_tools as tools
 
@@ -50,14 +51,45 @@ class Shaky(tools.Swinging):
         return replace(sample, q=sample.q + 1e-6 * self._rng.random(7))
 
 
-def _run(path: Path, describe=describe_estimate, ring_s: float = 5.0, duration_s: float = RUN_S):
+class Trap:
+    """A word in a recording's metadata; where a recorder's process takes it in, `spring` is called.
+
+    Args:
+        spring: takes the path of the recording.
+        path: of the recording.
+    """
+
+    def __init__(self, spring, path: Path) -> None:
+        self.spring, self.path = spring, path
+
+    def __reduce__(self):
+        return _sprung, (self.spring, self.path)
+
+
+def _sprung(spring, path: Path) -> str:
+    spring(path)
+    return "a trap"
+
+
+def _in_the_middle(path: Path, act) -> None:
+    """Call `act` beside the recorder once samples of half a second are in the file."""
+
+    def wait() -> None:
+        assert tools.wait_for(lambda: path.exists() and path.stat().st_size > ROOM // 2, 120.0)
+        act()
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def _run(path: Path, spring=None, ring_s: float = 5.0, duration_s: float = RUN_S):
     arm = Shaky()
+    metadata = {"note": "test" if spring is None else Trap(spring, path)}
     result = run_live(
         arm,
         tools.parts()[0],
         jobs=Jobs(
             learner=tools.learner_job(),
-            recording=replace(tools.recording_job(path), describe=describe),
+            recording=replace(tools.recording_job(path), metadata=metadata),
         ),
         options=tools.live_options(duration_s, ring_s),
     )
@@ -97,28 +129,15 @@ def small_disk(tmp_path):
         subprocess.run(["umount", str(disk)], check=True)
 
 
-def _little_room(snapshot):
-    """From the first estimate on, this process may write files of so many bytes."""
+def _little_room(path: Path) -> None:
+    """From now on this process may write files of so many bytes."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, resource.RLIM_INFINITY))
-    return describe_estimate(snapshot)
-
-
-class _NoRoom:
-    """`describe_estimate`; a process that it is handed to may write files of `ROOM` bytes."""
-
-    def __reduce__(self):
-        return _without_room, ()
-
-
-def _without_room():
-    resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, resource.RLIM_INFINITY))
-    return describe_estimate
 
 
 def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
     """Where there is no small disk to be had, a file that may not grow is as good."""
     path = (small_disk or tmp_path) / "a.mcap"
-    result = _run(path, describe_estimate if small_disk else _little_room)
+    result = _run(path, None if small_disk else _little_room)
     assert small_disk is None or "No space left on device" in result.troubles[0]
     _check_full(result, path)
     assert path.stat().st_size <= ROOM
@@ -126,7 +145,11 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
 
 def test_a_run_whose_recording_is_incomplete_says_so(tmp_path, monkeypatch, capsys):
     """By its exit code, in words, and in its figures."""
-    monkeypatch.setattr("adapter.cli.run.describe_estimate", _NoRoom())
+    trap = {"note": Trap(_little_room, tmp_path)}
+    said_usually = recording_metadata
+    monkeypatch.setattr(
+        "adapter.cli.run.recording_metadata", lambda *x, **more: {**said_usually(*x, **more), **trap}
+    )
     run = ["run", "--duration", "1", "--quiet", "--no-report", "--out", str(tmp_path)]
     assert main([*run, "--json", str(tmp_path / "o.json")]) == ExitCode.INCOMPLETE
     figures = json.loads((tmp_path / "o.json").read_text())
@@ -135,14 +158,16 @@ def test_a_run_whose_recording_is_incomplete_says_so(tmp_path, monkeypatch, caps
     assert f"{figures['unrecorded']} samples (" in said and "not in the recording" in said
 
 
-def _stop_once(snapshot):
+def _stop_once(path: Path) -> None:
     """Hangs once, as a write to a disk does that has other work."""
-    if snapshot.learned > 300:
+
+    def stop() -> None:
         place = Path(os.environ["TEST_GRAVES"]) / "hanging"
         if not place.exists():
             place.write_text(str(os.getpid()))
             os.kill(os.getpid(), signal.SIGSTOP)
-    return describe_estimate(snapshot)
+
+    _in_the_middle(path, stop)
 
 
 @pytest.mark.parametrize(("hangs_s", "ring_s"), [(0.7, 5.0), (2.0, 1.0)])
@@ -164,10 +189,8 @@ def test_a_slow_disk_costs_what_the_ring_cannot_hold(tmp_path, hangs_s, ring_s):
     assert (result.unrecorded == 0) == (ring_s > hangs_s)
 
 
-def _die_once(snapshot):
-    if snapshot.learned > 500:
-        tools.die_once("recorder")
-    return describe_estimate(snapshot)
+def _die_once(path: Path) -> None:
+    _in_the_middle(path, partial(tools.die_once, "recorder"))
 
 
 def test_a_killed_recorder_is_followed_by_one_with_a_file_of_its_own(tmp_path):
