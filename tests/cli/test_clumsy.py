@@ -13,13 +13,14 @@ from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import COMMANDS, build_parser, main
 from drivers.errors import choices
 
+RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
 FILES = {  # the words after a command, FILE being what cannot be used
     "run": ["--driver", "log:FILE", "--duration", "1"],
     "plan": ["--robot", "FILE"],
     "excite": ["FILE"],
     "replay": ["FILE"],
     "gap": ["FILE", "--model", "panda"],
-    "fleet": ["--model", "FILE"],
+    "fleet": [str(RECORDING), "--model", "FILE"],
     "load": ["FILE"],
     "diff": ["FILE"],
     "discover": ["FILE"],

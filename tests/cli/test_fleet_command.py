@@ -46,7 +46,7 @@ def test_what_is_left_behind(folder: Path, capsys: pytest.CaptureFixture[str]) -
     page = (out / "fleet.html").read_text()
     assert "torn.mcap" in page and "left" in page
     printed = capsys.readouterr()
-    assert "as usual" in printed.out and "left out" in printed.err
+    assert "one.mcap" in printed.out and "left out" in printed.err
     assert fleet("--out", out, "--forget", folder / "logs" / "left" / "one.mcap") == (
         ExitCode.NOTHING_LEARNED
     )

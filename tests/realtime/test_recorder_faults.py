@@ -148,7 +148,8 @@ def test_a_run_whose_recording_is_incomplete_says_so(tmp_path, monkeypatch, caps
     trap = {"note": Trap(_little_room, tmp_path)}
     said_usually = recording_metadata
     monkeypatch.setattr(
-        "adapter.cli.run.recording_metadata", lambda *x, **more: {**said_usually(*x, **more), **trap}
+        "adapter.cli.run.recording_metadata",
+        lambda *x, **more: {**said_usually(*x, **more), **trap},
     )
     run = ["run", "--duration", "1", "--quiet", "--no-report", "--out", str(tmp_path)]
     assert main([*run, "--json", str(tmp_path / "o.json")]) == ExitCode.INCOMPLETE
