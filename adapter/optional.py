@@ -14,7 +14,9 @@ from adapter.errors import MeansError
 
 EXTRAS = {  # module -> what it is called, and the extra that brings it
     "coal": ("coal", "motion"),
+    "cyclonedds": ("Eclipse Cyclone DDS", "ros"),
     "distributed": ("Dask distributed", "cluster"),
+    "foxglove": ("foxglove-sdk", "live"),
     "fsspec": ("fsspec", "cluster"),
     "gymnasium": ("Gymnasium", "gymnasium"),
     "mujoco": ("MuJoCo", "mujoco"),

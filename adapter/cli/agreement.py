@@ -15,7 +15,7 @@ from adapter.control.excitation import plan_lines
 from adapter.control.free_path import FreeMotion
 from adapter.control.push_bound import push_bound
 from adapter.errors import SettingsError, UsageError
-from adapter.report.plan_page import write_plan
+from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import say
 from drivers.interface import Driver
 
@@ -80,7 +80,7 @@ def agree(
     say("\n".join(lines))
 
     def write() -> Path:
-        return write_plan(folder / PLAN_PAGE, draw.arm, motion, limits, least, lines)
+        return write_plan(folder / PLAN_PAGE, draw.arm, motion, limits, least, PlanWords(lines))
 
     if args.yes:  # nobody looks at it now, and the arm's samples do not wait
         return write

@@ -28,7 +28,7 @@ from adapter.effects.splits import DecidingExperiment
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.report.plan_page import write_plan
+from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.config import read_config
 from adapter.runs.library import filtered
 from adapter.runs.terminal import results_folder, say, show
@@ -278,7 +278,7 @@ def _write(
     least = arm.clearance(motion, seconds)
     lines = plan_lines(motion, limits, names, seconds)
     lines.insert(-1, f"Nearest on the way: {least} (margin {arm.cell.margin:g} m).")
-    write_plan(folder / PLAN_PAGE, arm, motion, limits, least, lines)
+    write_plan(folder / PLAN_PAGE, arm, motion, limits, least, PlanWords(lines))
     times_ns, points = _points(motion, seconds, args.rate)
     with (folder / "motion.csv").open("w", newline="") as file:
         writer = csv.writer(file)

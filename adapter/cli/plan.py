@@ -18,7 +18,7 @@ from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
 from adapter.report.next_steps import Step
-from adapter.report.plan_page import write_plan
+from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import results_folder, say, show
 from drivers.interface import Driver, JointSample
 from drivers.registry import open_driver, split_address
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     ]
     page = results_folder(args.out, "plan") / PLAN_PAGE
     steps = _steps(sys.argv[2:], plan.maybe_real)
-    write_plan(page, draw.arm, motion, limits, draw.least, lines, steps)
+    write_plan(page, draw.arm, motion, limits, draw.least, PlanWords(lines, steps))
     for line in lines:
         show(line)
     for step in steps:

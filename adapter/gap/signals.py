@@ -9,10 +9,10 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -21,7 +21,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
-from adapter.effects.base import Motion
+from adapter.effects.base import ArmDynamics, Motion
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.gap.evidence import ORDER
@@ -29,9 +29,6 @@ from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
-
-if TYPE_CHECKING:
-    from adapter.gap.long_recording import LongRecording
 
 # The band.
 RATE_HZ = 250.0  # of the models
@@ -281,6 +278,24 @@ def on_grid(grid: Array, t: Array, tau: Array) -> Array:
     return oaconvolve(raw, _ANTI_ALIAS[:, None], mode="valid", axes=0)[::factor][: len(grid)]
 
 
+class WholeMotion(Protocol):
+    """A long recording of which some stretches are in memory, see `long_recording`."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """From when to when it is used, s."""
+
+    @property
+    def seconds(self) -> float:
+        """How much of it there is."""
+
+    def signals(self, spans: Sequence[tuple[float, float]], arm: ArmDynamics) -> Signals:
+        """Some stretches of it."""
+
+    def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
+        """All of it, piece by piece."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """One recording.
@@ -305,7 +320,7 @@ class Recorded:
     commands: Array | None = None
     dq_late_s: float = 0.0
     begins: tuple[int, ...] = (0,)
-    whole: LongRecording | None = None
+    whole: WholeMotion | None = None
     spans: tuple[tuple[float, float], ...] = ()
     loads_s: tuple[float, ...] = ()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -34,16 +34,22 @@ VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
 )
 
 
+class PlanWords(NamedTuple):
+    """What is said of a motion, line by line, and what to do next."""
+
+    lines: Sequence[str]
+    steps: Sequence[Step] = ()
+
+
 def write_plan(
     path: str | Path,
     arm: ArmInCell,
     motion: PathMotion,
     limits: MotionLimits,
     nearest: Clearance,
-    lines: Sequence[str],
-    steps: Sequence[Step] = (),
+    said: PlanWords,
 ) -> Path:
-    """Write the page of a motion in its cell, with what to do next. Raises RunFolderError."""
+    """Write the page of a motion in its cell. Raises RunFolderError."""
     start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
     span_s = max(nearest.path_s, 30.0)
     poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
@@ -53,8 +59,8 @@ def write_plan(
         "ignored": [" and ".join(pair) for pair in arm.ignored],
         "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
         "joints": _joint_panels(motion, limits, arm.model.tree.joint_names),
-        "lines": lines,
-        "steps": steps,
+        "lines": said.lines,
+        "steps": said.steps,
     }
     return write_whole(path, fill(TEMPLATE, context))
 

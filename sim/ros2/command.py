@@ -8,19 +8,14 @@ import json
 from sim.ending import Ending
 from sim.faults import read_fault
 from sim.options import options_of
+from sim.ros2.arm import Place, ServedArm
 from sim.ros2.options import KINDS, check
 from sim.scenarios import build
-
-MISSING = "a simulated ros2 arm needs a package: pip install 'panda-adapter[ros]'"
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until a signal comes or the time is over. Raises ValueError for wrong options."""
     check(args)
-    try:
-        from sim.ros2.arm import Place, ServedArm
-    except ImportError as error:
-        raise ValueError(MISSING) from error
     scenario = build(args.scenario, args.seed, **options_of(args.set))
     place = Place(
         args.domain, args.states, args.commands, args.every, args.watch, not args.no_description

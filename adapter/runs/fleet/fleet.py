@@ -202,7 +202,8 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
             work.broken.append(result)
         settings.progress(number, len(left))
     places = {**store.places(), **{content: path for path, content in work.contents.items()}}
-    heads = _newest([replace(x, path=places.get(x.content, x.path)) for x in store.heads()])
+    # by the places where they were read: what has moved since is still what it grew from
+    heads = [replace(x, path=places.get(x.content, x.path)) for x in _newest(store.heads())]
     read = len(left) - sum(x.path in {task.path for task in left} for x in work.broken)
     gone = tuple(path for path, content in work.contents.items() if store.forgotten(content))
     arms = _arms(store, heads, documented, settings)
