@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import weakref
 
 import numpy as np
 
@@ -23,8 +24,8 @@ class RowsFile:
 
     def __init__(self, width: int, in_memory: int = IN_MEMORY) -> None:
         self.width, self._count = width, 0
-        # The file lives as long as this object, which closes it.
         self._file = tempfile.SpooledTemporaryFile(max_size=in_memory)  # noqa: SIM115
+        weakref.finalize(self, self._file.close)
 
     def __len__(self) -> int:
         return self._count

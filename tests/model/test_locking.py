@@ -126,5 +126,7 @@ def test_what_cannot_be_locked_is_refused() -> None:
     load = {"effect": "payload", "parameters": {"m": 1.0, "cx": 0.0, "cy": 0.0, "cz": 0.0}}
     with pytest.raises(ModelError, match="payload may act on panda_link7, the last link"):
         locked(replace(panda, effects=(load,)), {"panda_joint7": 0.0})
-    with pytest.raises(ModelError, match=r"'finger', .*is not there; have joints that can be lock"):
+    with pytest.raises(
+        ModelError, match=r"'finger', .*is not there; of the joints that can be lock"
+    ):
         documented("panda", lock={"finger": 0.0})
