@@ -134,6 +134,14 @@ def _little_room(path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, resource.RLIM_INFINITY))
 
 
+def _no_more_room(path: Path) -> None:
+    def fill() -> None:
+        most = path.stat().st_size + 4096
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+
+    _in_the_middle(path, fill)
+
+
 def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
     """Where there is no small disk to be had, a file that may not grow is as good."""
     path = (small_disk or tmp_path) / "a.mcap"
@@ -145,13 +153,13 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(tmp_path, small_disk):
 
 def test_a_run_whose_recording_is_incomplete_says_so(tmp_path, monkeypatch, capsys):
     """By its exit code, in words, and in its figures."""
-    trap = {"note": Trap(_little_room, tmp_path)}
+    trap = {"note": Trap(_no_more_room, tmp_path / "recording.mcap")}
     said_usually = recording_metadata
     monkeypatch.setattr(
         "adapter.cli.run.recording_metadata",
         lambda *x, **more: {**said_usually(*x, **more), **trap},
     )
-    run = ["run", "--duration", "1", "--quiet", "--no-report", "--out", str(tmp_path)]
+    run = ["run", "--duration", "3", "--quiet", "--no-report", "--out", str(tmp_path)]
     assert main([*run, "--json", str(tmp_path / "o.json")]) == ExitCode.INCOMPLETE
     figures = json.loads((tmp_path / "o.json").read_text())
     assert figures["fault"] is None and figures["unrecorded"] > 0
