@@ -98,7 +98,7 @@ def test_lost_repeated_and_badly_stamped_samples():
 
 
 def test_scenarios_refuse_what_they_do_not_know():
-    with pytest.raises(ValueError, match="no scenario 'nomnal'; have: nominal, bent_link"):
+    with pytest.raises(ValueError, match="no scenario 'nomnal'; did you mean nominal"):
         build("nomnal")
     with pytest.raises(ValueError, match=r"no option 'mas'; have: mass, t_s, noise"):
         build("payload_at_20s", mas=1.0)
