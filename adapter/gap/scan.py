@@ -45,6 +45,7 @@ from adapter.model.spatial import Array
 CATALOGUED, PATTERNS = "catalogued", "patterns"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
+AT_ONCE = 24  # candidates of a long recording
 FEWEST_BLOCKS = 1  # nothing shorter is dated
 FIRST_SHARE = 0.2  # of the residual that may be noise, for a start
 RICH_ROUNDS = 2
@@ -323,6 +324,10 @@ class SignatureTable:
         Yields:
             with itself (b, k, k), with the carried signatures (b, k, c), with the data (b, k).
         """
+        if len(self.fit.recordings[recording].begins) > 1 and len(candidates) > AT_ONCE:
+            for first in range(0, len(candidates), AT_ONCE):  # all at once take much memory
+                yield from self._running(recording, candidates[first : first + AT_ONCE])
+            return
         t, n = self.times[recording], self.fit.n
         begin = sum(len(x) for x in self.times[:recording]) * n
         rows = slice(begin, begin + len(t) * n)
