@@ -48,6 +48,7 @@ DESCRIPTION = "/robot_description"
 # For the first states, s; where discovery shows somebody who sends them
 FIRST_S, SLOW_S = 4.0, 15.0
 SEEN_S, MEASURED = 1.0, 20  # at least, before others are judged; messages that tell the rate
+BLIND_S = 0.005  # without a state, of an arm that is braked: its speed is not known any more
 SILENCE_S = 0.05  # without a command, of an arm that is driven
 HELD_S = 10.0  # that an arm is held for which nobody asks any more
 LOOK_S = 0.25  # between two looks at who else commands
@@ -180,6 +181,7 @@ class Bridge:
         self._taken = False  # from the driver, which has to stop before it drives again
         self._heard = time.monotonic()
         self._look_at = self._idle_at = 0.0
+        self._answer: Array | None = None
 
     def prepare(self) -> None:
         """Wait for the arm and look at it; says that it is ready. Raises DriverError."""
@@ -288,9 +290,12 @@ class Bridge:
         waiter = self._waiter()
         while not self._done():
             waiter.wait(2_000_000)
+            self._answer = None
             for data in self._states.take():
                 self._take_state(data)
             with self._lock:
+                if self._answer is not None and self._memory.doing in BRAKES:
+                    self._send(self._answer)
                 self._supervise()
 
     def _waiter(self) -> Any:
@@ -310,11 +315,12 @@ class Bridge:
     def _done(self) -> bool:
         if not self._gone.is_set():
             return False
-        doing = self._memory.doing
-        if doing == Doing.HOLDING and self._memory.asked == Asked.BRAKE and self._idle_at == 0.0:
-            self._idle_at = time.monotonic()
-        released = self._memory.asked == Asked.LISTEN or doing == Doing.LISTENING
-        return released or (self._idle_at > 0.0 and time.monotonic() > self._idle_at + HELD_S)
+        memory, now = self._memory, time.monotonic()
+        if memory.doing == Doing.HOLDING and not self._idle_at:
+            self._idle_at = now
+        released = memory.asked == Asked.LISTEN or memory.doing == Doing.LISTENING
+        held = self._idle_at > 0.0 and now > self._idle_at + HELD_S
+        return released or held or now > self._heard + HELD_S
 
     def _pass_on(self) -> None:
         """Send a command as soon as it is there."""
@@ -356,7 +362,7 @@ class Bridge:
             if doing not in BRAKES:
                 self._braker.listen(values[1], values[2])
                 return
-            self._send(self._braker.torques(*values))
+            self._answer = self._braker.torques(*values)  # of several at once the last one is sent
             if self._braker.standing:
                 self._memory.words[STATE] = Doing.HOLDING
 
@@ -377,7 +383,7 @@ class Bridge:
                 self._take_over(f"{topic} has been silent for {1e3 * unheard_s:.0f} ms")
             elif silent_s > SILENCE_S:
                 self._take_over(f"no command came for {1e3 * silent_s:.0f} ms")
-        if memory.doing in BRAKES and now - self._heard > SILENCE_S:
+        if memory.doing in BRAKES and now - self._heard > BLIND_S:
             self._send(self._braker.blind())
         if self._commands is not None and now > self._look_at:
             self._look_at = now + LOOK_S

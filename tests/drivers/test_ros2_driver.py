@@ -2,8 +2,11 @@
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -149,6 +152,7 @@ def test_it_drives_brakes_and_says_why_not():
         _moves_and_stops(address)
         _nobody_else_may_command(address)
         _silence_of_the_loop_brakes(address)
+        _a_killed_loop_leaves_a_held_arm(address)
 
 
 @contextmanager
@@ -242,6 +246,43 @@ def _silence_of_the_loop_brakes(address):
                 arm.read()
         arm.stop()  # by a new bridge
         assert arm._bridge.memory.doing in (Doing.BRAKING, Doing.HOLDING)
+
+
+LOOP = """
+import sys
+from tests.drivers.test_ros2_driver import PANDA_JOINTS, Ros2Arm, push
+arm = Ros2Arm(sys.argv[1], PANDA_JOINTS, True)
+arm.connect()
+push(arm, 2.0, 60)
+print("driving", flush=True)
+push(arm, 2.0, 100_000)
+"""
+
+
+def _a_killed_loop_leaves_a_held_arm(address):
+    """kill -9 of the driver's process while it drives: the bridge brakes the arm and holds it."""
+    root = str(Path(__file__).parents[2])
+    child = subprocess.Popen(
+        [sys.executable, "-c", LOOP, address],
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": root},
+    )
+    with child, child.stdout:
+        said = child.stdout.readline()
+        child.kill()
+    assert said == b"driving\n"
+    listener = Ros2Arm(address, PANDA_JOINTS, False)
+    patiently(listener.connect, listener.close)
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:
+        sample = patient_read(listener)
+    after = [patient_read(listener) for _ in range(200)]
+    assert np.abs(np.median([s.dq for s in after], axis=0)).max() < 0.05
+    assert np.abs(after[-1].q - sample.q).max() < 0.05
+    second = Ros2Arm(address, PANDA_JOINTS, True)  # it holds: nobody else may command yet
+    with pytest.raises(DriverError, match="somebody else publishes"):
+        second.connect()
+    listener.close()
 
 
 @pytest.mark.alone
