@@ -221,11 +221,11 @@ def _opened(browser: subprocess.Popen[str]) -> Iterator[Tab]:
     else:
         raise AssertionError("Chromium did not start")
     whole = line.split()[-1]
-    with connect(whole, compression=None) as socket:
+    with connect(whole, compression=None, open_timeout=TIMEOUT_S) as socket:
         socket.send(json.dumps({"id": 0, "method": "Target.getTargets"}))
         targets = json.loads(socket.recv())["result"]["targetInfos"]
     page = next(target for target in targets if target["type"] == "page")
     host = whole.split("/")[2]
     place = f"ws://{host}/devtools/page/{page['targetId']}"
-    with connect(place, compression=None, max_size=None) as socket:
+    with connect(place, compression=None, max_size=None, open_timeout=TIMEOUT_S) as socket:
         yield Tab(socket, browser.pid)
