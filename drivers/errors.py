@@ -21,15 +21,15 @@ class EndOfStream(DriverError):
 
 
 def choices(asked: object, have: Iterable[str], more: str = "") -> str:
-    """What there is instead of a name that does not exist, the likeliest first.
+    """What there is instead of a name that does not exist, and the likeliest of it.
 
     >>> choices("pnada", ("fr3", "panda"))
-    'did you mean panda? have: fr3, panda'
+    'have: fr3, panda; did you mean panda?'
     >>> choices("ur5", ("fr3", "panda"), " or a .urdf file")
     'have: fr3, panda or a .urdf file'
     """
     names = list(have)
     small = {name.lower(): name for name in names}
     alike = difflib.get_close_matches(str(asked).lower(), small, n=1, cutoff=ALIKE)
-    hint = f"did you mean {small[alike[0]]}? " if alike else ""
-    return f"{hint}have: {', '.join(names)}{more}"
+    hint = f"; did you mean {small[alike[0]]}?" if alike else ""
+    return f"have: {', '.join(names)}{more}{hint}"

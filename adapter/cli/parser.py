@@ -58,5 +58,5 @@ def _told(word: str, options: Sequence[str]) -> str:
     if not name.startswith("-"):
         return f"use for '{word}'"
     told = choices(name.lstrip("-"), [option.lstrip("-") for option in options])
-    hint, there, _ = told.partition("? ")
-    return f"option '{name}'; {hint.replace('mean ', 'mean --')}?" if there else f"option '{name}'"
+    _, there, alike = told.partition("; did you mean ")
+    return f"option '{name}'" + (f"; did you mean --{alike}" if there else "")

@@ -134,7 +134,7 @@ def _check_joints(robot: FileRobot, names: Iterable[str], kinds: Sequence[str], 
         if joint is None or joint.kind not in kinds:
             fault = "is not there" if joint is None else f"is {joint.kind}"
             have = [j.name for j in robot.joints.values() if j.kind in kinds]
-            told = f"of the {what} {choices(name, have)}"
+            told = choices(name, have, f" ({what})")
             raise ModelError(f"{robot.file}: joint '{name}', asked for, {fault}; {told}")
 
 
