@@ -24,6 +24,7 @@ from adapter.gap.evidence import ORDER
 from adapter.gap.fit import EDGE_S, Fit
 from adapter.gap.long_recording import LongRecording, Span
 from adapter.gap.real_arm import load_in, loaded_arm
+from adapter.gap.signals import regressor_of
 from adapter.gap.weighed import pieces_of
 from adapter.model.spatial import Array
 
@@ -63,7 +64,7 @@ class Windows:
         std = _prior_std(fit.n)
         G, g = np.zeros((count, len(std), len(std))), np.zeros((count, len(std)))
         power, rows = np.zeros(count), np.zeros(count)
-        for piece in pieces_of(fit, whole):
+        for piece in pieces_of(replace(fit, weights=()), whole):
             own = piece.recordings[0]
             X, data = piece.whiten([_signatures(piece)]), piece.whiten(piece.model.residuals())
             place = np.repeat((own.t[ORDER:] // every_s).astype(int), fit.n)
@@ -211,7 +212,8 @@ def _signatures(piece: Fit) -> Array:
     """(c, k, n) of all that may change."""
     own, motion = piece.recordings[0], piece.recordings[0].motion
     at, unit = JointSignals(motion.q, motion.dq, motion.ddq), np.eye(piece.n)
-    tables = [own.low_regressor[-10:]]
+    body = own.low_of(lambda rows: regressor_of(motion, rows)[:, :, -10:])
+    tables = [np.moveaxis(body, 2, 0)]
     for effect in _of_joints():
         column = own.low(effect.columns(at)[0])
         tables.append(column.T[:, :, None] * unit[:, None])

@@ -404,17 +404,21 @@ class Fit:
 
         They don't count at all around its start and end: nobody picks up a load in no time.
         """
-        own, level = self.recordings[recording], self.noise[recording].level
-        weight = np.ones_like(own.tau)
+        level, weight = self.noise[recording].level, self.counted(recording)
         for k, e in enumerate(self.named):
-            if e.recording not in (None, recording):
-                continue
-            if e.candidate.effect.inexact:
+            if e.candidate.effect.inexact and e.recording in (None, recording):
                 weight /= np.sqrt(1.0 + (unsure(self.model, recording, k) / level) ** 2)
-            for edge in e.interval_s:
-                after = EDGE_S + ORDER / BAND_HZ
-                weight[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
         return weight
+
+    def counted(self, recording: int) -> Array:
+        """(k, n) zero around the start and end of a named effect, else one."""
+        own = self.recordings[recording]
+        out = np.ones_like(own.tau)
+        for e in self.named:
+            for edge in e.interval_s if e.recording in (None, recording) else ():
+                after = EDGE_S + ORDER / BAND_HZ
+                out[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
+        return out
 
     def whiten(self, tables: Sequence[Array]) -> Array:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""

@@ -36,6 +36,7 @@ from adapter.gap.signals import (
 )
 from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.model.spatial import Array
+from adapter.signals.source_clock import source_stamps
 from drivers.files.mcap import AnyLog, Log
 from drivers.files.rows import RowsFile
 
@@ -234,7 +235,7 @@ class LongRecording:
         parts = []
         for k, (first, last) in enumerate(self.survey.pieces):
             if last >= begin_s and first <= end_s:
-                parts.append(_piece(self.log, k, self.survey.begin_ns))
+                parts.append(_piece(self.log, k))
         whole = [Recorded.of(x, self.dq_late_s, self.survey.begin_ns) for x in parts]
         t = np.concatenate([x.t for x in whole])
         rows = np.flatnonzero((t >= begin_s) & (t <= end_s) & np.append(True, np.diff(t) > 0))
@@ -371,22 +372,19 @@ def _read(log: AnyLog, k: int) -> tuple[Log, np.ndarray]:
     return seen.piece(0, size), rows[rows < size]
 
 
-def _piece(log: AnyLog, k: int, begin_ns: int) -> Log:
+def _piece(log: AnyLog, k: int) -> Log:
     """The usable samples of the k-th piece."""
-    raw, rows = _read(log, k)
-    own = rows_of(raw, rows)
-    return at_source(own, check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau))[0]
+    own = rows_of(*_read(log, k))
+    return replace(own, stamp_ns=source_stamps(own.stamp_ns, own.q, own.dq))
 
 
 def _pieces(log: AnyLog, survey: Survey) -> Iterator[tuple[Array, Array, Array, Array]]:
     """t, q, dq, tau of usable samples, in order."""
     last = -np.inf
     for k in range(_count(log)):
-        raw, rows = _read(log, k)
-        own = rows_of(raw, rows)
+        own = _piece(log, k)
         if not len(own):
             continue
-        own = at_source(own, check_timing(own.stamp_ns, own.q, own.dq, own.tau))[0]
         t = 1e-9 * (own.stamp_ns - survey.begin_ns).astype(np.float64)
         kept = t > last
         if kept.any():

@@ -79,8 +79,7 @@ def pieces_of(fit: Fit, whole: WholeMotion) -> Iterator[Fit]:
         model = replace(fit.model, recordings=(own,), start_nm=np.zeros((1, fit.n)))
         piece = replace(fit, model=model, noise=(plain,), weights=())
         if doubted:
-            counted = piece.with_noise((plain,)).weights[0]
-            doubt = doubt_of(piece, 0, counted)
+            doubt = doubt_of(piece, 0, piece.counted(0))
             yield replace(piece, noise=(DoubtedNoise.of(plain, doubt),))
         else:
             yield piece.with_noise((plain,)) if fit.weights else piece
