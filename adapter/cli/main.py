@@ -239,7 +239,9 @@ def _told(value: Any) -> Any:
     """An argument in a sentence: files by their names, of many the first."""
     if isinstance(value, list | tuple):
         return (
-            _told(value[0]) + (f" and {len(value) - 1} more" * (len(value) > 1)) if value else "-"
+            f"{_told(value[0])}" + f" and {len(value) - 1} more" * (len(value) > 1)
+            if value
+            else "-"
         )
     if value is None:
         return "the documented arm"

@@ -71,7 +71,7 @@ def low(x: Array) -> Array:
     if flat.shape[1] > MANY:  # half of a regressor is zero
         used = flat.any(axis=0)
         if not used.all():
-            out = np.zeros((_size_of_low(len(x)), len(used)))
+            out = np.zeros((_size_of_low(len(x)), flat.shape[1]))
             out[:, used] = low(flat[:, used])
             return out.reshape(-1, *shape)
     whole = _size_of_low(len(x))

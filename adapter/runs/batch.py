@@ -37,7 +37,7 @@ GAIN, LOOK_EVERY, FEW_STEPS = 0.003, 4, 4
 THETA_POLISH = ((250, 1.0), (250, 0.3))
 PER_SAMPLE = 10  # states taken for each independent one
 LONGEST_NS = 10_000_000  # between two that are taken
-TRIPLES = 500  # of neighbouring states, which tell the noise of the motion
+TRIPLES, APART = 2000, 8  # of neighbouring states, which tell the noise; at first so many apart
 
 
 class Waiting(NamedTuple):
@@ -163,21 +163,17 @@ def _gain(learner: OnlineLearner, before: Array) -> float:
 
 
 class _Triples:
-    """Three neighbouring states of every table, and of ever fewer tables the more there are."""
+    """Three neighbouring states, again and again; ever further apart the more there are."""
 
     def __init__(self, width: int) -> None:
-        self._kept: list[Array] = [np.zeros((0, 3, width))]
-        self._stride, self._tables = 1, 0
+        self._kept, self._apart = [np.zeros((0, 3, width))], APART
 
     def take(self, table: Array) -> None:
         """Take states (m, w) that follow."""
-        self._tables += 1
-        if len(table) < 3 or self._tables % self._stride:
-            return
-        middle = len(table) // 2
-        self._kept.append(table[middle - 1 : middle + 2][None].copy())
-        if len(self._kept) > TRIPLES:
-            self._kept, self._stride = self._kept[:1] + self._kept[1::2], 2 * self._stride
+        first = np.arange(0, len(table) - 2, self._apart)
+        self._kept.append(table[first[:, None] + np.arange(3)])
+        while sum(map(len, self._kept)) > TRIPLES:
+            self._kept, self._apart = [self.rows()[::2]], 2 * self._apart
 
     def rows(self) -> Array:
         """(t, 3, w)."""

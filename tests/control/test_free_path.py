@@ -116,7 +116,7 @@ def test_a_cell_is_read_from_toml_and_kept_in_a_recording():
     assert config.cell.box[0].size == (1.0, 1.0, 1.0) and config.cell.plane[0].offset == -2.0
     assert config_from(config_table(config)) == config
     for wrong, said in (
-        ({"bax": []}, "no setting 'bax'; did you mean box"),
+        ({"bax": []}, "no setting 'bax'; have: .*; did you mean box"),
         ({"box": [{"name": "a", "size": [1, 1], "xyz": [0, 0, 0]}]}, "'a': size needs 3 lengths"),
         ({"plane": [{"name": "a", "normal": [0, 0, 0], "offset": 0}]}, "must not be zero"),
         ({"margin": 0.0}, "margin must be at least"),

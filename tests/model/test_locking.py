@@ -127,6 +127,6 @@ def test_what_cannot_be_locked_is_refused() -> None:
     with pytest.raises(ModelError, match="payload may act on panda_link7, the last link"):
         locked(replace(panda, effects=(load,)), {"panda_joint7": 0.0})
     with pytest.raises(
-        ModelError, match=r"'finger', .*is not there; of the joints that can be lock"
+        ModelError, match=r"'finger', .*is not there; have: .*joints that can be lock"
     ):
         documented("panda", lock={"finger": 0.0})

@@ -245,7 +245,7 @@ def test_a_joint_that_is_not_there_is_named_with_the_choices() -> None:
 def test_robots_by_name_and_by_file(tmp_path: Path) -> None:
     assert "panda" in names()
     with pytest.raises(
-        ModelError, match=r"'pnada'; did you mean panda\? have: fr3, panda, a \.urdf"
+        ModelError, match=r"'pnada'; have: fr3, panda, a \.urdf.*; did you mean panda\?"
     ):
         documented("pnada")
     with pytest.raises(ModelError, match=r"gone\.urdf"):

@@ -98,9 +98,9 @@ def test_lost_repeated_and_badly_stamped_samples():
 
 
 def test_scenarios_refuse_what_they_do_not_know():
-    with pytest.raises(ValueError, match="no scenario 'nomnal'; did you mean nominal"):
+    with pytest.raises(ValueError, match=r"no scenario 'nomnal'; have: .*; did you mean nominal"):
         build("nomnal")
-    with pytest.raises(ValueError, match=r"no option 'mas'; did you mean mass"):
+    with pytest.raises(ValueError, match=r"no option 'mas'; have: .*; did you mean mass"):
         build("payload_at_20s", mas=1.0)
     with pytest.raises(ValueError, match="no robot 3; have: panda, fr3"):
         build("nominal", robot=3)

@@ -394,7 +394,7 @@
     rows.forEach(([, at], r) => {
       for (let k = 0; k < 3; k++) {
         const value = frame.wrench ? frame.wrench[at + k] : null, std = frame.wrench ? frame.wrench_std[at + k] : null;
-        const shown = some(value) && some(std) ? `${value.toFixed(at ? 2 : 1)} ± ${std.toFixed(at ? 2 : 1)}`.replace("-", "−") : "–";
+        const shown = some(value) && some(std) ? `${value.toFixed(at ? 2 : 1)} ±\u00a0${std.toFixed(at ? 2 : 1)}`.replace("-", "−") : "–";
         put(body.rows[r].cells[k + 1], shown);
       }
     });
