@@ -29,10 +29,10 @@ SCHEMA_POLISH = 300  # more of them, to the optimum
 # States taken at once where few steps are; more, and a change at the hand would be seen late. Of a
 # long recording it is one of so many parts, up to another number of states that are taken.
 SETTLED, PARTS, MOST_TAKEN = 100, 2000, 50
-# θ takes as many steps as states at first, at a higher rate, then while that gains more than this
-# share of the joints' error variances, as a look at every so many batches tells; else a few.
+# θ takes as many steps as states at first, at a higher rate, then while so many of them or more
+# gain more than this share of the joints' error variances; else a few.
 FIRST_STEPS, FIRST_RATE = 2000, 1.75
-GAIN, LOOK_EVERY, FEW_STEPS = 0.003, 4, 4
+GAIN_STEPS, GAIN, FEW_STEPS = 40, 0.003, 4
 # (steps, share of the usual rate) at the end, to the optimum
 THETA_POLISH = ((250, 1.0), (250, 0.3))
 PER_SAMPLE = 10  # states taken for each independent one
@@ -144,16 +144,16 @@ def _learn_theta(
     settled = max(SETTLED // thin, min(len(torque) // PARTS, MOST_TAKEN))
     for start in range(0, before, settled):
         learner.learn_theta(torque.rows(start, min(start + settled, before)), 0)
-    moving, start, number = True, before, 0
+    moving, start, looked_at, seen = True, before, theta.updates, theta.th.copy()
     while start < len(torque):
         progress(thin * start)
         batch = torque.rows(start, start + (together if moving else settled))
         learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
-        before_step = theta.th.copy()
         learner.learn_theta(batch, together * thin if moving else FEW_STEPS)
-        if not moving or number % LOOK_EVERY == 0:
-            moving = theta.updates < FIRST_STEPS or _gain(learner, before_step) > GAIN
-        start, number = start + len(batch), number + 1
+        if not moving or theta.updates >= looked_at + GAIN_STEPS:
+            moving = theta.updates < FIRST_STEPS or _gain(learner, seen) > GAIN
+            looked_at, seen = theta.updates, theta.th.copy()
+        start += len(batch)
 
 
 def _gain(learner: OnlineLearner, before: Array) -> float:
