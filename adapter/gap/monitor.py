@@ -17,7 +17,7 @@ import numpy as np
 
 from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
-from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList
+from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
@@ -103,9 +103,11 @@ class Monitor:
         "what" (a name of the catalogue, or "unexplained"), "joints" (from 1; empty at the
         flange), "since_s", "reported_s" and "over_s" (None while it lasts) in s on the arm's
         clock, "size" (parameters of the catalogue), "score" (standard deviations),
-        "ambiguous_with" (what else it may be: "what" and "joints").
+        "ambiguous_with" (what else it may be: "what" and "joints"), "line" (all of it in words,
+        times from the first state on).
         """
-        return self._found.reports
+        found = self._found
+        return [{**entry, "line": sentence(entry, found.start_s)} for entry in found.reports]
 
     def __call__(self, learner: OnlineLearner, table: Array) -> None:
         """Look at states (m, size) that the learner has just learned from."""

@@ -212,7 +212,7 @@ def _moves_and_stops(address):
 
         moving = patiently(swing, lambda: (arm.close(), arm.connect()))
         assert moving.q[0] - before.q[0] > 0.0
-        after = [arm.read() for _ in range(600)]
+        after = [arm.read() for _ in range(1500)]
         assert np.abs(np.median([s.dq for s in after[-100:]], axis=0)).max() < 0.05
         assert arm._bridge.memory.doing == Doing.HOLDING
         assert arm.intake.commands.sent >= 50 and arm.intake.commands.cut == 0

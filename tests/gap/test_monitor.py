@@ -12,11 +12,13 @@ from adapter.cli.results import disagreement_lines
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.gap.monitor import Blocks, Monitor
 from adapter.physics.rigid_arm import RigidArm
+from adapter.realtime.run_messages import RunMessages
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout
+from drivers.files.estimates import EstimateNames
 from sim.hidden.bristles import draw_bristles
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
@@ -105,6 +107,9 @@ def test_what_is_new_is_named_within_two_seconds(kind: str, seed: int) -> None:
     assert report["joints"] == joints
     assert abs(report["since_s"] - AT_S) < 0.3
     assert AT_S < report["reported_s"] < AT_S + 2.0
+    told = RunMessages(EstimateNames((), (), ()), None).news(9, {"findings": found.reports})
+    assert told[0].fields["status"][0]["message"] == report["line"]
+    assert report["line"].startswith(report["what"].replace("_", " "))
     scale = np.linalg.norm(list(size.values()))
     if report["what"] == kind:
         assert all(abs(report["size"][key] - x) < 0.1 * scale for key, x in size.items())
