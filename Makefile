@@ -13,6 +13,9 @@ SHARED := $(PAIRS) -m "not alone and not slow"
 WITH_ALONE := $(sort $(shell grep --recursive --files-with-matches --include '*.py' mark.alone tests))
 REAL_TIME := -m "alone and not slow" $(WITH_ALONE)
 
+# Where this is set every one of the tests' processes translates all it imports anew, for seconds
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench licences clean
 
 run: $(STAMP)
