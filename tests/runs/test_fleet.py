@@ -19,6 +19,7 @@ from adapter.errors import MeansError, SettingsError
 from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.config import PipelineSettings
+from adapter.runs.fleet import engine
 from adapter.runs.fleet.arm import FleetArm, learn_arm
 from adapter.runs.fleet.engine import AT_HAND, here, on_cluster
 from adapter.runs.fleet.fleet import (
@@ -360,7 +361,8 @@ def test_a_log_that_has_grown_counts_once(logs: Path, tmp_path: Path) -> None:
     assert learn_fleet([str(moved)], panda_model(), settings).read == 1
 
 
-def test_nobody_answers_at_the_address(tmp_path: Path) -> None:
+def test_nobody_answers_at_the_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="the extra [cluster] is not installed")
+    monkeypatch.setattr(engine, "ANSWER_S", 1.0)
     with pytest.raises(MeansError, match="no Dask scheduler there"):
         list(on_cluster(moments_of, [Task("x", "")], "tcp://127.0.0.1:1"))

@@ -6,15 +6,17 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mcap_ros2._dynamic import generate_dynamic  # not what encoded it
 from rich.console import Console
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
 from adapter.cli.display import LiveTable, table_of
 from adapter.realtime.timing import Histogram
@@ -31,6 +33,7 @@ from tests.helpers.robot_models import PANDA as PANDA_URDF
 from tests.helpers.viewed import TICK_NS, Seen, again, seen_run
 
 SECONDS = 4.0
+PROTOCOLS = [Subprotocol("foxglove.sdk.v1")]
 CONTACT = {"contact_joint": 3, "learned": True}
 FOUND = {
     "what": "viscous_friction",
@@ -263,7 +266,7 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
     now = troubled(seen)
     got: dict[str, list] = {}
     place = f"ws://127.0.0.1:{port}"
-    with connect(place, subprotocols=["foxglove.sdk.v1"]) as client:  # type: ignore[list-item]
+    with connect(place, close_timeout=0.5, subprotocols=PROTOCOLS) as client:
         channels: dict[int, dict] = {}
         while len(channels) < len(foxglove_view.TOPICS):
             told = json.loads(client.recv(timeout=20))
@@ -273,6 +276,7 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
                 assert told["op"] == "serverInfo" and told["capabilities"] == []
         wanted = [{"id": number, "channelId": number} for number in channels]
         client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        decoders: dict[int, Callable[[bytes], Any]] = {}
         feed = threading.Thread(target=_feed, args=(shown, now))
         feed.start()
         while len(got) < len(channels):
@@ -282,8 +286,10 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
             opcode, number, stamp_ns = struct.unpack_from("<BIQ", data)
             channel = channels[number]
             assert opcode == 1 and channel["encoding"] == "cdr"
-            decode = generate_dynamic(channel["schemaName"], channel["schema"])
-            message = decode[channel["schemaName"]](data[13:])
+            if number not in decoders:
+                made = generate_dynamic(channel["schemaName"], channel["schema"])
+                decoders[number] = made[channel["schemaName"]]
+            message = decoders[number](data[13:])
             got.setdefault(channel["topic"], []).append((stamp_ns, message))
         feed.join()
     assert got.keys() == foxglove_view.TOPICS.keys()
