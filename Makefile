@@ -6,10 +6,12 @@ STAMP := $(VENV)/.ready
 # Folders whose tests answer in seconds: what a change breaks at once
 QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/report
 
-# Files go to one of two processes whole: what a file's tests share is made once
+# Files go to one of some processes whole: what a file's tests share is made once. Where no time is
+# judged there is one more than there are processors, since some tests wait.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
-PAIRS := --numprocesses 2 --dist loadfile --no-loadscope-reorder
-SHARED := $(PAIRS) -m "not alone and not slow"
+BY_FILE := --dist loadfile --no-loadscope-reorder
+PAIRS := --numprocesses 2 $(BY_FILE)
+SHARED := --numprocesses 3 $(BY_FILE) -m "not alone and not slow"
 WITH_ALONE := $(sort $(shell grep --recursive --files-with-matches --include '*.py' mark.alone tests))
 REAL_TIME := -m "alone and not slow" $(WITH_ALONE)
 
