@@ -61,6 +61,9 @@ def bending(q: Array, s0: float) -> tuple[Array, Array]:
     return z[:, 0], np.exp(-np.cumsum(np.abs(steps)) / s0)
 
 
+LEAST_RAD, MOST_RAD = 1e-6, 0.3  # that s0 may be
+
+
 class BristleFriction(LearnedEffect, JointTorque):
     """Coulomb friction that winds up over a small way before the joint slides."""
 
@@ -68,7 +71,7 @@ class BristleFriction(LearnedEffect, JointTorque):
     title = "bristle friction"
     parameters = (
         Parameter("Fc", "N m"),
-        Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1),
+        Parameter("s0", "rad", lower=LEAST_RAD, upper=MOST_RAD, grid_share=0.1),
     )
     prior_std = 1.0  # of Fc, as of Coulomb friction
     shape_key, shapes = "s0", WAYS_RAD
@@ -86,7 +89,7 @@ class BristleFriction(LearnedEffect, JointTorque):
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another s0."""
-        return _template(ratio * float(values["s0"]))
+        return _template(min(max(ratio * float(values["s0"]), LEAST_RAD), MOST_RAD))
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""

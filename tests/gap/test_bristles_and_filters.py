@@ -8,8 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from adapter.effects.bristle_friction import BristleFriction
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect
@@ -69,3 +71,13 @@ def test_a_finer_friction_is_not_given_up_for_coulombs(seed, effect, tmp_path: P
     log, model, _ = write(trial, tmp_path, pinocchio_recording(trial))
     (found,) = find_gap([log], model).findings
     assert (found.effect, found.joints) == (f"{effect}_friction", trial.effects[0].joints)
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 1e9])
+def test_a_search_for_another_way_stays_among_those_that_may_be(ratio: float) -> None:
+    effect = BristleFriction()
+    told = effect.reshaped({"Fc": 0.3, "s0": 1e-3}, ratio)
+    assert told is not None
+    values = told.decode(np.array([0.3]))
+    bounds = next(p for p in effect.parameters if p.key == "s0")
+    assert bounds.lower <= values["s0"] <= bounds.upper
