@@ -63,6 +63,10 @@ class Parameter:
     optional: bool = False
     grid_share: float = 0.0
 
+    def nearest(self, value: float) -> float:
+        """The value, or the bound that it lies beyond."""
+        return min(max(value, self.lower), self.upper)
+
 
 class ArmDynamics(Protocol):
     """The rigid body that an effect acts on; see `physics.rigid_arm.RigidArm`."""

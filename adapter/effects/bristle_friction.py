@@ -29,6 +29,8 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL, TURNS
 from adapter.model.urdf_text import FRICTION, Additions
 
+WAY = Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
+
 
 @late_jit
 def bend(steps, s0, z, bent):
@@ -61,18 +63,12 @@ def bending(q: Array, s0: float) -> tuple[Array, Array]:
     return z[:, 0], np.exp(-np.cumsum(np.abs(steps)) / s0)
 
 
-LEAST_RAD, MOST_RAD = 1e-6, 0.3  # that s0 may be
-
-
 class BristleFriction(LearnedEffect, JointTorque):
     """Coulomb friction that winds up over a small way before the joint slides."""
 
     name = "bristle_friction"
     title = "bristle friction"
-    parameters = (
-        Parameter("Fc", "N m"),
-        Parameter("s0", "rad", lower=LEAST_RAD, upper=MOST_RAD, grid_share=0.1),
-    )
+    parameters = (Parameter("Fc", "N m"), WAY)
     prior_std = 1.0  # of Fc, as of Coulomb friction
     shape_key, shapes = "s0", WAYS_RAD
     positive = ("Fc",)
@@ -89,7 +85,7 @@ class BristleFriction(LearnedEffect, JointTorque):
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another s0."""
-        return _template(min(max(ratio * float(values["s0"]), LEAST_RAD), MOST_RAD))
+        return _template(WAY.nearest(ratio * float(values["s0"])))
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""

@@ -21,6 +21,7 @@ from adapter.effects.splits import SPEEDS, STILL
 from adapter.model.urdf_text import FRICTION, Additions
 
 VELOCITIES = (0.03, 0.06, 0.12, 0.25)  # rad/s, tried for vs
+SCALE = Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03)
 
 
 class StribeckFriction(JointTorque):
@@ -28,11 +29,7 @@ class StribeckFriction(JointTorque):
 
     name = "stribeck_friction"
     title = "Stribeck friction"
-    parameters = (
-        Parameter("Fc", "N m"),
-        Parameter("Fs", "N m"),
-        Parameter("vs", "rad/s", lower=1e-3, upper=10.0, grid_share=0.03),
-    )
+    parameters = (Parameter("Fc", "N m"), Parameter("Fs", "N m"), SCALE)
     positive = ("Fc", "Fs")
     log_odds = -3.0
     inexact = 0.03
@@ -46,7 +43,7 @@ class StribeckFriction(JointTorque):
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another vs."""
-        return _template(ratio * float(values["vs"]))
+        return _template(SCALE.nearest(ratio * float(values["vs"])))
 
     def possible(self, values: Values) -> bool:
         """Friction that falls with speed, all of it positive."""

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapter.effects.base import Effect as Fitted
 from adapter.effects.bristle_friction import BristleFriction
+from adapter.effects.stribeck_friction import StribeckFriction
 from adapter.gap.result import Finding
 from adapter.gap.workflow import find_gap
 from sim.effects import Effect
@@ -74,10 +76,11 @@ def test_a_finer_friction_is_not_given_up_for_coulombs(seed, effect, tmp_path: P
 
 
 @pytest.mark.parametrize("ratio", [1e-9, 1e9])
-def test_a_search_for_another_way_stays_among_those_that_may_be(ratio: float) -> None:
-    effect = BristleFriction()
-    told = effect.reshaped({"Fc": 0.3, "s0": 1e-3}, ratio)
+@pytest.mark.parametrize(("effect", "key"), [(BristleFriction(), "s0"), (StribeckFriction(), "vs")])
+def test_a_search_for_another_shape_stays_among_those_that_may_be(
+    effect: Fitted, key: str, ratio: float
+) -> None:
+    told = effect.reshaped({"Fc": 0.3, "Fs": 0.4, key: 1e-2}, ratio)
     assert told is not None
-    values = told.decode(np.array([0.3]))
-    bounds = next(p for p in effect.parameters if p.key == "s0")
-    assert bounds.lower <= values["s0"] <= bounds.upper
+    bounds = next(p for p in effect.parameters if p.key == key)
+    assert bounds.lower <= told.decode(np.array([0.3, 0.4]))[key] <= bounds.upper

@@ -76,7 +76,7 @@ OUTSIDE = {
     "x_quadratic_drag": Rule(170, holds=clear_beside_friction),
 }
 NULLS = range(200, 204)
-QUICK = {"coulomb_friction", "motor_inertia", "x_sine_disturbance", 200}
+QUICK = {"coulomb_friction", "payload", "motor_inertia", "x_sine_disturbance", 200}
 MOST_DRAWS = 40
 PRIOR = 0.02  # of the model's inertial numbers, what the search believes
 HELD_OUT, REPEATED = "motor_inertia", "torque_gain"  # of these there are two recordings

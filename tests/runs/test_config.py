@@ -187,7 +187,8 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
 
 
 def test_what_only_the_parts_know_is_refused_too() -> None:
-    with pytest.raises(SettingsError, match=r"no effect 'stiction'; have: .*bristle_friction"):
+    said = r"no effect 'stiction'; have: .*; did you mean bristle_friction"
+    with pytest.raises(SettingsError, match=said):
         config_from({"pipeline": {"learner": {"effects": ["stiction"]}}})
     with pytest.raises(ModelError, match="gravity holds a value that is not finite"):
         config_from({"gravity": [0.0, 0.0, np.nan]}).apply(documented("panda"))

@@ -145,7 +145,7 @@ def test_messages_are_small_and_plain(seen: Seen, course: list[Now]) -> None:
         for kind, message in messages.take(now).items():
             assert len(encode(message)) < 6000, kind
     history = json.loads(messages.history())
-    assert len(history["frames"]) == len(course) and 1 < len(history["estimates"]) <= len(course)
+    assert len(history["frames"]) == len(course) and 3 < len(history["estimates"]) <= len(course)
 
 
 def test_the_table_on_a_terminal(seen: Seen) -> None:
