@@ -245,6 +245,7 @@ class Effect(ABC):
         log_odds: ln of how much more often than the common ones it is met, before any data.
         sudden: whether it does come in mid-recording; a base that tilts or an encoder that
             slips is rarer.
+        steady: whether it is there all the time or never.
         passing: whether it comes and goes by itself.
         watched: whether the monitor looks for it while an arm is learned: an effect of a joint
             with `columns`, a body or a wrench at the flange.
@@ -269,6 +270,7 @@ class Effect(ABC):
     simpler: ClassVar[tuple[tuple[str, float], ...]] = ()
     form: ClassVar[str] = ""
     sudden: ClassVar[bool] = False
+    steady: ClassVar[bool] = False
     passing: ClassVar[bool] = False
     watched: ClassVar[bool] = False
     own_to_log: ClassVar[bool] = False

@@ -23,6 +23,7 @@ class LinkInertia(BodyEffect):
     log_odds = -2.0
     phrase = Phrase("{who} {has} other inertias than the model says ({torque})")
     shows = ((WEIGHED, "shows"),)
+    steady = True  # what a link gains while it moves is a load
     is_theta = True
 
     def decode(self, x: Array) -> dict[str, Any]:

@@ -75,6 +75,14 @@ class Candidate:
         """Whether its coefficients are, or stand for, inertial parameters of a link."""
         return self.effect.is_theta
 
+    def possible(self, x: Array, interval_s: tuple[float, float]) -> bool:
+        """Whether physics allows these coefficients (k,) at these times.
+
+        What the hand puts down is a load less from then on.
+        """
+        put_down = self.effect is HELD and np.isfinite(interval_s[0])
+        return put_down or self.effect.possible(self.template.decode(x))
+
     @property
     def theta(self) -> Array:
         """(k, 10) inertial parameters of its link per unit of each coefficient."""

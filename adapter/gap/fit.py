@@ -72,7 +72,7 @@ class Named:
     @property
     def possible(self) -> bool:
         """Whether physics allows its parameters."""
-        return self.candidate.effect.possible(self.values)
+        return self.candidate.possible(self.x, self.interval_s)
 
     def active(self) -> Active:
         """As the model uses it."""
@@ -423,10 +423,12 @@ class Fit:
     def whiten(self, tables: Sequence[Array]) -> Array:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
+        for x, own in zip(white, self.recordings, strict=True):
+            if len(own.begins) > 1:
+                x *= own.counted[ORDER:]
         if self.weights:
-            white = [x * w[ORDER:] for x, w in zip(white, self.weights, strict=True)]
-        if any(len(own.begins) > 1 for own in self.recordings):
-            white = [x * own.counted[ORDER:] for x, own in zip(white, self.recordings, strict=True)]
+            for x, weight in zip(white, self.weights, strict=True):
+                x *= weight[ORDER:]
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
         return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 

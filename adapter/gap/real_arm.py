@@ -217,10 +217,10 @@ def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
 
 
 def _without_impossible(fit: Fit) -> Fit:
-    """A fit without what was assumed and came out as no arm has it: friction that drives."""
+    """A fit without what came out as no arm has it: friction that drives, a sensor ahead."""
     while True:
         fit, _ = refitted(fit)
-        kept = [e for e in fit.named if not e.assumed or e.possible]
+        kept = [e for e in fit.named if e.possible]
         if len(kept) == len(fit.named):
             return fit
         fit = fit.with_named(kept)

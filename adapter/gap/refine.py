@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 
 from adapter.effects.base import TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ
+from adapter.gap.candidates import is_finer
 from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, noise_of
 from adapter.gap.fit import Fit, Named, refitted, shaped, unsure
 from adapter.gap.search import Found, weak, worst
@@ -121,8 +122,18 @@ def _refitted(fit: Fit, counted: Sequence[Array]) -> tuple[Fit, Carried]:
         fit = replace(fit, noise=tuple(map(DoubtedNoise.of, noise, doubts, seams)), weights=())
         fit = refitted(fit)[0]
         for k in range(len(fit.named)):
-            fit = shaped(fit, k)
+            if not _is_rest(fit, k):
+                fit = shaped(fit, k)
     return refitted(fit)
+
+
+def _is_rest(fit: Fit, k: int) -> bool:
+    """Whether it was assumed, and its joint has a simpler form by name: it is what that leaves.
+
+    With a shape of its own it would take that one's place.
+    """
+    e = fit.named[k]
+    return e.assumed and any(is_finer(e.candidate, other.candidate) for other in fit.named)
 
 
 def _noise(before: Noise, doubt: Array, residual: Array, seams: tuple[int, ...]) -> Noise:

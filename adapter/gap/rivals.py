@@ -120,7 +120,8 @@ def _standing(
     found = _rivals(named, candidates, products, _reduced(named.x, carried, products, own, rest))
     best: dict[tuple[str, int], Rival] = {}
     for rival in sorted(found, key=lambda x: -x.log_evidence):
-        best.setdefault(rival.candidate.key, rival)
+        if named.interval_s == WHOLE or not rival.candidate.effect.steady:
+            best.setdefault(rival.candidate.key, rival)
     best.pop(named.candidate.key, None)
     taken = {e.candidate.key for e in fit.named}
     rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
@@ -172,7 +173,7 @@ def _rivals(
         for b, i in enumerate(places):
             c = candidates[i]
             worth = float(evidence[b]) + price(replace(named, candidate=c))
-            possible = c.effect.possible(c.template.decode(x[b]))
+            possible = c.possible(x[b], named.interval_s)
             found[i] = Rival(c, worth, float(chi2[b]), float(overlap[b]), x[b], possible)
     return [found[i] for i in sorted(found)]
 

@@ -99,18 +99,21 @@ def rich_noise(
         if not isinstance(c.effect, Pattern) or c.effect.is_line:
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
-    X, prior = X[prior > 0.0], prior[prior > 0.0]
+    used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
     sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
-    white = (X / sigma).reshape(len(X), -1), (residual / sigma).ravel()
+    white, data = (X[used] / sigma).reshape(len(used), -1), (residual / sigma).ravel()
     for _ in range(RICH_ROUNDS):
-        information = white[0] @ white[0].T
-        information[np.diag_indices(len(X))] += prior**-2.0
-        x = cho_solve(cho_factor(information, lower=True), white[0] @ white[1])
+        information = white @ white.T
+        information[np.diag_indices(len(used))] += prior[used] ** -2.0
+        x[used] = cho_solve(cho_factor(information, lower=True), white @ data)
         noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM, ROBUST, seams)
-        white = (
-            (counted * noise.whiten(X)).reshape(len(X), -1),
-            (counted * noise.whiten(residual)).ravel(),
-        )
+        # some at a time into what is there: tables of a long recording are large
+        data = (counted * noise.whiten(residual)).ravel()
+        white = white[:, : len(data)]
+        for first in range(0, len(used), AT_ONCE):
+            some = used[first : first + AT_ONCE]
+            part = (counted * noise.whiten(X[some])).reshape(len(some), -1)
+            white[first : first + AT_ONCE] = part
     return noise
 
 
@@ -393,12 +396,12 @@ def leads_of(table: SignatureTable) -> list[Lead]:
     always: dict[tuple[str, int, str], Lead] = {}
     for lead in table.whole():
         _keep(always, lead, "whole")
-        if lead.candidate.effect.possible(_values(lead)):
+        if lead.candidate.possible(lead.x, WHOLE):
             _keep(best, lead, "whole")
     # a pattern may change in mid-recording as well, but then it is a pattern all the more
     chosen = [x.candidate for x in always.values() if not isinstance(x.candidate.effect, Pattern)]
-    for lead in table.timed(chosen):
-        if lead.candidate.effect.possible(_values(lead)):
+    for lead in table.timed([c for c in chosen if not c.effect.steady]):
+        if lead.candidate.possible(lead.x, lead.interval_s):
             _keep(best, lead, "timed")
     for lead in table.passing([c for c in chosen if c.effect.passing]):
         _keep(best, lead, "passing")
@@ -475,7 +478,3 @@ def _keep(best: dict[tuple[str, int, str], Lead], lead: Lead, kind: str) -> None
     key = (*lead.candidate.key, kind)
     if key not in best or lead.log_evidence > best[key].log_evidence:
         best[key] = lead
-
-
-def _values(lead: Lead) -> dict[str, Any]:
-    return lead.candidate.template.decode(lead.x)

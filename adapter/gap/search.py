@@ -50,6 +50,7 @@ CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
 TRUSTED_ROUNDS = 3  # in which what was missed must show where inertias are trusted after all
 USUAL = float(np.exp(-0.5))  # weight of a row that does not count, its own squared distance beside
+SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
@@ -131,22 +132,46 @@ def _extended(
 ) -> Fit:
     """With all that pays of one kind of candidates."""
     refused: set[tuple[str, int]] = set()
-    while budget.spend():
-        table = SignatureTable(fit, joints, kind)
-        fit, accepted = table.fit, False
-        moves = honest_moves(table, refused | {e.candidate.key for e in fit.named})
-        if fit.hand_judged:
-            moves = [x for x in moves if not any(map(from_the_start, x.leads))]
-        for move in moves[:TRIED]:
-            trial = _with(fit, move, table.fit.noise, progress)
-            if trial is None:
-                refused |= {x.candidate.key for x in move.leads if len(move.leads) == 1}
-                continue
-            fit, accepted = _alongside(trial, move, moves, table, progress), True
-            break
-        if not accepted and not (fit.caution and moves):  # else those that were refused hid others
-            break
+    more = True
+    while more and budget.spend():
+        fit, more = _round(fit, joints, kind, refused, progress)
     return fit
+
+
+def _round(
+    fit: Fit, joints: Sequence[int], kind: str, refused: set[tuple[str, int]], progress: Progress
+) -> tuple[Fit, bool]:
+    """With the best of what pays, and whether more may be found; the rest joins `refused`."""
+    table = SignatureTable(fit, joints, kind)
+    fit = table.fit
+    # a hand may pick up and put down as often as it likes
+    named = {e.candidate.key for e in fit.named if e.candidate.effect is not HELD}
+    moves = honest_moves(table, refused | named)
+    if fit.hand_judged:
+        moves = [x for x in moves if not any(map(from_the_start, x.leads))]
+    for move in moves[:TRIED]:
+        again = _dated_anew_beside(fit, move)
+        if again is not None:
+            return again, True
+        trial = _with(fit, move, table.fit.noise, progress)
+        if trial is not None:
+            return _alongside(trial, move, moves, table, progress), True
+        refused |= {x.candidate.key for x in move.leads if len(move.leads) == 1}
+    return fit, bool(fit.caution and moves)  # those that were refused may have hidden others
+
+
+def _dated_anew_beside(fit: Fit, move: Move) -> Fit | None:
+    """With its dates sought again, where one is near that of a move; None where none changes.
+
+    A date that is wrong by some samples looks like something else that begins then.
+    """
+    edges = [t for x in move.leads for t in x.interval_s if np.isfinite(t)]
+    if not any(abs(t - s) < SAME_TIME_S for t in edges for e in fit.named for s in e.interval_s):
+        return None
+    again = dated_anew(fit)
+    pairs = zip(again.named, fit.named, strict=True)
+    moved = any(not np.allclose(a.interval_s, b.interval_s, atol=DATE_S) for a, b in pairs)
+    return again if moved else None
 
 
 def _unless_trusted(
@@ -239,7 +264,7 @@ def _with(
     """
     progress(", ".join(f"{x.candidate.effect.title} {x.candidate.joint + 1}" for x in move.leads))
     before = len(fit.named)
-    new = tuple(Named(x.candidate, x.x, x.interval_s, x.recording) for x in move.leads)
+    new = *_held_before(fit, move), *(_named(x) for x in move.leads)
     trial, _ = refitted(fit.with_named((*fit.named, *new)).with_noise(rich))
     last = len(trial.named) - 1
     if new[-1].interval_s != WHOLE:
@@ -248,12 +273,34 @@ def _with(
     while True:
         trial, carried = under_own_noise(trial)
         bad = worst(trial, weak(trial, carried, before))
+        if bad is None:  # what no arm has beside the new ones: it is found again by a better name
+            bad = next((k for k in range(before) if _is_impossible(trial.named[k])), None)
         if bad is None:
-            break
-        trial = trial.without(bad)
+            return trial
+        trial, before = trial.without(bad), before - (bad < before)
         if len(trial.named) == before:
             return None
-    return trial if all(e.assumed or e.possible for e in trial.named) else None
+
+
+def _is_impossible(e: Named) -> bool:
+    return not (e.assumed or e.possible)
+
+
+def _named(lead: Lead) -> Named:
+    return Named(lead.candidate, lead.x, lead.interval_s, lead.recording)
+
+
+def _held_before(fit: Fit, move: Move) -> tuple[Named, ...]:
+    """The load that a move puts down, where the model has none yet."""
+    lead = move.leads[-1]
+    if not _puts_down(lead) or any(e.candidate.effect is HELD for e in fit.named):
+        return ()
+    return (Named(lead.candidate, np.zeros(len(lead.x)), recording=lead.recording),)
+
+
+def _puts_down(e: Named | Lead) -> bool:
+    """Whether the hand carries less from some time on."""
+    return e.candidate.effect is HELD and bool(np.isfinite(e.interval_s[0]) and e.x[0] < 0.0)
 
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
@@ -269,8 +316,7 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         if bad is not None:
             fit = fit.without(bad)
             continue
-        table = SignatureTable(fit, joints, CATALOGUED, rich=False)
-        ranked = standings(fit, carried, table)
+        ranked = standings(fit, carried, SignatureTable(fit, joints, CATALOGUED, rich=False))
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
@@ -312,6 +358,8 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
         rare = not (_is_common(e.candidate.effect) or e.candidate.columns_are_theta)
+        if from_the_start(e) and any(map(_puts_down, fit.named)):
+            continue  # the hand held what it puts down
         if (
             value < BELIEF + rare * fit.caution
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)

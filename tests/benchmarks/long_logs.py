@@ -1,14 +1,14 @@
 """What long logs cost: wall time, processor time and the most memory, by length and command.
 
     python tests/benchmarks/long_logs.py [--seconds 60 300 600] [--every 1 50] [--gap] [--hidden]
-        [--json FILE]
+        [--holds] [--seed 7] [--json FILE]
 
 A log is the documented Panda on a periodic motion of three sines a joint, with viscous and dry
-friction and the sensors' noise (seed 7), written once as MCAP below `--folder`. With `--hidden`
-the hand picks up 1 kg after two thirds of the time, something pushes it for 3 s after one third,
-and the friction of joint 3 rises by 0.3 N m over the whole. Each command runs
-in a process of its own on one thread, numba's kernels compiled before. Processor time is the fair
-figure where a machine is shared.
+friction and the sensors' noise (`--seed`), written once as MCAP below `--folder`. With `--hidden`
+the hand picks up 1 kg after two thirds of the time (`--holds`: puts it down), something pushes it
+for 3 s after one third, and the friction of joint 3 rises by 0.3 N m over the whole; what `gap`
+says of these is printed beside the truth. Each command runs in a process of its own on one thread,
+numba's kernels compiled before. Processor time is the fair figure where a machine is shared.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from typing import Any
 
 from adapter.model.robots import documented
 from drivers.files.mcap import McapWriter
-from tests.helpers.long_arm import RATE_HZ, Hidden, samples
+from tests.helpers.long_arm import LOAD_KG, PUSH_LASTS_S, PUSH_N, RATE_HZ, SEED, Hidden, samples
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-def write_log(path: Path, seconds: float, hidden: Hidden | None = None) -> None:
+def write_log(path: Path, seconds: float, hidden: Hidden | None, seed: int) -> None:
     """A recording of so many seconds."""
     names = documented("panda").tree.joint_names
     part = path.with_suffix(".part")
     with McapWriter(part, names, flush_s=60.0, overwrite=True) as writer:
-        for t, *signals in samples(seconds, hidden):
+        for t, *signals in samples(seconds, hidden, seed=seed):
             for stamp_s, *row in zip(t, *signals, strict=True):
                 writer.write_joint_state(round(1e9 * stamp_s) + 10**9 // RATE_HZ, *row)
     part.rename(path)
@@ -53,6 +53,28 @@ def measured(command: list[str]) -> dict[str, Any]:
         "cpu_s": used.ru_utime + used.ru_stime,
         "peak_mb": used.ru_maxrss / 1024,
     }
+
+
+def told(folder: Path, hidden: Hidden) -> dict[str, Any]:
+    """What a gap says of what is hidden, and the truth behind it."""
+    findings = json.loads((folder / "gap.json").read_text())["findings"]
+    said = {
+        f["effect"]: f
+        for f in findings
+        if f["effect"] in ("payload", "external_wrench", "friction_drift")
+        and f["z"] > 0.0
+        and (f["effect"] != "payload" or f["interval_s"][0] > 0.0)
+    }
+    load, push, drift = (said.get(x) for x in ("payload", "external_wrench", "friction_drift"))
+    sign = -1.0 if hidden.holds else 1.0
+    out: dict[str, Any] = {"effects": sorted({f["effect"] for f in findings})}
+    out["load kg"] = load and load["parameters"]["m"], sign * LOAD_KG
+    out["at s"] = load and load["interval_s"][0], hidden.changed_s
+    out["push N"] = push and push["parameters"]["fy"], PUSH_N[1]
+    ends = hidden.pushed_s, hidden.pushed_s + PUSH_LASTS_S
+    out["from, to s"] = push and push["interval_s"], ends
+    out["drift N m/s"] = drift and drift["parameters"]["dFc"], hidden.drift
+    return out
 
 
 def commands(log: Path, every: list[int], folder: Path, gap: bool) -> dict[str, list[str]]:
@@ -76,15 +98,19 @@ def main() -> None:
     parser.add_argument("--every", type=int, nargs="*", default=[1, 50])
     parser.add_argument("--gap", action="store_true", help="measure gap too")
     parser.add_argument("--hidden", action="store_true", help="in recordings that hold more")
+    parser.add_argument("--holds", action="store_true", help="the hand puts its load down")
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--folder", type=Path, default=Path("/tmp/w/long_logs"))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     rows = []
     for seconds in args.seconds:
-        log = args.folder / f"panda_{seconds}s{'_hidden' * args.hidden}.mcap"
+        kind = "_hidden" * args.hidden + "_holds" * args.holds
+        log = args.folder / f"panda_{seconds}s{kind}_{args.seed}.mcap"
+        hidden = Hidden(seconds, args.holds) if args.hidden else None
         if not log.exists():
-            write_log(log, seconds, Hidden(seconds) if args.hidden else None)
+            write_log(log, seconds, hidden, args.seed)
         for name, command in commands(log, args.every, args.folder, args.gap).items():
             row = {"seconds": seconds, "what": name, **measured(command)}
             row["times_real_time"] = seconds / row["cpu_s"]
@@ -95,6 +121,10 @@ def main() -> None:
                 f"{row['peak_mb']:5.0f} MB",
                 flush=True,
             )
+            if name == "gap" and hidden is not None:
+                row["told"] = told(Path(command[command.index("--out") + 1]), hidden)
+                for key, value in row["told"].items():
+                    print(f"         {key}: {value}", flush=True)
     if args.json is not None:
         args.json.write_text(json.dumps(rows, indent=1))
 

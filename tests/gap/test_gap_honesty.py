@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from adapter.effects import CATALOGUE
+from adapter.effects.active import WHOLE
+from adapter.effects.catalogue import HELD
 from adapter.gap import GapSettings, RecordingFault, RecordingRefused
 from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
 from adapter.gap.evidence import Noise
@@ -43,6 +45,7 @@ from adapter.gap.screen import refuse
 from adapter.gap.search import Budget, Found, search, weak, worst
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.words import as_json, console_summary, headline
+from adapter.model.inertia import theta_from_body
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
@@ -55,6 +58,7 @@ ARM = RigidArm.of(PANDA)
 N = ARM.n
 SECONDS, NOISE_NM, PRIOR = 8.0, 0.05, 0.02
 JOINT, FC = 3, 0.4  # joint (from 0), N m
+LOAD_KG = 1.0
 BASE_JOINT, B = 0, 0.03  # whose motor inertia links 1 and 2 can stand for, kg m2
 MOTION = sines(3)
 T = np.arange(0.0, SECONDS, 1e-3)
@@ -333,6 +337,23 @@ def test_each_date_of_an_effect_has_its_price() -> None:
     assert dates(-np.inf, np.inf) == 0.0
     assert dates(2.0, np.inf) == pytest.approx(1.0)
     assert dates(2.0, 4.0) == pytest.approx(2.0)
+
+
+def test_what_a_hand_puts_down_it_held() -> None:
+    """A load less from some time on is no lighter link, and needs a load before."""
+    body, put_down_s = theta_from_body(LOAD_KG, (0.0, 0.01, 0.19), 2e-3 * np.eye(3)), 4.53
+    held = ARM.theta.copy()
+    held[-1] += body
+    load = (ARM.changed(held).torque(*MOVED) - ARM.torque(*MOVED)) * (put_down_s > T)[:, None]
+    own = recording(11, load + on_joint(JOINT, FC * np.sign(MOVED[1][:, JOINT])))
+    found = search(nominal_fit(own), range(N), 1)
+    before, change = sorted(
+        (e for e in found.fit.named if e.candidate.effect is HELD), key=lambda e: e.interval_s[0]
+    )
+    assert before.interval_s == WHOLE and before.x[0] == pytest.approx(LOAD_KG, abs=0.05)
+    assert change.x[0] == pytest.approx(-LOAD_KG, abs=0.02)
+    assert change.interval_s[0] == pytest.approx(put_down_s, abs=0.02)
+    assert all(e.candidate.effect.name != "link_inertia" for e in found.fit.named)
 
 
 @pytest.mark.parametrize("vs", [0.03, 0.25])

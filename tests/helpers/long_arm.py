@@ -30,13 +30,19 @@ DRIFTING, RISES_NM = 2, 0.3  # joint (from 0), N m over the whole recording
 
 @dataclass(frozen=True)
 class Hidden:
-    """What happens in a recording of so many seconds besides friction."""
+    """What happens in a recording of so many seconds besides friction.
+
+    Attributes:
+        holds: whether the hand holds LOAD_KG from the start, and puts it down where else it would
+            pick it up.
+    """
 
     seconds: float
+    holds: bool = False
 
     @property
-    def picked_up_s(self) -> float:
-        """When the hand picks up LOAD_KG."""
+    def changed_s(self) -> float:
+        """When the hand picks up LOAD_KG, or puts it down."""
         return round(2.0 * self.seconds / 3.0, 1) + 0.03
 
     @property
@@ -50,9 +56,9 @@ class Hidden:
         return RISES_NM / self.seconds
 
 
-def one_period() -> tuple[Array, Array, Array]:
+def one_period(seed: int = SEED) -> tuple[Array, Array, Array]:
     """q, dq, tau (m, 7) of one period without noise."""
-    q, dq, ddq = motion()
+    q, dq, ddq = motion(seed)
     tau = ModelTorque(documented("panda"))(q, dq, ddq)
     return q, dq, tau + VISCOUS * dq + DRY * rubs(dq)
 
@@ -62,9 +68,9 @@ def rubs(dq: Array) -> Array:
     return np.asarray(np.tanh(dq / 0.01))
 
 
-def motion() -> tuple[Array, Array, Array]:
+def motion(seed: int = SEED) -> tuple[Array, Array, Array]:
     """q, dq, ddq (m, 7) of one period."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(seed)
     t = np.arange(round(PERIOD_S * RATE_HZ)) / RATE_HZ
     q = np.tile(np.array(CENTRE), (len(t), 1))
     dq, ddq = np.zeros_like(q), np.zeros_like(q)
@@ -78,9 +84,9 @@ def motion() -> tuple[Array, Array, Array]:
     return q, dq, ddq
 
 
-def extra_torque() -> tuple[Array, Array]:
+def extra_torque(seed: int = SEED) -> tuple[Array, Array]:
     """(m, 7) N m of the load and of the push, along one period."""
-    q, dq, ddq = motion()
+    q, dq, ddq = motion(seed)
     model = documented("panda")
     theta = model.theta.copy()
     theta[-1] += theta_from_body(LOAD_KG, LOAD_AT_M, LOAD_SIZE * np.eye(3))
@@ -91,12 +97,12 @@ def extra_torque() -> tuple[Array, Array]:
 
 
 def samples(
-    seconds: float, hidden: Hidden | None = None, rate_hz: int = RATE_HZ
+    seconds: float, hidden: Hidden | None = None, rate_hz: int = RATE_HZ, seed: int = SEED
 ) -> Iterator[tuple[Array, ...]]:
     """t, q, dq, tau of a recording of so many seconds, period by period."""
-    rng, every = np.random.default_rng(SEED), RATE_HZ // rate_hz
-    tables = tuple(x[::every] for x in one_period())
-    load, push = (x[::every] for x in extra_torque())
+    rng, every = np.random.default_rng(seed), RATE_HZ // rate_hz
+    tables = tuple(x[::every] for x in one_period(seed))
+    load, push = (x[::every] for x in extra_torque(seed))
     for first in range(0, round(seconds * rate_hz), len(load)):
         rows = min(len(load), round(seconds * rate_hz) - first)
         t = (first + np.arange(rows)) / rate_hz
@@ -105,16 +111,19 @@ def samples(
             for x, s in zip(tables, NOISE, strict=True)
         )
         if hidden is not None:
-            tau[t >= hidden.picked_up_s] += load[:rows][t >= hidden.picked_up_s]
+            held = (t < hidden.changed_s) if hidden.holds else (t >= hidden.changed_s)
+            tau[held] += load[:rows][held]
             pushed = (t >= hidden.pushed_s) & (t < hidden.pushed_s + PUSH_LASTS_S)
             tau[pushed] += push[:rows][pushed]
             tau[:, DRIFTING] += hidden.drift * t * rubs(tables[1][:rows, DRIFTING])
         yield t, q, dq, tau
 
 
-def log_of(seconds: float, hidden: Hidden | None = None, rate_hz: int = RATE_HZ) -> Log:
+def log_of(
+    seconds: float, hidden: Hidden | None = None, rate_hz: int = RATE_HZ, seed: int = SEED
+) -> Log:
     """The recording in memory."""
-    parts = zip(*samples(seconds, hidden, rate_hz), strict=True)
+    parts = zip(*samples(seconds, hidden, rate_hz, seed), strict=True)
     t, q, dq, tau = (np.concatenate(x) for x in parts)
     names = documented("panda").tree.joint_names
     return Log(Path("made.mcap"), names, np.round(1e9 * t).astype(np.int64) + 1, q, dq, tau)
