@@ -30,7 +30,9 @@ from drivers.files.mcap import read_log
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = read_log(args.log, topic=args.topic, sensors=True)
+    begin = getattr(args, "from")
+    span = begin, begin + args.seconds
+    log = read_log(args.log, topic=args.topic, sensors=True, within_s=span)
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))

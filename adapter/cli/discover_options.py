@@ -6,6 +6,9 @@ import argparse
 from pathlib import Path
 
 from adapter.cli.options import add_json, add_topic, check_logs
+from adapter.errors import UsageError
+
+READ_S = 120.0  # as long as a recording that other commands hold in memory
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +27,14 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "or /link_twists/<link> and /link_accels/<link>",
     )
     add_topic(parser)
+    add("--from", type=float, default=0.0, metavar="S", help="read from this second on")
+    add(
+        "--seconds",
+        type=float,
+        default=READ_S,
+        metavar="S",
+        help=f"read so many seconds, default {READ_S:g}; all of them are held in memory",
+    )
     add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
     add(
         "--base",
@@ -33,4 +44,12 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
     add_json(parser)
-    parser.set_defaults(check=lambda args: check_logs(args.log))
+    parser.set_defaults(check=_check)
+
+
+def _check(args: argparse.Namespace) -> list[Path]:
+    if not getattr(args, "from") >= 0.0:
+        raise UsageError(f"--from takes 0 or more seconds, got {getattr(args, 'from')}")
+    if not args.seconds > 0.0:
+        raise UsageError(f"--seconds must be above zero, got {args.seconds}")
+    return check_logs(args.log)

@@ -140,6 +140,21 @@ def test_other_commands_see_nothing_of_it(tmp_path) -> None:
     assert one.warnings == two.warnings == []
 
 
+def test_a_part_is_that_part_of_the_whole(tmp_path, capsys) -> None:
+    path = _write(tmp_path / "a.mcap", _case(1, False, False), str)
+    whole = read_log(path, sensors=True)
+    part = read_log(path, sensors=True, within_s=(1.0, 2.0))
+    at = np.searchsorted(whole.stamp_ns, part.stamp_ns)
+    assert 900 < len(part) <= 1001 and np.array_equal(whole.stamp_ns[at], part.stamp_ns)
+    np.testing.assert_array_equal(part.q, whole.q[at])
+    assert part.link_names == whole.link_names
+    assert "read from 1 to 2 s of 3 s" in "".join(part.warnings)
+    assert main(["discover", str(path), "--from", "5"]) != 0
+    assert "ends at 3.0 s, before 5 s" in capsys.readouterr().err
+    assert main(["discover", str(path), "--seconds", "0"]) != 0
+    assert "above zero" in capsys.readouterr().err
+
+
 def test_nothing_left_is_told(tmp_path, capsys) -> None:
     still = foreign(tmp_path / "a.mcap", payloads(samples(5), fields=("velocity",)))
     assert main(["discover", str(still)]) != 0

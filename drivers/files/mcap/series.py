@@ -34,6 +34,7 @@ from drivers.files.ros_types import (
     ODOMETRY,
     TWIST_STAMPED,
 )
+from drivers.interface import DriverError
 
 _JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     JOINT_STATE: parse_joint_state,
@@ -137,17 +138,24 @@ def collect(
     scan: Scan,
     wanted: Callable[[Series], bool],
     take: Callable[[Series], None] | None = None,
+    within_s: tuple[float, float] | None = None,
 ) -> dict[str, Series]:
     """Every topic of the file by name; those `wanted` are decoded, the others counted.
 
     Args:
         take: is given a topic of `wanted` each time that it has decoded some messages more.
+        within_s: log times since the first one; what lies outside them is counted, too.
+
+    Raises:
+        DriverError: the recording ends before these times.
     """
     topics: dict[str, Series] = {}
-    unknown = 0
+    unknown = outside = begin = end = 0
     for region in scan.regions():
         channels = region.channel
         times = region.times[:, 0].astype(np.int64)
+        if len(times):
+            begin, end = begin or int(times.min()), max(end, int(times.max()))
         for topic, numbers in _by_topic(scan, np.unique(channels)).items():
             which = np.flatnonzero(np.isin(channels, numbers))
             if not topic:
@@ -155,6 +163,11 @@ def collect(
                 continue
             series = _series(topics, scan, scan.channels[numbers[0]])
             if wanted(series) and series.encoding == "cdr" and series.schema in PARSERS:
+                if within_s is not None:
+                    since = 1e-9 * (times[which] - begin)
+                    inside = (since >= within_s[0]) & (since < within_s[1])
+                    series.count += int((~inside).sum())
+                    outside, which = outside + int((~inside).sum()), which[inside]
                 series.add(region, which, times)
                 if take is not None:
                     take(series)
@@ -162,6 +175,12 @@ def collect(
                 series.count += len(which)
     if unknown:
         scan.warnings.append(f"{scan.path}: {unknown} messages belong to no channel; left out")
+    if within_s is not None and outside:
+        (first, last), seconds = within_s, 1e-9 * (end - begin)
+        if first > seconds:
+            raise DriverError(f"{scan.path} ends at {seconds:.1f} s, before {first:g} s")
+        last = min(last, seconds)
+        scan.warnings.append(f"{scan.path}: read from {first:g} to {last:g} s of {seconds:.0f} s")
     for channel in scan.channels.values():
         _series(topics, scan, channel)
     for topic, count in scan.passed.items():
