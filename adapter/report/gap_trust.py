@@ -49,9 +49,9 @@ def _rivals(result: GapResult) -> Check | None:
     rows = rival_rows(result)
     if not rows:
         said = "no other effect of the catalogue explains 90 % of any of these on these data"
-        return Check(GOOD, "What else it could be", said)
-    said = "; ".join(f"{found} could also be {other} of it" for found, other, _ in rows)
-    return Check(LOOK, "What else it could be", said)
+        return Check(GOOD, "What else explains it", said)
+    said = "; ".join(f"{found}: {other} of it" for found, other, _ in rows)
+    return Check(LOOK, "What else explains it", said)
 
 
 def _scored(result: GapResult) -> Check:
