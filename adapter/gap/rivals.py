@@ -96,6 +96,12 @@ class _Products:
     data: Array
     own: tuple[Array, ...]
 
+    @classmethod
+    def of(cls, X: Array, carried: Carried, table: SignatureTable) -> _Products:
+        """Of white signatures X (c, r) in one interval."""
+        own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
+        return cls(X @ carried.N.T, X @ carried.data, own)
+
 
 def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standing, ...]:
     """Each named effect of a fit against all candidates in its interval."""
@@ -104,9 +110,7 @@ def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standi
     for k, named in enumerate(fit.named):
         when = (named.interval_s, named.recording)
         if when not in products:
-            X = fit.whiten(table.within(*when))
-            own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
-            products[when] = _Products(X @ carried.N.T, X @ carried.data, own)
+            products[when] = _Products.of(fit.whiten(table.within(*when)), carried, table)
         out.append(_standing(fit, carried, table.candidates, products[when], k))
     return tuple(out)
 

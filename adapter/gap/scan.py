@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -101,7 +102,9 @@ def rich_noise(
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
     sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
-    white, data = (X[used] / sigma).reshape(len(used), -1), (residual / sigma).ravel()
+    white, data = X[used], (residual / sigma).ravel()
+    white /= sigma
+    white = white.reshape(len(used), -1)
     for _ in range(RICH_ROUNDS):
         information = white @ white.T
         information[np.diag_indices(len(used))] += prior[used] ** -2.0
@@ -152,9 +155,13 @@ class SignatureTable:
             r + np.tensordot(self.fit.coefficients, c, 1)
             for r, c in zip(self.fit.model.residuals(), self.carried_tables, strict=True)
         ]
-        self.X = self.fit.whiten(tables)
         self.weights = self.fit.weights or tuple(np.ones_like(r.tau) for r in fit.recordings)
         self.times = [r.t[ORDER:] for r in fit.recordings]
+
+    @cached_property
+    def X(self) -> Array:
+        """(c, r) all signatures, white."""
+        return self.fit.whiten(self.tables)
 
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
         """What no effect of the catalogue has: patterns of each joint, and lines in time."""

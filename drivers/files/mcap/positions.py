@@ -16,6 +16,8 @@ from drivers.files.mcap.series import Series, collect
 from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES
 from drivers.interface import Array, DriverError
 
+GLANCE_S = 5.0  # that tell of most recordings that they are of another kind
+
 
 @dataclass(frozen=True, eq=False)
 class PositionLog:
@@ -62,7 +64,10 @@ def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog
     Raises:
         DriverError: the file is unreadable, or positions and commands are of other joints.
     """
-    scan, states = open_scan(Path(path)), topic or JOINT_STATES
+    states = topic or JOINT_STATES
+    if _is_of_another_kind(Path(path), states):
+        return None  # a long recording was not held in memory for that
+    scan = open_scan(Path(path))
     topics = collect(scan, lambda series: series.topic in (states, JOINT_COMMANDS))
     read, commanded = topics.get(states), topics.get(JOINT_COMMANDS)
     if read is None or commanded is None or not fits(commanded, effort=False):
@@ -76,6 +81,14 @@ def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog
     at, rows = _increasing(stamps(read, f"{path}: {states}", warnings), joints.q)
     when, commands = _increasing(asked.stamp_ns, asked.q[:, order])
     return PositionLog(scan.path, joints.names, at, rows, when, commands, tuple(warnings))
+
+
+def _is_of_another_kind(path: Path, states: str) -> bool:
+    """Whether the first seconds tell that it is of another kind: efforts, or nothing commanded."""
+    topics = collect(open_scan(path), lambda x: x.topic == states, within_s=(0.0, GLANCE_S))
+    if states not in topics or JOINT_COMMANDS not in topics or not topics[JOINT_COMMANDS].count:
+        return True
+    return fits(topics[states], effort=True) and _has_effort(topics[states])
 
 
 def _has_effort(series: Series) -> bool:
