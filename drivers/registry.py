@@ -1,5 +1,5 @@
 """A driver by its address: `pybullet:panda`, `log:FILE.mcap`, `fci://HOST`, `can://CHANNEL?...`,
-`ros2:///TOPIC?...`.
+`ros2:///TOPIC?...`, or `FILE.py:CLASS` of the user's own.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ COUNT = {
 }
 NAMELESS = ("can", "ros2")  # of these, arms that cannot tell which robot they are
 SCHEMES = ("log", "pybullet", *HARDWARE)
+OWN = ".own:open_own"  # takes the same
+OWN_KIND = " or FILE.py:CLASS of your own"
 
 
 def split_address(address: str) -> tuple[str, str]:
@@ -38,9 +40,25 @@ def split_address(address: str) -> tuple[str, str]:
     if not colon or not rest:
         raise DriverError(
             f"'{address}' is no driver address; write SCHEME:WHAT, as in pybullet:panda, "
-            "fci://172.16.0.2, can://can0?interface=socketcan or ros2:///joint_states"
+            "fci://172.16.0.2, can://can0?interface=socketcan or ros2:///joint_states, or "
+            "my_arm.py:MyArm, a driver of your own"
         )
     return scheme, rest
+
+
+def is_own(scheme: str) -> bool:
+    """Whether a driver is a class in a file of the user's."""
+    return scheme.endswith(".py")
+
+
+def maybe_real(scheme: str) -> bool:
+    """Whether an arm may be real behind such a driver."""
+    return scheme in HARDWARE or is_own(scheme)
+
+
+def tells_no_robot(scheme: str) -> bool:
+    """Whether an arm behind such a driver cannot tell which robot it is."""
+    return scheme in NAMELESS or is_own(scheme)
 
 
 def open_driver(
@@ -52,7 +70,7 @@ def open_driver(
     """The driver that an address names, not connected yet.
 
     Args:
-        address: SCHEME:WHAT.
+        address: SCHEME:WHAT, or FILE.py:CLASS.
         builders: of the schemes that need more than their address (a simulated arm needs its
             plant), by scheme; they take what follows the colon.
         joint_names: joints wanted of a recording, in this order; names of an arm's joints.
@@ -66,8 +84,10 @@ def open_driver(
         return builders[scheme](rest)
     if scheme == "log":
         return _load(LOG)(rest, joint_names)
+    if is_own(scheme):
+        return _load(OWN)(address, joint_names, allow_motion)
     if scheme not in HARDWARE:
-        raise DriverError(f"no driver '{scheme}'; {choices(scheme, SCHEMES)}")
+        raise DriverError(f"no driver '{scheme}'; {choices(scheme, SCHEMES, OWN_KIND)}")
     return _load(HARDWARE[scheme])(address, joint_names, allow_motion)
 
 

@@ -62,7 +62,7 @@ from adapter.signals.matching import counted, present
 from drivers.faults.driver import FaultyDriver, with_faults
 from drivers.files.mcap import read_log
 from drivers.interface import Driver
-from drivers.registry import HARDWARE, joint_count, open_driver, split_address
+from drivers.registry import joint_count, maybe_real, open_driver, split_address
 
 DrawMotion = Callable[[MotionLimits, Array, ExcitationSettings], PathMotion]
 SIMULATED_BY = "adapter.cli.simulated"  # loaded by name where it is used: brings PyBullet
@@ -131,13 +131,13 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     if world is not None and world.scenario.imus:
         pipeline = with_imus(config.pipeline, world.scenario.imus)
         config = dataclasses.replace(config, pipeline=pipeline)
-    maybe_real = world is None and scheme in HARDWARE
-    if maybe_real and _may_move(args):
+    real = world is None and maybe_real(scheme)
+    if real and _may_move(args):
         need_complete(robot)
         config = dataclasses.replace(config, excitation=gentle(config.excitation))
     usual = "documented" if config.excitation.kind == DESIGNED else "none"
     forward = args.feedforward or usual
-    return RunPlan(config.apply(robot), config, world, maybe_real, forward)
+    return RunPlan(config.apply(robot), config, world, real, forward)
 
 
 def _joints_of_arm(address: str, world: SimulationLike | None) -> tuple[str, ...]:
@@ -163,14 +163,14 @@ def _may_move(args: argparse.Namespace) -> bool:
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     plan = run_plan(args)
-    config, robot, maybe_real = plan.config, plan.robot, plan.maybe_real
-    if maybe_real and _may_move(args):
+    config, robot = plan.config, plan.robot
+    if plan.maybe_real and _may_move(args):
         need_somebody(args.yes)
     folder = results_folder(args.out, "run")
     truth = args.truth or _write_truth(plan.world, folder)
     reference = reference_from(truth, robot)
     driver = open_arm(args, plan)
-    if maybe_real and not driver.can_move:
+    if plan.maybe_real and not driver.can_move:
         say("only listening; --allow-motion lets the arm move")
     compile_first(robot, config.pipeline, 1, say)
     front_end = make_front_end(robot, config.pipeline)

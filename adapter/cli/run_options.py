@@ -6,12 +6,12 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import NAMES, add_learning, add_motion, check_learning
+from adapter.cli.options import NAMES, add_learning, add_motion, check_files, check_learning
 from adapter.control.settings import KINDS
 from adapter.errors import UsageError
 from adapter.model.robot_names import robot_names
 from drivers.errors import choices
-from drivers.registry import NAMELESS, SCHEMES, split_address
+from drivers.registry import OWN_KIND, SCHEMES, is_own, split_address, tells_no_robot
 
 FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
@@ -121,8 +121,10 @@ def _check(args: argparse.Namespace) -> None:
     if not args.duration > 0.0:
         raise UsageError(f"--duration must be above zero, got {args.duration}")
     scheme, rest = split_address(args.driver)
-    if scheme not in SCHEMES:
-        raise UsageError(f"no driver '{scheme}'; {choices(scheme, SCHEMES)}")
+    if is_own(scheme):
+        check_files(Path(scheme))
+    elif scheme not in SCHEMES:
+        raise UsageError(f"no driver '{scheme}'; {choices(scheme, SCHEMES, OWN_KIND)}")
     if scheme == "pybullet" and rest not in SIMULATED:
         raise UsageError(f"no simulated arm '{rest}'; {choices(rest, SIMULATED)}")
     if (args.scenario or args.set) and not simulated(args.driver):
@@ -133,10 +135,10 @@ def _check(args: argparse.Namespace) -> None:
     for option in args.set:
         if "=" not in option:
             raise UsageError(f"'{option}' is not KEY=VALUE")
-    unnamed = scheme in NAMELESS and args.robot is None and not simulated(args.driver)
+    unnamed = tells_no_robot(scheme) and args.robot is None and not simulated(args.driver)
     if args.allow_motion and unnamed:
         raise UsageError(
-            f"an arm behind {scheme}:// does not say which robot it is; --robot must, before it "
+            f"an arm behind {args.driver} does not say which robot it is; --robot must, before it "
             f"may be moved: {', '.join(robot_names())} or the arm's own .urdf"
         )
     check_learning(args)

@@ -32,7 +32,8 @@ class MyArm:  # the wire is a recording here, which sends its rows one by one
     def close(self) -> None: ...
 
 
-arm: Driver = MyArm()
-arm.connect()
-learner = adapter.Learner("panda")
-print([learner.step(1e-9 * s.stamp_ns, s.q, s.dq, s.tau) for s in (arm.read(), arm.read())])
+if __name__ == "__main__":  # else: adapter run --driver write_a_driver.py:MyArm --robot panda
+    arm: Driver = MyArm()
+    arm.connect()
+    learner = adapter.Learner("panda")
+    print([learner.step(1e-9 * s.stamp_ns, s.q, s.dq, s.tau) for s in (arm.read(), arm.read())])

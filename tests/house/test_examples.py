@@ -18,7 +18,7 @@ def said(name: str, folder: Path, patch: pytest.MonkeyPatch, capsys: pytest.Capt
     patch.chdir(folder)
     path = ROOT / "docs" / "examples" / f"{name}.py"
     assert len(path.read_text().splitlines()) <= MOST_LINES
-    runpy.run_path(str(path))
+    runpy.run_path(str(path), run_name="__main__")
     return str(capsys.readouterr().out)
 
 
