@@ -13,10 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.gap.fit import (
-    honest_covariance,
-    place_of,
-)
+from adapter.gap.fit import Fit, honest_covariance, place_of, under_own_noise
 from adapter.gap.hand import hand_frame
 from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
@@ -39,6 +36,8 @@ MOVES_S = 1.0  # of motion, or the arm hardly moves
 SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
 STEP, STEP_S = 1e-6, 1.0 / RATE_HZ
+DATES = tuple(np.linspace(0.1, 0.9, 9))  # shares of a recording at which the load may change
+CLEAR, LEAST_CHANGE_KG = 6.0, 0.05  # standard deviations of a change; what is less is not told
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,8 @@ def find_load(
     turn = fit.named[0].candidate.theta
     theta = fit.coefficients[at] @ turn
     covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
-    notes += _judged(taken[0].judged, model, theta)
+    rests = _judged(taken[0].judged, model, theta)
+    notes += rests or _changed(fit)
     notes += sampling_words([x.recorded for x in taken])
     before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
     found = load_of(theta, covariance, riding)
@@ -161,6 +161,29 @@ def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:
     loaded_model = replace(model, theta=loaded)
     judge_torque(log, loaded_model, RigidArm.of(loaded_model), smoothed)
     return []
+
+
+def _changed(fit: Fit) -> list[str]:
+    """That the hand's load, the first effect of a fit, clearly is another from some time on."""
+    t, found = fit.recordings[0].t, (CLEAR, 0.0, 0.0)
+    change = replace(fit.named[0], x=np.zeros(len(fit.named[0].x)), recording=0)
+    for share in DATES:
+        at = float(t[0] + share * (t[-1] - t[0]))
+        trial = fit.with_named([*fit.named, replace(change, interval_s=(at, np.inf))])
+        trial, known = under_own_noise(trial)
+        place = place_of(trial, len(fit.named))[0]
+        mass = float(trial.named[-1].x[0])
+        clear = abs(mass) / float(np.sqrt(honest_covariance(trial, known)[place, place]))
+        if abs(mass) > LEAST_CHANGE_KG:
+            found = max(found, (clear, at, mass))
+    clear, at, mass = found
+    if not at:
+        return []
+    return [
+        f"the hand holds some {abs(mass):.2g} kg {'more' if mass > 0.0 else 'less'} from about "
+        f"{at:.0f} s on, and what is told is of the whole recording; `adapter gap` dates it, "
+        "`adapter replay` weighs what is held at the end"
+    ]
 
 
 def _in_frame(theta: Array, covariance: Array, frame: FixedFrame) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from adapter.gap.load import HandLoad
+from adapter.gap.phrases import plus_minus
 from adapter.model.inertia import six_from_tensor
 from adapter.model.spatial import Array
 
@@ -23,7 +24,7 @@ NOT_SHOWN = "not shown"
 
 def sentence(load: HandLoad) -> str:
     """What the hand carries, with standard deviations."""
-    mass = f"{load.mass:.3f} ± {load.mass_std:.3f} kg"
+    mass = f"{plus_minus(load.mass, load.mass_std)} kg"
     if not load.is_there:
         less = load.mass < -3.0 * load.mass_std
         why = "the hand is lighter than the model says, or its inertias are wrong"

@@ -246,15 +246,22 @@ def _shrink(result: GapResult) -> str:
     """Torque error before and after, of all joints together and of that which is left worst."""
     before, after = (np.asarray(x.torque_rmse_nm) for x in (result.before, result.after))
     known = np.isfinite(before) & np.isfinite(after)
-    if not known.any():
+    joint = worst_joint(result)
+    if joint is None:
         return ""
-    joint = max(np.flatnonzero(known), key=lambda j: (after[j], before[j]))
     total = fall(*(float(np.sqrt(np.sum(x[known] ** 2))) for x in (before, after)))
     seen = " (in sample only: nothing could be held out)" if result.in_sample else ""
     if known.sum() == 1:
         return f"torque error {total} N m{seen}"
     worst = f"{fall(before[joint], after[joint])} of joint {joint + 1}, the worst"
     return f"torque error {total} N m over all joints, {worst}{seen}"
+
+
+def worst_joint(result: GapResult) -> int | None:
+    """The joint (from 0) whose torque error is left largest; None where none is known."""
+    before, after = (np.asarray(x.torque_rmse_nm) for x in (result.before, result.after))
+    known = np.flatnonzero(np.isfinite(before) & np.isfinite(after))
+    return max(map(int, known), key=lambda j: (after[j], before[j]), default=None)
 
 
 def worse(result: GapResult) -> str:

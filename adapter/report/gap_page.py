@@ -10,7 +10,14 @@ import numpy as np
 
 from adapter.gap.phrases import DASH, listed, plain
 from adapter.gap.result import GapResult, Leftover
-from adapter.gap.words import by_kind, fall, headline_parts, left_above_noise, signal_words
+from adapter.gap.words import (
+    by_kind,
+    fall,
+    headline_parts,
+    left_above_noise,
+    signal_words,
+    worst_joint,
+)
 from adapter.model.spatial import Array
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
@@ -141,10 +148,11 @@ def _tiles(result: GapResult) -> list[Tile]:
     before, after = result.before, result.after
     noise = np.asarray(result.noise_floor_nm, dtype=float)
     tiles = [Tile("Effects found", str(len(by_kind(result.findings))), _left_words(result))]
-    worst = _worst(before.torque_rmse_nm / np.where(noise > 0.0, noise, np.nan))
+    worst = worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
         tiles.append(Tile("Torque error", _fall(first, last), f"joint {worst + 1}, the worst; rms"))
+    if worst is not None and noise[worst] > 0.0:
         tiles.append(
             Tile(
                 "In units of its noise",

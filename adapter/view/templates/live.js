@@ -24,7 +24,8 @@
     if (!some(x)) return "–";
     if (!some(std) || std <= 0) return `${number(x)} ${unit}`;
     const decimals = Math.min(Math.max(0, 1 - Math.floor(Math.log10(std))), 7);
-    return `${x.toFixed(decimals)} ± ${std.toFixed(decimals)} ${unit}`.replace("-", "−");
+    const told = (x.toFixed(decimals) * 1 === 0 ? 0 : x).toFixed(decimals);  // no minus before 0.00
+    return `${told} ± ${std.toFixed(decimals)} ${unit}`.replace("-", "−");
   };
   const signed = (x, digits) => (x > 0 ? "+" : "") + number(x, digits);
   const count = (x) => String(x).replace(/\B(?=(\d{3})+$)/g, "\u202f");
@@ -319,8 +320,12 @@
     seen.forEach((r, k) => { if (k) g.lineTo(x(r[0]), y(r[1])); else g.moveTo(x(r[0]), y(r[1])); });
     g.stroke();
     g.fillStyle = colors.muted;
-    g.fillText(number(high, 2), 3, 11);
-    g.fillText(number(low, 2), 3, h - 4);
+    g.strokeStyle = colors.card;  // around the figures, or curves strike them through
+    g.lineWidth = 4;
+    for (const [value, at] of [[high, 11], [low, h - 4]]) {
+      g.strokeText(number(value, 2), 3, at);
+      g.fillText(number(value, 2), 3, at);
+    }
   };
 
   const drawEstimate = () => {
