@@ -62,11 +62,12 @@ class Active:
 
     @property
     def shown(self) -> bool:
-        """Whether any of its numbers is more than noise, or is not known to be noise."""
+        """Whether any number that was learned is more than noise; or nobody knows of any."""
         stds = {key: self.std.get(key) for key in self.values}
-        return any(
-            std is None or np.any(np.abs(np.asarray(self.values[key], float)) > SHOWN_STD * std)
-            for key, std in stds.items()
+        known = {key: std for key, std in stds.items() if std is not None}
+        return not known or any(
+            np.any(np.abs(np.asarray(self.values[key], float)) > SHOWN_STD * std)
+            for key, std in known.items()
         )
 
 

@@ -59,8 +59,7 @@ def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     else:
         return RobotText(urdf_text(model, more), None, left_out, ())
     written, notes = urdf_onto(model, more, text, file)
-    lacking = [f"a URDF has no place for {what}" for what in unplaced(model, more)]
-    return RobotText(written, file, left_out, (*notes, *lacking))
+    return RobotText(written, file, left_out, (*notes, *_lacking("URDF", unplaced(model, more))))
 
 
 def to_urdf(model: SelfModel) -> str:
@@ -88,8 +87,12 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     if onto is None:
         return RobotText(mjcf_text(model, more), None, left_out, tuple(notes))
     written, notes = mjcf_onto(model, more, onto)
-    lacking = [f"an MJCF has no place for {what}" for what in more.left_out]
-    return RobotText(written, str(onto), left_out, (*notes, *lacking))
+    return RobotText(written, str(onto), left_out, (*notes, *_lacking("MJCF", more.left_out)))
+
+
+def _lacking(kind: str, left_out: Sequence[str]) -> list[str]:
+    """What a format has no place for, in one sentence."""
+    return [f"{kind} has no place for {'; '.join(left_out)}"] if left_out else []
 
 
 def additions(model: SelfModel, places: Sequence[str]) -> Additions:
@@ -130,4 +133,6 @@ def _said(model: SelfModel, active: Active) -> str:
 
 
 def _number(value: object) -> str:
-    return repr(value) if isinstance(value, int | float) else str(np.asarray(value).tolist())
+    if isinstance(value, int | float):
+        return f"{value:.4g}"
+    return str([float(f"{x:.4g}") for x in np.ravel(np.asarray(value, float))])

@@ -162,7 +162,7 @@ def test_what_has_no_place_is_in_one_comment() -> None:
         "Fs = 0.7 N m",
         "Fc_pos = 0.6 N m",
         "damping of panda_joint6, which is negative: -0.01",
-        "torque_offset of panda_joint1, o = 1.0 N m (it ended)",
+        "torque_offset of panda_joint1, o = 1 N m (it ended)",
     ):
         assert part in said
     assert "coulomb_friction" not in said
