@@ -24,7 +24,7 @@ from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import labelled, output, say, show, warn, write_json
-from drivers.files.mcap import read_log
+from drivers.files.mcap import read_sensors
 
 
 def run(args: argparse.Namespace) -> int:
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     announce_compiling(say)
     begin = getattr(args, "from")
     span = begin, begin + args.seconds
-    log = read_log(args.log, topic=args.topic, sensors=True, within_s=span)
+    log = read_sensors(args.log, args.topic, span)
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))

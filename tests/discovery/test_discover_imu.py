@@ -15,7 +15,7 @@ from mcap_ros2.writer import Writer as RosWriter
 from adapter.cli import main
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
-from drivers.files.mcap import read_log
+from drivers.files.mcap import read_log, read_sensors
 from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS
 from drivers.interface import DriverError
 from tests.helpers.discovery_data import Case, Motion, anyhow, panda, record
@@ -143,7 +143,7 @@ def test_other_commands_see_nothing_of_it(tmp_path) -> None:
 def test_a_part_is_that_part_of_the_whole(tmp_path, capsys) -> None:
     path = _write(tmp_path / "a.mcap", _case(1, False, False), str)
     whole = read_log(path, sensors=True)
-    part = read_log(path, sensors=True, within_s=(1.0, 2.0))
+    part = read_sensors(path, within_s=(1.0, 2.0))
     at = np.searchsorted(whole.stamp_ns, part.stamp_ns)
     assert 900 < len(part) <= 1001 and np.array_equal(whole.stamp_ns[at], part.stamp_ns)
     np.testing.assert_array_equal(part.q, whole.q[at])

@@ -15,7 +15,15 @@ from drivers.files.mcap.imus import READERS, FrameMotion
 from drivers.files.mcap.joint_rows import derive_velocity, looks_like_degrees
 from drivers.files.mcap.joints import Commands
 from drivers.files.mcap.links import Carrier
-from drivers.files.mcap.log import Log, Topic, read_estimates, read_log, read_messages, survey
+from drivers.files.mcap.log import (
+    Log,
+    Topic,
+    read_estimates,
+    read_log,
+    read_messages,
+    read_sensors,
+    survey,
+)
 from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
 from drivers.files.mcap.sampled import SampledLog, sample_log
@@ -54,6 +62,7 @@ __all__ = [
     "read_log",
     "read_messages",
     "read_position_log",
+    "read_sensors",
     "recover",
     "sample_log",
     "stored",

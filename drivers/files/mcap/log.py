@@ -221,7 +221,6 @@ def read_log(
     sensors: bool = False,
     frames: bool = False,
     imus: bool = False,
-    within_s: tuple[float, float] | None = None,
 ) -> Log:
     """Read a recording, cut or whole, by whatever recorder.
 
@@ -235,21 +234,30 @@ def read_log(
             stamps; efforts and velocities may be absent.
         frames: read into `Log.frames` what topics say of frames' motion, whatever frames; `imus`
             the same for Imu topics alone.
-        within_s: read what was recorded in this time since the first message, nothing else.
 
     Raises:
         DriverError: the file is unreadable or empty, or has no joint states with positions and
             efforts; the sentence says what the file does have.
     """
     return assembled(
-        open_scan(Path(path)),
-        joint_names,
-        topic,
-        sensors=sensors,
-        frames=frames,
-        imus=imus,
-        within_s=within_s,
+        open_scan(Path(path)), joint_names, topic, sensors=sensors, frames=frames, imus=imus
     )
+
+
+def read_sensors(
+    path: str | Path, topic: str | None = None, within_s: tuple[float, float] | None = None
+) -> Log:
+    """As `read_log` with `sensors`, of a part of the recording.
+
+    Args:
+        within_s: log times since the first message, s; None: all.
+
+    Raises:
+        DriverError: as `read_log`; the recording ends before that time.
+    """
+    scan = open_scan(Path(path))
+    scan.within_s = within_s
+    return assembled(scan, None, topic, sensors=True)
 
 
 def assembled(
@@ -260,13 +268,10 @@ def assembled(
     sensors: bool = False,
     frames: bool = False,
     imus: bool = False,
-    within_s: tuple[float, float] | None = None,
 ) -> Log:
     """What a scan tells, see `read_log`."""
     tell = tuple(READERS) if frames else (IMU,) if imus else ()
-    topics = collect(
-        scan, lambda series: is_wanted(series, topic, sensors, tell), within_s=within_s
-    )
+    topics = collect(scan, lambda series: is_wanted(series, topic, sensors, tell))
     series = choose_topic(scan, topics, topic, not sensors)
     with np.errstate(invalid="ignore"):  # not-a-number is counted, not computed with
         joints = assemble_joints(series, scan.path, joint_names, effort=not sensors)

@@ -85,7 +85,9 @@ def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog
 
 def _is_of_another_kind(path: Path, states: str) -> bool:
     """Whether the first seconds tell that it is of another kind: efforts, or nothing commanded."""
-    topics = collect(open_scan(path), lambda x: x.topic == states, within_s=(0.0, GLANCE_S))
+    scan = open_scan(path)
+    scan.within_s = (0.0, GLANCE_S)
+    topics = collect(scan, lambda series: series.topic == states)
     if states not in topics or JOINT_COMMANDS not in topics or not topics[JOINT_COMMANDS].count:
         return True
     return fits(topics[states], effort=True) and _has_effort(topics[states])

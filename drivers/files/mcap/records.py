@@ -197,6 +197,8 @@ class Scan:
         metadata, attachments: in the order of the file.
         truncated: the file has no proper end.
         passed: messages of topics that `regions` passes over.
+        within_s: log times since the first message that are read, all where None; what lies outside
+            is counted.
         warnings: what was wrong with the file, one sentence each.
     """
 
@@ -210,6 +212,7 @@ class Scan:
         self.attachments: list[Attachment] = []
         self.truncated = False
         self.passed: dict[str, int] = {}
+        self.within_s: tuple[float, float] | None = None
         self.warnings: list[str] = []
 
     def regions(self) -> Iterator[Region]:

@@ -138,19 +138,17 @@ def collect(
     scan: Scan,
     wanted: Callable[[Series], bool],
     take: Callable[[Series], None] | None = None,
-    within_s: tuple[float, float] | None = None,
 ) -> dict[str, Series]:
     """Every topic of the file by name; those `wanted` are decoded, the others counted.
 
     Args:
         take: is given a topic of `wanted` each time that it has decoded some messages more.
-        within_s: log times since the first one; what lies outside them is counted, too.
 
     Raises:
-        DriverError: the recording ends before these times.
+        DriverError: the recording ends before `scan.within_s`.
     """
     topics: dict[str, Series] = {}
-    unknown = outside = begin = end = 0
+    within_s, unknown, outside, begin, end = scan.within_s, 0, 0, 0, 0
     for region in scan.regions():
         channels = region.channel
         times = region.times[:, 0].astype(np.int64)
