@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
+WARM := $(VENV)/.warm
 # Folders whose tests answer in seconds: what a change breaks at once
 QUICK := tests/house tests/model tests/physics tests/signals tests/runs tests/report
 
@@ -20,10 +21,10 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench licences clean
 
-run: $(STAMP)
+run: $(WARM)
 	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
 
-experiment: $(STAMP)
+experiment: $(WARM)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json
 
 # The lint beside the tests that judge no time: mypy alone would leave a processor idle.
@@ -37,10 +38,10 @@ test: $(STAMP)
 quick: $(STAMP)
 	$(MAKE) --jobs 2 lint quick-tests
 
-shared: $(STAMP)
+shared: $(WARM)
 	$(PYTEST) $(SHARED)
 
-quick-tests: $(STAMP)
+quick-tests: $(WARM)
 	$(PYTEST) $(SHARED) $(QUICK)
 
 lint: $(STAMP)
@@ -49,10 +50,10 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-setup: $(STAMP)
+setup: $(WARM)
 
 # Notebooks are executed first, so that their pages have pictures
-docs: $(STAMP)
+docs: $(WARM)
 	PYTHONPATH=. $(BIN)/python docs/site/notebooks.py
 	$(BIN)/mkdocs build --strict --config-file docs/site/mkdocs.yml
 
@@ -61,10 +62,14 @@ $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version.split()[0])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --no-compile --constraint constraints.txt --editable '.[test]'
+	touch $@
+
+# Kernels are compiled once, beside the lint where there is one
+$(WARM): $(STAMP)
 	$(BIN)/python -m adapter.cli.warm_up > /dev/null 2>&1
 	touch $@
 
-trials: $(STAMP)
+trials: $(WARM)
 	mkdir -p runs
 	$(PYTEST) --numprocesses 2 --dist loadfile -m slow
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/trials.py --json runs/trials.json
@@ -85,12 +90,12 @@ trials: $(STAMP)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/fault_trials.py --driver can --trials 10000 --json runs/fault_trials_can.json
 	PYTHONPATH=. $(BIN)/python tests/benchmarks/mutations.py --json runs/mutations.json
 
-soak: $(STAMP)
+soak: $(WARM)
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --minutes 10
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --driver fci --faults 0.01 --minutes 30
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/soak.py --driver can --faults 0.01 --minutes 30
 
-bench: $(STAMP)
+bench: $(WARM)
 	$(BIN)/adapter bench
 	$(BIN)/python tests/benchmarks/wires.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/tree_rate.py --json runs/tree_rate.json

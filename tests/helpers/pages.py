@@ -17,6 +17,7 @@ NOT_GIVEN = {
     "can://can0": "a real CAN bus; a simulated one is in simulated-hardware.md",
     "adapter sim fci --": "its options: tests/sim",
     "adapter excite": "minutes of search; tests/cli/test_excite.py gives it with a nearer goal",
+    "write_a_driver.py": "given by tests/drivers/test_own_driver.py",
     "adapter completion": "given by tests/cli/test_clumsy.py",
     "adapter experiment atlas": "a small one is given by tests/experiments/test_experiment.py",
 }
