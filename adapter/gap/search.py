@@ -292,8 +292,8 @@ def _named(lead: Lead) -> Named:
 
 def _held_before(fit: Fit, move: Move) -> tuple[Named, ...]:
     """The load that a move puts down, where the model has none yet."""
-    lead = move.leads[-1]
-    if not _puts_down(lead) or any(e.candidate.effect is HELD for e in fit.named):
+    lead, known = move.leads[-1], [a.effect for a in fit.model.known]
+    if not _puts_down(lead) or HELD in [*known, *(e.candidate.effect for e in fit.named)]:
         return ()
     return (Named(lead.candidate, np.zeros(len(lead.x)), recording=lead.recording),)
 
@@ -358,7 +358,7 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
         rare = not (_is_common(e.candidate.effect) or e.candidate.columns_are_theta)
-        if from_the_start(e) and any(map(_puts_down, fit.named)):
+        if from_the_start(e) and e.possible and any(map(_puts_down, fit.named)):
             continue  # the hand held what it puts down
         if (
             value < BELIEF + rare * fit.caution
