@@ -233,8 +233,10 @@ def _rollout(rollout: RolloutCurves, j: int) -> Panel:
         below.set_ylim(-1.1 * worst, 1.1 * worst)
     below.set_ylabel("mrad off")  # for the pointer; drawn inside, where long numbers leave room
     below.yaxis.label.set_visible(False)
-    inside = {"color": MUTED, "fontsize": SIZES["half"][2], "va": "top"}
-    below.text(0.01, 0.95, "mrad off", transform=below.transAxes, **inside)
+    size = SIZES["half"][2]
+    below.text(
+        0.01, 0.95, "mrad off", transform=below.transAxes, color=MUTED, fontsize=size, va="top"
+    )
     below.set_xlim(start, stop)
     time_axis(drawing, "time, s")
     note = "position, restarted from the data every 0.5 s; below, how far it is off"
