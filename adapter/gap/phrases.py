@@ -51,7 +51,7 @@ def plus_minus(value: Any, std: Any) -> str:
     decimals = 1 - _order(std)
     if value and decimals > MOST_DIGITS - 1 - _order(value):
         return plain(value, MOST_DIGITS)
-    shown, doubt = round(value, decimals), round(std, decimals)
+    shown, doubt = round(value, decimals) + 0.0, round(std, decimals)  # no minus before 0.00
     return f"{shown:.{max(decimals, 0)}f} ± {doubt:.{max(decimals, 0)}f}"
 
 

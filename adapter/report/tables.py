@@ -76,14 +76,16 @@ def joint_tables(data: RunData) -> list[Table]:
     std = schema.get("std") or {}
     names = ("Joint", "", list(data.documented.tree.joint_names))
     columns: list[tuple[str, str, list[str]]] = [names]
-    for head, unit, key, std_key in (
-        ("Turn error", "mrad", "rotation_error_rad", "rotation_rad"),
-        ("Shift error", "mm", "position_error_m", "position_m"),
+    for head, unit, key, std_key, at in (
+        ("Turn error", "mrad", "rotation_error_rad", "rotation_rad", slice(0, 3)),
+        ("Shift error", "mm", "position_error_m", "position_m", slice(3, 6)),
     ):
         if schema.get(key):
             columns.append((head, unit, _column(schema[key], 1e3)))
         if std.get(std_key):
-            columns.append((f"± {head.split()[0].lower()}", unit, _column(std[std_key], 1e3)))
+            pairs = zip(std[std_key], data.lam_shown, strict=True)
+            known = [x if np.any(shown[at]) else None for x, shown in pairs]
+            columns.append((f"± {head.split()[0].lower()}", unit, _column(known, 1e3)))
     if theta_started(data):
         measured = np.sqrt(np.mean(data.score_signals()[3] ** 2, axis=0))
         columns.append(("Torque, rms", "N m", _column(measured)))
@@ -233,7 +235,9 @@ def schema_table(data: RunData) -> Table:
     rows = []
     for j, name in enumerate(data.documented.tree.joint_names):
         for what, lam in (("learned", data.model.lam), ("documented", data.documented.lam)):
-            rows.append([f"{name}, {what}", *(f"{x:.4f}".replace("-", "−") for x in lam[j])])
+            rows.append(
+                [f"{name}, {what}", *(f"{round(x, 4) + 0.0:.4f}".replace("-", "−") for x in lam[j])]
+            )
     note = (
         "R = Rz(α) Rx(β) Rz(γ). Angles of one frame may differ and mean the same frame; "
         "what motion does not show is taken from the documentation."

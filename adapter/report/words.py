@@ -56,7 +56,8 @@ def plus_minus(value: Any, std: Any) -> str:
     if value is None or std is None or not math.isfinite(std) or std <= 0.0:
         return number(value)
     decimals = min(max(0, 1 - math.floor(math.log10(std))), 7)
-    return f"{value:.{decimals}f} ± {std:.{decimals}f}".replace("-", "−")
+    shown = round(value, decimals) + 0.0  # no minus before 0.00
+    return f"{shown:.{decimals}f} ± {std:.{decimals}f}".replace("-", "−")
 
 
 def count(value: int) -> str:
