@@ -30,9 +30,7 @@ from drivers.files.mcap import read_sensors
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    begin = getattr(args, "from")
-    span = begin, begin + args.seconds
-    log = read_sensors(args.log, args.topic, span)
+    log = read_sensors(args.log, args.topic, (args.from_s, args.from_s + args.seconds))
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))

@@ -27,7 +27,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "or /link_twists/<link> and /link_accels/<link>",
     )
     add_topic(parser)
-    add("--from", type=float, default=0.0, metavar="S", help="read from this second on")
+    add("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin at this second")
     add(
         "--seconds",
         type=float,
@@ -48,8 +48,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> list[Path]:
-    if not getattr(args, "from") >= 0.0:
-        raise UsageError(f"--from takes 0 or more seconds, got {getattr(args, 'from')}")
+    if not args.from_s >= 0.0:
+        raise UsageError(f"--from takes 0 or more seconds, got {args.from_s}")
     if not args.seconds > 0.0:
         raise UsageError(f"--seconds must be above zero, got {args.seconds}")
     return check_logs(args.log)

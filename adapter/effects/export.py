@@ -59,7 +59,7 @@ def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     else:
         return RobotText(urdf_text(model, more), None, left_out, ())
     written, notes = urdf_onto(model, more, text, file)
-    return RobotText(written, file, left_out, (*notes, *_lacking("URDF", unplaced(model, more))))
+    return RobotText(written, file, left_out, (*notes, *_lacking("a URDF", unplaced(model, more))))
 
 
 def to_urdf(model: SelfModel) -> str:
@@ -87,7 +87,7 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     if onto is None:
         return RobotText(mjcf_text(model, more), None, left_out, tuple(notes))
     written, notes = mjcf_onto(model, more, onto)
-    return RobotText(written, str(onto), left_out, (*notes, *_lacking("MJCF", more.left_out)))
+    return RobotText(written, str(onto), left_out, (*notes, *_lacking("an MJCF", more.left_out)))
 
 
 def _lacking(kind: str, left_out: Sequence[str]) -> list[str]:

@@ -156,7 +156,7 @@ def _round(
         trial = _with(fit, move, table.fit.noise, progress)
         if trial is not None:
             return _alongside(trial, move, moves, table, progress), True
-        refused |= {x.candidate.key for x in move.leads if len(move.leads) == 1}
+        refused.update(x.candidate.key for x in move.leads if len(move.leads) == 1)
     return fit, bool(fit.caution and moves)  # those that were refused may have hidden others
 
 

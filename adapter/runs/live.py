@@ -15,11 +15,10 @@ from adapter.gap.monitor import Monitor
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
-from adapter.model.spatial import Array
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import NEWS_BYTES, Snapshot
 from adapter.runs.config import PipelineSettings
-from adapter.runs.outcome import SHOWN_SHARE, changes_at, collect
+from adapter.runs.outcome import SHOWN_SHARE, changes_at, collect, in_parents
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.terminal import json_ready, json_text
 from adapter.signals.records import LinkMotionKind
@@ -86,14 +85,6 @@ def disagreement(line: str) -> str:
     return f"new disagreement: {line}"
 
 
-def _in_parents(R0: Array, table: Array) -> Array:
-    """(n, 6) diagonals of tables (n, 6, 6), turns told in the axes of the parents."""
-    turned = R0 @ table[:, :3, :3] @ np.swapaxes(R0, 1, 2)
-    return np.concatenate(
-        [np.einsum("jaa->ja", turned), np.einsum("jaa->ja", table[:, 3:, 3:])], axis=1
-    )
-
-
 def keep_quiet(line: str) -> None:
     """Where nobody wants to hear at once; a function with a name can travel in a file."""
 
@@ -143,7 +134,8 @@ class Publisher:
     def _deviations(learner: OnlineLearner) -> tuple[Any, Any, Any]:
         n, schema, theta = learner.tree.n, learner.schema, learner.theta
         variance, shown = (
-            _in_parents(schema.R0, x) for x in (schema.covariance(), schema.identifiable)
+            np.einsum("jaa->ja", in_parents(schema.R0, x))
+            for x in (schema.covariance(), schema.identifiable)
         )
         lam_std = np.where(shown > SHOWN_SHARE, np.sqrt(np.maximum(variance, 0.0)), np.nan)
         std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))

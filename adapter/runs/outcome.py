@@ -95,12 +95,16 @@ class Outcome:
     disagreements: tuple[dict[str, Any], ...] | None = None
 
 
+def in_parents(R0: Array, table: Array) -> Array:
+    """Tables (n, 6, 6) of (phi, d) as of (turn in the parent's axes, d); R0 (n, 3, 3)."""
+    to_parent = np.zeros(table.shape)
+    to_parent[:, :3, :3], to_parent[:, 3:, 3:] = R0, np.eye(3)
+    return np.asarray(to_parent @ table @ to_parent.transpose(0, 2, 1))
+
+
 def collect(learner: OnlineLearner) -> Outcome:
     """Read off a learner what there is to tell."""
     schema, theta = learner.schema, learner.theta
-    to_parent = np.zeros((learner.tree.n, 6, 6))  # (phi, d) -> (turn in the parent's axes, d)
-    to_parent[:, :3, :3], to_parent[:, 3:, 3:] = schema.R0, np.eye(3)
-    back = to_parent.transpose(0, 2, 1)
     traced = learner.theta_trace.rows[:, 1 : 1 + 10 * learner.tree.bodies].reshape(-1, 10)
     eigenvalues = min_eigenvalue(np.concatenate([traced, theta.theta]))
     return Outcome(
@@ -108,8 +112,8 @@ def collect(learner: OnlineLearner) -> Outcome:
         updates=schema.updates,
         start_lam=schema.start_lam,
         lam=schema.lam,
-        lam_covariance=to_parent @ schema.covariance() @ back,
-        lam_identifiable=to_parent @ schema.certain @ back,
+        lam_covariance=in_parents(schema.R0, schema.covariance()),
+        lam_identifiable=in_parents(schema.R0, schema.certain),
         lam_rank=round(float(np.einsum("jaa->", schema.certain))),
         lam_converged=schema.converged,
         lam_measured=schema.kind == LinkMotionKind.MEASURED,
@@ -130,7 +134,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
         schema_known=learner.schema_trace.rows[:, 1 + 12 * learner.tree.n :].copy(),
-        lam_information=to_parent @ schema.information @ back,
+        lam_information=in_parents(schema.R0, schema.information),
         theta_trace=learner.theta_trace.rows.copy(),
         score_trace=learner.score_trace.rows.copy(),
         min_eigenvalue=float(np.min(eigenvalues)),

@@ -62,7 +62,6 @@ def told(folder: Path, hidden: Hidden) -> dict[str, Any]:
         f["effect"]: f
         for f in findings
         if f["effect"] in ("payload", "external_wrench", "friction_drift")
-        and f["z"] > 0.0
         and (f["effect"] != "payload" or f["interval_s"][0] > 0.0)
     }
     load, push, drift = (said.get(x) for x in ("payload", "external_wrench", "friction_drift"))
