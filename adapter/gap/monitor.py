@@ -11,6 +11,7 @@ An arm at rest shows nothing: the front end passes on states of motion only.
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, Disagreement
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
+from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
 BLOCK_NS = 40_000_000  # states averaged to one row
@@ -33,6 +35,43 @@ MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
 START_INFLATION = 2.0  # of sums of rows, before it is measured
 
 
+class Mark(IntEnum):
+    """Places in the marks of a block that is not over."""
+
+    COUNT = 0  # states in it
+    BEGIN_NS = 1
+    LAST_NS = 2
+    SINCE_NS = 3  # sum of the times since the beginning
+
+
+@jit
+def average(table, first, marks, total, rows):
+    """Average states (m, size), from their column `first` on, to rows; how many are full now.
+
+    Args:
+        marks: (4,) int64, see `Mark`; total: (w,) sum of the block's states.
+        rows: (m, 1 + w) filled: time in the middle, s, and average.
+    """
+    full = 0
+    for m in range(table.shape[0]):
+        stamp = table[m, :1].view(np.int64)[0]
+        count, since_last = marks[Mark.COUNT], stamp - marks[Mark.LAST_NS]
+        if count and not 0 < since_last <= HOLE_NS:
+            marks[Mark.COUNT] = 0
+        elif count and stamp - marks[Mark.BEGIN_NS] >= BLOCK_NS:
+            rows[full, 0] = 1e-9 * (marks[Mark.BEGIN_NS] + marks[Mark.SINCE_NS] / count)
+            rows[full, 1:] = total / count
+            marks[Mark.COUNT], full = 0, full + 1
+        if not marks[Mark.COUNT]:
+            total[:] = 0.0
+            marks[Mark.BEGIN_NS], marks[Mark.SINCE_NS] = stamp, 0
+        total += table[m, first : first + total.shape[0]]
+        marks[Mark.SINCE_NS] += stamp - marks[Mark.BEGIN_NS]
+        marks[Mark.COUNT] += 1
+        marks[Mark.LAST_NS] = stamp
+    return full
+
+
 class Blocks:
     """Averages states to rows; cheap for each of them.
 
@@ -42,31 +81,17 @@ class Blocks:
 
     def __init__(self, n: int) -> None:
         at = StateLayout(n)
-        self._signals = slice(at.q.start, at.memory.stop)
-        self._sum = np.zeros(at.memory.stop - at.q.start)
-        self._count, self._begin_ns, self._last_ns, self._stamps = 0, 0, 0, 0
+        self._first = at.q.start
+        self._total = np.zeros(at.memory.stop - at.q.start)
+        self._marks = np.zeros(len(Mark), dtype=np.int64)
+        self._one = np.empty((1, 1 + len(self._total)))
 
     def add(self, table: Array) -> list[tuple[float, Array]]:
         """Take states (m, size); rows (s, states from q to `memory`)."""
-        return [row for state in table if (row := self._add_one(state)) is not None]
-
-    def _add_one(self, state: Array) -> tuple[float, Array] | None:
-        stamp = stamp_of(state)
-        done = None
-        if self._count and not 0 < stamp - self._last_ns <= HOLE_NS:
-            self._count = 0
-        elif self._count and stamp - self._begin_ns >= BLOCK_NS:
-            middle = self._begin_ns + self._stamps / self._count
-            done = 1e-9 * middle, self._sum / self._count
-            self._count = 0
-        if not self._count:
-            self._sum[:] = 0.0
-            self._begin_ns, self._stamps = stamp, 0
-        self._sum += state[self._signals]
-        self._stamps += stamp - self._begin_ns
-        self._count += 1
-        self._last_ns = stamp
-        return done
+        m = len(table)
+        rows = self._one if m == 1 else np.empty((m, self._one.shape[1]))
+        full = average(table, self._first, self._marks, self._total, rows)
+        return [(float(row[0]), row[1:].copy()) for row in rows[:full]]
 
 
 class Monitor:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Evidence, Level, RowGroup
-from adapter.gap.monitor_signatures import Signature, candidates
+from adapter.gap.monitor_signatures import Candidates, Signature, candidates
 from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
@@ -42,6 +42,7 @@ class DisagreementDetector:
 
     def __init__(self, n: int, belief: Belief, level: Level, found: DisagreementList) -> None:
         self._candidates = candidates(n)
+        self._all = Candidates(self._candidates)
         self._belief, self._level, self._found = belief, level, found
         self._peaks, self._power_peak = np.zeros(len(self._candidates)), np.ones(n)
         self._recent: list[Array] = []
@@ -57,9 +58,7 @@ class DisagreementDetector:
         before = len(self._found.reports)
         evidence = self._evidence()
         G, b = evidence.information(ROWS_PER_GROUP)
-        scores = np.array(
-            [c.evidence(_block(G, c.columns), b[:, c.columns]) for c in self._candidates]
-        )
+        scores = self._all.evidence(G, b)
         left = evidence.residual - evidence.rows.Z @ evidence.shift
         left *= np.sqrt(self._level.share(evidence.rows.unsure))
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
@@ -151,15 +150,15 @@ class DisagreementDetector:
         weight[np.abs(t - since_s) < EDGE_S] = 0.0
         clear = self._evidence(weight)
         G, b = clear.from_row(first)
-        fits = [(_block(G, c.columns), b[:, c.columns]) for c in self._candidates]
-        best = np.array([c.evidence(*x)[0] for c, x in zip(self._candidates, fits, strict=True)])
+        best = self._all.evidence(G, b)[:, 0]
         order = np.argsort(-best)
         which = int(order[0])
         close = [self._candidates[k] for k in order[1:4] if best[k] > best[which] - MARGIN]
         if close and may_wait:
             return
         candidate = self._candidates[which]
-        a = candidate.coefficients(*(x[0] for x in fits[which]))
+        own = candidate.columns
+        a = candidate.coefficients(G[0][np.ix_(own, own)], b[0, own])
         joints = self._left(clear, candidate, a, first)
         if joints:
             self._found.unexplained(joints, since_s, self._now_s, score)
@@ -198,10 +197,6 @@ class DisagreementDetector:
         if len(self._recent) > GROUPS:
             self._peaks = np.maximum(self._peaks, self._recent.pop(0))
             self._power_peak = np.maximum(self._power_peak, self._powers.pop(0))
-
-
-def _block(G: Array, columns: np.ndarray) -> Array:
-    return np.asarray(G[:, columns[:, None], columns])
 
 
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states

@@ -71,6 +71,34 @@ class Signature:
         return {key: value for key, value in values.items() if np.ndim(value) == 0}
 
 
+class Candidates:
+    """Signatures, those of equally many columns scored together: there are forty, five a second.
+
+    Args:
+        signatures: in the order that scores come in.
+    """
+
+    def __init__(self, signatures: Sequence[Signature]) -> None:
+        self._odds = np.array([signature.log_odds for signature in signatures])
+        sizes = np.array([len(signature.columns) for signature in signatures])
+        self._alike = []
+        for size in np.unique(sizes):
+            same = np.flatnonzero(sizes == size)
+            own = [signature for signature in signatures if len(signature.columns) == size]
+            columns, std = np.array([x.columns for x in own]), np.array([x.std for x in own])
+            self._alike.append((same, columns, std))
+
+    def evidence(self, G: Array, b: Array) -> Array:
+        """(c, s) `Signature.evidence` of each, from G (s, K, K) and b (s, K) of all columns."""
+        found = np.empty((len(self._odds), len(b)))
+        for same, columns, std in self._alike:
+            own = G[:, columns[:, :, None], columns[:, None, :]], b[:, columns]
+            flat = [part.reshape(-1, *part.shape[2:]) for part in own]
+            one = scores(flat[0], flat[1], np.tile(std, (len(b), 1)))[0]
+            found[same] = one.reshape(len(b), -1).T
+        return found + self._odds[:, None]
+
+
 def watched() -> tuple[list[Effect], list[Effect]]:
     """Effects that may begin while one watches: those of joints, those of the flange."""
     both = [effect for effect in CATALOGUE.values() if effect.watched]

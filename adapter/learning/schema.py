@@ -27,7 +27,9 @@ from adapter.learning.schema_kernels import (
     absorb,
     carry_spin,
     descend,
+    directions,
     distances,
+    finish,
     profiled,
     residual_variance,
     retract,
@@ -142,6 +144,7 @@ class Schema:
         self.certain = np.zeros((n, 6, 6))
         self.rank = 0
         self.ranks, self._there = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=bool)
+        self._left = np.zeros((n, 6))
         self.check = SchemaCheck(n)
         self.started_anew: list[int] = []
         self._calm_ns = self._looked_ns = 0
@@ -301,32 +304,23 @@ class Schema:
 
     def _judge(self) -> None:
         """Which directions the data show, how far the optimum is, whether λ has settled."""
-        values, vectors = np.linalg.eigh(self.information)
-        least, enough = self._limits
-        shown, certain = values > least, values > enough
-        for k, kind in enumerate((shown & certain, shown & ~certain)):
-            kept = vectors * kind[:, None, :]
-            self._may_move[:, k] = kept @ kept.transpose(0, 2, 1)
-            safe = np.where(kind, values, 1.0)
-            self._inverse[:, k] = (kept / safe[:, None, :]) @ kept.transpose(0, 2, 1)
-        self.identifiable[:] = self._may_move.sum(axis=1)
+        curvature, before = np.linalg.eigh(self.information), self.ranks.copy()
+        stds = (0.0, 0.0) if self._exact else (1.0, SURE)
+        goals = self.settings.distance_goal, *stds
+        out = self._may_move, self._inverse, self._left, self.ranks, self._there
+        self.rank = directions(tuple(curvature), self._limits, goals, self.gradient, out)
+        np.add(self._may_move[:, 0], self._may_move[:, 1], out=self.identifiable)
         self.certain[:] = self._may_move[:, 0]
-        self.rank, ranks = int(shown.sum()), (shown & certain).sum(axis=1)
-        same = ranks.any() and bool((ranks == self.ranks).all())
-        self.ranks[:] = ranks
-        left = np.einsum("jkab,jb->jka", self._inverse, self.gradient)
-        std = np.sqrt(np.einsum("jkaa->jka", self._inverse)) * [[1.0], [SURE]]
-        tolerance = np.maximum(self.settings.distance_goal, 0.0 if self._exact else std)
-        self._there = (np.abs(left) < tolerance).all(axis=(1, 2))
+        same = self.ranks.any() and bool((self.ranks == before).all())
         looked_ns, self._looked_ns = self._looked_ns, int(self.moments.last_stamps[0])
         since_ns = min(self._looked_ns - looked_ns, LONGEST_WAIT_NS)
         self._calm_ns = self._calm_ns + since_ns if same and self._there.all() else 0
-        self._settle(left.sum(axis=1))
+        self._settle()
 
-    def _settle(self, left: Array) -> None:
-        """Mend what stands wrong, and say whether λ has converged, with (n, 6) left to go."""
-        if self._exact:
-            self._finish(left)
+    def _settle(self) -> None:
+        """Mend what stands wrong, and say whether λ has converged."""
+        if self._exact:  # ADAM forgets the large gradients of its way too slowly to come close soon
+            finish(self._frames, self._left, NEAR, self.gradient)
         else:
             self._hold_unshown()
         checked = self.each_sample
@@ -337,18 +331,8 @@ class Schema:
         settled = checked and calm >= 1.0 and not self._rough
         if self._exact:  # no noise hides for long what is shown
             known = self.rank == self.ranks.sum() or calm >= PATIENCE
-            settled = settled and known and bool(np.abs(left).max() < EXACT_DISTANCE)
+            settled = settled and known and bool(np.abs(self._left).max() < EXACT_DISTANCE)
         self.converged = settled
-
-    def _finish(self, left: Array) -> None:
-        """Go the (n, 6) that is left at once where it is little and no noise moves it.
-
-        ADAM forgets the large gradients of its way too slowly to come close soon.
-        """
-        near = (np.abs(left) < NEAR).all(axis=1)
-        self.R0[near] = self.R0[near] @ exp_rotation(-left[near, :3])
-        self.p[near] -= left[near, 3:]
-        self.gradient[near] = 0.0
 
     def _check_valleys(self) -> None:
         """Start joints anew that stand in a wrong valley; ADAM goes on from there."""

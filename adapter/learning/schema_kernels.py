@@ -67,26 +67,25 @@ class MotionMoments(NamedTuple):
     counts: Array
 
 
-def _placement_derivatives() -> NDArray[np.float64]:
-    """D[c, i] (3, 3): T(p)[:, i] = T(0)[:, i] + D[c, i] p."""
-    D = np.zeros((3, 12, 3, 3))
-    cross = np.zeros((3, 3, 3))  # column i of w x p, by component of w
-    for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1))):
-        cross[i, b, a] = 1.0  # w_i p_a shows in row b with +, w_i p_b in row a with -
-        cross[i, a, b] = -1.0
-    D[1, 3:6] = cross
-    D[2, 3:6] = cross
-    # w (w.p) - |w|^2 p for the products xx xy xz yy yz zz
-    for i, (a, b) in enumerate(PRODUCTS):
-        D[2, 6 + i, a, b] += 1.0
-        if a == b:
-            D[2, 6 + i] -= np.eye(3)
-        else:
-            D[2, 6 + i, b, a] += 1.0
-    return D
+def _placed() -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Row r, axis a and sign s (9, 2) of all that a frame's place p puts into T(p).
+
+    The columns behind the first three, those of the three axes of w (or dw) and of the products,
+    are `T[r, 3 + k] = s p[a]` in two places each: w x p, and w (w.p) - |w|^2 p.
+    """
+    found: list[list[tuple[int, int, float]]] = []
+    for a, b in ((1, 2), (2, 0), (0, 1)):  # w_i p_a shows in row b with +, w_i p_b in row a with -
+        found.append([(b, a, 1.0), (a, b, -1.0)])
+    for a, b in PRODUCTS.tolist():
+        others = [r for r in range(3) if r != a]
+        same = [(r, r, -1.0) for r in others]
+        found.append(same if a == b else [(a, b, 1.0), (b, a, 1.0)])
+    table = np.array(found)
+    rows, axes = table[:, :, 0].astype(np.int64), table[:, :, 1].astype(np.int64)
+    return rows, axes, np.ascontiguousarray(table[:, :, 2])
 
 
-DERIVATIVES = _placement_derivatives()
+ROWS, AXES, SIGNS = _placed()
 
 
 @jit
@@ -135,75 +134,70 @@ def channel_cost(M, ch, R, p, g, H):
     The gradient is that of half the sum, in (phi, d); the curvature is Gauss-Newton's, and left
     out where H is empty (0, 6).
     """
-    D = DERIVATIVES
-    k = 3 if ch == 0 else (6 if ch == 1 else 12)
-    T = np.zeros((3, k))
-    for i in range(k):
-        for r in range(3):
-            T[r, i] = 1.0 if i == r else 0.0
-            for a in range(3):
-                T[r, i] += D[ch, i, r, a] * p[a]
-    TM = np.zeros((3, k))  # sum z s^T
-    Tsy = np.zeros((3, 3))  # sum z y^T
-    for r in range(3):
-        for i in range(k):
-            t = T[r, i]
-            if t != 0.0:
-                for j in range(k):
-                    TM[r, j] += t * M[ch, 3 + i, 3 + j]
-                for j in range(3):
-                    Tsy[r, j] += t * M[ch, 3 + i, j]
-    Suy = R.T @ Tsy  # sum u y^T with u = R^T z
+    k = N_SIGNALS[ch]
+    T, TM, Tsy = np.zeros((3, k)), np.empty((3, k)), np.empty((3, 3))
+    for r in range(3):  # T begins with a unit matrix
+        T[r, r] = 1.0
+        for j in range(k):
+            TM[r, j] = M[ch, 3 + r, 3 + j]  # sum z s^T
+        for j in range(3):
+            Tsy[r, j] = M[ch, 3 + r, j]  # sum z y^T
+    for i in range(3, k):
+        for e in range(2):
+            r = ROWS[i - 3, e]
+            t = SIGNS[i - 3, e] * p[AXES[i - 3, e]]
+            T[r, i] = t
+            for j in range(k):
+                TM[r, j] += t * M[ch, 3 + i, 3 + j]
+            for j in range(3):
+                Tsy[r, j] += t * M[ch, 3 + i, j]
     cost = 0.0
-    for r in range(3):
-        cost += M[ch, r, r] - 2.0 * Suy[r, r]
+    for r in range(3):  # u = R^T z
+        uy = R[0, r] * Tsy[0, r] + R[1, r] * Tsy[1, r] + R[2, r] * Tsy[2, r]
+        cost += M[ch, r, r] - 2.0 * uy
         for i in range(k):
             cost += TM[r, i] * T[r, i]
-    g[0] += Suy[1, 2] - Suy[2, 1]
-    g[1] += Suy[2, 0] - Suy[0, 2]
-    g[2] += Suy[0, 1] - Suy[1, 0]
+        g[0] += R[r, 1] * Tsy[r, 2] - R[r, 2] * Tsy[r, 1]
+        g[1] += R[r, 2] * Tsy[r, 0] - R[r, 0] * Tsy[r, 2]
+        g[2] += R[r, 0] * Tsy[r, 1] - R[r, 1] * Tsy[r, 0]
     for i in range(3, k):
-        for r in range(3):
-            e = -TM[r, i]  # sum s_i (R y - z)_r
-            for a in range(3):
-                e += R[r, a] * M[ch, 3 + i, a]
-            for a in range(3):
-                g[3 + a] -= D[ch, i, r, a] * e
+        y = M[ch, 3 + i]
+        for e in range(2):
+            r = ROWS[i - 3, e]  # sum s_i (R y - z)_r
+            left = R[r, 0] * y[0] + R[r, 1] * y[1] + R[r, 2] * y[2] - TM[r, i]
+            g[3 + AXES[i - 3, e]] -= SIGNS[i - 3, e] * left
     if H.shape[0]:
-        _add_curvature(M[ch], DERIVATIVES[ch], R, T, TM, H)
+        _add_curvature(M[ch], R, T, TM, H)
     return cost
 
 
 @jit
-def _add_curvature(M, D, R, T, TM, H):
+def _add_curvature(M, R, T, TM, H):
     """Gauss-Newton's curvature (6, 6) of one channel in (phi, d), added to H."""
-    k = T.shape[1]
-    U = R.T @ TM  # sum u s^T
-    Suu = U @ T.T @ R
-    trace = Suu[0, 0] + Suu[1, 1] + Suu[2, 2]
+    k, trace = T.shape[1], 0.0
+    for i in range(k):
+        ux = R[0, 0] * TM[0, i] + R[1, 0] * TM[1, i] + R[2, 0] * TM[2, i]  # sum u s_i
+        uy = R[0, 1] * TM[0, i] + R[1, 1] * TM[1, i] + R[2, 1] * TM[2, i]
+        uz = R[0, 2] * TM[0, i] + R[1, 2] * TM[1, i] + R[2, 2] * TM[2, i]
+        for b in range(3):  # sum u u^T
+            v = R[0, b] * T[0, i] + R[1, b] * T[1, i] + R[2, b] * T[2, i]
+            H[0, b] -= ux * v
+            H[1, b] -= uy * v
+            H[2, b] -= uz * v
+            trace += (ux if b == 0 else (uy if b == 1 else uz)) * v
+        if i < 3:
+            continue
+        for e in range(2):
+            r, a, s = ROWS[i - 3, e], 3 + AXES[i - 3, e], SIGNS[i - 3, e]
+            H[0, a] += s * (uz * R[r, 1] - uy * R[r, 2])
+            H[1, a] += s * (ux * R[r, 2] - uz * R[r, 0])
+            H[2, a] += s * (uy * R[r, 0] - ux * R[r, 1])
+            for j in range(3, k):
+                for f in range(2):
+                    if ROWS[j - 3, f] == r:
+                        H[a, 3 + AXES[j - 3, f]] += M[3 + i, 3 + j] * s * SIGNS[j - 3, f]
     for a in range(3):
-        for b in range(3):
-            H[a, b] -= Suu[a, b]
         H[a, a] += trace
-    for i in range(3, k):
-        for a in range(3):  # H_phi,d += [U_i]x^T (R^T D_i)
-            x, y, z = U[0, i], U[1, i], U[2, i]
-            v0, v1, v2 = 0.0, 0.0, 0.0
-            for r in range(3):
-                d = D[i, r, a]
-                v0 += R[r, 0] * d
-                v1 += R[r, 1] * d
-                v2 += R[r, 2] * d
-            H[0, 3 + a] += z * v1 - y * v2
-            H[1, 3 + a] += x * v2 - z * v0
-            H[2, 3 + a] += y * v0 - x * v1
-        for j in range(3, k):
-            m = M[3 + i, 3 + j]
-            for a in range(3):
-                for b in range(3):
-                    x = D[i, 0, a] * D[j, 0, b] + D[i, 1, a] * D[j, 1, b]
-                    H[3 + a, 3 + b] += m * (x + D[i, 2, a] * D[j, 2, b])
-    for a in range(3):
         for b in range(3):
             H[3 + b, a] = H[a, 3 + b]
 
@@ -409,24 +403,85 @@ def retract(frames, step, project, distance, pace):
     """
     tree = Frames(*frames)
     longest, share, rate = pace
-    turn = np.empty((3, 3))
     for j in range(step.shape[0]):
         x = (min(longest, share * distance[j, 0]) / rate) * (project[j, 0] @ step[j])
         if distance[j, 1] > 0.0:
             x += (min(longest, share * distance[j, 1]) / rate) * (project[j, 1] @ step[j])
-        a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-        s = np.sin(a) / a if a > 1e-8 else 1.0
-        h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
-        for r in range(3):
-            for c in range(3):
-                turn[r, c] = h * x[r] * x[c]
-            turn[r, r] += 1.0 - h * a * a
-        turn[0, 1] -= s * x[2]
-        turn[0, 2] += s * x[1]
-        turn[1, 0] += s * x[2]
-        turn[1, 2] -= s * x[0]
-        turn[2, 0] -= s * x[1]
-        turn[2, 1] += s * x[0]
-        tree.R0[j] = tree.R0[j] @ turn
-        tree.p[j] += x[3:]
+        move(tree, j, x)
     step[:] = 0.0
+
+
+@jit
+def move(tree, j, x):
+    """Move frame j by x (6,) in its own axes: R0 exp(phi), p + d."""
+    turn = np.empty((3, 3))
+    a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    s = np.sin(a) / a if a > 1e-8 else 1.0
+    h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
+    for r in range(3):
+        for c in range(3):
+            turn[r, c] = h * x[r] * x[c]
+        turn[r, r] += 1.0 - h * a * a
+    turn[0, 1] -= s * x[2]
+    turn[0, 2] += s * x[1]
+    turn[1, 0] += s * x[2]
+    turn[1, 2] -= s * x[0]
+    turn[2, 0] -= s * x[1]
+    turn[2, 1] += s * x[0]
+    tree.R0[j] = tree.R0[j] @ turn
+    tree.p[j] += x[3:]
+
+
+@jit
+def directions(curvature, limits, goals, g, out):
+    """Which directions the data show, how many of them are known, and how far their optimum is.
+
+    Args:
+        curvature: eigenvalues (n, 6) and eigenvectors (n, 6, 6), in columns.
+        limits: curvature above which a direction is shown, and known.
+        goals: rad and m that may be left where λ has arrived; standard deviations that may be, in
+            directions that are known, and in those that are not yet.
+        g: (n, 6) gradient.
+        out: projectors and inverse curvature (n, 2, 6, 6), on directions that are known and on
+            those that are not yet; (n, 6) left to go; (n,) known directions; (n,) whether λ has
+            arrived. All are filled.
+
+    Returns:
+        How many directions are shown.
+    """
+    (values, vectors), (least, enough) = curvature, limits
+    project, inverse, left, ranks, there = out
+    shown, ahead = 0, np.empty(6)
+    for j in range(g.shape[0]):
+        project[j], inverse[j], left[j], ranks[j], there[j] = 0.0, 0.0, 0.0, 0, True
+        for i in range(6):
+            value, v = values[j, i], vectors[j, :, i]
+            if not value > least:
+                continue
+            known = value > enough
+            k = 0 if known else 1
+            shown += 1
+            ranks[j] += known
+            for a in range(6):
+                for b in range(6):
+                    project[j, k, a, b] += v[a] * v[b]
+                    inverse[j, k, a, b] += v[a] * v[b] / value
+        for k in range(2):
+            for a in range(6):
+                ahead[a] = 0.0
+                for b in range(6):
+                    ahead[a] += inverse[j, k, a, b] * g[j, b]
+                most = max(goals[0], goals[1 + k] * math.sqrt(inverse[j, k, a, a]))
+                there[j] = there[j] and abs(ahead[a]) < most
+                left[j, a] += ahead[a]
+    return shown
+
+
+@jit
+def finish(frames, left, near, g):
+    """Move every frame that has less than `near` left (n, 6) to go there; then its g is zero."""
+    tree = Frames(*frames)
+    for j in range(left.shape[0]):
+        if np.abs(left[j]).max() < near:
+            move(tree, j, -left[j])
+            g[j] = 0.0

@@ -32,14 +32,17 @@ from adapter.learning.theta_kernels import (
     Rows,
     Weighing,
     absorb,
+    add_information,
     follow,
     gradient,
     joint_costs,
+    unfolded,
     values,
 )
 from adapter.model.inertia import log_cholesky_from_theta, min_eigenvalue, theta_from_body
 from adapter.model.spatial import Array
 from adapter.model.tree import BASE, Tree
+from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout
 
 # Prior: what a link of an arm may well be. Neutral body, and standard deviations around it.
@@ -357,11 +360,8 @@ class Theta:
         Args:
             A: of other moments than the present ones, see `Moments`.
         """
-        width = int(self.rows.sizes[j]) + 1
-        out, start = np.zeros((width, width)), self.rows.starts[j]
-        upper = np.triu_indices(width)
-        out[upper] = (self.moments.A if A is None else A)[start : start + len(upper[0])]
-        return out + np.triu(out, 1).T
+        moments = self.moments.A if A is None else A
+        return np.asarray(unfolded(moments, self.rows.starts[j], self.rows.sizes[j] + 1))
 
     def information(self) -> tuple[Array, Array]:
         """All that is known of (θ, effects): information matrix (P, P) and right side (P,).
@@ -384,10 +384,7 @@ class Theta:
             weights: (n,) of a sample of each joint, see `weights`.
         """
         H, rhs = np.zeros((self.P, self.P)), np.zeros(self.P)
-        for j, weight in enumerate(weights):
-            at, moments = self._parameter_moments(j, A)
-            H[np.ix_(at, at)] += weight * moments[:-1, :-1]
-            rhs[at] += weight * moments[:-1, -1]
+        add_information(self._rows, A, weights, H, rhs)
         return H, rhs
 
     def costs(self, th: Array, A: Array) -> Array:
@@ -397,14 +394,6 @@ class Theta:
     def weights(self) -> Array:
         """(n,) information of a sample of each joint's torque, 1/(N m)²."""
         return np.asarray(1.0 / (self.noise_gain * self.variance()))
-
-    def _parameter_moments(self, j: int, A: Array | None = None) -> tuple[NDArray[np.intp], Array]:
-        """Joint j's parameters (p,), and moments (p + 1, p + 1) of them and its torque."""
-        size = self.rows.sizes[j]
-        at, which = np.unique(self.rows.place[j, :size], return_inverse=True)
-        to = np.zeros((size + 1, len(at) + 1))
-        to[np.arange(size), which], to[-1, -1] = self.rows.share[j, :size], 1.0
-        return at, to.T @ self.joint_moments(j, A) @ to
 
     def _base_information(self) -> Array:
         """(10, 10 (n + 1) + 1) information of the base's wrench: base by [base, links, wrench]."""
@@ -497,14 +486,14 @@ class Theta:
         """
         if not any(effect.shapes for effect in self.effects):
             return
-        H, rhs = self.information()
+        known, rhs = self._known_of_all()
         chosen, first = self.shapes.copy(), 0
         for k, effect in enumerate(self.effects):
             columns = len(effect.shapes) or 1
             if effect.shapes:
                 grid = np.geomspace(effect.shapes[0], effect.shapes[-1], SHAPES_TRIED)
                 for j in range(self.tree.n):
-                    S, y = self._reduced(j, k, slice(first, first + columns), H, rhs)
+                    S, y = self._reduced(j, k, slice(first, first + columns), known, rhs)
                     tried = np.r_[self.shapes[k, j], grid]
                     s = effect.shares(tried).T
                     gain = np.maximum(s @ y, 0.0) ** 2 / np.einsum("ga,ab,gb->g", s, S, s)
@@ -527,11 +516,11 @@ class Theta:
         Noise of ddq is in the model's torque and, with the other sign, in its second rate: without
         anything there the one takes off what the other puts on, and is learned for that.
         """
-        H, rhs = self.information()
+        known, rhs = self._known_of_all()
         first, weights = 0, self.weights()
         for k, effect in enumerate(self.effects):
             for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
-                S, y = self._reduced(j, k, slice(first, first + 1), H, rhs)
+                S, y = self._reduced(j, k, slice(first, first + 1), known, rhs)
                 explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / (weights[j] * self.count)
                 there = explained > RATES_OVER_NOISE * motion_noise[j] + REAL_MODEL_ERROR**2
                 self.rows.share[j, size - self.columns + first] = float(there)
@@ -541,29 +530,38 @@ class Theta:
             first += len(effect.shapes) or 1
         values(self.mean, self.rows.steps, self.th)
 
-    def _reduced(self, j: int, k: int, columns: slice, H: Array, rhs: Array) -> tuple[Array, Array]:
+    def _reduced(
+        self, j: int, k: int, columns: slice, known: Array, rhs: Array
+    ) -> tuple[Array, Array]:
         """(K, K) and (K,) information of joint j's columns of effect k, all else integrated out.
 
         Args:
-            columns: among those of the effects; H, rhs: all that is known.
+            columns: among those of the effects.
+            known, rhs: covariance of all parameters, and their right side.
         """
-        P, size, count = self.P, self.rows.sizes[j], columns.stop - columns.start
-        weight, (at, folded) = self.weights()[j], self._parameter_moments(j)
-        G, b = np.zeros((P + count, P + count)), np.zeros(P + count)
-        G[:P, :P], b[:P] = H, rhs
-        G[np.ix_(at, at)] -= weight * folded[:-1, :-1]
-        b[at] -= weight * folded[:-1, -1]
-        begin = size - self.columns + columns.start
-        place, share = self.rows.place[j, :size].copy(), self.rows.share[j, :size].copy()
-        place[begin : begin + count], share[begin : begin + count] = P + np.arange(count), 1.0
-        moments = weight * self.joint_moments(j)
-        np.add.at(G, (place[:, None], place), np.outer(share, share) * moments[:-1, :-1])
-        np.add.at(b, place, share * moments[:-1, -1])
-        own = self._effects_from + k * self.tree.n + j
-        others, ours = np.setdiff1d(self.known(), own), slice(P, None)
-        gain = np.linalg.solve(G[np.ix_(others, others)], np.c_[G[others, ours], b[others]])
-        left = np.c_[G[ours, ours], b[ours]] - G[ours][:, others] @ gain
-        return left[:, :-1], left[:, -1]
+        size, own = self.rows.sizes[j], self._effects_from + k * self.tree.n + j
+        begin = size - self.columns
+        split = np.arange(begin + columns.start, begin + columns.stop)
+        moments = self.weights()[j] * self.joint_moments(j)
+        G, b = moments[np.ix_(split, split)], moments[split, -1]
+        rest = np.delete(np.arange(size), split)
+        across = np.zeros((self.P, len(split)))
+        shared = self.rows.share[j, rest, None] * moments[np.ix_(rest, split)]
+        np.add.at(across, self.rows.place[j, rest], shared)
+        others = known - np.outer(known[:, own], known[own]) / known[own, own]
+        gain = across.T @ others
+        return G - gain @ across, b - gain @ rhs
+
+    def _known_of_all(self) -> tuple[Array, Array]:
+        """Covariance (P, P) by torques and prior alone, and right side (P,)."""
+        H, rhs = self.information()
+        return self._inverse_of(H), rhs
+
+    def _inverse_of(self, H: Array) -> Array:
+        """(P, P) of information; zero for the idle spare body."""
+        at, out = self.known(), np.zeros((self.P, self.P))
+        out[np.ix_(at, at)] = np.linalg.inv(H[np.ix_(at, at)])
+        return out
 
     def known(self) -> NDArray[np.intp]:
         """Indices of the parameters that have any information (the idle spare body has none)."""
@@ -586,9 +584,7 @@ class Theta:
     def covariance(self) -> Array:
         """(P, P) covariance of (θ, effects); zero for the idle spare body."""
         H, _ = self.information()
-        at = self.known()
-        out = np.zeros((self.P, self.P))
-        out[np.ix_(at, at)] = np.linalg.inv(H[np.ix_(at, at)])
+        out = self._inverse_of(H)
         if self.tree.floating:  # the base takes the opposite of what the links are off
             links = self.rows.base_place[10:]
             follows = np.zeros((10, self.P))
@@ -669,6 +665,7 @@ _NOTHING = np.empty(0)
 _NO_LEVEL = _NOTHING, _NOTHING
 
 
+@jit
 def likely_spread(x: Array, variance: Array, spread: float) -> float:
     """Spread under which numbers that are zero but for it are most likely, from a wider one.
 

@@ -445,6 +445,39 @@ def _times_row(rows, j, th, A, t, v):
 
 
 @jit
+def unfolded(A, start, width):
+    """(width, width) of the symmetric matrix whose upper triangle starts there in the flat A."""
+    out, k = np.empty((width, width)), start
+    for a in range(width):
+        for b in range(a, width):
+            out[a, b] = out[b, a] = A[k]
+            k += 1
+    return out
+
+
+@jit
+def add_information(rows, A, weights, H, rhs):
+    """Add what joints' torques in A tell, a sample of each weighing so much (n,), to H and rhs.
+
+    Args:
+        rows: `Rows` as a plain tuple; H (P, P), rhs (P,): of the parameters.
+    """
+    at = Rows(*rows)
+    for j in range(at.sizes.shape[0]):
+        s, k = at.sizes[j], at.starts[j]
+        for a in range(s):
+            i, x = at.place[j, a], weights[j] * at.share[j, a]
+            for b in range(a, s):
+                o, value = at.place[j, b], x * at.share[j, b] * A[k]
+                H[i, o] += value
+                if a != b:
+                    H[o, i] += value
+                k += 1
+            rhs[i] += x * A[k]
+            k += 1
+
+
+@jit
 def add_joint_slopes(rows, A, weighing, th, g):
     """Add the gradient by th (P,) of half the weighted torque cost to g (P,).
 
