@@ -449,14 +449,19 @@ class LearnedEffect(Effect):
         shape_key, shapes: a parameter in which it is not linear, and the rising values that have
             a column each in the learner, which chooses one between them; none where there is none.
         step: a usual size of the parameter, for ADAM.
-        by_rates: whether it depends on rates of the model's torque.
+        rate: which of the rates of the model's torque its one column is; None for none.
     """
 
     learned: ClassVar[int] = 0
     shape_key: ClassVar[str] = ""
     shapes: ClassVar[tuple[float, ...]] = ()
     step: ClassVar[float] = 1.0
-    by_rates: ClassVar[bool] = False
+    rate: ClassVar[int | None] = None
+
+    @property
+    def by_rates(self) -> bool:
+        """Whether it depends on rates of the model's torque."""
+        return self.rate is not None
 
     @property
     def key(self) -> str:

@@ -36,7 +36,7 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     scope = ALL
     parameters = (Parameter("d", "s", lower=-0.1, upper=0.1), Parameter("c", "s2"))
     prior_std = (3e-3, 1e-4)
-    by_rates = True
+    rate = 1
     learned, step = 1, 1e-4  # c; how late a torque is, is for `gap` to say
     positive = ("c",)
     log_odds = -8.0
@@ -80,4 +80,4 @@ class TorqueFilter(LearnedEffect, SensorEffect):
 
     def basis(self, at: JointSignals) -> tuple[Array, ...]:
         """The second rate of the model's torque."""
-        return (at.rates[1],)
+        return (at.rates[self.rate],)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.learning.settings import ChangeSettings
 from adapter.model.spatial import Array
@@ -79,14 +82,43 @@ class ChangeDetector:
         s = self.settings
         if self.waiting:
             return self._confirm(error, explained)
-        self.samples += self.each * len(error)
-        speeds = s.fast, s.slow
-        most, mean = compare(error, self.each, speeds, self.samples, self.recent, self.level)
-        if s.enabled and self.samples >= self._armed_at and self._alarming(most, mean):
-            self._wait = s.wait
-        else:
-            self._remember_burst(self.each * len(error), most, mean)
+        samples = self.samples + self.each * len(error)
+        levels = self.recent, self.level
+        most, mean = compare(error, self.each, (s.fast, s.slow), samples, *levels)
+        self.weigh(self.each * len(error), most, mean)
         return False
+
+    def weigh(self, samples: int, most: float, mean: float) -> None:
+        """Take what `compare` says of so many samples more; the detector may wait then."""
+        self.samples += samples
+        armed = self.settings.enabled and self.samples >= self._armed_at
+        if armed and self._alarming(most, mean):
+            self._wait = self.settings.wait
+        else:
+            self._remember_burst(samples, most, mean)
+
+    def weigh_all(self, samples: NDArray[np.int64], ratios: Array) -> None:
+        """`weigh` step by step: (m,) samples each, and (m or more, 2) of `compare` where any."""
+        ratios, counts = ratios[: len(samples)][samples > 0], samples[samples > 0]
+        total, peak = int(counts.sum()), ratios.max(axis=0, initial=0.0)
+        most = self.parts(total)[-1]
+        calm = self._block_samples + total < BURST_BLOCK and (peak <= most).all()
+        if calm and self.samples >= self._armed_at - self.settings.slow:
+            self.samples += total
+            self._block_samples += total
+            np.maximum(self._block, peak, out=self._block)
+            return
+        for count, (one, mean) in zip(counts.tolist(), ratios.tolist(), strict=True):
+            self.weigh(count, one, mean)
+
+    def parts(self, ahead: int) -> tuple[Any, ...]:
+        """What `compare` needs, and what ratios say nothing within so many samples; see `steps`."""
+        s, most = self.settings, (math.inf, math.inf)
+        if s.enabled and self.samples + ahead >= self._armed_at:
+            fade = 1.0 - (BURST_BLOCK + ahead) / s.burst_memory  # a block may be over meanwhile
+            one, every = (fade * s.burst_factor * self._peaks).tolist()
+            most = max(s.one_factor, one), max(s.all_factor, every)
+        return (s.fast, s.slow), self.samples, self.recent, self.level, most
 
     def _remember_burst(self, samples: int, most: float, mean: float) -> None:
         """Largest ratios, block by block: a block counts once it is over, so that what is just

@@ -11,16 +11,18 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
-from adapter.learning.adam import FlatAdam
+from adapter.learning.adam import FlatAdam, same_bits
 from adapter.learning.change import ChangeDetector, explained_share
 from adapter.learning.imu_schema import ImuSchema
 from adapter.learning.known_effects import KnownEffects, believed, told_shapes
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
+from adapter.learning.steps import Done, steps
 from adapter.learning.theta import Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import Moments
 from adapter.learning.torque_rates import TorqueRates
@@ -35,6 +37,7 @@ JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
+FEWEST = 2  # states that are worth a call of `steps`
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
 # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
@@ -149,8 +152,11 @@ class OnlineLearner:
         )
         self.theta = Theta(tree, before, effects_by_name(s.effects), s.theta, each_sample)
         by_rates = any(effect.by_rates for effect in self.theta.effects)
-        rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
-        self.rates = rates if by_rates else None
+        self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
+        self.rates = self._rates if by_rates else None
+        places = [(column, self._rates.place(rate)) for column, rate in self.theta.rate_columns]
+        self._unlimited = np.full((tree.n, 6), np.inf)
+        self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
         self.given = tuple(known.effects)
         self.known = _taken_off(known, s.effects, self.theta.smoothing_s, tree.floating)
@@ -220,8 +226,24 @@ class OnlineLearner:
             ModelError: records of another size.
         """
         table = self.without_known(self.sound(table))
-        if not len(table):
-            return 0
+        return self._learn(table) if len(table) else 0
+
+    def step_each(self, table: Array) -> int:
+        """`step` with each of the states (m, size), in order, to the same bits.
+
+        Returns:
+            How many of them were learned from; the others are counted in `refused`.
+
+        Raises:
+            ModelError: records of another size.
+        """
+        table, at = self.without_known(self.sound(table)), 0
+        while at < len(table):
+            at += self._learn_each(table[at:]) or self._learn(table[at : at + 1])
+        return len(table)
+
+    def _learn(self, table: Array) -> int:
+        """`step_table` on states, at least one, that can be learned from; how many there were."""
         self.stamp_ns = stamp_of(table[-1])
         self.schema.absorb(table)
         self._since_update += len(table)
@@ -238,6 +260,93 @@ class OnlineLearner:
         if self.watch is not None:
             self.watch(self, self._torque_states if due else table)
         return len(table)
+
+    def _learn_each(self, table: Array) -> int:
+        """Take the first states of a table in one call; how many, none where it cannot be."""
+        count: int = self._steady(table)
+        if self.rates is None:
+            rows = np.ascontiguousarray(table[:count, self.layout.before_links])
+            ends = np.arange(1, count + 1)
+        else:
+            rows, ends = self.rates.coming(table[:count])
+        if len(ends) < FEWEST or not len(rows):
+            return 0
+        table = table[: len(ends)]
+        self.schema.absorb(table[:1])
+        self._schema_gradient()
+        self.follow_convergence()
+        done = self._room(rows, ends)
+        # where λ is looked at again behind so many, θ looks at the frames before the last of them
+        every = self.settings.schema.judge_every
+        allowed = self._allowed() if len(ends) == every else self._unlimited
+        count = int(steps(table, (*self._parts(len(rows)), allowed), tuple(done)))
+        self.schema.updates += count - 1
+        self.adam.steps += count
+        self.theta.took(int(ends[count - 1]), count)
+        self._look_back(table[:count], done)
+        return count
+
+    def _steady(self, table: Array) -> int:
+        """How many states (m, size) from here on need nothing that `steps` does not do."""
+        s = self.settings
+        if s.mode != Mode.MOMENTS or s.update_every > 1 or self.tree.floating or s.schema.imus:
+            return 0
+        begun = self.theta_started_ns is not None and self._shadow is None
+        if not begun or self.change.waiting or self.change.each > 1 or not self.theta.steady():
+            return 0
+        if (self.rates is not None and not self._rates_known) or not same_bits():
+            return 0
+        until_judged = (self._judged + 1) * JUDGE_THETA_EVERY - self.theta.updates
+        return min(self.schema.steady(table), max(until_judged, 0))
+
+    def _room(self, rows: Array, ends: NDArray[np.int64]) -> Done:
+        """Room for what steps leave, with the states that θ will be given."""
+        m, k, n = len(ends), len(rows), self.tree.n
+        return Done(
+            rows,
+            self.theta.effect_columns(rows),
+            np.empty((k, n)),
+            ends,
+            np.empty((m, 2)),
+            np.empty((m, self.theta.P)),
+            np.empty((m, n, 3, 3)),
+            np.empty((m, n, 3)),
+        )
+
+    def _look_back(self, table: Array, done: Done) -> None:
+        """Count, trace and look at what `steps` has done with states (m, size)."""
+        ends = done.ends[: len(table)]
+        rows = self._torque_states = done.rows[: ends[-1]]
+        self.stamp_ns = stamp_of(table[-1])
+        self.learned += len(table)
+        self._hold(rows)
+        self._keep_scores(rows, done.errors[: ends[-1]])
+        for k in self.theta_trace.due(len(rows)):
+            step = int(np.searchsorted(ends, k, side="right"))
+            self.theta_trace.keep(stamp_of(rows[k]), done.th[step])
+        self.change.weigh_all(np.diff(ends, prepend=0), done.ratios)
+        if self.change.waiting:
+            self._alarm_ns = stamp_of(rows[-1])
+            self._doubted.clear()
+        for k in self.schema_trace.due(len(table)):
+            known = self.schema.ranks.astype(float), float(self.schema.converged)
+            self.schema_trace.keep(stamp_of(table[k]), done.R0[k], done.p[k], *known)
+        if self.watch is not None:
+            self.watch(self, rows)
+
+    def _parts(self, ahead: int) -> tuple[Any, ...]:
+        """What `steps` needs, with so many states ahead for θ."""
+        adam = self.adam
+        moved = adam.parameters, adam.gradient, adam.first, adam.second, adam.steps
+        span_ns, waiting, buffer = self._rates.parts
+        span_ns = 0 if self.rates is None else span_ns
+        return (
+            self.schema.parts(),
+            self.theta.parts(self.frames, self.theta_converged),
+            (span_ns, waiting, np.empty_like(self.theta.theta), buffer, self._which),
+            self.change.parts(ahead),
+            (*moved, (adam.rate, *adam.betas)),
+        )
 
     def sound(self, table: Array) -> Array:
         """The states of a table that can be learned from."""
@@ -411,10 +520,7 @@ class OnlineLearner:
 
     def _look_on(self, table: Array, error: Array) -> None:
         """Keep the scores, and notice a change."""
-        for k in self.score_trace.due(len(table)):
-            state, at = table[k], self.layout
-            parts = state[at.q.start : at.ddq.stop], state[at.joint_tau], error[k, -self.tree.n :]
-            self.score_trace.keep(stamp_of(state), *parts, state[at.base], state[at.memory])
+        self._keep_scores(table, error)
         if self.theta_trace.due(len(table)):
             self.theta_trace.keep(stamp_of(table[-1]), self.theta.th)
         alarmed_before = self.change.waiting
@@ -426,6 +532,12 @@ class OnlineLearner:
         elif self.change.waiting and not alarmed_before:
             self._alarm_ns = stamp_of(table[-1])
             self._doubted.clear()
+
+    def _keep_scores(self, table: Array, error: Array) -> None:
+        for k in self.score_trace.due(len(table)):
+            state, at = table[k], self.layout
+            parts = state[at.q.start : at.ddq.stop], state[at.joint_tau], error[k, -self.tree.n :]
+            self.score_trace.keep(stamp_of(state), *parts, state[at.base], state[at.memory])
 
     def _a_load_explains(self) -> bool:
         """Whether the newest errors are what a body at the hand makes, and not friction's, say.
@@ -470,10 +582,13 @@ class OnlineLearner:
 
     def _follow_schema(self) -> None:
         """Rebuild θ's moments when λ has left them by more than it is sure of."""
-        std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
-        allowed = np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
-        if (np.abs(self.schema.moved_from(self._R0, self._p)) > allowed).any():
+        if self.schema.strayed(*self.frames, self._allowed()):
             self._begin_rebuild()
+
+    def _allowed(self) -> Array:
+        """(n, 6) turns and shifts that λ may be away from the frames of θ, rad and m."""
+        std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
+        return np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
 
     def _begin_rebuild(self) -> None:
         self._R0[:], self._p[:] = self.schema.R0, self.schema.p

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,10 +31,12 @@ from adapter.learning.schema_kernels import (
     directions,
     distances,
     finish,
+    moved,
     profiled,
     residual_variance,
     retract,
     steepest,
+    strayed,
     without_noise,
 )
 from adapter.learning.settings import SchemaSettings
@@ -193,6 +196,36 @@ class Schema:
             carry_spin(self._frames, base, table)
         keep = self._keep() if self.settings.forget_s is not None else 1.0
         absorb(self._parent, base, table, self._moments, float(self.kind), (keep, self.weight))
+
+    def steady(self, table: Array) -> int:
+        """How many states (m, size) go by until something but the curvature now is looked at."""
+        s = self.settings
+        if self.each_sample or self._rough or s.forget_s is not None:
+            return 0
+        if self.updates % s.judge_every:
+            return 0
+        if not s.spin_measured and self.kind == LinkMotionKind.MEASURED:
+            return 0
+        ahead = table[: s.judge_every]
+        other = np.flatnonzero(ahead[:, KIND] != float(self.kind))
+        return int(other[0]) if len(other) else len(ahead)
+
+    def parts(self) -> tuple[Any, ...]:
+        """What `steps` needs of it."""
+        s = self.settings
+        return (
+            self._frames,
+            self._moments,
+            self._base_motion(),
+            float(self.kind),
+            self.weight,
+            self._may_move,
+            self._inverse,
+            self._distance,
+            (s.rate, s.share),
+            self.tangent,
+            self.gradient,
+        )
 
     def _base_motion(self) -> Array:
         """(12,) motion of a base at rest; empty where the states tell of the base."""
@@ -370,10 +403,12 @@ class Schema:
     def moved_from(self, R0: Array, p: Array) -> Array:
         """(n, 6) small turns and shifts (phi, d) from other frames to these, rad and m.
 
-        Sines of the turns, which is all that is asked for a hundred times a second; inf for more
-        than a quarter turn.
+        Sines of the turns; inf for more than a quarter turn.
         """
-        turn = np.swapaxes(R0, 1, 2) @ self.R0
-        sine = 0.5 * (turn[:, (2, 0, 1), (1, 2, 0)] - turn[:, (1, 2, 0), (2, 0, 1)])
-        sine[np.einsum("jaa->j", turn) < 1.0] = np.inf
-        return np.concatenate([sine, self.p - p], axis=1)
+        by = np.empty((len(p), 6))
+        moved(self._frames, R0, p, by)
+        return by
+
+    def strayed(self, R0: Array, p: Array, allowed: Array) -> bool:
+        """Whether a frame has left others by more than (n, 6), see `moved_from`."""
+        return bool(strayed(self._frames, R0, p, allowed))

@@ -412,6 +412,35 @@ def retract(frames, step, project, distance, pace):
 
 
 @jit
+def moved(frames, R0, p, out):
+    """Fill out (n, 6) with small turns and shifts from R0 (n, 3, 3), p (n, 3) to the frames.
+
+    Sines of the turns, which is all that is asked for a hundred times a second; inf for more than
+    a quarter turn.
+    """
+    tree, turn = Frames(*frames), np.empty((3, 3))
+    for j in range(p.shape[0]):
+        for a in range(3):
+            for b in range(3):
+                turn[a, b] = 0.0
+                for r in range(3):
+                    turn[a, b] += R0[j, r, a] * tree.R0[j, r, b]
+        far = turn[0, 0] + turn[1, 1] + turn[2, 2] < 1.0
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            out[j, k] = np.inf if far else 0.5 * (turn[b, a] - turn[a, b])
+            out[j, 3 + k] = tree.p[j, k] - p[j, k]
+
+
+@jit
+def strayed(frames, R0, p, allowed):
+    """Whether any frame has moved from R0 (n, 3, 3), p (n, 3) by more than (n, 6), see `moved`."""
+    by = np.empty(allowed.shape)
+    moved(frames, R0, p, by)
+    return (np.abs(by) > allowed).any()
+
+
+@jit
 def move(tree, j, x):
     """Move frame j by x (6,) in its own axes: R0 exp(phi), p + d."""
     turn = np.empty((3, 3))

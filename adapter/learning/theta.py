@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -264,10 +265,15 @@ class Theta:
     def _absorb(
         self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
     ) -> Array:
-        forget, columns = self.settings.forget_s, self.effect_columns(table)
-        rate = 0.0 if forget is None else 1e-3 / forget
-        placed = self._parent, *frames
-        return absorb(placed, self._rows, self._given, table, columns, (tuple(into), rate, weight))
+        columns, placed = self.effect_columns(table), (self._parent, *frames)
+        sums = tuple(into), self._forgetting, weight
+        return absorb(placed, self._rows, self._given, table, columns, sums)
+
+    @property
+    def _forgetting(self) -> float:
+        """Rate per sample."""
+        forget_s = self.settings.forget_s
+        return 0.0 if forget_s is None else 1e-3 / forget_s
 
     def replace_moments(self, moments: Moments, count: float) -> None:
         """Put moments rebuilt with a better λ in place of the old ones.
@@ -282,6 +288,49 @@ class Theta:
     def _set_prior(self, H: Array, rhs: Array) -> None:
         self.prior, self.prior_rhs, self._ranges = H, rhs, ranges_of(H)
         self._before = tuple(Prior(H, rhs, self._ranges, 1.0))
+
+    def parts(self, frames: tuple[Array, Array], settled: bool) -> tuple[Any, ...]:
+        """What `steps` needs of it; `settled` as for `after_step`."""
+        s = self.settings
+        into = tuple(self.moments), self._forgetting, self.weight
+        span = float(s.settled_average if settled else s.average)
+        weighing = self.count, self.noise_gain, self.floor, self.floor_count, self.model_variance
+        return (
+            (self._parent, *frames),
+            self._rows,
+            self._given,
+            into,
+            self._before,
+            (*weighing, self.base_weights(), self.share),
+            self.x,
+            self.mean,
+            self.th,
+            (*self._work, self.gradient),
+            self.in_use,
+            max(span, 1.0),
+            self.updates,
+        )
+
+    @property
+    def rate_columns(self) -> list[tuple[int, int]]:
+        """Columns of effects that are rates of the model's torque, and which rates these are."""
+        first, found = 0, []
+        for effect in self.effects:
+            if effect.rate is not None:
+                found.append((first, effect.rate))
+            first += len(effect.shapes) or 1
+        return found
+
+    def steady(self) -> bool:
+        """Whether every state is one step, with nothing to start or restart at any of them."""
+        if self.spare_in_use:
+            return self.count > max(self.settings.restarts, default=0)
+        return self.count >= self.settings.warm_up
+
+    def took(self, states: int, steps: int) -> None:
+        """`steps` has given it so many states, and moved it so often."""
+        self.count += self.weight * states
+        self.updates += steps
 
     def compute_gradient(self) -> bool:
         """Fill the gradient of one ADAM step; False while there is too little to step on."""

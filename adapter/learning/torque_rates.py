@@ -150,6 +150,39 @@ def follow(arm, table, span_ns, waiting, out):
     return count
 
 
+@jit
+def coming(table, span_ns, waiting, out, ends):
+    """What `follow` will give for each of some states (m, w), but for rates.
+
+    Args:
+        waiting: `Waiting`, as a plain tuple; nothing is changed.
+        out: (k, w) filled; ends: (m,) filled with how many of them are given by then.
+
+    Returns:
+        How many of the states come without a hole in time.
+    """
+    ring = Waiting(*waiting)
+    first, known, given, w = ring.marks[0], ring.marks[1], 0, ring.rows.shape[1]
+    if not known:
+        return 0
+    last = ring.stamps[(known - 1) % ROOM]
+    for m in range(table.shape[0]):
+        stamp = table[m, :1].view(np.int64)[0]
+        if not 0 < stamp - last <= LONGEST_STEP_NS:
+            return m
+        last, behind = stamp, known + m + 1
+        while first < behind:
+            old = ring.rows[first % ROOM] if first < known else table[first - known, :w]
+            waits = stamp - old[:1].view(np.int64)[0] < span_ns
+            if waits and 2 * (behind - first) < ROOM:
+                break
+            out[given] = old
+            given += 1
+            first += 1
+        ends[m] = given
+    return table.shape[0]
+
+
 class TorqueRates:
     """States with the rates of their torque, as soon as those can be told.
 
@@ -164,7 +197,7 @@ class TorqueRates:
     def __init__(self, tree: Tree, smoothing_s: float, delay_s: float) -> None:
         layout = StateLayout(tree.n, tree.floating)
         self._parent = np.array(tree.parent, dtype=np.int64)
-        self._width = layout.before_links.stop
+        self._width, self._rates_from = layout.before_links.stop, layout.rates.start
         self._span_ns = round(1e9 * max(smoothing_s, LEAST_SPAN_S))
         rows, tau = np.zeros((ROOM, self._width)), np.zeros((ROOM, tree.n))
         stamps, marks, bends = np.zeros(ROOM, np.int64), np.zeros(2, np.int64), np.zeros(tree.n + 1)
@@ -207,6 +240,28 @@ class TorqueRates:
         bends = np.zeros_like(self.bends)
         bend_all(self._arm, self._triples, bends)
         return bends
+
+    def coming(self, table: Array) -> tuple[Array, NDArray[np.int64]]:
+        """What `follow` gives for each of the states (m, size), if they came one by one.
+
+        Returns:
+            (k, columns `before_links`) without rates, and (c,) how many of them come with each
+            of the first c states; there is a hole in time behind those.
+        """
+        own = np.ascontiguousarray(table[:, : self._width])
+        out = np.empty((ROOM + len(own), self._width))
+        ends = np.zeros(len(own), dtype=np.int64)
+        ends = ends[: coming(own, self._span_ns, tuple(self._ring), out, ends)]
+        return out[: ends[-1] if len(ends) else 0], ends
+
+    def place(self, rate: int) -> int:
+        """Where one of the rates begins in a state."""
+        return self._rates_from + rate * len(self._parent)
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """Span in ns, what waits, and room for rows that are given at a time; see `steps`."""
+        return self._span_ns, tuple(self._ring), self._one
 
     def follow(self, table: Array, frames: tuple[Array, Array], theta: Array, base: Array) -> Array:
         """States (k, columns `before_links`) that are complete now; the next call may reuse them.

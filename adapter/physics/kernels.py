@@ -10,8 +10,11 @@ torque of joint j is their product with the line of its axis. Eqs. 14c and 16 sa
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
@@ -23,8 +26,27 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def jit(function: F) -> F:
-    """Compile with numba: cached on disk, IEEE arithmetic as written, so that runs repeat."""
-    return cast(F, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    """Compile with numba: cached on disk, IEEE arithmetic as written, so that runs repeat.
+
+    A kernel holds those that it calls, but numba looks only at a kernel's own file for changes:
+    after an upgrade an old one would go on. So what is cached is of all kernels as they are now.
+    """
+    compiled = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
+    file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if file is not None:  # none where nothing can be written
+        file._source_stamp = file._source_stamp, all_kernels()
+    return cast(F, compiled)
+
+
+@cache
+def all_kernels() -> str:
+    """What the files of this package that hold kernels say, in short."""
+    found = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        text = path.read_bytes()
+        if b"\n@jit\n" in text:
+            found.update(text)
+    return found.hexdigest()
 
 
 class Frames(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.batch import learn_batch
 from adapter.runs.config import PipelineSettings
-from adapter.runs.contacts import ReplayObserver, contacts_of
+from adapter.runs.contacts import ADOPT_EVERY, ReplayObserver, contacts_of
 from adapter.runs.outcome import Outcome, collect
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
@@ -30,7 +31,9 @@ from drivers.files.mcap import AnyLog, Log, StoredLog, stored
 from drivers.interface import DriverError, JointSample, LinkMotion
 
 FEWEST_FOR_NOISE = 50  # samples
-AT_ONCE = 2000  # states that pass the front end in one table: as much as a processor's cache holds
+# States that pass the front end in one table: as much as a processor's cache holds. Of the exact
+# mode whole times `ADOPT_EVERY`.
+AT_ONCE = 2000
 STRETCHES = 64, 2000  # of a long recording, and samples of each, that tell its rate and noise
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
@@ -226,21 +229,26 @@ def _exact_piece(
 ) -> None:
     tick_ns = np.zeros(len(log), dtype=np.int64)
     front_end, learner = pipeline.front_end, pipeline.learner
-    heard = _heard(log)
-    stamps = log.stamp_ns.tolist()
-    for i, stamp_ns in enumerate(stamps):
-        links = None
-        if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
-            links = LinkMotion(log.twists[i], log.accels[i])
-        base = None if log.base is None else log.base[i]
-        sample = JointSample(stamp_ns, log.q[i], log.dq[i], log.tau[i], links, base)
-        before = time.perf_counter_ns()
-        states = front_end.step(sample)
-        tick_ns[i] = time.perf_counter_ns() - before
-        for state in states:
-            learner.step(state)
+    heard, stamps = _heard(log), log.stamp_ns.tolist()
+    # the observer goes on with what is learned behind every so-manyth sample, so that one ends each
+    for begin, end in pairwise([0, *range(1, len(log), ADOPT_EVERY), len(log)]):
+        samples, states = [], []
+        for i in range(begin, end):
+            links = None
+            if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
+                links = LinkMotion(log.twists[i], log.accels[i])
+            base = None if log.base is None else log.base[i]
+            sample = JointSample(stamps[i], log.q[i], log.dq[i], log.tau[i], links, base)
+            before = time.perf_counter_ns()
+            found = front_end.step(sample)
+            tick_ns[i] = time.perf_counter_ns() - before
+            samples.append(sample)
+            states.append(found.copy())  # the next call reuses it
+        if states:
+            learner.step_each(np.concatenate(states))
         if observer is not None:
-            observer.step(sample)
+            for sample in samples:
+                observer.step(sample)
     ticks.add(tick_ns)
 
 
