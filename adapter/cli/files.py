@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 from importlib import import_module
-from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from adapter.effects.active import check_effects
 from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
+from adapter.model.self_model import SelfModel
 from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table, table_log
 from adapter.signals.recording import describe, summary
@@ -63,8 +65,8 @@ def run_recover(args: argparse.Namespace) -> int:
 def run_info(args: argparse.Namespace) -> int:
     """Carry `info` out."""
     if args.file.suffix == ".json":
-        facts = _model_facts(args.file)
-        lines = [f"{key}: {value}" for key, value in facts.items()]
+        model = check_effects(load_model(args.file), args.file)
+        facts, lines = _model_facts(model), _model_lines(model)
     else:
         log = opened(args)
         facts = describe(args.file if log is None else log, args.topic)
@@ -93,8 +95,7 @@ def opened(args: argparse.Namespace) -> Log | None:
     return recording_log(spec)
 
 
-def _model_facts(path: Path) -> dict[str, Any]:
-    model = check_effects(load_model(path), path)
+def _model_facts(model: SelfModel) -> dict[str, Any]:
     return {
         "name": model.name,
         "joints": list(model.tree.joint_names),
@@ -103,3 +104,51 @@ def _model_facts(path: Path) -> dict[str, Any]:
         "effects": sorted({str(entry["effect"]) for entry in model.effects}),
         "provenance": dict(model.provenance),
     }
+
+
+def _model_lines(model: SelfModel) -> list[str]:
+    """What a model file holds, a line each."""
+    told, n = model.provenance, model.tree.n
+    names = model.tree.joint_names
+    lines = [
+        f"model      {model.name}",
+        f"joints     {n}: {', '.join(names)}",
+        f"λ          {model.lambda_source}",
+        *(f"           from the documentation: {text}" for text in told.get("lambda_filled", ())),
+        f"θ          {told.get('theta_source', 'documented')}",
+        *(f"           from the documentation: {text}" for text in told.get("theta_filled", ())),
+    ]
+    masses = [f"{m:.3g}" for m in model.theta[:, 0]]
+    if model.theta_identifiable is not None:  # else nothing was learned, and all is told
+        std = model.theta_std[:, 0]
+        masses = [
+            f"{m} ± {s:.1g}" if shown else "-"
+            for m, s, shown in zip(masses, std, model.theta_identifiable[:, 0], strict=True)
+        ]
+    hint = " (-: no motion shows it alone)" if "-" in masses else ""
+    lines.append(f"mass       {', '.join(masses)} kg, link by link{hint}")
+    lines += [f"effect     {text}" for text in _effect_lines(model)]
+    lines += [
+        f"{label:10s} {told[key]}"
+        for key, label in (("command", "made by"), ("source", "from"), ("program", "with"))
+        if told.get(key)
+    ]
+    return lines
+
+
+def _effect_lines(model: SelfModel) -> list[str]:
+    """Each effect with its parameters, those of joints side by side."""
+    found: dict[tuple[str, str, str], dict[int, float]] = {}
+    for entry in model.effects:
+        for key, value in entry["parameters"].items():
+            if np.ndim(value) == 0:
+                name = str(entry["effect"]).replace("_", " ")
+                at = found.setdefault((name, key, str(entry["units"][key])), {})
+                at |= dict.fromkeys(entry["joints"] or [0], float(value))
+    lines = []
+    for (name, key, unit), at in found.items():
+        joints = [0] if 0 in at else range(1, model.tree.n + 1)
+        values = ", ".join(f"{at[j]:.3g}" if j in at else "-" for j in joints)
+        where = " at the flange" if 0 in at else ""
+        lines.append(f"{name} {key}{where}: {values} {unit}".rstrip())
+    return lines

@@ -171,7 +171,10 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(truth, robot)
     driver = open_arm(args, plan)
     if plan.maybe_real and not driver.can_move:
-        say("only listening; --allow-motion lets the arm move")
+        if _may_move(args):
+            warn(["--allow-motion changes nothing here: this driver only listens"])
+        else:
+            say("only listening; --allow-motion lets the arm move")
     compile_first(robot, config.pipeline, 1, say)
     front_end = make_front_end(robot, config.pipeline)
     result = _go(args, plan, driver, front_end, folder, truth)

@@ -80,6 +80,9 @@ def _longer(data: RunData, files: _Files) -> Step:
         driver = str(data.figures.get("driver") or "ADDRESS")
         more = [] if driver.startswith(SIMULATED) else ["--allow-motion"]
         words = ["run", "--driver", driver, "--duration", f"{span_s:.0f}"]
+        if not data.figures.get("tracking"):  # somebody else moved the arm
+            why = "The learner had not settled: listen for longer, to more motion of every joint"
+            return Step(why, files.command(*words, "--passive"))
         return Step(why, files.command(*words, "--excitation", "designed", *more))
     why = "The learner had not settled: see what this motion lacks"
     return Step(why, files.command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))

@@ -28,7 +28,7 @@ POSES = 80  # drawn along the path
 GOLDEN = 0.618034  # spreads them over the path without a step that a period could share
 RIM = 24  # corners of a circle
 VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
-    ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; red: nearest"),
+    ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; orange: nearest"),
     ("Seen from the side", lambda points: points[..., [0, 2]], "x to the right, z up"),
     ("Seen from above", lambda points: points[..., [0, 1]], "x to the right, y up"),
 )
@@ -53,13 +53,16 @@ def write_plan(
     start, closest = motion.q, motion.path(nearest.path_s)[0].copy()
     span_s = max(nearest.path_s, 30.0)
     poses = [motion.path(span_s * (k * GOLDEN % 1.0))[0].copy() for k in range(POSES)]
+    names = arm.model.tree.joint_names
+    of_joints = [line for line in said.lines if line.startswith(names)]
     context: dict[str, Any] = {
         "robot": arm.model.name,
         "nearest": f"{nearest} after {nearest.path_s:.1f} s of path, margin {arm.cell.margin:g} m",
         "ignored": [" and ".join(pair) for pair in arm.ignored],
         "views": [_view(arm, poses, closest, start, view) for view in VIEWS],
-        "joints": _joint_panels(motion, limits, arm.model.tree.joint_names),
-        "lines": said.lines,
+        "joints": _joint_panels(motion, limits, names),
+        "lines": [line for line in said.lines if line not in of_joints],
+        "of_joints": of_joints,
         "steps": said.steps,
     }
     return write_whole(path, fill(TEMPLATE, context))

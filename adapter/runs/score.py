@@ -149,8 +149,8 @@ def schema_score(
         "identifiable_rank": outcome.lam_rank,
         "observable_rank": seen.rank,
         "std": {
-            "rotation_rad": np.linalg.norm(spread[:, :3], axis=1).tolist(),
-            "position_m": np.linalg.norm(spread[:, 3:], axis=1).tolist(),
+            "rotation_rad": _shown(np.linalg.norm(spread[:, :3], axis=1)),
+            "position_m": _shown(np.linalg.norm(spread[:, 3:], axis=1)),
         },
         "settled": outcome.lam_converged,
         "source": "measured" if outcome.lam_measured else "reproduces the documentation",
@@ -159,6 +159,11 @@ def schema_score(
         "filled": completed.filled,
         "restarts": outcome.lam_restarts,
     }
+
+
+def _shown(std: Array) -> list[float | None]:
+    """(n,) with None for joints of which no motion shows anything."""
+    return [x if x > 0.0 else None for x in std.tolist()]
 
 
 def _slid(documented: SelfModel, reference: Reference, lam: Array) -> Reference:

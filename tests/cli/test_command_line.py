@@ -114,12 +114,15 @@ def test_export(run, tmp_path: Path) -> None:
     assert np.allclose(masses, model.theta[:, 0])
 
 
-def test_info_recover_and_report(run, tmp_path: Path) -> None:
+def test_info_recover_and_report(run, tmp_path: Path, capsys) -> None:
     folder, figures = run
     facts = command("info", folder / "recording.mcap", "--json", tmp_path / "i.json")
     assert facts["samples"] == figures["samples"]
     facts = command("info", folder / "model.json", "--json", tmp_path / "m.json")
     assert facts["lambda_source"] == "reproduces the documentation"
+    told = capsys.readouterr().out
+    assert "λ          reproduces the documentation" in told and "kg, link by link" in told
+    assert "{" not in told and "'" not in told
     cut = tmp_path / "cut.mcap"
     whole = (folder / "recording.mcap").read_bytes()
     cut.write_bytes(whole[: len(whole) // 2])

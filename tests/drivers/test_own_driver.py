@@ -70,8 +70,12 @@ def test_a_run_learns_behind_it(tmp_path: Path, capsys, monkeypatch) -> None:
     monkeypatch.chdir(EXAMPLE.parents[2])
     figures = tmp_path / "out.json"
     out = ["--duration", "5", "--out", str(tmp_path / "run"), "--json", str(figures)]
-    assert main(["run", "--driver", f"{EXAMPLE}:MyArm", "--robot", "panda", *out]) == 0
+    mine = ["run", "--driver", f"{EXAMPLE}:MyArm", "--robot", "panda", "--allow-motion", "--yes"]
+    assert main([*mine, *out]) == 0
     assert json.loads(figures.read_text())["samples"] > 4000
+    told = capsys.readouterr()
+    assert "--allow-motion changes nothing here" in told.err  # it has no command to give
+    assert "--allow-motion" not in told.out
     assert main(["run", "--driver", f"{EXAMPLE}:MyArm", "--allow-motion"]) == 2
     assert "--robot must" in capsys.readouterr().err
     assert main(["run", "--driver", "nobody.py:MyArm"]) == 2
