@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.active import check_effects
+from adapter.effects.base import with_squares
 from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
@@ -150,5 +151,5 @@ def _effect_lines(model: SelfModel) -> list[str]:
         joints = [0] if 0 in at else range(1, model.tree.n + 1)
         values = ", ".join(f"{at[j]:.3g}" if j in at else "-" for j in joints)
         where = " at the flange" if 0 in at else ""
-        lines.append(f"{name} {key}{where}: {values} {unit}".rstrip())
+        lines.append(f"{name} {key}{where}: {values} {with_squares(unit)}".rstrip())
     return lines

@@ -48,6 +48,11 @@ LATE = "late"
 JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 
 
+def with_squares(unit: str) -> str:
+    """A unit of a file as people write it: kg m² for kg m2."""
+    return unit.replace("2", "²")
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A number that an effect needs: key and unit as in files, and what it may be.
@@ -62,6 +67,11 @@ class Parameter:
     count: int = 1
     optional: bool = False
     grid_share: float = 0.0
+
+    @property
+    def written(self) -> str:
+        """The unit as people write it: kg m²."""
+        return with_squares(self.unit)
 
     def nearest(self, value: float) -> float:
         """The value, or the bound that it lies beyond."""

@@ -67,7 +67,7 @@ def _arm(arm: FleetArm) -> ArmOnPage:
 def _parameters(arm: FleetArm) -> Table:
     """What is learned of each joint and of the link that it moves; θ whole is in the model file."""
     heads = ["joint", "mass of its link", *(CATALOGUE[name].title for name in arm.effects)]
-    units = ["", "kg", *(CATALOGUE[name].parameters[0].unit for name in arm.effects)]
+    units = ["", "kg", *(CATALOGUE[name].parameters[0].written for name in arm.effects)]
     std = effect_std(arm)
     links = len(arm.model.theta) - arm.model.tree.n  # a base that floats comes first
     rows = []
@@ -109,6 +109,6 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
         drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
         effect = CATALOGUE[name]
-        unit = effect.parameters[0].unit
+        unit = effect.parameters[0].written
         panels.append(drawing.panel(effect.title, unit, "by joint, with standard deviations"))
     return panels

@@ -58,7 +58,7 @@ def _joints(numbers: tuple[int, ...]) -> str:
 def drift_words(drift: Drift) -> str:
     """A sentence."""
     effect, per = CATALOGUE[drift.effect], f"per unit of {drift.follows}"
-    unit = effect.parameters[0].unit
+    unit = effect.parameters[0].written
     per = "a day" if drift.follows == TIME else per
     share = f" ({100.0 * drift.span / abs(drift.usual):.0f} % of it)" if drift.usual else ""
     or_ = "".join(f" or {x}" for x in drift.rivals)
@@ -78,7 +78,7 @@ def standing_out_words(arm: FleetArm) -> Iterator[str]:
     for number, several in sorted(by_log.items()):
         told = [
             f"{CATALOGUE[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
-            f"{CATALOGUE[x.effect].parameters[0].unit} where {x.expected:.3g} was to be expected"
+            f"{CATALOGUE[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
             for x in several
         ]
         yield f"{Path(arm.logs[number].moments.path).name} stands out: {'; '.join(told)}"

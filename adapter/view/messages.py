@@ -13,11 +13,13 @@ Each message is whole in itself, so that one that a slow page never gets is no l
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from adapter.effects.base import with_squares
 from adapter.effects.catalogue import CATALOGUE, effects_by_name
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
@@ -42,12 +44,14 @@ Message = dict[str, Any]
 
 def numbers(values: Array | float, digits: int = DIGITS) -> Any:
     """As lists of plain numbers with so many digits; what is not finite becomes None."""
-    x = np.atleast_1d(np.asarray(values, dtype=np.float64))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        size = 10.0 ** (digits - 1 - np.floor(np.log10(np.abs(x))))
-        rounded = np.where(x == 0.0, 0.0, np.round(x * size) / size)
-    found = json_ready(np.where(np.isfinite(x), rounded, np.nan))
-    return found if np.ndim(values) else found[0]
+    return _rounded(np.asarray(values, dtype=np.float64).tolist(), f".{digits}g")
+
+
+def _rounded(x: list[Any] | float, shape: str) -> Any:
+    """Number by number: of so few at a time numpy would take ten times as long."""
+    if isinstance(x, list):
+        return [_rounded(part, shape) for part in x]
+    return float(format(x, shape)) if math.isfinite(x) else None
 
 
 def encode(message: Mapping[str, Any]) -> bytes:
@@ -86,7 +90,7 @@ class Messages:
             "theta_documented": numbers(arm.theta),
             "theta_alone": self._onlooker.shown_alone.tolist(),
             "effects": [
-                [effect.title, effect.units()[effect.key]]
+                [effect.title, with_squares(effect.units()[effect.key])]
                 for effect in effects_by_name(known.effects)
             ],
             "reach_m": reach(arm),
@@ -206,7 +210,7 @@ def _finding(found: Mapping[str, Any]) -> Message:
     size = {} if effect is None else {k: v for k, v in found["size"].items() if k in units}
     return {
         "title": found["what"] if effect is None else effect.title,
-        "size": [[key, numbers(value), units[key]] for key, value in size.items()],
+        "size": [[key, numbers(value), with_squares(units[key])] for key, value in size.items()],
         "or": [rival["what"].replace("_", " ") for rival in found["ambiguous_with"]],
         **{key: found[key] for key in ("joints", "since_s", "reported_s", "over_s")},
     }

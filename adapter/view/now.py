@@ -24,7 +24,7 @@ from adapter.signals.records import StateLayout, stamp_of
 
 ROWS_A_LOOK = 8  # states of which the residual is computed, spread over those since the last look
 RMS_S, LATELY_S = 1.0, 5.0  # of residuals; of timing
-FRAMES_EVERY = 300  # states; they take milliseconds
+FRAMES_EVERY = 1000  # states; they take milliseconds
 ABOVE_NOISE = 2.0  # times the noise, beyond which a residual is said to be more
 SHOWN_ALONE = 0.99  # of a parameter's direction, that lies in what torques show
 BEHIND = 1000  # samples that wait for the learner, beyond which it is said
@@ -124,7 +124,7 @@ class Residual:
         lasting = not_learned(arm, known.effects)
         self._model = ModelFeedforward(arm.tree, with_bodies(arm).gravity, known.effects, lasting)
         self._tool = np.zeros((n, 10)) if arm.tool is None else arm.theta_with_tool() - arm.theta
-        self._version, self._ready, self._rate = 0, False, 1.0
+        self._version, self._ready = 0, False
         self._last, self._power, self._stamp_ns = np.full(n, np.nan), np.full(n, np.nan), 0
 
     def follow(self, snapshot: Snapshot, learning: bool) -> None:
@@ -174,6 +174,7 @@ class Onlooker:
         self._frames: LearnedFrames | None = None
         self._frames_of = 0
         self._timings: deque[tuple[float, LoopTiming]] = deque()
+        self._late: LoopTiming | None = None
 
     def look(self, view: View) -> Now:
         """What is to be shown of it."""
@@ -222,11 +223,13 @@ class Onlooker:
         timing, past = view.timing, self._timings
         if timing is None:
             return None
-        if not past or past[-1][1] is not timing:
-            past.append((view.elapsed_s, timing))
+        if past and past[-1][1] is timing:
+            return self._late
+        past.append((view.elapsed_s, timing))
         while len(past) > 2 and view.elapsed_s - past[1][0] > LATELY_S:
             past.popleft()
-        return timing.since(past[0][1]) if len(past) > 1 else timing
+        self._late = timing.since(past[0][1]) if len(past) > 1 else timing
+        return self._late
 
     def _learned_frames(self, snapshot: Snapshot | None) -> LearnedFrames | None:
         """Looked at anew a few times a second: it takes milliseconds."""
