@@ -119,14 +119,13 @@ def _model_lines(model: SelfModel) -> list[str]:
         f"θ          {told.get('theta_source', 'documented')}",
         *(f"           from the documentation: {text}" for text in told.get("theta_filled", ())),
     ]
-    masses = [f"{m:.3g}" for m in model.theta[:, 0]]
+    masses, hint = [f"{m:.3g}" for m in model.theta[:, 0]], ""
     if model.theta_identifiable is not None:  # else nothing was learned, and all is told
-        std = model.theta_std[:, 0]
+        shown, std = model.theta_identifiable[:, 0], model.theta_std[:, 0]
         masses = [
-            f"{m} ± {s:.1g}" if shown else "-"
-            for m, s, shown in zip(masses, std, model.theta_identifiable[:, 0], strict=True)
+            f"{m} ± {s:.1g}" if known else m for m, s, known in zip(masses, std, shown, strict=True)
         ]
-    hint = " (-: no motion shows it alone)" if "-" in masses else ""
+        hint = "" if shown.all() else "; without ±: no motion shows this one alone"
     lines.append(f"mass       {', '.join(masses)} kg, link by link{hint}")
     lines += [f"effect     {text}" for text in _effect_lines(model)]
     lines += [

@@ -17,6 +17,10 @@ _KINDS = {"float": "takes a number, got ", "int": "takes a whole number, got "}
 class Parser(argparse.ArgumentParser):
     """As argparse's, with other sentences, and without the usage of all options before them."""
 
+    def __init__(self, *args: Any, **options: Any) -> None:
+        # an option cut short would be another one's, `--mode` of `run` `--model` of `gap`
+        super().__init__(*args, **{"allow_abbrev": False, **options})
+
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As argparse does; an option that nobody knows is told with one that is alike."""
         found, unknown = self.parse_known_args(args, namespace)

@@ -68,7 +68,7 @@ def _steps(words: Sequence[str], maybe_real: bool) -> list[Step]:
         for before, word in pairwise(["", *words])
         if "--out" not in (before, word) and not word.startswith("--out=")
     ]
-    leave = ["--allow-motion"] if maybe_real else []
+    leave = ["--allow-motion"] if maybe_real and "--allow-motion" not in kept else []
     return [Step("Move the arm so", shlex.join(["adapter", "run", *kept, *leave]))]
 
 

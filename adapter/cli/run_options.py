@@ -31,7 +31,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         default="pybullet:panda",
         metavar="ADDRESS",
         help="pybullet:panda (default), log:FILE, fci://HOST, can://CHANNEL?interface=..., "
-        "ros2:///joint_states",
+        "ros2:///joint_states, FILE.py:CLASS of your own",
     )
     add(
         "--allow-motion",
@@ -56,8 +56,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add(
         "--scenario",
         metavar="NAME",
-        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, wall_mounted "
-        "(whose mounting is to be told: --gravity 9.81 0 0)",
+        help="of the simulated arm: nominal, bent_link, payload_at_20s, friction, real_drives, "
+        "wall_mounted (whose mounting is to be told: --gravity 9.81 0 0)",
     )
     add(
         "--set",

@@ -52,6 +52,8 @@ class Clearance:
     path_s: float
 
     def __str__(self) -> str:
+        if not np.isfinite(self.distance):
+            return "nothing that could touch"
         return f"{self.distance:.3f} m between {self.names[0]} and {self.names[1]}"
 
 

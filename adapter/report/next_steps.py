@@ -18,6 +18,12 @@ MOST = 4
 LEARNED_SHARE = 0.7  # of a recording that is learned from where the rest is held out
 LONGER = 2.0  # times the duration of a run that was too short
 SIMULATED = "pybullet"
+# Options of a run that the next one does not repeat
+ITS_OWN = (
+    *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
+    *("--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"),
+    *("--foxglove", "--fault"),
+)
 
 
 @dataclass(frozen=True)
@@ -77,15 +83,39 @@ def _longer(data: RunData, files: _Files) -> Step:
     if is_live(data.figures):
         span_s = LONGER * (_seconds(data) or 30.0)
         why = "The learner had not settled: run for longer, with a motion designed to teach most"
-        driver = str(data.figures.get("driver") or "ADDRESS")
-        more = [] if driver.startswith(SIMULATED) else ["--allow-motion"]
-        words = ["run", "--driver", driver, "--duration", f"{span_s:.0f}"]
+        words = [*_again(data), "--duration", f"{span_s:.0f}"]
+        more = _leave(data)
         if not data.figures.get("tracking"):  # somebody else moved the arm
             why = "The learner had not settled: listen for longer, to more motion of every joint"
             return Step(why, files.command(*words, "--passive"))
         return Step(why, files.command(*words, "--excitation", "designed", *more))
     why = "The learner had not settled: see what this motion lacks"
     return Step(why, files.command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))
+
+
+def _again(data: RunData) -> list[str]:
+    """Words of a run of the same arm: those of this one, but what it was to do and to leave."""
+    told = shlex.split(str(data.model.provenance.get("command") or ""))
+    if told[:2] != ["adapter", "run"]:  # it was begun from Python
+        scenario = data.figures.get("scenario")
+        more = ["--scenario", str(scenario)] if scenario else []
+        return ["run", "--driver", _driver(data), *more]
+    options: list[list[str]] = []
+    for word in told[2:]:
+        if word.startswith("--") or not options:
+            options.append([])
+        options[-1].append(word)
+    kept = [option for option in options if option[0].partition("=")[0] not in ITS_OWN]
+    return ["run", *(word for option in kept for word in option)]
+
+
+def _driver(data: RunData) -> str:
+    return str(data.figures.get("driver") or "ADDRESS")
+
+
+def _leave(data: RunData) -> list[str]:
+    """What an arm that may be real needs to be moved."""
+    return [] if _driver(data).startswith(SIMULATED) else ["--allow-motion"]
 
 
 def _seconds(data: RunData) -> float | None:
@@ -101,11 +131,8 @@ def _feedforward(data: RunData, worth: Worth) -> Step | None:
     if worth.tracking is not None or not moved.get("rms_rad"):
         return None
     span_s = max(LONGER * (_seconds(data) or 30.0), 30.0)
-    driver = str(figures.get("driver") or "ADDRESS")
-    words = ["run", "--driver", driver]
-    words += ["--scenario", str(figures["scenario"])] if figures.get("scenario") else []
-    words += ["--feedforward", "learned", "--duration", f"{span_s:.0f}"]
-    words += [] if driver.startswith(SIMULATED) else ["--allow-motion"]
+    words = [*_again(data), "--feedforward", "learned", "--duration", f"{span_s:.0f}"]
+    words += _leave(data)
     why = "Let the learned model help the controller; the next report says what that is worth"
     if figures.get("feedforward") == "learned":
         why = "Run for longer, so that the learned model gets to help the controller"

@@ -81,7 +81,7 @@ def test_the_tour(toured: Path) -> None:
 
 
 def test_the_gap(toured: Path) -> None:
-    found = json.loads((toured / "gap.json").read_text())["findings"]
+    found = json.loads((toured / "runs" / "gap" / "gap.json").read_text())["findings"]
     coulomb = {j for f in found if f["effect"] == "coulomb_friction" for j in f["joints"]}
     assert coulomb == set(range(1, 8))
 
