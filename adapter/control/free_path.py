@@ -377,7 +377,8 @@ class FreeMotion:
         if nearest.distance < margin:
             raise SettingsError(
                 f"the arm stands too near to start: {nearest}, where {margin:g} m are kept; move "
-                "it by hand, or describe the cell in --config ([cell])"
+                "it by hand, or describe the cell in --config ([cell]); where their shapes only "
+                f'seem to touch, say allowed = [["{nearest.names[0]}", "{nearest.names[1]}"]] there'
             )
         path_s = self._duration_s + settings.stop_s + BEYOND_S
         for k in range(ATTEMPTS):

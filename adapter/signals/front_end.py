@@ -29,7 +29,7 @@ from adapter.signals.filters import NEVER, JointFilter, filter_step
 from adapter.signals.records import StateLayout, columns
 from adapter.signals.settings import FilterSettings, FrontEndSettings
 from adapter.signals.twist import Raw, TwistSynthesis
-from drivers.interface import JointSample
+from drivers.interface import DriverError, JointSample
 
 NOTEWORTHY = (
     Verdict.NON_FINITE,
@@ -282,10 +282,20 @@ class FrontEnd:
 
         At 1 kHz it is one at most, at lower rates as many as milliseconds have gone by. The records
         are reused by the next call. Reasons are counted in `refused`.
+
+        Raises:
+            DriverError: a sample of another number of joints.
         """
         signals, answers, n = self._signals, self._answers, self.layout.n
         row = signals[0]
-        row[:n], row[n : 2 * n], row[2 * n : 3 * n] = sample.q, sample.dq, sample.tau
+        try:
+            row[:n], row[n : 2 * n], row[2 * n : 3 * n] = sample.q, sample.dq, sample.tau
+        except ValueError:
+            sizes = [np.size(x) for x in (sample.q, sample.dq, sample.tau)]
+            raise DriverError(
+                f"a sample of the driver has {sizes[0]} positions, {sizes[1]} velocities and "
+                f"{sizes[2]} torques, the robot {n} joints ({', '.join(self.names)})"
+            ) from None
         if self.layout.floating:
             row[3 * n :] = np.nan if sample.base is None else sample.base
         answers[0, 0] = sample.stamp_ns

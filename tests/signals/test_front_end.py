@@ -15,7 +15,7 @@ from adapter.signals.records import (
     stamps_of,
 )
 from adapter.signals.settings import FrontEndSettings
-from drivers.interface import JointSample, LinkMotion
+from drivers.interface import DriverError, JointSample, LinkMotion
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
 
 N = 7
@@ -278,3 +278,9 @@ def run_unknown(samples: list[JointSample]) -> tuple[np.ndarray, FrontEnd]:
 def test_settings_are_checked(name: str, value: float) -> None:
     with pytest.raises(SettingsError, match=f"front_end.{name}"):
         FrontEndSettings(**{name: value})
+
+
+def test_a_sample_of_another_arm_is_named() -> None:
+    front_end, two = FrontEnd(panda_model()), np.zeros(2)
+    with pytest.raises(DriverError, match=r"has 2 positions, 2 velocities and 2 torques.*7 joints"):
+        front_end.step(JointSample(1, two, two, two))
