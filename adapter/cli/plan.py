@@ -6,7 +6,6 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from adapter.control.excitation import plan_lines
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
-from adapter.report.next_steps import Step
+from adapter.report.next_steps import Step, without
 from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import results_folder, say, show
 from drivers.interface import Driver, JointSample
@@ -63,11 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _steps(words: Sequence[str], maybe_real: bool) -> list[Step]:
     """The run of this plan: the same words, but where the plan goes."""
-    kept = [
-        word
-        for before, word in pairwise(["", *words])
-        if "--out" not in (before, word) and not word.startswith("--out=")
-    ]
+    kept = without(words, ["--out"])
     leave = ["--allow-motion"] if maybe_real and "--allow-motion" not in kept else []
     return [Step("Move the arm so", shlex.join(["adapter", "run", *kept, *leave]))]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -100,13 +101,17 @@ def _again(data: RunData) -> list[str]:
         scenario = data.figures.get("scenario")
         more = ["--scenario", str(scenario)] if scenario else []
         return ["run", "--driver", _driver(data), *more]
-    options: list[list[str]] = []
-    for word in told[2:]:
-        if word.startswith("--") or not options:
-            options.append([])
-        options[-1].append(word)
-    kept = [option for option in options if option[0].partition("=")[0] not in ITS_OWN]
-    return ["run", *(word for option in kept for word in option)]
+    return ["run", *without(told[2:], ITS_OWN)]
+
+
+def without(words: Sequence[str], options: Sequence[str]) -> list[str]:
+    """Words of a command without some of its options and what these were given."""
+    kept: list[str] = []
+    keep = True
+    for word in words:
+        keep = word.partition("=")[0] not in options if word.startswith("--") else keep
+        kept += [word] if keep else []
+    return kept
 
 
 def _driver(data: RunData) -> str:
