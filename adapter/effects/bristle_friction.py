@@ -75,6 +75,7 @@ class BristleFriction(LearnedEffect, JointTorque):
     inexact = 0.02
     band = 0.3  # static friction is 1 to 1.6 times Coulomb's in what is published
     form = LEVEL
+    bundled = True
     simpler = ((LEVEL, 0.01),)  # Coulomb friction, which is the same where s0 is small
     phrase = Phrase("{who} {lacks} {Fc} of bristle friction, which winds up over {s0}")
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over gradually"))

@@ -20,6 +20,7 @@ class MotorInertia(LinearEffect):
     phrase = Phrase.lacks("B", "reflected motor inertia")
     shows = ((SPEEDS, "is gone"), (STILL, "is gone"))
     watched = True
+    bundled = True
 
     def column(self, at: JointSignals) -> Array:
         """ddq."""

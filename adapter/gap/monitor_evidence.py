@@ -12,7 +12,7 @@ G and b its information and right side with x integrated out, P the prior's info
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
@@ -26,6 +26,7 @@ CLIP = 9.0  # times its level: what a row says at most about the level
 LEVEL_ROWS, LEVEL_SUMS = 250.0, 40.0  # rows and sums that the level is averaged over
 START_SUMS = 5.0  # that the first guess of the level counts
 LEAST_INFLATION = 1.2
+NOTHING_KNOWN = 1e12  # (N m)²
 
 
 class Belief:
@@ -86,6 +87,7 @@ class RowGroup:
         Z: (r, n, D) regressor and columns of the learned effects.
         S: (r, n, K) signatures; tau: (r, n) N m.
         unsure: (r, n) variance that no model of these rows can do without, (N m)².
+        dq: (r, n) rad/s; new: (r, n) 1 where that is beyond what the belief has seen, else 0.
     """
 
     t: Array
@@ -93,11 +95,18 @@ class RowGroup:
     S: Array
     tau: Array
     unsure: Array
+    dq: Array
+    new: Array
+
+    @property
+    def doubt(self) -> Array:
+        """(r, n) `unsure`, and all but infinite where the belief foretells nothing, (N m)²."""
+        return self.unsure + NOTHING_KNOWN * self.new
 
     @classmethod
     def joined(cls, groups: Sequence[RowGroup]) -> RowGroup:
         """One group of all rows of several."""
-        keys = ("t", "Z", "S", "tau", "unsure")
+        keys = [x.name for x in fields(cls)]
         return cls(*(np.concatenate([getattr(group, key) for group in groups]) for key in keys))
 
 

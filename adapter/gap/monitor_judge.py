@@ -60,7 +60,7 @@ class DisagreementDetector:
         G, b = evidence.information(ROWS_PER_GROUP)
         scores = self._all.evidence(G, b)
         left = evidence.residual - evidence.rows.Z @ evidence.shift
-        left *= np.sqrt(self._level.share(evidence.rows.unsure))
+        left *= np.sqrt(self._level.share(evidence.rows.doubt))
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
         ended = self._end_something(evidence, scores, power)
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
@@ -80,7 +80,7 @@ class DisagreementDetector:
     def _evidence(self, weight: Array | None = None) -> Evidence:
         rows = RowGroup.joined(self._groups)
         if weight is None:
-            weight = self._found.weights(rows.t, self._level.weight(rows.unsure))
+            weight = self._found.weights(rows.t, self._level.weight(rows.doubt))
         return Evidence(replace(rows, Z=self._found.columns(rows)), weight, self._belief)
 
     def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
@@ -169,7 +169,7 @@ class DisagreementDetector:
     def _left(self, evidence: Evidence, candidate: Signature, a: Array, first: int) -> list[int]:
         """Joints (from 0) where much of the residual stays when the candidate is in."""
         late = slice(first + EDGE_ROWS, None)
-        share = self._level.share(evidence.rows.unsure)[late]
+        share = self._level.share(evidence.rows.doubt)[late]
         left = share * evidence.leftover(candidate, a, first)[late] ** 2
         if len(left) < ROWS_PER_GROUP:
             return []

@@ -232,22 +232,35 @@ class SignatureTable:
         weights = self._undated(leads)
         fit, base = replace(self.fit, weights=weights), self.carried
         if any(lead.interval_s != WHOLE for lead in leads):  # other rows count than in the table
-            white = fit.whiten(self.carried_tables), fit.whiten(self.targets)
-            base = Carried(white[0], fit.prior_std, white[1])
+            base = self._carried_under(fit)
+        left = self._left(fit, base, tables, own_std)
+        # what other joints lack counts for nothing in the richest noise, and pulls at all of them
+        fit = replace(fit, noise=tuple(x.flat() for x in self._noise(left, weights)))
+        left = self._left(fit, self._carried_under(fit), tables, own_std)
+        fit = replace(fit, noise=self._noise(left, weights))
+        return score(*self._carried_under(fit).without(fit.whiten(tables)), own_std)
+
+    def _carried_under(self, fit: Fit) -> Carried:
+        """What is carried along, under the noise and the weights of a fit."""
+        return Carried(fit.whiten(self.carried_tables), fit.prior_std, fit.whiten(self.targets))
+
+    def _left(
+        self, fit: Fit, base: Carried, tables: Sequence[Array], own_std: Array
+    ) -> list[Array]:
+        """(k, n) of each recording: what further signatures `tables` and the carried ones leave."""
         X = fit.whiten(tables)
         C = X @ base.N.T
         own = score(*base.reduced(X @ X.T, C, X @ base.data), own_std).x
         carried = base.x - own @ base.solved(C)
-        left = [
+        return [
             target - np.tensordot(carried, N, 1) - np.tensordot(own, table, 1)
             for target, N, table in zip(self.targets, self.carried_tables, tables, strict=True)
         ]
-        quiet = [r * (w > 0.0) for r, w in zip(left, weights, strict=True)]
-        seams = [own.seams for own in fit.recordings]
-        noise = (noise_of(r, seams=own) for r, own in zip(quiet, seams, strict=True))
-        fit = replace(fit, noise=tuple(noise))
-        others = Carried(fit.whiten(self.carried_tables), fit.prior_std, fit.whiten(self.targets))
-        return score(*others.without(fit.whiten(tables)), own_std)
+
+    def _noise(self, left: Sequence[Array], weights: Sequence[Array]) -> tuple[Noise, ...]:
+        """Noise of what is left, rows that do not count left out."""
+        parts = zip(left, weights, self.fit.recordings, strict=True)
+        return tuple(noise_of(r * (w > 0.0), seams=own.seams) for r, w, own in parts)
 
     def _undated(self, leads: Sequence[Lead]) -> tuple[Array, ...]:
         """Weights (k, n) of the rows: none where a lead's start is not known well enough yet."""
@@ -453,20 +466,21 @@ def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
 
 
 def _bundles(table: SignatureTable, leads: Sequence[Lead], found: Sequence[Lead]) -> list[Move]:
-    """Friction with an offset, on each joint where they say more together than one of them."""
+    """What any joint may have, on each joint where it says more together than one of it alone."""
     moves = []
     for joint in {x.candidate.joint for x in leads}:
-        own = [
-            x
-            for x in leads
-            if x.candidate.joint == joint and x.candidate.effect.bundled and x.interval_s == WHOLE
-        ]
-        if len(own) < 2 or max(x.log_evidence for x in own) < BELIEF:
+        own: dict[str, Lead] = {}  # of one thing in several forms the best
+        for x in leads:
+            effect = x.candidate.effect
+            if x.candidate.joint == joint and effect.bundled and x.interval_s == WHOLE:
+                own.setdefault(effect.form or effect.name, x)
+        if len(own) < 2 or max(x.log_evidence for x in own.values()) < BELIEF:
             continue
-        worth_it = table.together(own).log_evidence + sum(x.odds for x in own)
+        bundle = tuple(own.values())
+        worth_it = table.together(bundle).log_evidence + sum(x.odds for x in bundle)
         alone = max((x.log_evidence for x in found if x.candidate.joint == joint), default=BELIEF)
         if worth_it > alone + BELIEF:
-            moves.append(Move(tuple(own), worth_it))
+            moves.append(Move(bundle, worth_it))
     return moves
 
 

@@ -314,13 +314,26 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         before, values = None, weak(fit, carried)
         bad = worst(fit, values)
         if bad is not None:
-            fit = fit.without(bad)
+            fit = _dropped(fit, bad)
             continue
         ranked = standings(fit, carried, SignatureTable(fit, joints, CATALOGUED, rich=False))
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
         before, fit, swaps = fit, dated_anew(swapped), swaps + 1
+
+
+def _dropped(fit: Fit, place: int) -> Fit:
+    """Without one of its effects; what has the same form on its joint takes its own shape anew.
+
+    Beside the other it had to explain the rest alone.
+    """
+    gone, fit = fit.named[place].candidate, fit.without(place)
+    for k, e in enumerate(fit.named):
+        alike = e.candidate.joint == gone.joint and e.candidate.effect.form == gone.effect.form
+        if alike and gone.effect.form:
+            fit = shaped(refitted(fit)[0], k)
+    return fit
 
 
 def _lost(before: Fit, fit: Fit) -> bool:

@@ -15,6 +15,7 @@ from adapter.physics.kernels import jit
 
 BURST_BLOCK = 500  # samples
 PAUSE = 500  # samples until the next look, where an error was nothing that a hand carries
+BEYOND = 1.5  # times the fastest that was seen: a velocity is new
 
 
 @jit
@@ -48,6 +49,16 @@ def explained_share(columns: Array, error: Array) -> float:
     found = np.linalg.lstsq(columns.reshape(len(left), -1), left, rcond=None)[0]
     rest = left - columns.reshape(len(left), -1) @ found
     return 1.0 - float(rest @ rest) / max(float(left @ left), 1e-300)
+
+
+def is_new(dq: Array, seen: Array) -> NDArray[np.bool_]:
+    """(m, n) where velocities dq (m, n) are beyond those seen (k, n), all in rad/s.
+
+    Friction of a joint that has turned one way only is told from nothing else; what it does the
+    other way, or much faster, is foretold wrong without anything having changed.
+    """
+    low, high = np.minimum(seen.min(axis=0), 0.0), np.maximum(seen.max(axis=0), 0.0)
+    return np.asarray((dq < BEYOND * low) | (dq > BEYOND * high))
 
 
 class ChangeDetector:

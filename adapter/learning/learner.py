@@ -17,7 +17,7 @@ from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.learning.adam import FlatAdam, same_bits
-from adapter.learning.change import ChangeDetector, explained_share
+from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
 from adapter.learning.known_effects import KnownEffects, believed, told_shapes
 from adapter.learning.schema import RestingBase, Schema
@@ -43,6 +43,7 @@ MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s²
 # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
 # motion, 0.88 at most where friction turned around).
 LOAD_SHARE = 0.95
+NEW_SHARE = 0.5  # of an error's power at velocities that are new: it is of those
 MOST_MOTION = np.repeat([1e3, 60.0, 2e3, 2e4], 3)  # [v w a dw], m/s (a fall is fast), rad/s, ...
 
 
@@ -554,9 +555,18 @@ class OnlineLearner:
         Y = np.zeros((m, n, 10 * n))
         regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
+        power, seen = np.square(error / size), self.speeds_seen
+        if len(seen) and power[is_new(motion.dq, seen)].sum() > NEW_SHARE * power.sum():
+            return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
         return explained_share(load, error / size) > LOAD_SHARE
+
+    @property
+    def speeds_seen(self) -> Array:
+        """(k, n) velocities of the states still held, rad/s."""
+        rows = np.arange(self._held_from, self._held_to) % len(self._held)
+        return np.asarray(self._held[rows, self.layout.dq])
 
     def _start_change(self, stamp_ns: int) -> None:
         self.changes.append(Change(stamp_ns))
