@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.control.feedforward import ModelFeedforward, not_learned
 from adapter.control.instant import Row, beside, wind_table
@@ -202,6 +203,56 @@ def observe(bodies, joints, table, step):
 
 
 @jit
+def observe_each(bodies, joints, table, readings, begun, how, past):
+    """Take readings one after the other, up to the first that may be a contact.
+
+    Args:
+        bodies, joints, table: as for `ask`.
+        readings: stamps (m,) int64 ns; q, dq, tau (m, 3, n).
+        begun: stamp of the reading before, ns; age of the noise, s; whether it begins anew.
+        how: rate of both poles in 1/s; standard deviations of a contact; whether nothing pushes;
+            whether bristles follow.
+        past: stamps (2,) int64 ns and readings (2, 2, n) of a little before, older first; followed.
+
+    Returns:
+        How many were taken; `begun` behind them; distance of the external torque from nothing,
+        NaN where none is known; and the step, s, of one that is to be judged, else 0.
+    """
+    stamps, signals = readings
+    stamp, age_s, anew = begun
+    pole, limit, quiet, winds = how
+    past_ns, before = past
+    n, last = table.shape[1], math.nan
+    for i in range(signals.shape[0]):
+        table[: Of.TORQUE.value] = signals[i]
+        dt_s = 1e-9 * (stamps[i] - stamp)
+        if anew or not 0.0 < dt_s <= LONGEST_S:
+            dt_s = math.inf
+        older_s = age_s + (dt_s if dt_s < math.inf else 0.0)
+        distance = observe(bodies, joints, table, (dt_s, pole, older_s, quiet, winds))
+        if math.isnan(distance):
+            continue
+        if anew:
+            fastest = 0.0
+            for j in range(n):
+                fastest = max(fastest, abs(table[Of.DQ.value, j]))
+            if fastest < TURN_DQ:  # what holds it is known at once
+                for j in range(n):
+                    table[Of.TORQUE.value, j] = table[Of.SLOW.value, j] = -table[Of.RATE.value, j]
+                    known = table[Of.TAU.value, j] + table[Of.TORQUE.value, j]
+                    table[Of.EXPECTED.value, j] = known
+        anew, stamp, age_s = False, stamps[i], older_s
+        if stamp - past_ns[1] > AGO_NS:
+            past_ns[0], before[0] = past_ns[1], before[1]
+            past_ns[1], before[1] = stamp, table[: Of.TAU.value]
+        if dt_s < math.inf:
+            last = distance
+            if age_s > WARM_UP_S and (not quiet or distance > limit):
+                return i + 1, (stamp, age_s, anew), last, dt_s
+    return signals.shape[0], (stamp, age_s, anew), last, 0.0
+
+
+@jit
 def hand_wrench(frames, q, r, std, out):
     """Wrench on the last link that explains r best, at its origin in axes of the base.
 
@@ -294,14 +345,15 @@ class ContactObserver:
         self._tool = documented.theta_with_tool() - documented.theta
         self._pole = 2.0 * math.pi * self.settings.bandwidth_hz
         self._table = table = np.zeros((Of.NOISE + n, n))
-        self._q, self._dq, self._tau = table[: Of.TORQUE]
         self.torque, self.std, self.distance = table[Of.TORQUE], table[Of.STD], 0.0
         self.std[:], self.expected, self.explained = np.inf, table[Of.EXPECTED], np.zeros(n)
         self.contact: Contact | None = None
         self.contacts: list[Contact] = []
         self._age_s = 0.0
         self._anew, self._stamp_ns, self._since, self._recent = True, 0, 0, 0.0
-        self._past = ((0, np.zeros((2, n))),) * 2  # stamps and readings (2, n) of a little before
+        # stamps and readings (2, n) of a little before, older first
+        self._past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
+        self._stamps, self._signals = np.zeros(1, dtype=np.int64), np.zeros((1, 3, n))
         table[Of.SPIKE] = SPIKE_S * effort
         effort = np.where(np.isfinite(effort), effort, 0.0)
         table[Of.ERROR], table[Of.WEIGHT] = UNLEARNED_EFFORT * effort, UNLEARNED_WEIGHT
@@ -315,7 +367,10 @@ class ContactObserver:
         table[Of.NOISE :] = np.eye(n)
         joints = self._model.table.copy()
         ask(self._bodies, joints, table, True, 1e-3)
-        observe(self._bodies, joints, table, (1e-3, self._pole, 1.0, True, True))
+        past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
+        how = self._pole, self.settings.sigmas, True, True
+        readings = self._stamps, self._signals
+        observe_each(self._bodies, joints, table, readings, (0, 0.0, True), how, past)
         hand_wrench(self.frames, 0.0 * one, 0.0 * one, one, np.zeros((2, 6)))
 
     def adopt(
@@ -347,7 +402,7 @@ class ContactObserver:
         taken for an external one only until the observer has followed.
         """
         now, then = change
-        dt_s = 1e-9 * (self._stamp_ns - self._past[0][0])
+        dt_s = 1e-9 * float(self._stamp_ns - self._past[0][0])
         gone = now[1] - ((now[0] - then[0]) / dt_s if 0.0 < dt_s < LONG_AGO_S else 0.0)
         self._table[[Of.MOMENTUM, Of.RATE]] += now
         self._table[[Of.TORQUE, Of.SLOW, Of.EXPECTED]] -= gone
@@ -356,7 +411,7 @@ class ContactObserver:
     def _ask_twice(self) -> Array:
         """(2, 2, n) momentum and drift by the model in use, now and a little before."""
         model, said = self._model, []
-        for q, dq in (model.table[: Row.DQ + 1].copy(), self._past[0][1]):
+        for q, dq in (model.table[: Row.DQ + 1].copy(), self._past[1][0]):
             joints, table = model.table.copy(), self._table.copy()
             joints[Row.Q], joints[Row.DQ] = q, dq
             if model.odd:
@@ -379,38 +434,48 @@ class ContactObserver:
 
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample; one that is not finite leaves it as it was."""
-        self._q[:], self._dq[:], self._tau[:] = sample.q, sample.dq, sample.tau
-        dt_s = 1e-9 * (sample.stamp_ns - self._stamp_ns)
-        if self._anew or not 0.0 < dt_s <= LONGEST_S:
-            dt_s = math.inf
-        model, age_s = self._model, self._age_s + (dt_s if dt_s < math.inf else 0.0)
-        if model.odd:
-            if not np.isfinite(self._table[: Of.TORQUE]).all():
-                return self.torque
-            self._table[Of.ODD] = model.odd_beside(self._q, self._dq, dt_s)
-        step = dt_s, self._pole, age_s, self.contact is None, not model.odd
-        distance = observe(self._bodies, model.table, self._table, step)
-        if distance != distance:
-            return self.torque
-        if self._anew and np.abs(self._dq).max() < TURN_DQ:  # what holds it is known at once
-            self.torque[:] = self._table[Of.SLOW] = -self._table[Of.RATE]
-            self.expected[:] = self._tau + self.torque
-        self._anew, self._stamp_ns, self._age_s = False, sample.stamp_ns, age_s
-        if sample.stamp_ns - self._past[1][0] > AGO_NS:
-            self._past = self._past[1], (sample.stamp_ns, self._table[: Of.TAU].copy())
-        if dt_s < math.inf:
-            self.distance = distance
-            if age_s > WARM_UP_S:
-                self._judge(sample, dt_s)
+        self._stamps[0] = sample.stamp_ns
+        self._signals[0, 0], self._signals[0, 1] = sample.q, sample.dq
+        self._signals[0, 2] = sample.tau
+        return self.step_each(self._stamps, self._signals)
+
+    def step_each(self, stamp_ns: NDArray[np.int64], signals: Array) -> Array:
+        """`step` with samples in order: stamps (m,), and q, dq, tau (m, 3, n) of each."""
+        at = 0
+        while at < len(signals):
+            at += self._take(stamp_ns[at:], signals[at:])
         return self.torque
 
-    def _judge(self, sample: JointSample, dt_s: float) -> None:
-        """Begin, follow and end a contact."""
+    def _take(self, stamp_ns: NDArray[np.int64], signals: Array) -> int:
+        """Take the first samples in one call; how many."""
+        model = self._model
+        if model.odd:
+            stamp_ns, signals = stamp_ns[:1], signals[:1]
+            if not np.isfinite(signals).all():
+                return 1
+            dt_s = 1e-9 * int(stamp_ns[0] - self._stamp_ns)
+            known = not self._anew and 0.0 < dt_s <= LONGEST_S
+            q, dq = signals[0, 0], signals[0, 1]
+            self._table[Of.ODD] = model.odd_beside(q, dq, dt_s if known else math.inf)
+        begun = self._stamp_ns, self._age_s, self._anew
+        how = self._pole, self.settings.sigmas, self.contact is None, not model.odd
+        count, begun, distance, dt_s = observe_each(
+            self._bodies, model.table, self._table, (stamp_ns, signals), begun, how, self._past
+        )
+        self._stamp_ns, self._age_s, self._anew = begun
+        if not math.isnan(distance):
+            self.distance = distance
+        if dt_s:
+            self._judge(self._stamp_ns, signals[count - 1], dt_s)
+        return int(count)
+
+    def _judge(self, stamp_ns: int, signals: Array, dt_s: float) -> None:
+        """Begin, follow and end a contact, with a sample q, dq, tau (3, n)."""
         contact, limit = self.contact, self.settings.sigmas
         if contact is None:
             if self.distance > limit:
                 joint = int(np.argmax(np.abs(self.torque) / self.std))
-                contact = Contact(sample.stamp_ns, joint, self.torque.copy(), self.std.copy())
+                contact = Contact(stamp_ns, joint, self.torque.copy(), self.std.copy())
                 self.contact, self._since, self._recent = contact, 0, limit * limit
                 if len(self.contacts) < MOST_CONTACTS:
                     self.contacts.append(contact)
@@ -418,10 +483,10 @@ class ContactObserver:
         keep = math.exp(-dt_s / self.settings.hold_s)
         self._recent = keep * self._recent + (1.0 - keep) * self.distance**2
         if self._recent < 0.25 * limit * limit:
-            contact.end_ns, self.contact = sample.stamp_ns, None
+            contact.end_ns, self.contact = stamp_ns, None
         if self._since % SEEN_EVERY == 0 and len(contact.seen) < SEEN:
-            since_s = np.full(len(self.std), 1e-9 * (sample.stamp_ns - contact.begin_ns))
-            now = since_s, sample.q, sample.dq, self.torque, self.std
+            since_s = np.full(len(self.std), 1e-9 * (stamp_ns - contact.begin_ns))
+            now = since_s, signals[0], signals[1], self.torque, self.std
             contact.seen.append(np.array(now))
         if np.abs(self.torque).max() > np.abs(contact.torque).max():
             contact.torque, contact.std = self.torque.copy(), self.std.copy()

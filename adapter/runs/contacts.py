@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from adapter.control.contact_kind import kind_of
 from adapter.control.observer import ContactObserver
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
 from drivers.interface import JointSample
 
 ADOPT_EVERY = 50  # samples
@@ -29,13 +33,25 @@ class ReplayObserver:
 
     def step(self, sample: JointSample) -> None:
         """Take a sample that the learner has seen."""
+        signals = np.array([[sample.q, sample.dq, sample.tau]])
+        self.step_each(np.array([sample.stamp_ns]), signals)
+
+    def step_each(self, stamp_ns: NDArray[np.int64], signals: Array) -> None:
+        """Take samples that the learner has seen: stamps (m,), and q, dq, tau (m, 3, n) of each."""
+        begin = 0
+        while begin < len(signals):
+            self._adopt()
+            end = min(begin + ADOPT_EVERY - self._samples % ADOPT_EVERY, len(signals))
+            self.observer.step_each(stamp_ns[begin:end], signals[begin:end])
+            self._samples += end - begin
+            begin = end
+
+    def _adopt(self) -> None:
         learner = self._learner
         if self._samples % ADOPT_EVERY == 0 and learner.theta_converged:
             theta, std = learner.theta, learner.theta.variance() ** 0.5
             now = theta.theta, theta.effect_values, theta.shapes, std
             self.observer.adopt(learner.schema.lam, *now)
-        self._samples += 1
-        self.observer.step(sample)
 
 
 def contacts_of(observer: ContactObserver, documented: SelfModel) -> list[dict[str, Any]]:

@@ -28,7 +28,7 @@ from adapter.signals.front_end import FrontEnd
 from adapter.signals.settings import FilterSettings
 from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation_error
 from drivers.files.mcap import AnyLog, Log, StoredLog, stored
-from drivers.interface import DriverError, JointSample, LinkMotion
+from drivers.interface import DriverError
 
 FEWEST_FOR_NOISE = 50  # samples
 # States that pass the front end in one table: as much as a processor's cache holds. Of the exact
@@ -80,7 +80,7 @@ class Replay:
         outcome: of the learner.
         pipeline: its front end has the counts of refused samples.
         samples: read from the recording.
-        ticks: compute times of the front end by sample (exact mode only).
+        ticks: compute times of the front end by sample, means of some (exact mode only).
         wall_s: time spent on learning, without reading the file.
         span_s: time that the samples span in the recording.
         contacts: see `contacts.contacts_of`; of the exact mode and a fixed base only.
@@ -227,36 +227,25 @@ def _exact(
 def _exact_piece(
     log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
 ) -> None:
-    tick_ns = np.zeros(len(log), dtype=np.int64)
-    front_end, learner = pipeline.front_end, pipeline.learner
-    heard, stamps = _heard(log), log.stamp_ns.tolist()
+    front_end, learner, stamps = pipeline.front_end, pipeline.learner, log.stamp_ns
+    signals, tick_ns = np.stack([log.q, log.dq, log.tau], axis=1), np.zeros(len(log), np.int64)
+    links = None if log.twists is None or log.accels is None else (log.twists, log.accels)
     # the observer goes on with what is learned behind every so-manyth sample, so that one ends each
     for begin, end in pairwise([0, *range(1, len(log), ADOPT_EVERY), len(log)]):
-        samples, states = [], []
-        for i in range(begin, end):
-            links = None
-            if heard is not None and heard[i] and log.twists is not None and log.accels is not None:
-                links = LinkMotion(log.twists[i], log.accels[i])
-            base = None if log.base is None else log.base[i]
-            sample = JointSample(stamps[i], log.q[i], log.dq[i], log.tau[i], links, base)
-            before = time.perf_counter_ns()
-            found = front_end.step(sample)
-            tick_ns[i] = time.perf_counter_ns() - before
-            samples.append(sample)
-            states.append(found.copy())  # the next call reuses it
-        if states:
-            learner.step_each(np.concatenate(states))
+        own = slice(begin, end)
+        if begin == end:
+            continue
+        said = None if links is None else (links[0][own], links[1][own])
+        base = None if log.base is None else log.base[own]
+        before = time.perf_counter_ns()
+        joints = stamps[own], log.q[own], log.dq[own], log.tau[own]
+        states = front_end.step_table(*joints, said, base)
+        tick_ns[own] = (time.perf_counter_ns() - before) // (end - begin)
+        if len(states):
+            learner.step_each(states)
         if observer is not None:
-            for sample in samples:
-                observer.step(sample)
+            observer.step_each(stamps[own], signals[own])
     ticks.add(tick_ns)
-
-
-def _heard(log: Log) -> NDArray[np.bool_] | None:
-    if log.twists is None or log.accels is None:
-        return None
-    silent = np.isnan(log.twists).all(axis=(1, 2)) & np.isnan(log.accels).all(axis=(1, 2))
-    return np.asarray(~silent)
 
 
 def filtered_tables(log: AnyLog, stop: int, front_end: FrontEnd) -> Iterator[Array]:
