@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 from adapter.gap.workflow import find_gap
+from sim.effects import Effect
 from sim.hidden import Recording, Trial, draw, pybullet_recording, write
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import SECOND, detectability, second
@@ -210,3 +212,36 @@ def test_what_is_in_no_list_stays_unexplained(outside: Told) -> None:
 
 def test_what_is_in_no_list_gets_no_sure_name(outside: Told) -> None:
     assert outside.row["sure_wrong"] == 0, outside
+
+
+DRIVE_SEEDS = (3, 5)
+
+
+def real_drives(seed: int) -> Trial:
+    """A trial whose seven joints have bristles, damping and a motor each, of drawn sizes."""
+    drawn = (draw(k, "null") for k in count(1000 * seed))
+    trial = next(x for x in drawn if x.motion.kind == "sines" and not x.motion.slow)
+    rng = np.random.default_rng([seed, 41])
+    effects: list[Effect] = []
+    for j in range(1, 8):
+        level, way, damping, motor = rng.uniform((0.2, 5e-4, 0.03, 0.05), (0.6, 2e-3, 0.1, 0.15))
+        effects.append(Effect("bristle_friction", (j,), {"Fc": level, "s0": way}))
+        effects.append(Effect("viscous_friction", (j,), {"Fv": damping}))
+        effects.append(Effect("motor_inertia", (j,), {"B": motor}))
+    return replace(trial, effects=tuple(effects), friction=None)
+
+
+@pytest.fixture(scope="module", params=DRIVE_SEEDS)
+def drives(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    trial = real_drives(request.param)
+    return trial, answer(trial, tmp_path_factory.mktemp("drives"), pinocchio_recording)
+
+
+def test_what_hides_each_other_in_every_joint_is_named(drives: Any) -> None:
+    trial, result = drives
+    hidden = {(e.name, e.joints[0]) for e in trial.effects}
+    said = {(f["effect"], f["joints"][0]) for f in result["findings"]}
+    assert said <= hidden
+    # damping as small as the noise counts to the friction beside it
+    assert {x for x in hidden if x[0] != "viscous_friction"} <= said
+    assert not result["unexplained"]
