@@ -260,7 +260,7 @@ class Effect(ABC):
         watched: whether the monitor looks for it while an arm is learned: an effect of a joint
             with `columns`, a body or a wrench at the flange.
         own_to_log: whether each recording has one of its own, where several are of one arm.
-        bundled: whether friction and offsets of the same joint can hide it and be hidden by it.
+        bundled: whether any joint may have it: such effects of one joint hide one another.
         over_angle: whether it is a curve over the joint's angle.
         is_theta: whether its coefficients are the ten inertial parameters of a link.
     """

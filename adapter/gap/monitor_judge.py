@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Evidence, Level, RowGroup
 from adapter.gap.monitor_signatures import Candidates, Signature, candidates
 from adapter.gap.result import UNEXPLAINED
@@ -30,6 +31,7 @@ LEFT_RATIO, LEFT_SHARE = 4.0, 0.15  # of the level, of the residual: more is lef
 POWER, POWER_OVER, POWER_S = 6.0, 2.0, 1.0  # times the level over a second: something, nothing
 POWER_ROWS = 25
 MOST = 6  # disagreements at a time
+ROUNDING, NO_UNIT = 1e-9, "1"
 
 
 class DisagreementDetector:
@@ -342,9 +344,16 @@ class DisagreementList:
 def sentence(report: Mapping[str, Any], start_s: float) -> str:
     """One line on a report, for people; times count from the stamp `start_s`."""
     where = f" on joint {', '.join(map(str, report['joints']))}" if report["joints"] else ""
-    size = ", ".join(f"{key} {value:.3g}" for key, value in report["size"].items())
+    size = ", ".join(_written(report["what"], key, x) for key, x in report["size"].items())
     over = "" if report["over_s"] is None else f", over at {report['over_s'] - start_s:.2f} s"
     also = " or ".join(other["what"] for other in report["ambiguous_with"])
     what = report["what"] + (f" (or {also})" if also else "")
     line = f"{what.replace('_', ' ')}{where} since {report['since_s'] - start_s:.2f} s{over}"
     return f"{line}{': ' + size if size else ''} (seen at {report['reported_s'] - start_s:.2f} s)"
+
+
+def _written(effect: str, key: str, value: float) -> str:
+    """A parameter of an effect with its unit, what is no more than rounding as 0."""
+    unit = next(p.written for p in CATALOGUE[effect].parameters if p.key == key)
+    shown = value if abs(value) > ROUNDING else 0.0
+    return f"{key} {shown:.3g}{'' if unit == NO_UNIT else f' {unit}'}"
