@@ -203,24 +203,23 @@ def observe(bodies, joints, table, step):
 
 
 @jit
-def observe_each(bodies, joints, table, readings, begun, how, past):
+def observe_each(bodies, joints, table, readings, step, past):
     """Take readings one after the other, up to the first that may be a contact.
 
     Args:
         bodies, joints, table: as for `ask`.
         readings: stamps (m,) int64 ns; q, dq, tau (m, 3, n).
-        begun: stamp of the reading before, ns; age of the noise, s; whether it begins anew.
-        how: rate of both poles in 1/s; standard deviations of a contact; whether nothing pushes;
-            whether bristles follow.
+        step: where it stands (stamp of the reading before, ns; age of the noise, s; whether it
+            begins anew), and how it goes on (rate of both poles in 1/s; standard deviations of a
+            contact; whether nothing pushes; whether bristles follow).
         past: stamps (2,) int64 ns and readings (2, 2, n) of a little before, older first; followed.
 
     Returns:
-        How many were taken; `begun` behind them; distance of the external torque from nothing,
+        How many were taken; where it stands behind them; distance of the external torque from nothing,
         NaN where none is known; and the step, s, of one that is to be judged, else 0.
     """
     stamps, signals = readings
-    stamp, age_s, anew = begun
-    pole, limit, quiet, winds = how
+    (stamp, age_s, anew), (pole, limit, quiet, winds) = step
     past_ns, before = past
     n, last = table.shape[1], math.nan
     for i in range(signals.shape[0]):
@@ -370,7 +369,7 @@ class ContactObserver:
         past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
         how = self._pole, self.settings.sigmas, True, True
         readings = self._stamps, self._signals
-        observe_each(self._bodies, joints, table, readings, (0, 0.0, True), how, past)
+        observe_each(self._bodies, joints, table, readings, ((0, 0.0, True), how), past)
         hand_wrench(self.frames, 0.0 * one, 0.0 * one, one, np.zeros((2, 6)))
 
     def adopt(
@@ -457,12 +456,13 @@ class ContactObserver:
             known = not self._anew and 0.0 < dt_s <= LONGEST_S
             q, dq = signals[0, 0], signals[0, 1]
             self._table[Of.ODD] = model.odd_beside(q, dq, dt_s if known else math.inf)
-        begun = self._stamp_ns, self._age_s, self._anew
+        stands = self._stamp_ns, self._age_s, self._anew
         how = self._pole, self.settings.sigmas, self.contact is None, not model.odd
-        count, begun, distance, dt_s = observe_each(
-            self._bodies, model.table, self._table, (stamp_ns, signals), begun, how, self._past
+        now, readings = (stands, how), (stamp_ns, signals)
+        count, stands, distance, dt_s = observe_each(
+            self._bodies, model.table, self._table, readings, now, self._past
         )
-        self._stamp_ns, self._age_s, self._anew = begun
+        self._stamp_ns, self._age_s, self._anew = stands
         if not math.isnan(distance):
             self.distance = distance
         if dt_s:
