@@ -215,8 +215,8 @@ def observe_each(bodies, joints, table, readings, step, past):
         past: stamps (2,) int64 ns and readings (2, 2, n) of a little before, older first; followed.
 
     Returns:
-        How many were taken; where it stands behind them; distance of the external torque from nothing,
-        NaN where none is known; and the step, s, of one that is to be judged, else 0.
+        How many were taken; where it stands behind them; distance of the external torque from
+        nothing, NaN where none is known; and the step, s, of one that is to be judged, else 0.
     """
     stamps, signals = readings
     (stamp, age_s, anew), (pole, limit, quiet, winds) = step
