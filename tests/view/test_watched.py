@@ -255,7 +255,7 @@ def test_a_page_comes_back_by_itself(seen: Seen, tmp_path: Path) -> None:
         second(Onlooker(other).look(seen.views[3]))
         page.wait_for("document.getElementById('badge').textContent === 'live'")
         page.wait_for("document.getElementById('who').textContent.includes('fci://arm')")
-        assert "Learning where" in page.value("document.getElementById('headline').textContent")
+        page.wait_for("document.getElementById('headline').textContent.includes('Learning where')")
         second._server.stop()
 
 
