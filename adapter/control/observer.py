@@ -353,6 +353,7 @@ class ContactObserver:
         # stamps and readings (2, n) of a little before, older first
         self._past = np.zeros(2, dtype=np.int64), np.zeros((2, 2, n))
         self._stamps, self._signals = np.zeros(1, dtype=np.int64), np.zeros((1, 3, n))
+        self._q, self._dq, self._tau = self._signals[0]
         table[Of.SPIKE] = SPIKE_S * effort
         effort = np.where(np.isfinite(effort), effort, 0.0)
         table[Of.ERROR], table[Of.WEIGHT] = UNLEARNED_EFFORT * effort, UNLEARNED_WEIGHT
@@ -434,9 +435,9 @@ class ContactObserver:
     def step(self, sample: JointSample) -> Array:
         """External torque (n,) N m with this sample; one that is not finite leaves it as it was."""
         self._stamps[0] = sample.stamp_ns
-        self._signals[0, 0], self._signals[0, 1] = sample.q, sample.dq
-        self._signals[0, 2] = sample.tau
-        return self.step_each(self._stamps, self._signals)
+        self._q[:], self._dq[:], self._tau[:] = sample.q, sample.dq, sample.tau
+        self._take(self._stamps, self._signals)
+        return self.torque
 
     def step_each(self, stamp_ns: NDArray[np.int64], signals: Array) -> Array:
         """`step` with samples in order: stamps (m,), and q, dq, tau (m, 3, n) of each."""

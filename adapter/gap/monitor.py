@@ -20,7 +20,7 @@ from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
-from adapter.learning.change import is_new
+from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
@@ -177,7 +177,7 @@ class Monitor:
         self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
-        self._speeds = _extremes(learner.speeds_seen)
+        self._speeds = extremes(learner.speeds_seen)
 
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
         """A group is full: judge the window with it, and let the oldest group into the belief."""
@@ -223,10 +223,4 @@ class Monitor:
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
         self._found.forget_before(float(group.t[0]), self._belief)
-        self._speeds = _extremes(np.concatenate([self._speeds, group.dq]))
-
-
-def _extremes(dq: Array) -> Array:
-    """(2, n) least and largest of velocities (k, n), and of none."""
-    rest = np.zeros((1, dq.shape[1]))
-    return np.array([f(np.concatenate([dq, rest]), axis=0) for f in (np.min, np.max)])
+        self._speeds = extremes(np.concatenate([self._speeds, group.dq]))

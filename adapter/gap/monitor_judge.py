@@ -11,6 +11,7 @@ import numpy as np
 from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Evidence, Level, RowGroup
 from adapter.gap.monitor_signatures import Candidates, Signature, candidates
+from adapter.gap.phrases import measured
 from adapter.gap.result import UNEXPLAINED
 from adapter.model.spatial import Array
 
@@ -31,7 +32,6 @@ LEFT_RATIO, LEFT_SHARE = 4.0, 0.15  # of the level, of the residual: more is lef
 POWER, POWER_OVER, POWER_S = 6.0, 2.0, 1.0  # times the level over a second: something, nothing
 POWER_ROWS = 25
 MOST = 6  # disagreements at a time
-ROUNDING, NO_UNIT = 1e-9, "1"
 
 
 class DisagreementDetector:
@@ -353,7 +353,6 @@ def sentence(report: Mapping[str, Any], start_s: float) -> str:
 
 
 def _written(effect: str, key: str, value: float) -> str:
-    """A parameter of an effect with its unit, what is no more than rounding as 0."""
-    unit = next(p.written for p in CATALOGUE[effect].parameters if p.key == key)
-    shown = value if abs(value) > ROUNDING else 0.0
-    return f"{key} {shown:.3g}{'' if unit == NO_UNIT else f' {unit}'}"
+    """A parameter of an effect with its unit."""
+    unit = next(p.unit for p in CATALOGUE[effect].parameters if p.key == key)
+    return f"{key} {measured(value, None, unit)}"

@@ -57,8 +57,13 @@ def is_new(dq: Array, seen: Array) -> NDArray[np.bool_]:
     Friction of a joint that has turned one way only is told from nothing else; what it does the
     other way, or much faster, is foretold wrong without anything having changed.
     """
-    low, high = np.minimum(seen.min(axis=0), 0.0), np.maximum(seen.max(axis=0), 0.0)
+    low, high = extremes(seen)
     return np.asarray((dq < BEYOND * low) | (dq > BEYOND * high))
+
+
+def extremes(dq: Array) -> Array:
+    """(2, n) least and largest of velocities (k, n) and of rest, rad/s."""
+    return np.array([dq.min(axis=0, initial=0.0), dq.max(axis=0, initial=0.0)])
 
 
 class ChangeDetector:

@@ -95,9 +95,9 @@ def difference_summary(found: ModelDifference) -> list[str]:
     away = f"elsewhere by {rms:.2g} mm rms, {most:.2g} mm at most"
     stands = f"{found.hand} stands {away if found.hand_max_m > NOTHING else 'where it stood'}"
     lines = [f"all together: torque of {torques} N m rms; {stands}"]
-    if not any(map(_listed, found.changes)):
-        lines.insert(0, f"{found.names[0]} and {found.names[1]} agree, as far as they are known")
     left = [change for change in found.changes if not _listed(change)]
+    if len(left) == len(found.changes):
+        lines.insert(0, f"{found.names[0]} and {found.names[1]} agree, as far as they are known")
     noise = [change for change in left if not change.significant]
     idle = ", ".join(_name(change) for change in left if change.significant)
     parts = []

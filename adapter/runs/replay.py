@@ -227,24 +227,17 @@ def _exact(
 def _exact_piece(
     log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
 ) -> None:
-    front_end, learner, stamps = pipeline.front_end, pipeline.learner, log.stamp_ns
     signals, tick_ns = np.stack([log.q, log.dq, log.tau], axis=1), np.zeros(len(log), np.int64)
-    links = None if log.twists is None or log.accels is None else (log.twists, log.accels)
     # the observer goes on with what is learned behind every so-manyth sample, so that one ends each
     for begin, end in pairwise([0, *range(1, len(log), ADOPT_EVERY), len(log)]):
-        own = slice(begin, end)
-        if begin == end:
-            continue
-        said = None if links is None else (links[0][own], links[1][own])
-        base = None if log.base is None else log.base[own]
+        part, own = log.piece(begin, end), slice(begin, end)
         before = time.perf_counter_ns()
-        joints = stamps[own], log.q[own], log.dq[own], log.tau[own]
-        states = front_end.step_table(*joints, said, base)
+        states = _filtered(part, pipeline.front_end)
         tick_ns[own] = (time.perf_counter_ns() - before) // (end - begin)
         if len(states):
-            learner.step_each(states)
+            pipeline.learner.step_each(states)
         if observer is not None:
-            observer.step_each(stamps[own], signals[own])
+            observer.step_each(part.stamp_ns, signals[own])
     ticks.add(tick_ns)
 
 
@@ -252,12 +245,16 @@ def filtered_tables(log: AnyLog, stop: int, front_end: FrontEnd) -> Iterator[Arr
     """Filtered states (m, size) of the first `stop` samples of a recording, a table at a time."""
     at_once = max(AT_ONCE // front_end.filter.settings.states_per_sample, 1)
     for start in range(0, stop, at_once):
-        part = log.piece(start, min(start + at_once, stop))
-        links = None
-        if part.twists is not None and part.accels is not None:
-            links = part.twists, part.accels
-        joints = part.stamp_ns, part.q, part.dq, part.tau
-        yield front_end.step_table(*joints, links, part.base)
+        yield _filtered(log.piece(start, min(start + at_once, stop)), front_end)
+
+
+def _filtered(part: Log, front_end: FrontEnd) -> Array:
+    """(k, size) filtered states of a part that follows those before."""
+    links = None
+    if part.twists is not None and part.accels is not None:
+        links = part.twists, part.accels
+    joints = part.stamp_ns, part.q, part.dq, part.tau
+    return front_end.step_table(*joints, links, part.base)
 
 
 def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
