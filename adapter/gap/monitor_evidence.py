@@ -39,6 +39,7 @@ class Belief:
     def __init__(self, H: Array, rhs: Array) -> None:
         self.H, self.rhs = H.copy(), rhs.copy()
         self._floor = 1e-3 * H.diagonal()
+        self._mean: Array | None = None
 
     def absorb(self, Z: Array, weight: Array, tau: Array, keep: float) -> None:
         """Add rows Z (r, D), tau (r,) of these weights; `keep` is the share of the old kept.
@@ -55,10 +56,13 @@ class Belief:
         weighted = Z * weight[:, None]
         self.H += weighted.T @ Z
         self.rhs += weighted.T @ tau
+        self._mean = None
 
     def mean(self) -> Array:
-        """(D,)."""
-        return np.asarray(np.linalg.solve(self.H, self.rhs))
+        """(D,); nobody may write to it."""
+        if self._mean is None:
+            self._mean = np.asarray(np.linalg.solve(self.H, self.rhs))
+        return self._mean
 
     def extend(self, std: Array) -> None:
         """New coefficients behind the others: zero give or take std (k,)."""
@@ -66,7 +70,7 @@ class Belief:
         H = np.zeros((size + k, size + k))
         H[:size, :size] = self.H
         H[np.arange(size, size + k), np.arange(size, size + k)] = 1.0 / std**2
-        self.H, self.rhs = H, np.r_[self.rhs, np.zeros(k)]
+        self.H, self.rhs, self._mean = H, np.r_[self.rhs, np.zeros(k)], None
 
     def drop(self, at: slice) -> None:
         """Integrate out the coefficients there."""
@@ -76,6 +80,7 @@ class Belief:
         cross = self.H[np.ix_(rest, np.arange(size)[at])]
         self.rhs = self.rhs[rest] - cross @ gain[:, -1]
         self.H = self.H[np.ix_(rest, rest)] - cross @ gain[:, :-1]
+        self._mean = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,7 +95,8 @@ class ImuSchema(Schema):
         self._waiting += 1
         more_s, known_s = self._moved_s - self._solved_s, self._solved_s
         due_s = min(max(FIRST_S, (GROWTH - 1.0) * known_s), MOST_S)
-        if more_s >= due_s or (more_s > 0.0 and self._waiting > LAST_WORD):
+        self.looked = more_s >= due_s or (more_s > 0.0 and self._waiting > LAST_WORD)
+        if self.looked:
             self._solved_s = self._moved_s
             self._solve()
 

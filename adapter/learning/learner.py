@@ -37,7 +37,6 @@ JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
-FEWEST = 2  # states that are worth a call of `steps`
 # No joint of a robot shows more; a state beyond is refused as a NaN is.
 MOST_Q, MOST_DQ, MOST_DDQ, MOST_TAU = 1e4, 60.0, 2e4, 1e5  # rad, rad/s, rad/s², N m and N
 # Of an error's power a body at the hand explains so much (0.997 where 0.3 kg were taken up in
@@ -156,7 +155,6 @@ class OnlineLearner:
         self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
         self.rates = self._rates if by_rates else None
         places = [(column, self._rates.place(rate)) for column, rate in self.theta.rate_columns]
-        self._unlimited = np.full((tree.n, 6), np.inf)
         self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
         self.given = tuple(known.effects)
@@ -252,6 +250,10 @@ class OnlineLearner:
         if updating:
             self._since_update = 0
             self._schema_gradient()
+        return self._learn_theta_too(table, updating)
+
+    def _learn_theta_too(self, table: Array, updating: bool) -> int:
+        """The rest of `_learn`, λ having seen the states and, if it is updating, its gradient."""
         due = self._theta_is_due(table)
         theta_too = due and self._take_torque(table)
         if updating:
@@ -264,27 +266,29 @@ class OnlineLearner:
 
     def _learn_each(self, table: Array) -> int:
         """Take the first states of a table in one call; how many, none where it cannot be."""
-        count: int = self._steady(table)
+        steady = table[: self._steady(table)]
         if self.rates is None:
-            rows = np.ascontiguousarray(table[:count, self.layout.before_links])
-            ends = np.arange(1, count + 1)
+            rows = np.ascontiguousarray(steady[:, self.layout.before_links])
+            ends = np.arange(1, len(steady) + 1)
         else:
-            rows, ends = self.rates.coming(table[:count])
-        if len(ends) < FEWEST or not len(rows):
+            rows, ends = self.rates.coming(steady)
+        if not len(ends):
             return 0
-        table = table[: len(ends)]
         self.schema.absorb(table[:1])
         self._schema_gradient()
+        steady = table[: self.schema.until_look(table[: len(ends)])]
+        ends = ends[: len(steady)]
+        if not ends[-1] or (self.schema.looked and self._strayed()):
+            return self._learn_theta_too(table[:1], True)
+        table = steady
         self.follow_convergence()
-        done = self._room(rows, ends)
-        # where λ is looked at again behind so many, θ looks at the frames before the last of them
-        every = self.settings.schema.judge_every
-        allowed = self._allowed() if len(ends) == every else self._unlimited
-        count = int(steps(table, (*self._parts(len(rows)), allowed), tuple(done)))
+        done = self._room(rows[: ends[-1]], ends)
+        count = int(steps(table, self._parts(int(ends[-1])), tuple(done)))
         self.schema.updates += count - 1
         self.adam.steps += count
         self.theta.took(int(ends[count - 1]), count)
         self._look_back(table[:count], done)
+        self._judge_theta()
         return count
 
     def _steady(self, table: Array) -> int:
@@ -405,7 +409,7 @@ class OnlineLearner:
         for _ in range(updates):
             if self.theta.compute_gradient():
                 self.adam.step()
-                self.theta.after_step(self.theta_converged, self._states_per_update)
+                self._after_theta_step()
 
     def take_every(self, states: int, triples: Array | None = None) -> None:
         """Let each state that comes from here on stand for so many, the others being left out.
@@ -448,7 +452,11 @@ class OnlineLearner:
         self.adam.step()
         self.schema.apply_step(self.adam.rate)
         if theta_too:
-            self.theta.after_step(self.theta_converged, self._states_per_update)
+            self._after_theta_step()
+
+    def _after_theta_step(self) -> None:
+        self.theta.after_step(self.theta_converged, self._states_per_update)
+        self._judge_theta()
 
     def _trace_schema(self, table: Array) -> None:
         if self.schema_trace.due(len(table)):
@@ -464,8 +472,8 @@ class OnlineLearner:
                 self._hold(table)
                 return False
             self.start_theta(stamp_of(table[0]))
-        elif self.schema.updates % self.settings.schema.judge_every == 0:
-            self._follow_schema()
+        elif self.schema.looked and self._strayed():
+            self._begin_rebuild()
         return True
 
     def start_theta(self, stamp_ns: int) -> None:
@@ -492,7 +500,6 @@ class OnlineLearner:
         if self.theta.restart_due(self.theta.weight * len(table)):
             self.theta.restart_spare()
             self._forget_momentum()
-        self._judge_theta()
         return True
 
     def _with_rates(self, table: Array) -> Array:
@@ -590,15 +597,11 @@ class OnlineLearner:
         self._held_to += count
         self._held_from = max(self._held_from, self._held_to - size)
 
-    def _follow_schema(self) -> None:
-        """Rebuild θ's moments when λ has left them by more than it is sure of."""
-        if self.schema.strayed(*self.frames, self._allowed()):
-            self._begin_rebuild()
-
-    def _allowed(self) -> Array:
-        """(n, 6) turns and shifts that λ may be away from the frames of θ, rad and m."""
+    def _strayed(self) -> bool:
+        """Whether λ has left the frames of θ's moments by more than it is sure of."""
         std = np.sqrt(np.einsum("jaa->ja", self.schema.covariance()))
-        return np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
+        allowed = np.maximum(self.settings.rebuild_stds * std, REBUILD_FLOOR)
+        return self.schema.strayed(*self.frames, allowed)
 
     def _begin_rebuild(self) -> None:
         self._R0[:], self._p[:] = self.schema.R0, self.schema.p

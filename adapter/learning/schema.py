@@ -49,7 +49,7 @@ from adapter.model.spatial import (
 )
 from adapter.model.tree import Tree
 from adapter.signals.filters import THIRD_DIFFERENCE_GAIN
-from adapter.signals.records import KIND, LinkMotionKind, StateLayout
+from adapter.signals.records import KIND, LinkMotionKind, StateLayout, stamp_of
 
 PURE_SHIFT = 0.05  # share of turns below which an unshown direction is a shift alone
 # Curvature that counts as shown, and as known, where nothing but rounding (some 1e-6) disturbs it.
@@ -60,6 +60,7 @@ SURE = 3.0  # standard deviations that may be left in directions that are not kn
 # soon over, unless a brake holds a joint.
 PATIENCE = 5
 LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
+SETTLED_LOOK_NS = 50_000_000  # between two looks at a λ that has converged
 EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
 FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
 LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none
@@ -95,6 +96,7 @@ class Schema:
         tangent, gradient: (n, 6) what ADAM steps on (zero between steps), and its gradient.
         moments: of all samples so far.
         weight: samples that one that is given stands for, where the others are left out.
+        looked: whether the newest update looked at the curvature.
         information: (n, 6, 6) of (phi, d).
         identifiable: (n, 6, 6) projector on the directions the data show, if roughly: ADAM keeps
             to them. rank: their number over all joints.
@@ -137,7 +139,7 @@ class Schema:
         )
         self._moments = tuple(self.moments)
         self._clean = np.zeros_like(self.moments.M)
-        self.updates, self.weight = 0, 1.0
+        self.updates, self.weight, self.looked = 0, 1.0, False
         self.tangent, self.gradient = np.zeros((n, 6)), np.zeros((n, 6))
         self._distance = np.zeros((n, 2))
         self.information = np.zeros((n, 6, 6))
@@ -198,17 +200,26 @@ class Schema:
         absorb(self._parent, base, table, self._moments, float(self.kind), (keep, self.weight))
 
     def steady(self, table: Array) -> int:
-        """How many states (m, size) go by until something but the curvature now is looked at."""
+        """How many states (m, size) go by until more is due than steps and looks."""
         s = self.settings
         if self.each_sample or self._rough or s.forget_s is not None:
             return 0
-        if self.updates % s.judge_every:
-            return 0
         if not s.spin_measured and self.kind == LinkMotionKind.MEASURED:
             return 0
-        ahead = table[: s.judge_every]
-        other = np.flatnonzero(ahead[:, KIND] != float(self.kind))
-        return int(other[0]) if len(other) else len(ahead)
+        other = np.flatnonzero(table[:, KIND] != float(self.kind))
+        return int(other[0]) if len(other) else len(table)
+
+    def until_look(self, table: Array) -> int:
+        """How many states (m, size), the first of which it has seen, go by until the next look."""
+        every = self.settings.judge_every
+        for k in range(1 + -self.updates % every, len(table), every):
+            if self._look_due(stamp_of(table[k])):
+                return k
+        return len(table)
+
+    def _look_due(self, stamp_ns: int) -> bool:
+        """Whether curvature is looked at with a state of this stamp, where it may be."""
+        return not self.converged or not 0 < stamp_ns - self._looked_ns < SETTLED_LOOK_NS
 
     def parts(self) -> tuple[Any, ...]:
         """What `steps` needs of it."""
@@ -271,7 +282,8 @@ class Schema:
 
     def compute_gradient(self) -> None:
         """Fill `gradient` for one ADAM step; looks at the curvature now and then."""
-        looking = self.updates % self.settings.judge_every == 0
+        may_look = self.updates % self.settings.judge_every == 0
+        self.looked = looking = may_look and self._look_due(int(self.moments.last_stamps[0]))
         self.updates += 1
         frames, moments = self._frames, self.moments
         if looking:

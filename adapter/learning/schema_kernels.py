@@ -135,7 +135,8 @@ def channel_cost(M, ch, R, p, g, H):
     out where H is empty (0, 6).
     """
     k = N_SIGNALS[ch]
-    T, TM, Tsy = np.zeros((3, k)), np.empty((3, k)), np.empty((3, 3))
+    work = np.zeros((9, k))
+    T, TM, Tsy = work[:3], work[3:6], work[6:]
     for r in range(3):  # T begins with a unit matrix
         T[r, r] = 1.0
         for j in range(k):
@@ -331,14 +332,14 @@ def profiled(frames, M, count, clean, g, H):
         clean: moments that the curvature is of, with the same weights; (0, 3, 15, 15): none asked.
     """
     tree = Frames(*frames)
-    gc, Hc, unused = np.zeros(6), np.zeros((6, 6)), np.zeros(6)
+    gc, Hc, unused = np.empty(6), np.empty((6, 6)), np.zeros(6)
     for j in range(M.shape[0]):
         R, p = tree.R0[j], tree.p[j]
         g[j] = 0.0
         if clean.shape[0]:
             H[j] = 0.0
         for ch in range(3):
-            gc[:], Hc[:] = 0.0, 0.0
+            gc[:] = 0.0
             cost = max(channel_cost(M[j], ch, R, p, gc, Hc[:0]), 0.0)
             power = M[j, ch, 0, 0] + M[j, ch, 1, 1] + M[j, ch, 2, 2]
             least = 3.0 * count * NOISE_FLOOR * NOISE_FLOOR + MISFIT_FLOOR * power
@@ -346,6 +347,7 @@ def profiled(frames, M, count, clean, g, H):
             for a in range(6):
                 g[j, a] += weight * gc[a]
             if clean.shape[0]:
+                Hc[:] = 0.0
                 channel_cost(clean[j], ch, R, p, unused, Hc)
                 H[j] += weight * Hc
 
@@ -378,8 +380,19 @@ def distances(inverse, count, g, out):
     known and in those that are not yet (inverse (n, 2, 6, 6)); then g is put per sample."""
     for j in range(g.shape[0]):
         for k in range(2):
-            out[j, k] = np.abs(inverse[j, k] @ g[j]).max()
+            out[j, k] = 0.0
+            for a in range(6):
+                out[j, k] = max(out[j, k], abs(_row_times(inverse[j, k], a, g[j])))
     g /= max(count, 1.0)
+
+
+@jit
+def _row_times(A, a, x):
+    """Row a of A x for A (6, 6); so small a product is faster than a library's."""
+    total = 0.0
+    for b in range(6):
+        total += A[a, b] * x[b]
+    return total
 
 
 @jit
@@ -402,11 +415,14 @@ def retract(frames, step, project, distance, pace):
             may not set the pace in those that are known.
     """
     tree = Frames(*frames)
-    longest, share, rate = pace
+    (longest, share, rate), x = pace, np.empty(6)
     for j in range(step.shape[0]):
-        x = (min(longest, share * distance[j, 0]) / rate) * (project[j, 0] @ step[j])
-        if distance[j, 1] > 0.0:
-            x += (min(longest, share * distance[j, 1]) / rate) * (project[j, 1] @ step[j])
+        x[:] = 0.0
+        for k in range(2):
+            if k == 0 or distance[j, k] > 0.0:
+                size = min(longest, share * distance[j, k]) / rate
+                for a in range(6):
+                    x[a] += size * _row_times(project[j, k], a, step[j])
         move(tree, j, x)
     step[:] = 0.0
 
@@ -444,21 +460,24 @@ def strayed(frames, R0, p, allowed):
 def move(tree, j, x):
     """Move frame j by x (6,) in its own axes: R0 exp(phi), p + d."""
     turn = np.empty((3, 3))
-    a = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
-    s = np.sin(a) / a if a > 1e-8 else 1.0
-    h = (1.0 - np.cos(a)) / (a * a) if a > 1e-8 else 0.5
+    angle = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    s = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    h = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5
     for r in range(3):
         for c in range(3):
             turn[r, c] = h * x[r] * x[c]
-        turn[r, r] += 1.0 - h * a * a
+        turn[r, r] += 1.0 - h * angle * angle
     turn[0, 1] -= s * x[2]
     turn[0, 2] += s * x[1]
     turn[1, 0] += s * x[2]
     turn[1, 2] -= s * x[0]
     turn[2, 0] -= s * x[1]
     turn[2, 1] += s * x[0]
-    tree.R0[j] = tree.R0[j] @ turn
-    tree.p[j] += x[3:]
+    for r in range(3):
+        a, b, c = tree.R0[j, r, 0], tree.R0[j, r, 1], tree.R0[j, r, 2]
+        for k in range(3):
+            tree.R0[j, r, k] = a * turn[0, k] + b * turn[1, k] + c * turn[2, k]
+        tree.p[j, r] += x[3 + r]
 
 
 @jit

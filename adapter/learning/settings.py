@@ -29,7 +29,8 @@ class SchemaSettings:
         sample_rate: ADAM's rate in mode `sample`.
         start_rms: spread of the random starting λ, rad and m.
         forget_s: time constant of the forgotten window in moving samples x 1 ms; None keeps all.
-        judge_every: updates between two looks at curvature and identifiability.
+        judge_every: updates between two looks at curvature and identifiability; fewer looks are
+            enough once λ has converged.
         std_goal: standard deviation of a turn (rad) or shift (m) that counts as known.
         distance_goal: what of those may be left to the optimum when λ has converged.
         stable_s: for how long that must hold, of motion.

@@ -1,7 +1,7 @@
 """Many steps of the learner in one call: what `OnlineLearner.step` does with one state, in order.
 
 At 1 kHz a step waits for its state. A recording's states are all there, and between two looks at
-λ nothing is decided that a kernel could not decide, so that ten of them cost one call.
+λ nothing is decided that a kernel could not decide, so that these cost one call.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adapter.learning.adam import adam_step
 from adapter.learning.change import compare
-from adapter.learning.schema_kernels import Count, MotionMoments, absorb, descend, retract, strayed
+from adapter.learning.schema_kernels import Count, MotionMoments, absorb, descend, retract
 from adapter.learning.theta_kernels import Rows, Weighing, gradient
 from adapter.learning.theta_kernels import absorb as absorb_torque
 from adapter.learning.theta_kernels import follow as follow_mean
@@ -140,12 +140,11 @@ class Done(NamedTuple):
 def steps(table, parts, done):
     """Learn from states (m, size) one after the other; behind how many it stopped.
 
-    It stops early behind a state whose error may be a change at the hand, and before the last one
-    where λ has strayed from θ's frames. λ has seen the first state already, and has its gradient.
+    It stops early behind a state whose error may be a change at the hand. λ has seen the first
+    state already, and has its gradient.
 
     Args:
-        parts: λ's, θ's, those of rates, of changes and of ADAM, as plain tuples; how far λ may
-            stray, see `strayed`.
+        parts: λ's, θ's, those of rates, of changes and of ADAM, as plain tuples.
         done: `Done` as a plain tuple, whose rows but for rates, columns and ends are filled.
     """
     schema, theta, rates = SchemaParts(*parts[0]), ThetaParts(*parts[1]), RateParts(*parts[2])
@@ -155,12 +154,9 @@ def steps(table, parts, done):
     sizes, n, begin = Rows(*theta.rows).steps, parent.shape[0], 0
     data = theta.sums[0][0], theta.sums[0][1]
     pace = schema.pace[0], schema.pace[1], adam.pace[0]
-    placed = theta.frames[1], theta.frames[2]
     before_links = table[:, : out.rows.shape[1]].copy()
     for m in range(table.shape[0]):
         one, end = table[m : m + 1], out.ends[m]
-        if m and m == table.shape[0] - 1 and strayed(schema.frames, *placed, parts[5]):
-            return m
         if m:
             each = 1.0, schema.weight
             absorb(parent, schema.base, one, schema.moments, schema.kind, each)

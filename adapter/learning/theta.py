@@ -535,14 +535,15 @@ class Theta:
         """
         if not any(effect.shapes for effect in self.effects):
             return
-        known, rhs = self._known_of_all()
+        known, weights = self._known_of_all(), self.weights()
         chosen, first = self.shapes.copy(), 0
         for k, effect in enumerate(self.effects):
             columns = len(effect.shapes) or 1
             if effect.shapes:
                 grid = np.geomspace(effect.shapes[0], effect.shapes[-1], SHAPES_TRIED)
                 for j in range(self.tree.n):
-                    S, y = self._reduced(j, k, slice(first, first + columns), known, rhs)
+                    own = slice(first, first + columns)
+                    S, y = self._reduced(j, k, own, weights[j], known)
                     tried = np.r_[self.shapes[k, j], grid]
                     s = effect.shares(tried).T
                     gain = np.maximum(s @ y, 0.0) ** 2 / np.einsum("ga,ab,gb->g", s, S, s)
@@ -565,11 +566,10 @@ class Theta:
         Noise of ddq is in the model's torque and, with the other sign, in its second rate: without
         anything there the one takes off what the other puts on, and is learned for that.
         """
-        known, rhs = self._known_of_all()
-        first, weights = 0, self.weights()
+        known, weights, first = self._known_of_all(), self.weights(), 0
         for k, effect in enumerate(self.effects):
             for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
-                S, y = self._reduced(j, k, slice(first, first + 1), known, rhs)
+                S, y = self._reduced(j, k, slice(first, first + 1), weights[j], known)
                 explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / (weights[j] * self.count)
                 there = explained > RATES_OVER_NOISE * motion_noise[j] + REAL_MODEL_ERROR**2
                 self.rows.share[j, size - self.columns + first] = float(there)
@@ -580,31 +580,33 @@ class Theta:
         values(self.mean, self.rows.steps, self.th)
 
     def _reduced(
-        self, j: int, k: int, columns: slice, known: Array, rhs: Array
+        self, j: int, k: int, columns: slice, weight: float, known: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """(K, K) and (K,) information of joint j's columns of effect k, all else integrated out.
 
         Args:
             columns: among those of the effects.
-            known, rhs: covariance of all parameters, and their right side.
+            weight: of a sample of the joint's torque; known: see `_known_of_all`.
         """
         size, own = self.rows.sizes[j], self._effects_from + k * self.tree.n + j
-        begin = size - self.columns
+        (covariance, mean), begin = known, size - self.columns
         split = np.arange(begin + columns.start, begin + columns.stop)
-        moments = self.weights()[j] * self.joint_moments(j)
+        moments = weight * self.joint_moments(j)
         G, b = moments[np.ix_(split, split)], moments[split, -1]
         rest = np.delete(np.arange(size), split)
         across = np.zeros((self.P, len(split)))
         shared = self.rows.share[j, rest, None] * moments[np.ix_(rest, split)]
         np.add.at(across, self.rows.place[j, rest], shared)
-        others = known - np.outer(known[:, own], known[own]) / known[own, own]
-        gain = across.T @ others
-        return G - gain @ across, b - gain @ rhs
+        # what the rest tells, but for the effect's own parameter, which stands for its columns
+        self_too, variance = covariance[own] @ across, covariance[own, own]
+        G_rest = across.T @ covariance @ across - np.outer(self_too, self_too) / variance
+        return G - G_rest, b - (mean @ across - self_too * mean[own] / variance)
 
     def _known_of_all(self) -> tuple[Array, Array]:
-        """Covariance (P, P) by torques and prior alone, and right side (P,)."""
+        """Covariance (P, P) and mean (P,) of all parameters by torques and prior alone."""
         H, rhs = self.information()
-        return self._inverse_of(H), rhs
+        covariance = self._inverse_of(H)
+        return covariance, covariance @ rhs
 
     def _inverse_of(self, H: Array) -> Array:
         """(P, P) of information; zero for the idle spare body."""

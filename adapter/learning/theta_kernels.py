@@ -22,6 +22,7 @@ longer to receive.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -328,27 +329,19 @@ def accumulate_base(near, z, C):
                 out[b] += x0 * z0[b] + x1 * z1[b] + x2 * z2[b]
 
 
-@jit
+@partial(jit, sums_in_any_order=True)
 def times_moments(A, at, t, v):
     """v = A t for the symmetric matrix whose upper triangle starts at `at` in the flat A."""
     width = t.shape[0]
     v[:] = 0.0
     for a in range(width):
-        ta = t[a]
-        size = width - a
+        size, ta = width - a, t[a]
         triangle, tb, vb = A[at : at + size], t[a:], v[a:]
-        s0, s1, s2, s3 = triangle[0] * ta, 0.0, 0.0, 0.0
+        total = triangle[0] * ta
         for b in range(1, size):
             vb[b] += triangle[b] * ta
-        rest = 1 + (size - 1) // 4 * 4
-        for b in range(1, rest, 4):  # four sums side by side: one would wait for itself
-            s0 += triangle[b] * tb[b]
-            s1 += triangle[b + 1] * tb[b + 1]
-            s2 += triangle[b + 2] * tb[b + 2]
-            s3 += triangle[b + 3] * tb[b + 3]
-        for b in range(rest, size):
-            s0 += triangle[b] * tb[b]
-        v[a] += (s0 + s1) + (s2 + s3)
+            total += triangle[b] * tb[b]
+        v[a] += total
         at += size
 
 

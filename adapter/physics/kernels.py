@@ -25,13 +25,15 @@ from adapter.model.spatial import Array, matrix_from_zxz
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def jit(function: F) -> F:
+def jit(function: F, sums_in_any_order: bool = False) -> F:
     """Compile with numba: cached on disk, IEEE arithmetic as written, so that runs repeat.
 
-    A kernel holds those that it calls, but numba looks only at a kernel's own file for changes:
+    With `sums_in_any_order` the compiler may choose the order of sums, for speed; it chooses once,
+    so that runs on one machine still repeat. A kernel holds those that it calls, but numba looks only at a kernel's own file for changes:
     after an upgrade an old one would go on. So what is cached is of all kernels as they are now.
     """
-    compiled = numba.njit(cache=True, fastmath=False, error_model="numpy")(function)
+    freedom = {"reassoc"} if sums_in_any_order else False
+    compiled = numba.njit(cache=True, fastmath=freedom, error_model="numpy")(function)
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if file is not None:  # none where nothing can be written
         file._source_stamp = file._source_stamp, all_kernels()

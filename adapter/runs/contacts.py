@@ -15,7 +15,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from drivers.interface import JointSample
 
-ADOPT_EVERY = 50  # samples
+ADOPT_EVERY = 100  # samples
 
 
 class ReplayObserver:
@@ -40,15 +40,16 @@ class ReplayObserver:
         """Take samples that the learner has seen: stamps (m,), and q, dq, tau (m, 3, n) of each."""
         begin = 0
         while begin < len(signals):
-            self._adopt()
             end = min(begin + ADOPT_EVERY - self._samples % ADOPT_EVERY, len(signals))
             self.observer.step_each(stamp_ns[begin:end], signals[begin:end])
             self._samples += end - begin
             begin = end
+            if self._samples % ADOPT_EVERY == 0:
+                self._adopt()
 
     def _adopt(self) -> None:
         learner = self._learner
-        if self._samples % ADOPT_EVERY == 0 and learner.theta_converged:
+        if learner.theta_converged:
             theta, std = learner.theta, learner.theta.variance() ** 0.5
             now = theta.theta, theta.effect_values, theta.shapes, std
             self.observer.adopt(learner.schema.lam, *now)

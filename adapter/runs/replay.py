@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -228,12 +227,12 @@ def _exact_piece(
     log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
 ) -> None:
     signals, tick_ns = np.stack([log.q, log.dq, log.tau], axis=1), np.zeros(len(log), np.int64)
-    # the observer goes on with what is learned behind every so-manyth sample, so that one ends each
-    for begin, end in pairwise([0, *range(1, len(log), ADOPT_EVERY), len(log)]):
-        part, own = log.piece(begin, end), slice(begin, end)
-        before = time.perf_counter_ns()
+    # the observer goes on with what is learned behind every so-many samples
+    for begin in range(0, len(log), ADOPT_EVERY):
+        own = slice(begin, min(begin + ADOPT_EVERY, len(log)))
+        part, before = log.piece(own.start, own.stop), time.perf_counter_ns()
         states = _filtered(part, pipeline.front_end)
-        tick_ns[own] = (time.perf_counter_ns() - before) // (end - begin)
+        tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
         if len(states):
             pipeline.learner.step_each(states)
         if observer is not None:
