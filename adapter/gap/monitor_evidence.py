@@ -153,18 +153,19 @@ class Evidence:
         self, step: int, columns: Array | slice = slice(None), first: int = 0
     ) -> tuple[Array, Array]:
         """(s, k, k) G and (s, k) b for starts at every `step` rows from the row `first` on."""
-        S = self._S[first:, :, columns]
-        D, K = self._Z.shape[2], S.shape[2]
-        blocks = len(S) // step
-        Zb = self._Z[first:].reshape(blocks, -1, D).transpose(0, 2, 1)
-        Sb = S.reshape(blocks, -1, K)
-        rb = self._r[first:].reshape(blocks, -1, 1)
-        back = slice(None, None, -1)
-        B = np.cumsum((Zb @ Sb)[back], axis=0)[back]
-        C = np.cumsum((Sb.transpose(0, 2, 1) @ Sb)[back], axis=0)[back]
-        b = np.cumsum((Sb.transpose(0, 2, 1) @ rb)[back], axis=0)[back][:, :, 0]
-        X = self._inverse @ B
-        return C - X.transpose(0, 2, 1) @ X, b - self._pull @ X
+        Z, S, r = self._Z[first:], self._S[first:, :, columns], self._r[first:]
+        D, K, starts = Z.shape[2], S.shape[2], len(S) // step
+        G, b = np.empty((starts, K, K)), np.empty((starts, K))
+        B, C, own = np.zeros((D, K)), np.zeros((K, K)), np.zeros(K)
+        for k in reversed(range(starts)):  # what a later start has, an earlier one has too
+            rows = slice(k * step, (k + 1) * step)
+            Zk, Sk = Z[rows].reshape(-1, D), S[rows].reshape(-1, K)
+            B += Zk.T @ Sk
+            C += Sk.T @ Sk
+            own += r[rows].ravel() @ Sk
+            X = self._inverse @ B
+            G[k], b[k] = C - X.T @ X, own - self._pull @ X
+        return G, b
 
     def from_row(self, first: int) -> tuple[Array, Array]:
         """(1, K, K) G and (1, K) b of all columns for a start at one row."""

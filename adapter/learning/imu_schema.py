@@ -92,11 +92,11 @@ class ImuSchema(Schema):
     def compute_gradient(self) -> None:
         """Solve anew where enough has come, or no more is coming; ADAM has nothing to do."""
         self.updates += 1
+        self.looked = self.updates % self.settings.judge_every == 0
         self._waiting += 1
         more_s, known_s = self._moved_s - self._solved_s, self._solved_s
         due_s = min(max(FIRST_S, (GROWTH - 1.0) * known_s), MOST_S)
-        self.looked = more_s >= due_s or (more_s > 0.0 and self._waiting > LAST_WORD)
-        if self.looked:
+        if more_s >= due_s or (more_s > 0.0 and self._waiting > LAST_WORD):
             self._solved_s = self._moved_s
             self._solve()
 

@@ -177,7 +177,7 @@ class OnlineLearner:
         self._R0, self._p = self.schema.R0.copy(), self.schema.p.copy()
         self._alarm_ns = 0
         self._doubted: list[tuple[Array, Array]] = []  # states and errors since an alarm
-        self._judged = -1
+        self._judged = 0
         self._shadow: Moments | None = None
         self._shadow_at = 0
         self.schema_trace = Trace(2 + 13 * tree.n)
@@ -280,6 +280,8 @@ class OnlineLearner:
         ends = ends[: len(steady)]
         if not ends[-1] or (self.schema.looked and self._strayed()):
             return self._learn_theta_too(table[:1], True)
+        if self.schema.looked:
+            self._judge_theta()
         table = steady
         self.follow_convergence()
         done = self._room(rows[: ends[-1]], ends)
@@ -288,7 +290,6 @@ class OnlineLearner:
         self.adam.steps += count
         self.theta.took(int(ends[count - 1]), count)
         self._look_back(table[:count], done)
-        self._judge_theta()
         return count
 
     def _steady(self, table: Array) -> int:
@@ -301,8 +302,7 @@ class OnlineLearner:
             return 0
         if (self.rates is not None and not self._rates_known) or not same_bits():
             return 0
-        until_judged = (self._judged + 1) * JUDGE_THETA_EVERY - self.theta.updates
-        return min(self.schema.steady(table), max(until_judged, 0))
+        return self.schema.steady(table)
 
     def _room(self, rows: Array, ends: NDArray[np.int64]) -> Done:
         """Room for what steps leave, with the states that θ will be given."""
@@ -409,7 +409,8 @@ class OnlineLearner:
         for _ in range(updates):
             if self.theta.compute_gradient():
                 self.adam.step()
-                self._after_theta_step()
+                self.theta.after_step(self.theta_converged, self._states_per_update)
+                self._judge_theta()
 
     def take_every(self, states: int, triples: Array | None = None) -> None:
         """Let each state that comes from here on stand for so many, the others being left out.
@@ -452,11 +453,7 @@ class OnlineLearner:
         self.adam.step()
         self.schema.apply_step(self.adam.rate)
         if theta_too:
-            self._after_theta_step()
-
-    def _after_theta_step(self) -> None:
-        self.theta.after_step(self.theta_converged, self._states_per_update)
-        self._judge_theta()
+            self.theta.after_step(self.theta_converged, self._states_per_update)
 
     def _trace_schema(self, table: Array) -> None:
         if self.schema_trace.due(len(table)):
@@ -472,8 +469,11 @@ class OnlineLearner:
                 self._hold(table)
                 return False
             self.start_theta(stamp_of(table[0]))
-        elif self.schema.looked and self._strayed():
-            self._begin_rebuild()
+        elif self.schema.looked:
+            if self._strayed():
+                self._begin_rebuild()
+            if not self.change.waiting:
+                self._judge_theta()
         return True
 
     def start_theta(self, stamp_ns: int) -> None:
@@ -516,11 +516,11 @@ class OnlineLearner:
 
     def _judge_theta(self) -> None:
         """θ has converged when it predicts the last seconds as well as it fits all samples."""
-        now = self.theta.updates // JUDGE_THETA_EVERY
-        if now == self._judged:
+        before, now = self._judged, self.theta.updates
+        if now - before < JUDGE_THETA_EVERY:
             return
         self._judged = now
-        if now % (ADAPT_EVERY // JUDGE_THETA_EVERY) == 0 and self.theta.count >= ADAPT_EVERY:
+        if now // ADAPT_EVERY > before // ADAPT_EVERY:
             self.theta.adapt_prior(None if self.rates is None else self.rates.noise)
         excess = float(np.mean(self.change.level / self.theta.variance()))
         limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS

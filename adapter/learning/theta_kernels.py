@@ -296,25 +296,35 @@ def accumulate(rows, z, A):
     Four samples at a time: a triangle is read and written once for all of them.
     """
     m = z.shape[0]
+    fours = m // TOGETHER * TOGETHER
     for j in range(z.shape[1]):
         at, width = rows.starts[j], rows.sizes[j] + 1
-        for a in range(width):
-            triangle = A[at : at + width - a]
-            k = 0
-            while k + TOGETHER <= m:
-                z0, z1, z2, z3 = z[k, j, a:], z[k + 1, j, a:], z[k + 2, j, a:], z[k + 3, j, a:]
-                x0, x1, x2, x3 = z0[0], z1[0], z2[0], z3[0]
-                for b in range(width - a):
-                    triangle[b] += x0 * z0[b] + x1 * z1[b] + x2 * z2[b] + x3 * z3[b]
-                k += TOGETHER
-            while k < m:
-                zb = z[k, j, a:]
-                x = zb[0]
-                if x != 0.0:
-                    for b in range(width - a):
-                        triangle[b] += x * zb[b]
-                k += 1
-            at += width - a
+        for k in range(0, fours, TOGETHER):
+            _add_four(A, at, z[k, j, :width], z[k + 1, j], z[k + 2, j], z[k + 3, j])
+        for k in range(fours, m):
+            _add_one(A, at, z[k, j, :width])
+
+
+@jit
+def _add_four(A, at, z0, z1, z2, z3):
+    """Add z zᵀ of four rows, z0 (w,) and others at least as long, to the triangle from `at` on."""
+    for a in range(z0.shape[0]):
+        b0, b1, b2, b3 = z0[a:], z1[a:], z2[a:], z3[a:]
+        triangle, x0, x1, x2, x3 = A[at : at + b0.shape[0]], z0[a], z1[a], z2[a], z3[a]
+        for b in range(b0.shape[0]):
+            triangle[b] += x0 * b0[b] + x1 * b1[b] + x2 * b2[b] + x3 * b3[b]
+        at += b0.shape[0]
+
+
+@jit
+def _add_one(A, at, z):
+    """Add z zᵀ of one row z (w,) to the triangle from `at` on."""
+    for a in range(z.shape[0]):
+        rest, x = z[a:], z[a]
+        triangle = A[at : at + rest.shape[0]]
+        for b in range(rest.shape[0]):
+            triangle[b] += x * rest[b]
+        at += rest.shape[0]
 
 
 @jit
