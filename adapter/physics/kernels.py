@@ -29,7 +29,9 @@ def jit(function: F, sums_in_any_order: bool = False) -> F:
     """Compile with numba: cached on disk, IEEE arithmetic as written, so that runs repeat.
 
     With `sums_in_any_order` the compiler may choose the order of sums, for speed; it chooses once,
-    so that runs on one machine still repeat. A kernel holds those that it calls, but numba looks only at a kernel's own file for changes:
+    so that runs on one machine still repeat.
+
+    A kernel holds those that it calls, but numba looks only at a kernel's own file for changes:
     after an upgrade an old one would go on. So what is cached is of all kernels as they are now.
     """
     freedom = {"reassoc"} if sums_in_any_order else False
