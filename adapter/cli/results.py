@@ -84,7 +84,8 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     start_s = figures.get("start_s") or 0.0
     lam, theta, tick = figures["lambda"], figures["theta"], figures["tick_us"]
     table = Table("", Column("", overflow="fold"), show_header=False, box=None, pad_edge=False)
-    refused = ", ".join(f"{count} {reason}" for reason, count in figures["refused"].items())
+    reasons = figures["refused"].items()
+    refused = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in reasons)
     table.add_row("samples", f"{figures['samples']}, learned {figures['learned']}")
     if refused:
         table.add_row("not learned", refused)

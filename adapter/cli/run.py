@@ -178,12 +178,6 @@ def run(args: argparse.Namespace) -> int:
     compile_first(robot, config.pipeline, 1, say)
     front_end = make_front_end(robot, config.pipeline)
     result = _go(args, plan, driver, front_end, folder, truth)
-    for line in result.timing.lines():
-        show(line)
-    if result.intake.commands is not None:
-        show(result.intake.commands.line())
-    if isinstance(driver, FaultyDriver):
-        show(driver.account.line())
     notes = [] if result.tracking is None else result.tracking["notes"]
     warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes + notes)
     if result.unrecorded:
@@ -191,9 +185,20 @@ def run(args: argparse.Namespace) -> int:
         warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
     if result.collected is None:
         complain("the learner ended early")
-        return ExitCode.LEARNER_FAILED
-    _conclude(args, folder, plan, reference, front_end, result)
-    return _ended(result)
+    else:
+        _conclude(args, folder, plan, reference, front_end, result)
+    _show_accounts(result, driver)
+    return ExitCode.LEARNER_FAILED if result.collected is None else _ended(result)
+
+
+def _show_accounts(result: LiveResult, driver: Driver) -> None:
+    """How long things took, and what became of commands and of faults that were asked for."""
+    for line in result.timing.lines():
+        show(line)
+    if result.intake.commands is not None:
+        show(result.intake.commands.line())
+    if isinstance(driver, FaultyDriver):
+        show(driver.account.line())
 
 
 def _ended(result: LiveResult) -> ExitCode:

@@ -52,7 +52,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
         help="motion: random (default), or designed to teach most in the time",
     )
     add_motion(parser)
-    add("--duration", type=float, default=30.0, metavar="S", help="default 30")
+    add(
+        "--duration",
+        type=float,
+        default=30.0,
+        metavar="S",
+        help="default 30; where the arm moves slowly at first (excitation.slow_s), behind that",
+    )
     add(
         "--scenario",
         metavar="NAME",

@@ -15,6 +15,7 @@ from adapter.physics.kernels import frames_of, place_frames
 
 POSES, DIRECTIONS = 40, 200  # that are looked at
 LOOKED_S = 30.0  # of path
+NO_PUSH_N = 1e4  # what hardly any joint feels
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))  # spreads directions evenly over a sphere
 # Of the effort limit, and N m: what a stopped arm may still push with on each joint. A CAN arm is
 # carried with a tenth of it beyond its weight (`resting`); half of that for what it sags by.
@@ -48,7 +49,7 @@ class PushBound:
         return [
             f"A push ends it within 0.05 s from {each} N m on a joint that the model does not "
             f"expect: at the hand from {self.middle:.0f} N for half of all directions and poses on "
-            f"the way, {_newtons(self.most)} for the worst.",
+            f"the way, {_worst(self.most)}.",
             f"Once stopped the joints push with at most {left} N m.",
         ]
 
@@ -81,5 +82,5 @@ def _directions() -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def _newtons(force: float) -> str:
-    return f"{force:.0f} N" if np.isfinite(force) else "any force"
+def _worst(force: float) -> str:
+    return f"{force:.0f} N for the worst" if force < NO_PUSH_N else "no push does in the worst"

@@ -5,7 +5,7 @@ import pinocchio as pin
 
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
-from adapter.control.push_bound import left_at_most, push_bound
+from adapter.control.push_bound import PushBound, left_at_most, push_bound
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.effects.export import to_urdf
 from adapter.model.robots import documented
@@ -45,3 +45,8 @@ def test_the_plan_says_both_bounds() -> None:
     assert f"{bound.middle:.0f} N for half" in first
     assert f"{bound.most:.0f} N for the worst" in first
     assert ", ".join(f"{x:.3g}" for x in left_at_most(LIMITS.effort)) in last
+
+
+def test_a_push_that_no_joint_feels_is_said_in_words() -> None:
+    one = np.ones(2)
+    assert "way, no push does in the worst." in PushBound(one, 30.0, 1.4e6, one).lines()[0]
