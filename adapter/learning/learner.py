@@ -276,13 +276,12 @@ class OnlineLearner:
             return 0
         self.schema.absorb(table[:1])
         self._schema_gradient()
-        steady = table[: self.schema.until_look(table[: len(ends)])]
-        ends = ends[: len(steady)]
+        table = table[: self.schema.until_look(table[: len(ends)])]
+        ends = ends[: len(table)]
         if not ends[-1] or (self.schema.looked and self._strayed()):
             return self._learn_theta_too(table[:1], True)
         if self.schema.looked:
             self._judge_theta()
-        table = steady
         self.follow_convergence()
         done = self._room(rows[: ends[-1]], ends)
         count = int(steps(table, self._parts(int(ends[-1])), tuple(done)))
@@ -401,6 +400,7 @@ class OnlineLearner:
         ready = not self.change.waiting
         if len(table):
             ready = self._take_torque(table)
+            self._judge_theta()
         if not ready or not updates:
             return
         self.schema.gradient[:] = 0.0
@@ -410,7 +410,6 @@ class OnlineLearner:
             if self.theta.compute_gradient():
                 self.adam.step()
                 self.theta.after_step(self.theta_converged, self._states_per_update)
-                self._judge_theta()
 
     def take_every(self, states: int, triples: Array | None = None) -> None:
         """Let each state that comes from here on stand for so many, the others being left out.
@@ -472,8 +471,7 @@ class OnlineLearner:
         elif self.schema.looked:
             if self._strayed():
                 self._begin_rebuild()
-            if not self.change.waiting:
-                self._judge_theta()
+            self._judge_theta()
         return True
 
     def start_theta(self, stamp_ns: int) -> None:
@@ -517,10 +515,10 @@ class OnlineLearner:
     def _judge_theta(self) -> None:
         """θ has converged when it predicts the last seconds as well as it fits all samples."""
         before, now = self._judged, self.theta.updates
-        if now - before < JUDGE_THETA_EVERY:
+        if self.change.waiting or now - before < JUDGE_THETA_EVERY:
             return
         self._judged = now
-        if now // ADAPT_EVERY > before // ADAPT_EVERY:
+        if now // ADAPT_EVERY > before // ADAPT_EVERY and self.theta.count >= ADAPT_EVERY:
             self.theta.adapt_prior(None if self.rates is None else self.rates.noise)
         excess = float(np.mean(self.change.level / self.theta.variance()))
         limit = CONVERGED_EXCESS if not self.theta_converged else 2.0 * CONVERGED_EXCESS
