@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,19 +30,24 @@ from adapter.signals.front_end import FrontEnd
 
 
 class Learned(NamedTuple):
-    """What a run or a replay ended with, and what it is judged against."""
+    """What a run or a replay ended with, and what it is judged against.
+
+    Attributes:
+        accounts: lines on how long things took and the like, told behind the figures.
+    """
 
     outcome: Outcome
     robot: SelfModel
     reference: Reference
     front_end: FrontEnd
+    accounts: Sequence[str] = ()
 
 
 def conclude(
     args: argparse.Namespace, folder: Path, learned: Learned, figures: dict[str, Any], source: str
 ) -> None:
     """Write model, figures and report; print the headline."""
-    outcome, robot, reference, front_end = learned
+    outcome, robot, reference, front_end, accounts = learned
     warn([*front_end.messages, *outcome.lam_notes])
     figures["model"] = str(folder / "model.json")
     data = run_data(
@@ -65,15 +71,17 @@ def conclude(
     if not args.no_report:
         figures["report"] = str(write_report(folder / "report.html", data))
     write_json(args.json, figures)
-    print_figures(data, figures.get("report"))
+    print_figures(data, figures.get("report"), accounts)
 
 
-def print_figures(data: RunData, report: str | None) -> None:
+def print_figures(data: RunData, report: str | None, accounts: Sequence[str]) -> None:
     """What changed and what it is worth, the figures behind it, and what to do next."""
     worth = Worth.of(data)
     for number, said in enumerate(headline(data, worth)):
         output.print(said, style="bold" if number == 0 else "", soft_wrap=True)
     output.print(_figures(data.figures, report))
+    for line in accounts:
+        output.print(line, style="dim", soft_wrap=True, highlight=False)
     for step in next_steps(data, worth):
         output.print(Text.assemble(("next ", "cyan"), step.why), soft_wrap=True)
         if step.command:

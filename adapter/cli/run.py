@@ -178,27 +178,26 @@ def run(args: argparse.Namespace) -> int:
     compile_first(robot, config.pipeline, 1, say)
     front_end = make_front_end(robot, config.pipeline)
     result = _go(args, plan, driver, front_end, folder, truth)
+    if isinstance(driver, FaultyDriver):
+        show(driver.account.line())
     notes = [] if result.tracking is None else result.tracking["notes"]
     warn(([result.fault] if result.fault else []) + result.troubles + result.intake.notes + notes)
     if result.unrecorded:
         share = 100.0 * result.unrecorded / result.samples
         warn([f"{result.unrecorded} samples ({share:.2g} %) are not in the recording"])
     if result.collected is None:
+        for line in _accounts(result):
+            show(line)
         complain("the learner ended early")
-    else:
-        _conclude(args, folder, plan, reference, front_end, result)
-    _show_accounts(result, driver)
-    return ExitCode.LEARNER_FAILED if result.collected is None else _ended(result)
+        return ExitCode.LEARNER_FAILED
+    _conclude(args, folder, plan, reference, front_end, result)
+    return _ended(result)
 
 
-def _show_accounts(result: LiveResult, driver: Driver) -> None:
-    """How long things took, and what became of commands and of faults that were asked for."""
-    for line in result.timing.lines():
-        show(line)
-    if result.intake.commands is not None:
-        show(result.intake.commands.line())
-    if isinstance(driver, FaultyDriver):
-        show(driver.account.line())
+def _accounts(result: LiveResult) -> list[str]:
+    """How long things took, and what became of commands."""
+    commands = result.intake.commands
+    return result.timing.lines() + ([] if commands is None else [commands.line()])
 
 
 def _ended(result: LiveResult) -> ExitCode:
@@ -384,5 +383,5 @@ def _conclude(
         tracking=result.tracking,
         feedforward=plan.feedforward,
     )
-    learned = Learned(outcome, robot, reference, front_end)
+    learned = Learned(outcome, robot, reference, front_end, _accounts(result))
     conclude(args, folder, learned, numbers, args.driver)
