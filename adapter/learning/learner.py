@@ -34,6 +34,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.records import StateLayout, stamp_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
+AHEAD = 100  # states that are looked at for one call of `steps`
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
 REBUILD_FLOOR = 1e-5  # rad and m: λ moving less changes no torque that a sensor could show
@@ -238,7 +239,7 @@ class OnlineLearner:
         """
         table, at = self.without_known(self.sound(table)), 0
         while at < len(table):
-            at += self._learn_each(table[at:]) or self._learn(table[at : at + 1])
+            at += self._learn_each(table[at : at + AHEAD]) or self._learn(table[at : at + 1])
         return len(table)
 
     def _learn(self, table: Array) -> int:

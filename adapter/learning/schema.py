@@ -60,7 +60,7 @@ SURE = 3.0  # standard deviations that may be left in directions that are not kn
 # soon over, unless a brake holds a joint.
 PATIENCE = 5
 LONGEST_WAIT_NS = 50_000_000  # what counts of the time between two looks at a λ that stands still
-SETTLED_LOOK_NS = 50_000_000  # between two looks at a λ that has converged
+SETTLED_LOOK_NS = LONGEST_WAIT_NS  # between two looks at a λ that has converged
 EXACT_DISTANCE = 1e-6  # rad, m: what may be left to the optimum of motion without noise
 FEWEST_DIFFERENCES = 50  # third differences that say something of the noise
 LONG_AGO_NS = -(2**61)  # before any stamp: the first sample follows none

@@ -419,7 +419,7 @@ def retract(frames, step, project, distance, pace):
     for j in range(step.shape[0]):
         x[:] = 0.0
         for k in range(2):
-            if k == 0 or distance[j, k] > 0.0:
+            if distance[j, k] > 0.0:
                 size = min(longest, share * distance[j, k]) / rate
                 for a in range(6):
                     x[a] += size * _row_times(project[j, k], a, step[j])
@@ -516,9 +516,7 @@ def directions(curvature, limits, goals, g, out):
                     inverse[j, k, a, b] += v[a] * v[b] / value
         for k in range(2):
             for a in range(6):
-                ahead[a] = 0.0
-                for b in range(6):
-                    ahead[a] += inverse[j, k, a, b] * g[j, b]
+                ahead[a] = _row_times(inverse[j, k], a, g[j])
                 most = max(goals[0], goals[1 + k] * math.sqrt(inverse[j, k, a, a]))
                 there[j] = there[j] and abs(ahead[a]) < most
                 left[j, a] += ahead[a]

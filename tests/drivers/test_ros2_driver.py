@@ -216,9 +216,7 @@ def _moves_and_stops(address):
         assert np.abs(np.median([s.dq for s in after[-100:]], axis=0)).max() < 0.05
         assert arm._bridge.memory.doing == Doing.HOLDING
         assert arm.intake.commands.sent >= 50 and arm.intake.commands.cut == 0
-        intake = arm.intake  # a machine that stands still lets a sample overtake others
-        assert intake.received == intake.used + sum(intake.refused.values())
-        assert set(intake.refused) <= {"overtaken"} and intake.used > 0.8 * intake.received
+        assert arm.intake.received == arm.intake.used
 
 
 def _nobody_else_may_command(address):
