@@ -30,7 +30,7 @@ from adapter.effects.active import with_bodies
 from adapter.errors import SettingsError
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.kernels import Frames, axis_line, jit, momenta, place_frames
+from adapter.physics.kernels import Frames, axis_line, borrowed, jit, momenta, place_frames
 from drivers.interface import JointSample
 
 LONGEST_S = 0.02  # a longer step of the stamps begins anew
@@ -218,6 +218,7 @@ def observe_each(bodies, joints, table, readings, step, past):
         How many were taken; where it stands behind them; distance of the external torque from
         nothing, NaN where none is known; and the step, s, of one that is to be judged, else 0.
     """
+    bodies, joints, table, readings, past = borrowed((bodies, joints, table, readings, past))
     stamps, signals = readings
     (stamp, age_s, anew), (pole, limit, quiet, winds) = step
     past_ns, before = past

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.spatial import Array
-from adapter.physics.kernels import Frames, jit, link_spin
+from adapter.physics.kernels import Frames, borrowed, jit, link_spin
 from adapter.signals.records import KIND, columns
 
 # What a link measures, in the order of the moments (the online ones end with a), and the channel
@@ -215,6 +215,7 @@ def absorb(parent, base, table, moments, kind, each):
         moments: `MotionMoments` as a plain tuple.
         each: forgetting factor of a sample, 1 for none, and its weight.
     """
+    parent, table, moments = borrowed((parent, table, moments))
     into, (keep, weight) = MotionMoments(*moments), each
     n, counts = parent.shape[0], into.counts
     at = columns(n, base.shape[0] == 0)
@@ -331,6 +332,7 @@ def profiled(frames, M, count, clean, g, H):
         frames: `Frames` as a plain tuple; M: (n, 3, 15, 15) moments of `count` samples.
         clean: moments that the curvature is of, with the same weights; (0, 3, 15, 15): none asked.
     """
+    frames, M, clean, g, H = borrowed((frames, M, clean, g, H))
     tree = Frames(*frames)
     gc, Hc, unused = np.empty(6), np.empty((6, 6)), np.zeros(6)
     for j in range(M.shape[0]):

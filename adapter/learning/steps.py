@@ -19,7 +19,7 @@ from adapter.learning.theta_kernels import absorb as absorb_torque
 from adapter.learning.theta_kernels import follow as follow_mean
 from adapter.learning.torque_rates import follow as follow_rates
 from adapter.model.spatial import Array
-from adapter.physics.kernels import jit
+from adapter.physics.kernels import borrowed, jit
 
 
 class SchemaParts(NamedTuple):
@@ -147,6 +147,7 @@ def steps(table, parts, done):
         parts: λ's, θ's, those of rates, of changes and of ADAM, as plain tuples.
         done: `Done` as a plain tuple, whose rows but for rates, columns and ends are filled.
     """
+    parts, done = borrowed((parts, done))
     schema, theta, rates = SchemaParts(*parts[0]), ThetaParts(*parts[1]), RateParts(*parts[2])
     change, adam, out = ChangeParts(*parts[3]), AdamParts(*parts[4]), Done(*done)
     parent, R0, p = schema.frames

@@ -34,6 +34,7 @@ from adapter.physics.kernels import (
     JointMotion,
     axis_moment,
     body_wrench_regressor,
+    borrowed,
     jit,
     link_motion,
     place_frames,
@@ -392,6 +393,7 @@ def absorb(frames, rows, given, table, effects, moments):
     Returns:
         (m, rows) measured minus predicted torque; the base's wrench first if it floats.
     """
+    frames, rows, given, moments, table = borrowed((frames, rows, given, moments, table))
     tree, at, use = Frames(*frames), Rows(*rows), Given(*given)
     into, rate, weight = Moments(*moments[0]), moments[1], moments[2]
     m, n = table.shape[0], tree.parent.shape[0]
@@ -425,7 +427,7 @@ def absorb(frames, rows, given, table, effects, moments):
 @jit
 def joint_costs(rows, th, A):
     """(n,) sum of squared torque errors of each joint over all samples in A."""
-    at = Rows(*rows)
+    at, A = Rows(*borrowed(rows)), borrowed(A)
     n, width = at.place.shape
     cost, v, t = np.empty(n), np.empty(width + 1), np.empty(width + 1)
     for j in range(n):
@@ -520,6 +522,7 @@ def gradient(x, rows, moments, prior, weighing, out):
         moments: A and C of `Moments`.
         out: th, g, gx (P,), filled with the values, the gradient by them and that by x.
     """
+    x, rows, moments, prior, out = borrowed((x, rows, moments, prior, out))
     at, before, weigh = Rows(*rows), Prior(*prior), Weighing(*weighing)
     A, C = moments
     th, g, gx = out

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
-from adapter.physics.kernels import Frames, JointMotion, inverse_dynamics, jit, link_motion
+from adapter.physics.kernels import (
+    Frames,
+    JointMotion,
+    borrowed,
+    inverse_dynamics,
+    jit,
+    link_motion,
+)
 from adapter.signals.records import StateLayout, columns
 
 LEAST_SPAN_S = 5e-3  # where states did not go through a filter
@@ -116,6 +123,7 @@ def follow(arm, table, span_ns, waiting, out):
         arm: parent, R0, p, θ (bodies, 10), and the motion (12,) of a base that rests, or nothing.
         waiting: `Waiting`, as a plain tuple.
     """
+    arm, table, waiting, out = borrowed((arm, table, waiting, out))
     parent, R0, p, theta, rest = arm
     frames, ring = Frames(parent, R0, p), Waiting(*waiting)
     n, six, count = parent.shape[0], 0 if rest.shape[0] else 6, 0

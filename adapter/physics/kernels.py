@@ -19,6 +19,8 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 from adapter.model.spatial import Array, matrix_from_zxz
 
@@ -51,6 +53,30 @@ def all_kernels() -> str:
         if b"\n@jit\n" in text:
             found.update(text)
     return found.hexdigest()
+
+
+def _borrowed(_: Any, kind: types.Type) -> Any:
+    return kind(kind), lambda context, builder, _, given: _uncounted(context, builder, kind, *given)
+
+
+def _uncounted(context: Any, builder: Any, kind: types.Type, value: Any) -> Any:
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = cgutils.get_null_value(array.meminfo.type)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        parts = cgutils.unpack_tuple(builder, value)
+        kinds = kind.types  # type: ignore[attr-defined]
+        bare = [_uncounted(context, builder, *x) for x in zip(kinds, parts, strict=True)]
+        return context.make_tuple(builder, kind, bare)
+    return value
+
+
+# Arrays, alone or in tuples, that whoever calls a kernel keeps until it returns. numba counts who
+# holds an array, with locked instructions wherever a function hands one to another: half of what
+# small kernels cost. Of these nobody counts; a kernel must neither return one nor lend what it made
+# itself, which nobody would hold.
+borrowed = cast(Callable[[Any], Any], intrinsic(_borrowed))
 
 
 class Frames(NamedTuple):

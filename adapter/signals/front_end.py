@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.kernels import jit
+from adapter.physics.kernels import borrowed, jit
 from adapter.signals.bristles import wind
 from adapter.signals.checks import (
     MARKS,
@@ -191,9 +191,9 @@ def process(signals, rules, memory, whole, records, answers):
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
     """
-    own, kept = unpacked(rules, memory, whole)
-    samples = Samples(answers[:, 0], signals)
-    found = Answers(answers[:, 1], answers[:, 2:])
+    own, kept = borrowed(unpacked(rules, memory, whole))
+    samples = borrowed(Samples(answers[:, 0], signals))
+    found, records = borrowed((Answers(answers[:, 1], answers[:, 2:]), records))
     for i in range(signals.shape[0]):
         found.holes[i] = 0
         part = records[i * own.states : (i + 1) * own.states]

@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.kernels import Frames, JointMotion, base_at_rest, frames_of, jit, link_motion
+from adapter.physics.kernels import (
+    Frames,
+    JointMotion,
+    base_at_rest,
+    borrowed,
+    frames_of,
+    jit,
+    link_motion,
+)
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns
 from drivers.interface import JointSample
 
@@ -113,6 +121,7 @@ def synthesize(frames, base, records):
 
     `base` is the motion (12,) of a base at rest; empty where the records hold the base's.
     """
+    frames, base, records = borrowed((frames, base, records))
     arm = Frames(*frames)
     n = arm.parent.shape[0]
     at = columns(n, base.shape[0] == 0)
