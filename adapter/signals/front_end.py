@@ -187,17 +187,19 @@ def process(signals, rules, memory, whole, records, answers):
     Args:
         signals: (m, 3 n + b) q, dq, tau, and the b = 9 numbers of a base that floats.
         rules, memory, whole: see `packed` and `unpacked`.
-        records: (m K, size), K for each sample, filled where its verdict is GOOD.
+        records: (m K, size), filled from the first on, K for each sample whose verdict is GOOD.
         answers: (m, 4) int64 [stamp ns, verdict, stamps before and behind a gap]; the first is
             given, the others are filled.
     """
     own, kept = borrowed(unpacked(rules, memory, whole))
     samples = borrowed(Samples(answers[:, 0], signals))
     found, records = borrowed((Answers(answers[:, 1], answers[:, 2:]), records))
+    end = own.states
     for i in range(signals.shape[0]):
         found.holes[i] = 0
-        part = records[i * own.states : (i + 1) * own.states]
-        found.verdicts[i] = taken(samples, i, own, kept, found, part)
+        found.verdicts[i] = taken(samples, i, own, kept, found, records[end - own.states : end])
+        if found.verdicts[i] == Verdict.GOOD:
+            end += own.states
 
 
 class FrontEnd:
@@ -333,8 +335,7 @@ class FrontEnd:
             sample = JointSample(int(stamp_ns[i]), q[i], dq[i], tau[i])
             self._refuse(answers[i, 1], sample, answers[i, 2:])
         good = np.flatnonzero(answers[:, 1] == Verdict.GOOD)
-        records = records.reshape(len(q), states, self.layout.size)[good]
-        records = records.reshape(states * len(good), self.layout.size)
+        records = records[: states * len(good)]
         last = states - 1 + states * np.arange(len(good))  # the others are of instants in between
         own = None if links is None else (links[0][good], links[1][good])
         self.twist.fill_table(records, Raw(last, q[good], dq[good], own))
