@@ -90,11 +90,11 @@ def difference_summary(found: ModelDifference) -> list[str]:
     if not found.changes:
         return [f"{found.names[0]} and {found.names[1]} are the same"]
     pairs = zip(found.joints, found.torque_nm, found.torque_size_nm, strict=True)
-    torques = ", ".join(f"{joint} {x:.2g} of {size:.2g}" for joint, x, size in pairs)
+    torques = ", ".join(f"{x:.2g} of {size:.2g} on {joint}" for joint, x, size in pairs)
     rms, most = 1e3 * found.hand_rms_m, 1e3 * found.hand_max_m
     away = f"elsewhere by {rms:.2g} mm rms, {most:.2g} mm at most"
     stands = f"{found.hand} stands {away if found.hand_max_m > NOTHING else 'where it stood'}"
-    lines = [f"all together: torque of {torques} N m rms; {stands}"]
+    lines = [f"all together: torque changes by {torques} (N m, rms over a motion); {stands}"]
     left = [change for change in found.changes if not _listed(change)]
     if len(left) == len(found.changes):
         lines.insert(0, f"{found.names[0]} and {found.names[1]} agree, as far as they are known")

@@ -286,7 +286,7 @@ class FrontEnd:
         are reused by the next call. Reasons are counted in `refused`.
 
         Raises:
-            DriverError: a sample of another number of joints.
+            DriverError: a sample of another number of joints, or a stamp that is no whole number.
         """
         signals, answers, n = self._signals, self._answers, self.layout.n
         row = signals[0]
@@ -300,6 +300,11 @@ class FrontEnd:
             ) from None
         if self.layout.floating:
             row[3 * n :] = np.nan if sample.base is None else sample.base
+        if not isinstance(sample.stamp_ns, (int, np.integer)):
+            raise DriverError(
+                f"stamp_ns of a sample of the driver is {sample.stamp_ns!r}; it counts whole "
+                "nanoseconds (time.monotonic_ns())"
+            )
         answers[0, 0] = sample.stamp_ns
         process(signals, self._packed, self._kept, self._whole, self._records, answers)
         if answers[0, 1]:

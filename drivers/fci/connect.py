@@ -22,6 +22,7 @@ REPLY_LIMIT_S = 5.0
 RECOVERY_LIMIT_S = 10.0
 FIRST_STATE_S = 1.0  # for the length of the first state, which tells the version as well
 AUTO = "auto"
+LOOPBACK = ("127.0.0.1", "localhost")  # a simulated arm is looked for
 OPTIONS = ("protocol", "recover", "collision", "load")
 VERSIONS = {AUTO: None, "5": tables.PANDA, "10": tables.FR3}
 
@@ -44,10 +45,10 @@ class Channel:
                 (socket.gethostbyname(host), port), CONNECT_LIMIT_S
             )
         except ConnectionRefusedError as error:
-            raise DriverError(
-                f"no FCI at {where}: switch the robot on, unlock its brakes and activate FCI in "
-                "Desk"
-            ) from error
+            here = "start `adapter sim fci` and wait until it says that it is ready"
+            robot = "switch the robot on, unlock its brakes and activate FCI in Desk"
+            advice = here if host in LOOPBACK else robot
+            raise DriverError(f"no FCI at {where}: {advice}") from error
         except TimeoutError as error:
             raise DriverError(
                 f"nobody answers at {where}: check the address, the cable and this computer's "

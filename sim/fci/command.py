@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_USAGE
     try:
         with Ending(args.duration) as ending:
-            print(f"listening on {HOST}:{server.port} protocol {server.protocol}", flush=True)
+            address = f"fci://{HOST}" + (f":{server.port}" if server.port != PORT else "")
+            protocol = f"(protocol {server.protocol})"
+            print(f"ready: a simulated arm on {address} {protocol}", flush=True)
             if hand is not None:
                 print(f"the gripper on {HOST}:{hand.port}", flush=True)
             server.serve(ending.is_set)

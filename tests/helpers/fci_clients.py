@@ -93,7 +93,7 @@ def client(protocol: int, *actions: str) -> dict[str, dict]:
 
 
 def _wait_until_ready(process: subprocess.Popen, protocol: int) -> None:
-    ready = f"listening on 127.0.0.1:{PORT} protocol {protocol}"
+    ready = f"ready: a simulated arm on fci://127.0.0.1 (protocol {protocol})"
     for line in process.stdout:
         if line.strip() == ready:
             return

@@ -284,3 +284,10 @@ def test_a_sample_of_another_arm_is_named() -> None:
     front_end, two = FrontEnd(panda_model()), np.zeros(2)
     with pytest.raises(DriverError, match=r"has 2 positions, 2 velocities and 2 torques.*7 joints"):
         front_end.step(JointSample(1, two, two, two))
+
+
+@pytest.mark.parametrize("stamp", [1.5, np.float64(2e9)])
+def test_a_stamp_in_seconds_is_named(stamp: float) -> None:
+    front_end, seven = FrontEnd(panda_model()), np.zeros(N)
+    with pytest.raises(DriverError, match=r"stamp_ns .* counts whole nanoseconds"):
+        front_end.step(JointSample(stamp, seven, seven, seven))  # type: ignore[arg-type]
