@@ -15,7 +15,6 @@ import numpy as np
 
 from adapter.errors import ModelError
 from adapter.learning.batch.conic import (
-    LENGTH,
     cones,
     entries,
     matrices,
@@ -27,9 +26,11 @@ from adapter.model.spatial import Array
 
 KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
 LEAST_KEPT = 1e-3  # the same where no possible body has what was learned
-# Of its mass: what counts as the least eigenvalue (kg, lengths in units of `LENGTH`) of a
-# documented body in measuring others; a rod or a point has none.
-LEAST_SIZE = 1e-3
+LEAST_SIZE = 1e-3  # share of a measuring body, and kg, that a documented one has at least
+# m: as if documented bodies were spread so far about their centres at least, others are measured. A
+# rod or a point is not spread; beside a flat one (the Panda's second link) some millimetres weighed
+# more than 20 kg.
+THICK = 0.03
 NEARNESS = 1e-8  # weight of nearness beside the torques, where both cannot be had
 ALONE = 0.99  # of a parameter that must show for it to be called learned
 UNSOLVED = "no possible bodies were found near what was learned; is it sound?"
@@ -111,12 +112,13 @@ class Measure:
     """
 
     def __init__(self, told: Array) -> None:
-        units = np.diag([1.0 / LENGTH] * 3 + [1.0])
-        values, vectors = np.linalg.eigh(units @ pseudo_inertia(told) @ units)
-        mass = np.maximum(told[:, 0], LEAST_SIZE)
-        values = np.maximum(values, LEAST_SIZE * mass[:, None])
-        root = vectors * np.sqrt(values)[:, None, :]
-        self._root = np.linalg.inv(units) @ root
+        whole, mass = pseudo_inertia(told), np.maximum(told[:, :1], LEAST_SIZE)
+        centre = whole[:, :3, 3] / mass
+        spread = whole[:, :3, :3] - mass[..., None] * centre[:, :, None] * centre[:, None, :]
+        values, vectors = np.linalg.eigh(spread)
+        self._root = np.zeros_like(whole)
+        self._root[:, :3, :3] = vectors * np.sqrt(np.maximum(values, mass * THICK**2))[:, None, :]
+        self._root[:, :3, 3], self._root[:, 3, 3:] = np.sqrt(mass) * centre, np.sqrt(mass)
         self._inverse = np.linalg.inv(self._root)
         self.told, self.cones = self.of(told), cones(len(told))
         values, vectors = np.linalg.eigh(matrices(self.told.reshape(-1, 10)))
