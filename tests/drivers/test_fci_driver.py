@@ -145,11 +145,14 @@ def test_names_and_addresses_are_checked():
             FciArm(address)
 
 
-def test_nobody_there():
-    with socket.create_server(("127.0.0.1", 0)) as free:
+@pytest.mark.parametrize(
+    ("host", "advice"), [("127.0.0.1", "adapter sim fci"), ("127.0.0.2", "activate FCI in Desk")]
+)
+def test_nobody_there(host, advice):
+    with socket.create_server((host, 0)) as free:
         port = free.getsockname()[1]
-    with pytest.raises(DriverError, match=r"no FCI at .* activate FCI in Desk"):
-        FciArm(f"fci://127.0.0.1:{port}").connect()
+    with pytest.raises(DriverError, match=rf"no FCI at .*{advice}"):
+        FciArm(f"fci://{host}:{port}").connect()
 
 
 @pytest.mark.parametrize("server", [6, 9, 77])

@@ -486,7 +486,7 @@ def test_command_serves_and_sums_up(tmp_path, capsys):
             signal.signal(number, handler)
     said = capsys.readouterr().out.splitlines()
     assert code == 0 and said[0].startswith("ready: a simulated arm on fci://127.0.0.1")
-    assert said[0].endswith(" protocol 10") and "stalled_ms: 0" in said
+    assert said[0].endswith("(protocol 10)") and "stalled_ms: 0" in said
     assert json.loads(path.read_text("utf-8"))["clients"] == 0
 
 
