@@ -88,12 +88,12 @@ def fci(protocol: int, allow_motion: bool):
         options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
         server = process("-m", "sim.fci", *options)
         with server as line, closing() as arms:
-            where = line.split()[2]
+            address = next(word for word in line.split() if word.startswith("fci:"))
 
             def make() -> FciArm:
                 for arm in arms:
                     arm.close()  # the robot serves one client at a time
-                arms.append(FciArm(f"fci://{where}?recover=1", allow_motion=allow_motion))
+                arms.append(FciArm(f"{address}?recover=1", allow_motion=allow_motion))
                 return arms[-1]
 
             yield make
