@@ -80,6 +80,11 @@ def closing() -> Iterator[list]:
             arm.close()
 
 
+def fci_address(line: str) -> str:
+    """Of the simulated robot that says in this line that it is ready."""
+    return next(word for word in line.split() if word.startswith("fci:"))
+
+
 def fci(protocol: int, allow_motion: bool):
     """The FCI server of one protocol, and drivers that may move it or not."""
 
@@ -88,7 +93,7 @@ def fci(protocol: int, allow_motion: bool):
         options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
         server = process("-m", "sim.fci", *options)
         with server as line, closing() as arms:
-            address = next(word for word in line.split() if word.startswith("fci:"))
+            address = fci_address(line)
 
             def make() -> FciArm:
                 for arm in arms:

@@ -41,7 +41,7 @@ def _killed_in_motion(folder: Path) -> str:
     folder.mkdir()
     figures = folder / "run.json"
     with rigs.process("-m", "sim.fci", "--port", "0", "--patience", rigs.PATIENCE_S) as line:
-        address = f"fci://{line.split()[2]}"
+        address = rigs.fci_address(line)
         command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
         command += [
             "--yes",
