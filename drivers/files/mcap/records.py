@@ -280,8 +280,11 @@ class McapScan(Scan):
     def regions(self) -> Iterator[Region]:
         """All complete messages, in the order of the file; damaged chunks are passed over."""
         with ThreadPoolExecutor(1) as self._second:
-            yield from self._in_order()
-        self._second = None
+            try:
+                yield from self._in_order()
+            finally:  # also where somebody stops reading
+                self._second = None
+                self._ahead.clear()
 
     def _in_order(self) -> Iterator[Region]:
         at = len(MAGIC)
