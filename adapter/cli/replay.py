@@ -13,7 +13,7 @@ from adapter.cli.common import configure, effort_unit_of, robot_of_log
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.errors import SettingsError
-from adapter.gap.screen import check_effort_unit
+from adapter.gap.screen import check_torque
 from adapter.gap.torque_gains import TorqueGains, in_newton_metres
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
@@ -149,9 +149,9 @@ def _in_newton_metres(
     logs, gains = in_newton_metres(logs, robot, unit, known)
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
-    if gains is not None or not unit.is_given:
+    if not robot.tree.floating:
         for log in logs:
-            check_effort_unit(most_moved(log), robot)
+            check_torque(most_moved(log), robot, unit.is_given and gains is None)
     return logs, gains
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from adapter.cli.common import robot_of
 from adapter.control.teachable import teachable
-from adapter.gap.screen import RecordingRefused, check_effort_unit
+from adapter.gap.screen import RecordingRefused, check_torque
 from adapter.model.self_model import SelfModel
 from adapter.signals.matching import matching, most_moved, present
 from drivers.files.mcap import AnyLog, Log, open_log
@@ -51,7 +51,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
 def _doubt(log: Log, robot: SelfModel) -> list[str]:
     """A sentence where efforts are motor currents and not N m."""
     try:
-        check_effort_unit(log, robot)
+        check_torque(log, robot)
     except RecordingRefused as refusal:
         return [str(refusal)]
     return []

@@ -19,7 +19,7 @@ from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import SHARES, real_arm
 from adapter.gap.sampled import Sampled, sampling_words
-from adapter.gap.screen import MOVES_DQ, cleaned, judge_torque, moving_joints
+from adapter.gap.screen import MOVES_DQ, cleaned, judge_torque, moving_joints, smoothed_rows
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.timing import lateness
 from adapter.gap.weighed import moments_of
@@ -28,7 +28,7 @@ from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
-from adapter.signals.validation import GRID_S, smooth
+from adapter.signals.validation import GRID_S
 from drivers.files.mcap import AnyLog, Log
 
 DOCUMENTED_STD, SHARED_STD = 0.02, 0.2  # of the inertias: alone, and with a log without the load
@@ -148,12 +148,12 @@ def _taken(log: AnyLog, model: SelfModel) -> _Taken:
         part, _, said = cleaned(long.busiest(log), model)
         return _Taken(long.recorded(), part, long.survey.clock.period_s, said)
     own, clock, said = cleaned(log if isinstance(log, Log) else log.in_memory(), model)
-    return _Taken(Recorded.of(own, lateness(clock)), own, clock.period_s, said)
+    return _Taken(Recorded.of(own, lateness(clock)).cut(), own, clock.period_s, said)
 
 
 def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:
     """Refuse torques that even the loaded arm has in another unit, sign or order; notes on rest."""
-    smoothed = smooth(1e-9 * (log.stamp_ns - log.stamp_ns[0]), log.q, log.dq, log.tau)
+    smoothed = smoothed_rows(log)
     if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
         return ["the arm hardly moves: static friction in its joints counts as load"]
     loaded = model.theta.copy()

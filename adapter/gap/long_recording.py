@@ -24,6 +24,7 @@ from adapter.gap.signals import (
     EDGE_S,
     KNOT_S,
     LEAST_S,
+    MOTION,
     RATE_HZ,
     TAPS,
     Recorded,
@@ -172,7 +173,7 @@ class LongRecording:
             tau.append(torque)
         noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
         bands = np.max([bands_of(motion, noise) for motion in motions], axis=0)
-        t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in _MOTION)
+        t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
         begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
         motion = Motion(t, q, dq, ddq, arm, bands_hz=bands)
         return _banded(motion, np.concatenate(tau), noise, begins)
@@ -249,7 +250,7 @@ class LongRecording:
 
 
 LEAST_SAMPLES = round(LEAST_S * RATE_HZ / DECIMATION)
-_MOTION, _RAW = ("t", "q", "dq", "ddq"), ("t", "q", "dq", "tau")
+_RAW = ("t", "q", "dq", "tau")
 _COMMANDS = "command_t", "commands"
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from adapter.effects.torque import ModelTorque
 from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.motor_currents import in_words as currents_in_words
+from adapter.gap.signals import CUT_S
 from adapter.gap.timing import RecordingClock, check_timing, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
@@ -35,6 +36,8 @@ TILT_RAD = np.deg2rad(20.0)  # of gravity; less is a base that stands askew
 FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias stays below 100
 NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
+FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
+PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
 
@@ -110,8 +113,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) 
     recorded, names = log.joint_names, model.tree.joint_names
     log, timing, outside = cleaned(log, model)
     renamed = not set(names) <= set(recorded)
-    stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
-    q, dq, ddq, tau = smooth(stamps_s, log.q, log.dq, log.tau)
+    q, dq, ddq, tau = smoothed_rows(log)
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
     silent = _silent(log, names)
@@ -366,22 +368,39 @@ def judge_torque(
     )
 
 
-def check_effort_unit(log: Log, model: SelfModel) -> None:
-    """Refuse efforts that are motor currents, where there is motion enough to tell.
+def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
+    """q, dq, ddq, tau (m, n) of `validation.smooth`, without what its filter makes of a pause."""
+    stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    steps = np.diff(stamps_s)
+    pauses = np.flatnonzero(steps > CUT_S)
+    stamps_s[1:] -= np.cumsum(np.maximum(steps - PAUSE_S, 0.0))  # a clock that steps on by hours
+    signals = smooth(stamps_s, log.q, log.dq, log.tau)
+    t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)
+    for k in pauses:
+        clear &= (t < stamps_s[k] - GRID_S * EDGE) | (t > stamps_s[k + 1] + GRID_S * EDGE)
+    q, dq, ddq, tau = (x[clear] for x in signals)
+    return q, dq, ddq, tau
+
+
+def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
+    """Refuse efforts that are no joint torques of this arm, where there is motion enough to tell.
 
     Args:
         log: joints in the model's order; model: of an arm whose base is fixed.
+        unit_known: somebody says that torques are in N m, however large they are.
 
     Raises:
-        Refusal: see there.
+        Refusal: units, sign, order or meaning of the torques.
     """
     rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
     if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
         return
     log = rows_of(log, rows)
-    stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
-    smoothed = smooth(stamps_s, log.q, log.dq, log.tau)
-    refuse_currents(log, model, torque_shares(*compared(model, RigidArm.of(model), smoothed)))
+    smoothed = smoothed_rows(log)
+    if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
+        return
+    _silent(log, model.tree.joint_names)
+    judge_torque(log, model, RigidArm.of(model), smoothed, (), unit_known)
 
 
 def refuse_currents(log: Log, model: SelfModel, shares: TorqueShares) -> None:

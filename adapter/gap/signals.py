@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.optimize import minimize_scalar
@@ -41,7 +42,10 @@ CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at
 MASSES = 20  # instants at which the mass matrix is asked for
 MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording
+CUT_S, CUT_PERIODS = 0.15, 6.0  # without samples: what is longer, and of more periods, is a pause
+STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
+MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
@@ -220,7 +224,7 @@ def regressor_of(motion: Motion, rows: slice) -> Array:
 
 def motion_rows(motion: Motion, rows: slice) -> Motion:
     """Some instants of a motion."""
-    return replace(motion, **{key: getattr(motion, key)[rows] for key in ("t", "q", "dq", "ddq")})
+    return replace(motion, **{key: getattr(motion, key)[rows] for key in MOTION})
 
 
 def _size_of_low(rows: int) -> int:
@@ -239,6 +243,8 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     Raises:
         ValueError: less data than the filters need.
     """
+    if len(recording.begins) > 1:
+        return _together([prepare(x, arm, repeat) for x in recording.stretches()])
     t = recording.t
     if t[-1] - t[0] < LEAST_S:
         raise ValueError(f"the search needs {LEAST_S:g} s of data, got {t[-1] - t[0]:.2f} s")
@@ -251,6 +257,18 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     motion = replace(motion, bands_hz=bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
     return Signals(motion, noise, low(on_grid(grid, t, recording.tau)), band_t)
+
+
+def _together(parts: Sequence[Signals]) -> Signals:
+    """Stretches of one recording as one."""
+    motions = [x.motion for x in parts]
+    t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
+    bands = np.max([m.bands_hz for m in motions], axis=0)
+    begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
+    tau, band_t = (np.concatenate([getattr(x, k) for x in parts]) for k in ("tau", "t"))
+    motion = Motion(t, q, dq, ddq, motions[0].arm, bands_hz=bands)
+    noise = np.mean([x.noise for x in parts], axis=0)
+    return Signals(motion, noise, tau, band_t, begins)
 
 
 def bands_of(motion: Motion, noise: Array) -> Array:
@@ -342,12 +360,33 @@ class Recorded:
             command_t = 1e-9 * (stamps[known] - start).astype(float)
             commands = log.commands.tau[first][known]
         t = 1e-9 * (log.stamp_ns - start).astype(float)
-        return cls(log.path.name, t, log.q, log.dq, log.tau, command_t, commands, dq_late_s)
+        signals = log.path.name, t, log.q, log.dq, log.tau, command_t, commands, dq_late_s
+        return cls(*signals)
 
-    def part(self, rows: slice) -> Recorded:
+    def cut(self) -> Recorded:
+        """The stretches between its pauses, those that are long enough for the filters.
+
+        Nobody knows how the arm moved in a pause: no spline, filter or memory reaches over one.
+        """
+        step_s = float(np.median(np.diff(self.t))) if len(self.t) > 1 else 0.0
+        cuts = np.flatnonzero(np.diff(self.t) > max(CUT_S, CUT_PERIODS * step_s)) + 1
+        if not len(cuts):
+            return replace(self, begins=(0,))
+        edges = pairwise((0, *cuts.tolist(), len(self.t)))
+        rows = [np.arange(a, b) for a, b in edges if self.t[b - 1] - self.t[a] > STRETCH_LEAST_S]
+        if not rows:  # whoever asks for its motion says that it is too short
+            return replace(self, begins=(0,))
+        begins = np.cumsum([0, *(len(x) for x in rows[:-1])])
+        return replace(self.part(np.concatenate(rows)), begins=tuple(map(int, begins)))
+
+    def part(self, rows: slice | NDArray[np.int64]) -> Recorded:
         """Some of its rows; times stay those of the whole."""
         kept = {key: getattr(self, key)[rows] for key in ("t", "q", "dq", "tau")}
         return replace(self, **kept)
+
+    def between(self, begin_s: float, end_s: float) -> Recorded:
+        """Its samples from a time to another one (not included), cut at its pauses."""
+        return self.part(np.flatnonzero((self.t >= begin_s) & (self.t < end_s))).cut()
 
     @property
     def end_s(self) -> float:
@@ -357,7 +396,9 @@ class Recorded:
     @property
     def seconds(self) -> float:
         """How much of it there is in memory."""
-        return float(self.t[-1]) if self.whole is None else sum(b - a for a, b in self.spans)
+        if self.whole is not None:
+            return sum(b - a for a, b in self.spans)
+        return sum(float(x.t[-1] - x.t[0]) for x in self.stretches())
 
     def stretches(self) -> list[Recorded]:
         """Each stretch for itself."""

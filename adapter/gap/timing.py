@@ -8,12 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.signal import butter, sosfiltfilt
 
 from adapter.model.spatial import Array
 
 HOLE_PERIODS = 3.0  # a step longer than so many median periods is a hole
 FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, not a repeat
+AROUND = 5  # samples, of which the middle one tells where a reading should be
+# A reading further from it than so many usual ones, and than this share of its range, is no arm's.
+SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
+HELD_NM = 0.3  # that the arm holds throughout, so that torques of zero are none
 FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
 HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
 CUT_HZ = 8.0  # band in which velocity and position are compared: arms move below it
@@ -41,7 +46,8 @@ class RecordingClock:
         frozen: (start, length) s of runs in which no signal changes though the arm moves.
         repeated: share of rows identical to the one before.
         held: share of the other rows in which this signal ("q", "dq", "tau") stays as it was.
-        out_of_order: rows whose stamps don't increase; not_finite: rows with no number in them.
+        out_of_order: rows whose stamps don't increase; not_finite: rows with no number in them;
+            impossible: rows with a single reading that no arm makes, see `possible`.
         lateness_s, lateness_std_s: of dq against q, dq(t) = d/dt q(t - lateness); NaN where the
             motion does not tell.
         velocity_gain: (n,) size of dq against d/dt q; NaN where a joint does not move.
@@ -58,6 +64,7 @@ class RecordingClock:
     held: dict[str, float]
     out_of_order: int
     not_finite: int
+    impossible: int
     lateness_s: float
     lateness_std_s: float
     velocity_gain: Array
@@ -100,6 +107,11 @@ class RecordingClock:
         said = []
         if self.not_finite:
             said.append(f"{self.not_finite} samples hold no number; they are left out.")
+        if self.impossible:
+            said.append(
+                f"{self.impossible} samples hold what no arm makes (torques that are all exactly "
+                "zero, single readings far from those before and after); they are left out."
+            )
         if self.repeated > 0.001:
             said.append(
                 f"{100 * self.repeated:.1f} % of the samples repeat the one before; they are "
@@ -167,6 +179,7 @@ def joined(clocks: Sequence[RecordingClock], begins_s: Sequence[float]) -> Recor
         held={key: mean([c.held[key] for c in clocks]) for key in clocks[0].held},
         out_of_order=sum(c.out_of_order for c in clocks),
         not_finite=sum(c.not_finite for c in clocks),
+        impossible=sum(c.impossible for c in clocks),
         lateness_s=float(np.average(late[told], weights=weight)) if told.any() else float("nan"),
         lateness_std_s=float(weight.sum() ** -0.5) if told.any() else float("nan"),
         velocity_gain=gain,
@@ -210,6 +223,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
         not_finite=int((~_finite(q, dq, tau)).sum()),
+        impossible=int((~possible(*(x[increasing] for x in (q, dq, tau)))).sum()),
         lateness_s=late_s,
         lateness_std_s=std_s,
         velocity_gain=gain,
@@ -224,12 +238,34 @@ def uniform(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Index:
     """
     rows = _increasing(stamp_ns)
     rows = rows[_finite(q, dq, tau)[rows]]
+    rows = rows[possible(q[rows], dq[rows], tau[rows])]
     again = _same(q[rows]) & _same(dq[rows]) & _same(tau[rows])
     return rows[np.concatenate([[True], ~again])[: len(rows)]]
 
 
 def _finite(*signals: Array) -> NDArray[np.bool_]:
     return np.all([np.isfinite(x).all(axis=1) for x in signals], axis=0)
+
+
+def possible(q: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
+    """(m,) whether an arm makes these readings (m, n), told before any filter smears them.
+
+    Torques are not all exactly zero now and then where the arm holds its weight throughout (a
+    second publisher, bursts of a driver that had nothing to say), and no reading stands alone far
+    from those around it.
+    """
+    if len(tau) < FEWEST_COMPARED:
+        return np.ones(len(tau), dtype=bool)
+    dead = (tau == 0.0).all(axis=1)
+    holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10) if not dead.all() else 0.0
+    good = ~dead if holds > HELD_NM else np.ones(len(tau), dtype=bool)
+    for x in (q, dq, tau):
+        apart = np.abs(x - median_filter(x, size=(AROUND, 1), mode="nearest"))
+        with np.errstate(invalid="ignore"):
+            low, high = np.percentile(x[good], (1, 99), axis=0)
+        usual = np.median(apart[good], axis=0)
+        good &= (apart <= np.maximum(SPIKE_TIMES * usual, SPIKE_SHARE * (high - low))).all(axis=1)
+    return good
 
 
 def _same(x: Array) -> NDArray[np.bool_]:

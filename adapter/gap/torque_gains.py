@@ -222,7 +222,7 @@ def learn_gains(
         model, said = present(model, log.joint_names, log.path.name)
         notes += said
     usable = [cleaned(log, model) for log in logs]
-    recordings = [Recorded.of(log, lateness(clock)) for log, clock, _ in usable]
+    recordings = [Recorded.of(log, lateness(clock)).cut() for log, clock, _ in usable]
     shares = [_shares(log, model) for log, *_ in usable]
     if not any(x.tells.any() for x in shares):
         raise SettingsError(
@@ -237,7 +237,7 @@ def learn_gains(
         np.any([x.tells for x in shares], axis=0),
     )
     start = _first_gains(shares)
-    begun = [r.part(slice(int(LEARNED_SHARE * len(r.t)))) for r in recordings]
+    begun = [r.between(0.0, float(r.t[int(LEARNED_SHARE * len(r.t))])) for r in recordings]
     first, fit, _ = _fitted(replace(task, recordings=tuple(begun)), start)
     held_out, size = _on_the_rest(task, fit, first)
     gain, fit, std = _fitted(task, first)
@@ -382,13 +382,15 @@ def _on_the_rest(task: _GainTask, fit: Fit, gain: Array) -> tuple[Array, Array]:
     Where joints stick counts here, so it is fitted, too.
     """
     arm = RigidArm.of(task.model)
-    parts = (r.part(slice(int(LEARNED_SHARE * len(r.t)), None)) for r in task.recordings)
+    ends = (float(r.t[int(LEARNED_SHARE * len(r.t))]) for r in task.recordings)
+    parts = (r.between(end_s, np.inf) for r, end_s in zip(task.recordings, ends, strict=True))
     rest = [prepare(replace(part, tau=part.tau * gain), arm) for part in parts]
     fit, _ = _settled(replace(fit, weights=()), task.load_kg if any(task.loaded) else None)
     step = np.ones(len(gain))
     at, off = _gain_places(fit)
     step[at] = 1.0 + fit.coefficients[off]
-    model = replace(fit.model, recordings=tuple(rest), start_nm=np.zeros((len(rest), len(gain))))
+    held = np.zeros((sum(len(x.begins) for x in rest), len(gain)))
+    model = replace(fit.model, recordings=tuple(rest), start_nm=held)
     errors = [own.tau - model.predicted(i) / step for i, own in enumerate(rest)]
     return _rms(errors), _rms([own.tau for own in rest])
 

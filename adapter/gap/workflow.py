@@ -231,7 +231,7 @@ def _taken(log: AnyLog, name: str, model: SelfModel, unit_known: bool) -> _Taken
         return _Taken(sampled.screened(log, unit_known), sampled.recorded(), sampled)
     own = log if isinstance(log, Log) else log.in_memory()
     seen = refuse(own, model, RigidArm.of(model), unit_known)
-    fitted = replace(Recorded.of(seen.log, lateness(seen.timing)), name=name)
+    fitted = replace(Recorded.of(seen.log, lateness(seen.timing)).cut(), name=name)
     return _Taken(seen, fitted, None)
 
 
@@ -245,9 +245,8 @@ def _divided(taken: _Taken, settings: GapSettings, progress: Progress) -> _Taken
                 f"{whole.name} has {whole.end_s:.1f} s"
             )
         if sampled is None:
-            cut = int(np.searchsorted(whole.t, at_s))
-            rest = whole.part(slice(cut, None))
-            return taken._replace(fitted=whole.part(slice(cut)), scored=rest)
+            rest = whole.between(at_s, np.inf)
+            return taken._replace(fitted=whole.between(0.0, at_s), scored=rest)
         rest = sampled.within((at_s, whole.end_s)).recorded()
         sampled = sampled.within((0.0, at_s))
         taken = taken._replace(scored=rest)

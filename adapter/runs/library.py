@@ -19,6 +19,7 @@ from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult
+from adapter.gap.screen import check_torque
 from adapter.gap.workflow import GapSettings
 from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
@@ -31,7 +32,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
-from adapter.signals.matching import matching, present
+from adapter.signals.matching import matching, most_moved, present
 from drivers.files.html_table import html_table, plus_minus
 from drivers.files.mcap import AnyLog, Log, open_log
 from drivers.files.mcap import read_log as read_mcap
@@ -194,6 +195,7 @@ def learn(
 
     Raises:
         DriverError: the recording lacks a joint of the arm, or samples.
+        ValueError: units, sign or order of the torques are not the arm's; says which.
         SettingsError: an effect or a number that does not exist.
 
     >>> import adapter
@@ -208,6 +210,7 @@ def learn(
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
+    check_torque(most_moved(own), arm)
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)
     names = learnable(arm, REAL_ARM_EFFECTS if effects is None else tuple(effects))
     settings = PipelineSettings(filter=filter_settings, learner=LearnerSettings(effects=names))

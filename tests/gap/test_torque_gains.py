@@ -11,7 +11,7 @@ import pytest
 from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import SettingsError
-from adapter.gap.screen import RecordingRefused, check_effort_unit, refuse
+from adapter.gap.screen import RecordingRefused, check_torque, refuse
 from adapter.gap.torque_gains import EffortUnit, in_newton_metres, learn_gains
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -34,7 +34,7 @@ def said_of(log: Log, model: SelfModel) -> str:
         refuse(log, model, RigidArm.of(model))
     assert caught.value.kind == "scale"
     with pytest.raises(RecordingRefused) as again:
-        check_effort_unit(log, model)
+        check_torque(log, model)
     assert str(again.value) == str(caught.value)
     return str(caught.value)
 
@@ -60,9 +60,9 @@ def test_newton_metres_pass(seed: int, load_kg: float) -> None:
     hidden = driven_arm(seed, spread=0.4)
     log = currents(hidden, seed, 10.0, load_kg)
     log = replace(log, tau=log.tau * hidden.gain)
-    check_effort_unit(log, six_joints())
+    check_torque(log, six_joints())
     light = replace(six_joints(), theta=1.4 * six_joints().theta)
-    check_effort_unit(log, light)
+    check_torque(log, light)
 
 
 def kuka() -> tuple[Log, SelfModel]:
@@ -89,9 +89,9 @@ def ur10() -> tuple[Log, SelfModel]:
 def test_real_logs_pass(arm) -> None:  # type: ignore[no-untyped-def]
     """The UR10's bag too: its friction and gravity are those of a UR10 in N m, not in A."""
     log, model = arm()
-    check_effort_unit(matching(log, model), model)
+    check_torque(matching(log, model), model)
     with pytest.raises(RecordingRefused):
-        check_effort_unit(matching(replace(log, tau=log.tau / 10.0), model), model)
+        check_torque(matching(replace(log, tau=log.tau / 10.0), model), model)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real logs are not beside the project")

@@ -21,7 +21,7 @@ import numpy as np
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.errors import MeansError
-from adapter.gap.screen import check_effort_unit
+from adapter.gap.screen import check_torque
 from adapter.learning.known_effects import learnable
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
@@ -160,7 +160,7 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
     log = matching(log, model)
     if not len(log):
         raise DriverError("no samples to learn from")
-    check_effort_unit(log, model)
+    check_torque(log, model)
     settings, _ = fitted_to(log, PipelineSettings().filter)
     both = PipelineSettings(filter=settings, learner=_learning(model))
     front_end, learner = make_front_end(model, both), make_learner(model, both)
