@@ -137,10 +137,13 @@ class Information:
             information: of motions, without `prior`.
             share: of each parameter's usual size that is wanted.
         """
-        factor = np.linalg.cholesky(np.linalg.inv(self.prior + information))
+        # in units of the prior, where no sum has an eigenvalue below one, however little moves
+        back = np.linalg.inv(np.linalg.cholesky(self.prior).T)
+        gained, axes = np.linalg.eigh(back.T @ information @ back)
         shown = self._shown_map()
-        std = np.linalg.norm(shown @ factor, axis=1)
-        before = np.linalg.norm(shown @ np.linalg.cholesky(np.linalg.inv(self.prior)), axis=1)
+        believed = shown @ back
+        std = np.linalg.norm(believed @ axes / np.sqrt(1.0 + np.maximum(gained, 0.0)), axis=1)
+        before = np.linalg.norm(believed, axis=1)
         exists = np.linalg.norm(shown, axis=1) > SHOWN * self.size
         names, units = self._names()
         return Expected(names, units, std, share * self.size, exists & (std < 0.5 * before))

@@ -263,7 +263,7 @@ def _together(parts: Sequence[Signals]) -> Signals:
     """Stretches of one recording as one."""
     motions = [x.motion for x in parts]
     t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
-    bands = np.max([m.bands_hz for m in motions], axis=0)
+    bands = np.max([x.motion.bands_hz for x in parts if x.motion.bands_hz is not None], axis=0)
     begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
     tau, band_t = (np.concatenate([getattr(x, k) for x in parts]) for k in ("tau", "t"))
     motion = Motion(t, q, dq, ddq, motions[0].arm, bands_hz=bands)

@@ -200,6 +200,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
     """
     m = len(stamp_ns)
     increasing = _increasing(stamp_ns)
+    finite = increasing[_finite(q, dq, tau)[increasing]]
     keep = uniform(stamp_ns, q, dq, tau)
     steps_s = 1e-9 * np.diff(stamp_ns[increasing])
     period_s = float(np.median(steps_s)) if len(steps_s) else 0.0
@@ -223,7 +224,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
         not_finite=int((~_finite(q, dq, tau)).sum()),
-        impossible=int((~possible(*(x[increasing] for x in (q, dq, tau)))).sum()),
+        impossible=int((~possible(q[finite], dq[finite], tau[finite])).sum()),
         lateness_s=late_s,
         lateness_std_s=std_s,
         velocity_gain=gain,
@@ -259,10 +260,9 @@ def possible(q: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
     dead = (tau == 0.0).all(axis=1)
     holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10) if not dead.all() else 0.0
     good = ~dead if holds > HELD_NM else np.ones(len(tau), dtype=bool)
-    for x in (q, dq, tau):
+    for x in (q, dq, tau) if good.any() else ():
         apart = np.abs(x - median_filter(x, size=(AROUND, 1), mode="nearest"))
-        with np.errstate(invalid="ignore"):
-            low, high = np.percentile(x[good], (1, 99), axis=0)
+        low, high = np.percentile(x[good], (1, 99), axis=0)
         usual = np.median(apart[good], axis=0)
         good &= (apart <= np.maximum(SPIKE_TIMES * usual, SPIKE_SHARE * (high - low))).all(axis=1)
     return good

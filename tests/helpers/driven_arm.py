@@ -43,10 +43,13 @@ def six_joints() -> SelfModel:
 
 
 def driven_arm(seed: int, spread: float = 0.05) -> DrivenArm:
-    """An arm whose masses are off by 15 % in all at most, and by a spread link by link."""
+    """An arm whose masses are off by 15 % in all at most, and by a spread link by link.
+
+    No link weighs less than a fifth: without mass there is no centre, and torques of 1e24 N m.
+    """
     rng = np.random.default_rng([seed, 15])
     scale = rng.uniform(0.85, 1.15)
-    theta = scale * arm().theta * rng.normal(1.0, spread, (7, 1))
+    theta = scale * arm().theta * np.maximum(rng.normal(1.0, spread, (7, 1)), 0.2)
     theta[:, 1:4] *= rng.normal(1.0, spread, (7, 3))
     size = np.array([4.0, 5.0, 4.0, 3.0, 1.5, 1.5])  # N m, of gearboxes
     return DrivenArm(
