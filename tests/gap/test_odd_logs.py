@@ -1,0 +1,118 @@
+"""Logs as they come: a pause, a clock that steps, readings that no arm makes, another's torques."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import adapter
+from adapter.cli import main
+from adapter.gap.load import find_load
+from adapter.gap.screen import RecordingRefused
+from drivers.files.mcap import Log, McapWriter
+from sim.effects import payload, per_joint
+from tests.helpers.arm_data import Motion, arm, panda_model, record
+
+LOAD_KG, AT = 1.0, (0.0, 0.0, 0.15)
+SPIKES = 40
+
+
+@cache
+def base() -> Log:
+    """8 s of an arm with friction and 1 kg in its hand."""
+    held = payload(LOAD_KG, np.array(AT), 1e-3 * np.eye(3))
+    rubbing = per_joint("coulomb_friction", "Fc", [0.3] * 7)
+    return record(arm().with_changes(effects=[*rubbing, held]), Motion(8.0, 5)).log()
+
+
+def without(begin_s: float, end_s: float) -> Log:
+    at_s = 1e-9 * (base().stamp_ns - base().stamp_ns[0])
+    return base().take((at_s < begin_s) | (at_s >= end_s))
+
+
+def stepped(by_s: float) -> Log:
+    log = base()
+    late = np.arange(len(log)) > len(log) // 2
+    return replace(log, stamp_ns=log.stamp_ns + late * round(1e9 * by_s))
+
+
+def frozen() -> Log:
+    log, rows = base(), np.arange(len(base()))
+    held = np.where((rows > 4000) & (rows < 5250), 4000, rows)
+    return replace(log, q=log.q[held], dq=log.dq[held], tau=log.tau[held])
+
+
+def some_rows() -> np.ndarray:
+    rng = np.random.default_rng(3)
+    return np.isin(np.arange(len(base())), rng.choice(len(base()), SPIKES, replace=False))
+
+
+def spiked(times: float) -> Log:
+    return replace(base(), tau=np.where(some_rows()[:, None], times * base().tau, base().tau))
+
+
+def silent_bursts() -> Log:
+    burst = (np.arange(len(base())) % 1000 // 100 == 2)[:, None]
+    return replace(base(), tau=np.where(burst, 0.0, base().tau))
+
+
+def one_wild() -> Log:
+    tau = base().tau.copy()
+    tau[3000, 1] = 2.7e154
+    return replace(base(), tau=tau)
+
+
+ODD = {
+    "pause of 1 s": lambda: without(3.0, 4.0),
+    "pause of 3 s": lambda: without(2.5, 5.5),
+    "clock steps on by an hour": lambda: stepped(3600.0),
+    "all signals stand still": frozen,
+    "spikes of 50 times": lambda: spiked(50.0),
+    "single torques of zero": lambda: spiked(0.0),
+    "bursts of zeros": silent_bursts,
+    "one torque of 2.7e154": one_wild,
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_the_load_is_that_of_the_log_without_the_flaw(name: str) -> None:
+    found = find_load(ODD[name](), panda_model())
+    assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 0.3
+    assert found.left_nm.max() < 0.5
+
+
+@pytest.mark.parametrize(("name", "said"), [("spikes of 50 times", f"{SPIKES} samples hold")])
+def test_what_was_left_out_is_told(name: str, said: str) -> None:
+    found = adapter.find_gap(ODD[name](), panda_model())
+    assert any(said in note for note in found.notes)
+    assert [x.effect for x in found.findings if x.effect == "payload"] == ["payload"]
+
+
+WRONG = {
+    "sign": lambda tau: tau * np.where(np.arange(7) == 1, -1.0, 1.0),
+    "scale": lambda tau: 100.0 * tau,
+    "torque": np.zeros_like,
+    "order": lambda tau: tau[:, [0, 3, 2, 1, 4, 5, 6]],
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_every_door_refuses_the_same_with_the_same_sentence(kind: str, tmp_path, capsys) -> None:
+    log = replace(base(), tau=WRONG[kind](base().tau))
+    with pytest.raises(RecordingRefused) as of_gap:
+        adapter.find_gap(log, panda_model())
+    with pytest.raises(RecordingRefused) as of_learn:
+        adapter.learn(log, panda_model(), every=50)
+    assert of_gap.value.kind == of_learn.value.kind == kind
+    path = tmp_path / "wrong.mcap"
+    with McapWriter(path, log.joint_names) as writer:
+        for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
+            writer.write_joint_state(stamp_ns, *signals)
+    assert main(["replay", str(path), "--robot", "panda", "--out", str(tmp_path / "out")]) == 2
+    sentence = str(of_learn.value).split(": ", 1)[1]
+    words = "".join(capsys.readouterr().err.split())
+    assert sentence[:40].replace(" ", "") in words
+    assert not (tmp_path / "out" / "model.json").exists()
