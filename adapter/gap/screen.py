@@ -14,7 +14,7 @@ from adapter.effects.torque import ModelTorque
 from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.signals import CUT_S
-from adapter.gap.timing import RecordingClock, check_timing, uniform
+from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -135,7 +135,8 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     """
     recorded = log.joint_names
     log = of_this_robot(log, model)
-    signals = (log.q, log.dq, log.tau)
+    stamps, back = put_forward(log.stamp_ns)
+    log, signals = replace(log, stamp_ns=stamps), (log.q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
     log, timing, said = at_source(log, timing)
@@ -147,7 +148,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         )
     _check_motion_units(log, model, timing)
     renamed = not set(model.tree.joint_names) <= set(recorded)
-    return log, timing, [*said, *_outside_limits(log, model, recorded, renamed)]
+    return log, timing, [*back, *said, *_outside_limits(log, model, recorded, renamed)]
 
 
 def at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, list[str]]:

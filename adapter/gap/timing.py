@@ -18,6 +18,7 @@ FROZEN_PERIODS = 10  # so many identical samples in a row are a stuck source, no
 AROUND = 5  # samples, of which the middle one tells where a reading should be
 # A reading further from it than so many usual ones, and than this share of its range, is no arm's.
 SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
+PUT_BACK_S = 1.0  # of a pause where a clock was put back, which says nothing of how long it took
 HELD_NM = 0.3  # that the arm holds throughout, so that torques of zero are none
 FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
 HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
@@ -242,6 +243,23 @@ def uniform(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Index:
     rows = rows[possible(q[rows], dq[rows], tau[rows])]
     again = _same(q[rows]) & _same(dq[rows]) & _same(tau[rows])
     return rows[np.concatenate([[True], ~again])[: len(rows)]]
+
+
+def put_forward(stamp_ns: Index) -> tuple[Index, list[str]]:
+    """Stamps (m,) of a clock that was put back on the way, with a pause there instead; a note.
+
+    What comes back soon is out of order, see `uniform`: a clock that was put back stays so.
+    """
+    back = np.flatnonzero(np.diff(stamp_ns) < 0) + 1
+    lengths = np.diff(np.concatenate([[0], back, [len(stamp_ns)]]))
+    put = back[(lengths[:-1] >= FEWEST_COMPARED) & (lengths[1:] >= FEWEST_COMPARED)]
+    if not len(put):
+        return stamp_ns, []
+    later = np.zeros_like(stamp_ns)
+    later[put] = stamp_ns[put - 1] - stamp_ns[put] + round(1e9 * PUT_BACK_S)
+    longest_s = 1e-9 * float(np.max(stamp_ns[put - 1] - stamp_ns[put]))
+    said = f"The clock is put back {len(put)} times, by up to {longest_s:.3g} s: taken as pauses."
+    return stamp_ns + np.cumsum(later), [said]
 
 
 def _finite(*signals: Array) -> NDArray[np.bool_]:

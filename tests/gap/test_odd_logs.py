@@ -69,6 +69,7 @@ ODD = {
     "pause of 1 s": lambda: without(3.0, 4.0),
     "pause of 3 s": lambda: without(2.5, 5.5),
     "clock steps on by an hour": lambda: stepped(3600.0),
+    "clock put back by a second": lambda: stepped(-1.0),
     "all signals stand still": frozen,
     "spikes of 50 times": lambda: spiked(50.0),
     "single torques of zero": lambda: spiked(0.0),
