@@ -13,6 +13,7 @@ from adapter.effects.export import to_urdf
 from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
+from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import McapWriter, read_log
 from drivers.interface import JointSample
 
@@ -27,7 +28,8 @@ def motion(count: int = 400) -> list[JointSample]:
     t = 1e-3 * np.arange(count)[:, None]
     w = 3.0 + 0.5 * np.arange(7)
     q = MIDDLE + 0.2 * np.sin(w * t)
-    dq, tau = 0.2 * w * np.cos(w * t), np.cos(w * t)
+    dq, ddq = 0.2 * w * np.cos(w * t), -0.2 * w * w * np.sin(w * t)
+    tau = RigidArm.of(ROBOT).torque(q, dq, ddq)
     return [JointSample(1_000_000 * k, q[k], dq[k], tau[k]) for k in range(count)]
 
 
