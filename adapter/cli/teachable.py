@@ -49,7 +49,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
 
 
 def _doubt(log: Log, robot: SelfModel) -> list[str]:
-    """A sentence where efforts are motor currents and not N m."""
+    """A sentence where efforts are no joint torques of this arm."""
     try:
         check_torque(log, robot)
     except RecordingRefused as refusal:

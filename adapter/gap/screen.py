@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from adapter.effects.torque import ModelTorque
 from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.motor_currents import in_words as currents_in_words
-from adapter.gap.signals import CUT_S
+from adapter.gap.signals import pauses
 from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
@@ -372,12 +372,13 @@ def judge_torque(
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     """q, dq, ddq, tau (m, n) of `validation.smooth`, without what its filter makes of a pause."""
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
-    steps = np.diff(stamps_s)
-    pauses = np.flatnonzero(steps > CUT_S)
-    stamps_s[1:] -= np.cumsum(np.maximum(steps - PAUSE_S, 0.0))  # a clock that steps on by hours
+    behind = pauses(stamps_s)
+    stamps_s[1:] -= np.cumsum(
+        np.maximum(np.diff(stamps_s) - PAUSE_S, 0.0)
+    )  # a clock that steps on by hours
     signals = smooth(stamps_s, log.q, log.dq, log.tau)
     t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)
-    for k in pauses:
+    for k in behind:
         clear &= (t < stamps_s[k] - GRID_S * EDGE) | (t > stamps_s[k + 1] + GRID_S * EDGE)
     q, dq, ddq, tau = (x[clear] for x in signals)
     return q, dq, ddq, tau

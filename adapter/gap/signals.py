@@ -69,6 +69,13 @@ HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
 
 
+def pauses(t: Array) -> NDArray[np.int64]:
+    """Rows of t (m,), s, behind which a recording pauses."""
+    steps_s = np.diff(t)
+    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    return np.flatnonzero(steps_s > max(CUT_S, CUT_PERIODS * usual_s))
+
+
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat, shape = x.reshape(len(x), -1), x.shape[1:]
@@ -368,8 +375,7 @@ class Recorded:
 
         Nobody knows how the arm moved in a pause: no spline, filter or memory reaches over one.
         """
-        step_s = float(np.median(np.diff(self.t))) if len(self.t) > 1 else 0.0
-        cuts = np.flatnonzero(np.diff(self.t) > max(CUT_S, CUT_PERIODS * step_s)) + 1
+        cuts = pauses(self.t) + 1
         if not len(cuts):
             return replace(self, begins=(0,))
         edges = pairwise((0, *cuts.tolist(), len(self.t)))

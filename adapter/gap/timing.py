@@ -202,7 +202,8 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
     m = len(stamp_ns)
     increasing = _increasing(stamp_ns)
     finite = increasing[_finite(q, dq, tau)[increasing]]
-    keep = uniform(stamp_ns, q, dq, tau)
+    sound = finite[possible(q[finite], dq[finite], tau[finite])]
+    keep = _new(sound, q, dq, tau)
     steps_s = 1e-9 * np.diff(stamp_ns[increasing])
     period_s = float(np.median(steps_s)) if len(steps_s) else 0.0
     since_s = 1e-9 * (stamp_ns - stamp_ns[increasing[0]]) if m else np.zeros(0)
@@ -225,7 +226,7 @@ def check_timing(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> RecordingC
         held={name: float((x & fresh).sum() / max(fresh.sum(), 1)) for name, x in same.items()},
         out_of_order=m - len(increasing),
         not_finite=int((~_finite(q, dq, tau)).sum()),
-        impossible=int((~possible(q[finite], dq[finite], tau[finite])).sum()),
+        impossible=len(finite) - len(sound),
         lateness_s=late_s,
         lateness_std_s=std_s,
         velocity_gain=gain,
@@ -240,7 +241,11 @@ def uniform(stamp_ns: Index, q: Array, dq: Array, tau: Array) -> Index:
     """
     rows = _increasing(stamp_ns)
     rows = rows[_finite(q, dq, tau)[rows]]
-    rows = rows[possible(q[rows], dq[rows], tau[rows])]
+    return _new(rows[possible(q[rows], dq[rows], tau[rows])], q, dq, tau)
+
+
+def _new(rows: Index, q: Array, dq: Array, tau: Array) -> Index:
+    """Those rows that do not repeat the one before."""
     again = _same(q[rows]) & _same(dq[rows]) & _same(tau[rows])
     return rows[np.concatenate([[True], ~again])[: len(rows)]]
 

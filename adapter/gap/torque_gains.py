@@ -29,14 +29,13 @@ from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import as_driven, fitting_way, load_in
-from adapter.gap.screen import cleaned, compared, moving_joints
+from adapter.gap.screen import cleaned, compared, moving_joints, smoothed_rows
 from adapter.gap.signals import RATE_HZ, Recorded, prepare
 from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching, present
-from adapter.signals.validation import smooth
 from drivers.files.mcap import AnyLog, Log, read_log
 
 DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a known mass
@@ -264,8 +263,7 @@ class _GainTask:
 
 
 def _shares(log: Log, model: SelfModel) -> TorqueShares:
-    t = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
-    return torque_shares(*compared(model, RigidArm.of(model), smooth(t, log.q, log.dq, log.tau)))
+    return torque_shares(*compared(model, RigidArm.of(model), smoothed_rows(log)))
 
 
 def _first_gains(shares: Sequence[TorqueShares]) -> Array:
