@@ -24,7 +24,6 @@ from adapter.gap.signals import (
     EDGE_S,
     KNOT_S,
     LEAST_S,
-    MOTION,
     RATE_HZ,
     TAPS,
     Recorded,
@@ -32,8 +31,10 @@ from adapter.gap.signals import (
     Smoothness,
     Splines,
     bands_of,
+    low,
     on_grid,
     smoothness_of,
+    together,
 )
 from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.model.spatial import Array
@@ -166,17 +167,13 @@ class LongRecording:
 
     def signals(self, spans: Sequence[Span], arm: ArmDynamics) -> Signals:
         """Some stretches of it, as the search sees a recording."""
-        motions, tau = [], []
-        for run, begin, end in self._samples(spans):
-            motion, torque = self._motion(run.rows(begin, end), run, arm)
-            motions.append(motion)
-            tau.append(torque)
         noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
-        bands = np.max([bands_of(motion, noise) for motion in motions], axis=0)
-        t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
-        begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
-        motion = Motion(t, q, dq, ddq, arm, bands_hz=bands)
-        return _banded(motion, np.concatenate(tau), noise, begins)
+        parts = []
+        for run, begin, end in self._samples(spans):
+            motion, tau = self._motion(run.rows(begin, end), run, arm)
+            motion = replace(motion, bands_hz=bands_of(motion, noise))
+            parts.append(_banded(motion, tau, noise))
+        return together(parts)
 
     def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
         """All of it, piece by piece; each begins so many samples before what is its own.
@@ -191,7 +188,7 @@ class LongRecording:
                 end = min(begin + size, last)
                 motion, tau = self._motion(run.rows(begin - before, end), run, like.motion.arm)
                 motion = replace(motion, bands_hz=like.motion.bands_hz)
-                yield _banded(motion, tau, like.noise, (0,))
+                yield _banded(motion, tau, like.noise)
 
     def recorded(self, spans: Sequence[Span], name: str) -> Recorded:
         """Samples of some stretches, as they were recorded."""
@@ -254,11 +251,10 @@ _RAW = ("t", "q", "dq", "tau")
 _COMMANDS = "command_t", "commands"
 
 
-def _banded(motion: Motion, tau: Array, noise: Array, begins: tuple[int, ...]) -> Signals:
-    own = Signals(motion, noise, np.empty((0, tau.shape[1])), np.empty(0), begins, TRIM)
-    half = TAPS // 2
-    t = [motion.t[rows][half:-half:DECIMATION][TRIM:-TRIM] for rows in own.stretches]
-    return replace(own, tau=own.low(tau), t=np.concatenate(t))
+def _banded(motion: Motion, tau: Array, noise: Array) -> Signals:
+    """A stretch in the band, trimmed."""
+    t = motion.t[TAPS // 2 : -(TAPS // 2) : DECIMATION][TRIM:-TRIM]
+    return Signals(motion, noise, low(tau)[TRIM:-TRIM], t, trim=TRIM)
 
 
 def is_long(log: AnyLog) -> bool:

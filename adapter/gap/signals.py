@@ -251,7 +251,7 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
         ValueError: less data than the filters need.
     """
     if len(recording.begins) > 1:
-        return _together([prepare(x, arm, repeat) for x in recording.stretches()])
+        return together([prepare(x, arm, repeat) for x in recording.stretches()])
     t = recording.t
     if t[-1] - t[0] < LEAST_S:
         raise ValueError(f"the search needs {LEAST_S:g} s of data, got {t[-1] - t[0]:.2f} s")
@@ -266,8 +266,8 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     return Signals(motion, noise, low(on_grid(grid, t, recording.tau)), band_t)
 
 
-def _together(parts: Sequence[Signals]) -> Signals:
-    """Stretches of one recording as one."""
+def together(parts: Sequence[Signals]) -> Signals:
+    """Stretches of one recording, of one trim, as one."""
     motions = [x.motion for x in parts]
     t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
     bands = np.max([x.motion.bands_hz for x in parts if x.motion.bands_hz is not None], axis=0)
@@ -275,7 +275,7 @@ def _together(parts: Sequence[Signals]) -> Signals:
     tau, band_t = (np.concatenate([getattr(x, k) for x in parts]) for k in ("tau", "t"))
     motion = Motion(t, q, dq, ddq, motions[0].arm, bands_hz=bands)
     noise = np.mean([x.noise for x in parts], axis=0)
-    return Signals(motion, noise, tau, band_t, begins)
+    return Signals(motion, noise, tau, band_t, begins, parts[0].trim)
 
 
 def bands_of(motion: Motion, noise: Array) -> Array:
