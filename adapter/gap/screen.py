@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
-from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.motor_currents import in_words as currents_in_words
+from adapter.gap.motor_currents import torque_shares
 from adapter.gap.signals import pauses
 from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
@@ -360,7 +360,10 @@ def judge_torque(
     if unit_known:
         convinced = convinced and best.kind != "scale"
     elif not (convinced and best.kind == "scale" and unit(best)):
-        refuse_currents(log, model, torque_shares(comparison, tau))
+        shares = torque_shares(comparison, tau)
+        if shares.are_currents:
+            said = currents_in_words(shares, model.tree.joint_names)
+            raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
     if not convinced:
         return
     raise RecordingRefused(
@@ -403,13 +406,6 @@ def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
         return
     _silent(log, model.tree.joint_names)
     judge_torque(log, model, RigidArm.of(model), smoothed, (), unit_known)
-
-
-def refuse_currents(log: Log, model: SelfModel, shares: TorqueShares) -> None:
-    """Refuse efforts that are motor currents. Raises Refusal."""
-    if shares.are_currents:
-        said = currents_in_words(shares, model.tree.joint_names)
-        raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
 
 
 def compared(
