@@ -19,7 +19,14 @@ from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import SHARES, real_arm
 from adapter.gap.sampled import Sampled, sampling_words
-from adapter.gap.screen import MOVES_DQ, cleaned, judge_torque, moving_joints, smoothed_rows
+from adapter.gap.screen import (
+    MOVES_DQ,
+    cleaned,
+    judge_torque,
+    moving_joints,
+    silent,
+    smoothed_rows,
+)
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.timing import lateness
 from adapter.gap.weighed import moments_of
@@ -124,8 +131,8 @@ def find_load(
     turn = fit.named[0].candidate.theta
     theta = fit.coefficients[at] @ turn
     covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
-    rests = _judged(taken[0].judged, model, theta)
-    notes += rests or _changed(fit)
+    moves, said = _judged(taken[0].judged, model)
+    notes += [*said, *_changed(fit)] if moves else said
     notes += sampling_words([x.recorded for x in taken])
     before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
     found = load_of(theta, covariance, riding)
@@ -151,16 +158,17 @@ def _taken(log: AnyLog, model: SelfModel) -> _Taken:
     return _Taken(Recorded.of(own, lateness(clock)).cut(), own, clock.period_s, said)
 
 
-def _judged(log: Log, model: SelfModel, theta: Array) -> list[str]:
-    """Refuse torques that even the loaded arm has in another unit, sign or order; notes on rest."""
+def _judged(log: Log, model: SelfModel) -> tuple[bool, list[str]]:
+    """Whether the arm moves, and notes. Refuses torques in another unit, sign or order.
+
+    Asked of the arm without what was just fitted: a load of 90 kg explains N cm.
+    """
     smoothed = smoothed_rows(log)
     if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
-        return ["the arm hardly moves: static friction in its joints counts as load"]
-    loaded = model.theta.copy()
-    loaded[-1] += theta
-    loaded_model = replace(model, theta=loaded)
-    judge_torque(log, loaded_model, RigidArm.of(loaded_model), smoothed)
-    return []
+        return False, ["the arm hardly moves: static friction in its joints counts as load"]
+    dead = silent(log, model.tree.joint_names)
+    judge_torque(log, model, RigidArm.of(model), smoothed)
+    return True, dead
 
 
 def _changed(fit: Fit) -> list[str]:

@@ -116,9 +116,9 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) 
     q, dq, ddq, tau = smoothed_rows(log)
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
-    silent = _silent(log, names)
+    dead = silent(log, names)
     judge_torque(log, model, arm, (q, dq, ddq, tau), recorded if renamed else (), unit_known)
-    return Screened(log, timing, moving, outside, standing(names, moving, q, dq), silent)
+    return Screened(log, timing, moving, outside, standing(names, moving, q, dq), dead)
 
 
 def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]:
@@ -313,7 +313,7 @@ def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -
     return notes
 
 
-def _silent(log: Log, names: Sequence[str]) -> list[str]:
+def silent(log: Log, names: Sequence[str]) -> list[str]:
     """A note on joints whose torque never changes. Raises Refusal where no torque does."""
     dead = [name for name, span in zip(names, np.ptp(log.tau, axis=0), strict=True) if span == 0]
     if len(dead) == len(names):
@@ -404,7 +404,7 @@ def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
     smoothed = smoothed_rows(log)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
         return
-    _silent(log, model.tree.joint_names)
+    silent(log, model.tree.joint_names)
     judge_torque(log, model, RigidArm.of(model), smoothed, (), unit_known)
 
 

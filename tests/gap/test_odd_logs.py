@@ -107,7 +107,9 @@ def test_every_door_refuses_the_same_with_the_same_sentence(kind: str, tmp_path,
         adapter.find_gap(log, panda_model())
     with pytest.raises(RecordingRefused) as of_learn:
         adapter.learn(log, panda_model(), every=50)
-    assert of_gap.value.kind == of_learn.value.kind == kind
+    with pytest.raises(RecordingRefused) as of_load:
+        find_load(log, panda_model())
+    assert of_gap.value.kind == of_learn.value.kind == of_load.value.kind == kind
     path = tmp_path / "wrong.mcap"
     with McapWriter(path, log.joint_names) as writer:
         for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
