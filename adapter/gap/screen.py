@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
+from adapter.gap.joint_readings import ROWS, Rows, Telling, explains_nothing, otherwise_told
 from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.motor_currents import torque_shares
 from adapter.gap.signals import pauses
@@ -55,6 +56,7 @@ class RecordingFault(StrEnum):
     GRAVITY = "gravity"
     MOUNTING = "mounting"
     ORDER = "order"
+    JOINT = "joint"
 
     @property
     def is_an_answer(self) -> bool:
@@ -347,6 +349,8 @@ def judge_torque(
         Refusal: see there.
     """
     comparison, tau = compared(model, arm, smoothed)
+    alive = np.ptp(log.tau, axis=0) > 0.0
+    tau = np.where(alive, tau, comparison.model)  # a dead torque says nothing of the others
     as_is, *others = readings(comparison, tau)
     best = others[0]
     if renamed and min(as_is.cost, best.cost) > FOREIGN_COST:
@@ -365,11 +369,42 @@ def judge_torque(
             said = currents_in_words(shares, model.tree.joint_names)
             raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
     if not convinced:
+        _check_joints(log, model, arm, smoothed, alive, unit_known)
         return
     raise RecordingRefused(
         RecordingFault(best.kind),
         f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}",
     )
+
+
+def _check_joints(
+    log: Log,
+    model: SelfModel,
+    arm: RigidArm,
+    smoothed: tuple[Array, Array, Array, Array],
+    alive: NDArray[np.bool_],
+    unit_known: bool,
+) -> None:
+    """Refuse joints told otherwise than the model has them, and torques of no such arm."""
+    q, dq, ddq, tau = (x[EDGE:-EDGE] for x in smoothed)
+    every = max(EVERY, len(q) // ROWS)
+    telling = Telling(model, arm, alive, GRID_S * len(q), unit_known)
+    rows = Rows(q[::every], dq[::every], ddq[::every], tau[::every])
+    said, share = otherwise_told(rows, telling)
+    if said:
+        raise RecordingRefused(
+            RecordingFault.JOINT,
+            f"{log.path}: {'; '.join(said)}; the model explains the torques then and not as "
+            "recorded.",
+        )
+    moving = [j for j in moving_joints(q, dq) if alive[j]]
+    if explains_nothing(share[moving]):
+        raise RecordingRefused(
+            RecordingFault.TORQUE,
+            f"{log.path}: the torques are not those of this motion of {model.name}: whatever its "
+            f"load, friction and inertias, the model explains {100 * np.median(share[moving]):.0f} "
+            "% of how they change; are they measured, of this arm and of the same instants?",
+        )
 
 
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:

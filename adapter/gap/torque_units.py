@@ -86,7 +86,7 @@ class TorqueComparison:
         self.sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(tau_model**2, axis=0))
         self._row = np.sqrt(EFFECTIVE / len(q)) / self.sigma
         self.friction = np.stack([np.ones_like(dq), smooth_sign(dq, ddq, SMOOTHING_S), dq])
-        inertial = arm.regressor(q, dq, ddq) * _inertial_std(arm).ravel()
+        inertial = arm.regressor(q, dq, ddq) * inertial_std(arm).ravel()
         joint = self._at_joints()
         rows = [(x * self._row[None, :, None]).reshape(-1, x.shape[2]) for x in (inertial, joint)]
         self._columns = np.concatenate(rows, axis=1)
@@ -147,7 +147,7 @@ def _ridge(columns: Array) -> tuple[Array, bool]:
     return cho_factor(columns.T @ columns + np.eye(columns.shape[1]))
 
 
-def _inertial_std(arm: RigidArm) -> Array:
+def inertial_std(arm: RigidArm) -> Array:
     """(n, 10) plausible errors of a model's inertias, a payload on the last link among them."""
     theta = arm.theta
     mass = np.abs(theta[:, :1])

@@ -1,0 +1,227 @@
+"""Whether a joint as a whole is told otherwise than the model has it.
+
+A joint that counts the other way, whose zero is elsewhere, that goes by another's name, or that is
+told against the world turns its position, velocity and torque at once: no reading of the torques
+alone mends that. Each such reading moves the model's own torques, and is judged by the likelihood
+of what it leaves: inertias, a payload, friction, offsets and gains have their priors, and each
+joint's noise is unknown, so that an arm that is not quite its model needs more evidence than one
+that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adapter.effects.by_joint import smooth_sign
+from adapter.gap.torque_units import (
+    FLOOR_NM,
+    FLOOR_SHARE,
+    FRICTION,
+    SEEN_NM,
+    SMOOTHING_S,
+    inertial_std,
+)
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+
+SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
+CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count
+ROUNDS = 6  # of noise after fit; it settles in three
+EVIDENCE = 25.0  # twice the log-likelihood that a reading must gain: odds of 1 to 270 000
+MOST = 3  # readings in one recording
+ROWS = 100  # instants that are judged
+ZEROS = np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0])
+BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it costs
+LEAST_FACTOR = 1.5  # of one joint's torque; gains and friction explain less
+NEAR = 2  # joints up to which an axis may be told against another (parallel links)
+EXPLAINED, BEST_EXPLAINED = 0.35, 0.6  # of the torques' variance: middle joint, and best one
+
+
+class Rows(NamedTuple):
+    """Instants of a recording: q, dq, ddq, tau (m, n); and twice the log of tau's scale.
+
+    A reading that divides torques makes its misfit smaller by that alone, which counts for nothing.
+    """
+
+    q: Array
+    dq: Array
+    ddq: Array
+    tau: Array
+    scaled: float = 0.0
+
+
+class Explained(NamedTuple):
+    """Twice the negative log-likelihood, and the share (n,) of the torques' variance explained."""
+
+    cost: float
+    share: Array
+
+
+@dataclass(frozen=True)
+class Telling:
+    """What is likely of the recordings of an arm.
+
+    Attributes:
+        model: of the arm; arm: its rigid body.
+        alive: (n,) joints whose torque is measured.
+        span_s: of the rows; so many samples of a misfit with memory are independent.
+        unit_known: somebody says that torques are in N m.
+    """
+
+    model: SelfModel
+    arm: RigidArm
+    alive: NDArray[np.bool_]
+    span_s: float
+    unit_known: bool = False
+
+    @property
+    def samples(self) -> float:
+        """Independent samples of a joint."""
+        return min(MOST_SAMPLES, self.span_s / CORRELATED_S)
+
+    def explained(self, rows: Rows) -> Explained:
+        """How well the model explains rows, after corrections of a plausible size."""
+        columns, model = self._columns(rows)
+        apart = rows.tau - model
+        m = len(apart)
+        size = np.sqrt(np.mean(model**2, axis=0))
+        floor, sigma = SENSOR_NM + SENSOR_SHARE * size, FLOOR_NM + FLOOR_SHARE * size
+        squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
+        products = np.einsum("mjk,mj->jk", columns, apart)
+        for _ in range(ROUNDS):
+            weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
+            normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
+            x = np.linalg.solve(normal, weight @ products)
+            left = np.mean((apart - columns @ x) ** 2, axis=0)
+            total = self.samples + SENSOR_WEIGHT
+            sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
+        noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
+        cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
+        share = 1.0 - left / np.maximum(rows.tau.var(axis=0), floor**2)
+        return Explained(cost + self._beyond(rows.q), share)
+
+    def torque(self, rows: Rows) -> Array:
+        """(m, n) N m of the model without corrections."""
+        return np.asarray(self.arm.torque(rows.q, rows.dq, rows.ddq))
+
+    def _columns(self, rows: Rows) -> tuple[Array, Array]:
+        """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
+        regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
+        model = regressor @ self.arm.theta.ravel()
+        m, n = model.shape
+        step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
+        joint = np.zeros((m, n, len(FRICTION), n))
+        for k, column in enumerate((np.ones_like(model), step, rows.dq, model)):
+            joint[:, range(n), k, range(n)] = FRICTION[k] * column
+        inertial = regressor * inertial_std(self.arm).ravel()
+        return np.concatenate([inertial, joint.reshape(m, n, -1)], axis=2), model
+
+    def _beyond(self, q: Array) -> float:
+        """What positions (m, n) outside the model's limits cost."""
+        low, high = self.model.limits.lower, self.model.limits.upper
+        over = (np.maximum(q - high, low - q) > BEYOND_RAD) & (high > low)
+        return BEYOND * float(over.mean(axis=0).sum())
+
+
+def _own(rows: Rows, names: Sequence[str], j: int) -> Iterator[tuple[str, Rows]]:
+    """Readings of joint j alone."""
+    (q, dq, ddq, tau, scaled), unit = rows, np.eye(len(names))[j]
+    turn = 1.0 - 2.0 * unit
+    yield (
+        f"{names[j]} counts the other way round: turn its position, velocity and torque",
+        Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled),
+    )
+    for zero in ZEROS:
+        way = "more" if zero > 0.0 else "less"
+        yield (
+            f"the zero of {names[j]} is elsewhere than the model's: its own angle is "
+            f"{abs(np.degrees(zero)):.0f} degrees {way} than what is recorded",
+            Rows(q + zero * unit, dq, ddq, tau, scaled),
+        )
+
+
+def _coupled(rows: Rows, names: Sequence[str], i: int, j: int) -> Iterator[tuple[str, Rows]]:
+    """Joint j told against what carries joint i: its own angle is the sum of both, or what is left.
+
+    Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or does not.
+    """
+    q, dq, ddq, tau, scaled = rows
+    for sign, word in ((-1.0, "less"), (1.0, "and")):
+        turn = np.eye(len(names))
+        turn[j, i] = sign
+        said = (
+            f"{names[j]} is told together with {names[i]} (coupled axes): its angle is what is "
+            f"recorded {word} that of {names[i]}; record each joint's own angle and torque"
+        )
+        own = Rows(q @ turn.T, dq @ turn.T, ddq @ turn.T, tau, scaled)
+        yield said, own
+        yield said, own._replace(tau=tau @ np.linalg.inv(turn))
+
+
+def _sizes(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
+    """Torques in a size of its own: of one joint, or in shares of what each joint may."""
+    names, rated = telling.model.tree.joint_names, telling.model.limits.effort
+    model = telling.torque(rows)
+    for j, name in enumerate(names):
+        size = float(model[:, j] @ model[:, j])
+        factor = float(rows.tau[:, j] @ model[:, j]) / size if size else 0.0
+        seen = telling.alive[j] and size > len(model) * SEEN_NM**2
+        if seen and abs(np.log(max(factor, 1e-9))) > np.log(LEAST_FACTOR):
+            said = f"the torque of {name} is {factor:.3g} times what the model needs: its unit"
+            yield said, _divided(rows, np.where(np.arange(len(names)) == j, factor, 1.0))
+    if np.all(np.isfinite(rated) & (rated > 0.0)):
+        for whole, word in ((1.0, "shares"), (100.0, "percent"), (1000.0, "per mille")):
+            said = f"the torques are {word} of each joint's rated torque: convert them to N m"
+            yield said, _divided(rows, whole / rated)
+
+
+def _divided(rows: Rows, factor: Array) -> Rows:
+    """Rows whose torques were recorded so many times (n,) too large."""
+    more = float(np.log(factor**2).sum())
+    return rows._replace(tau=rows.tau / factor, scaled=rows.scaled + more)
+
+
+def joint_readings(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
+    """Sentences on how the joints may be told, and the rows if it is so."""
+    names, (q, dq, ddq, tau, _) = telling.model.tree.joint_names, rows
+    for j in range(len(names)):
+        yield from _own(rows, names, j)
+    for i, j in combinations(range(len(names)), 2):
+        order = [j if k == i else i if k == j else k for k in range(len(names))]
+        said = f"{names[i]} and {names[j]} are swapped: give each its own name in the recording"
+        yield said, Rows(q[:, order], dq[:, order], ddq[:, order], tau[:, order], rows.scaled)
+        if j - i <= NEAR:
+            yield from _coupled(rows, names, i, j)
+    if not telling.unit_known:
+        yield from _sizes(rows, telling)
+
+
+def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Array]:
+    """How the joints are told, where the recording is clear on it.
+
+    Returns:
+        A sentence for each reading, at most `MOST`; and the share (n,) of each joint's torque that
+        the model explains with them.
+    """
+    now = telling.explained(rows)
+    said: list[str] = []
+    while len(said) < MOST:
+        trials = [(telling.explained(x), word, x) for word, x in joint_readings(rows, telling)]
+        best, word, changed = min(trials, key=lambda trial: trial[0].cost)
+        if best.cost > now.cost - EVIDENCE:
+            break
+        said.append(word)
+        now, rows = best, changed
+    return said, now.share
+
+
+def explains_nothing(share: Array) -> bool:
+    """Whether so small shares of the torques of moving joints are those of no arm of the model."""
+    return bool(share.size and np.median(share) < EXPLAINED and share.max() < BEST_EXPLAINED)
