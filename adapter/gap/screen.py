@@ -15,7 +15,7 @@ from adapter.gap.joint_readings import ROWS, Rows, Telling, explains_nothing, ot
 from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.motor_currents import torque_shares
 from adapter.gap.signals import pauses
-from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform
+from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform, unwrapped
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -138,7 +138,11 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
     recorded = log.joint_names
     log = of_this_robot(log, model)
     stamps, back = put_forward(log.stamp_ns)
-    log, signals = replace(log, stamp_ns=stamps), (log.q, log.dq, log.tau)
+    q, turned = unwrapped(log.q, model.limits.lower, model.limits.upper)
+    if turned.size:
+        names = ", ".join(model.tree.joint_names[j] for j in turned)
+        back.append(f"{names} is told within one turn: a step of a whole turn is taken for none.")
+    log, signals = replace(log, stamp_ns=stamps, q=q), (q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
     log = rows_of(log, uniform(log.stamp_ns, *signals))
     log, timing, said = at_source(log, timing)

@@ -19,6 +19,7 @@ AROUND = 5  # samples, of which the middle one tells where a reading should be
 # A reading further from it than so many usual ones, and than this share of its range, is no arm's.
 SPIKE_TIMES, SPIKE_SHARE = 15.0, 0.2
 PUT_BACK_S = 1.0  # of a pause where a clock was put back, which says nothing of how long it took
+WRAP_RAD = 0.5  # between two samples; a step so near a whole turn is none
 HELD_NM = 0.3  # that the arm holds throughout, so that torques of zero are none
 FROZEN_DQ = 0.05  # rad/s; slower, an arm may well stand
 HELD_SHARE = 0.3  # of new samples in which a signal stays; more is a slower source
@@ -248,6 +249,25 @@ def _new(rows: Index, q: Array, dq: Array, tau: Array) -> Index:
     """Those rows that do not repeat the one before."""
     again = _same(q[rows]) & _same(dq[rows]) & _same(tau[rows])
     return rows[np.concatenate([[True], ~again])[: len(rows)]]
+
+
+def unwrapped(q: Array, lower: Array, upper: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Positions (m, n) of joints that were told within one turn, going on; and which joints.
+
+    Args:
+        lower, upper: (n,) rad, limits; of all turns that one is taken which lies nearest to them.
+    """
+    step = np.nan_to_num(np.diff(q, axis=0))
+    turns = np.where(np.abs(np.abs(step) - 2.0 * np.pi) < WRAP_RAD, np.sign(step), 0.0)
+    joints = np.flatnonzero(turns.any(axis=0))
+    if not joints.size:
+        return q, joints
+    q = q.copy()
+    q[1:] -= 2.0 * np.pi * np.cumsum(turns, axis=0)
+    middle = np.nan_to_num(0.5 * (lower + upper))[joints]
+    away = np.round((np.nanmedian(q[:, joints], axis=0) - middle) / (2.0 * np.pi))
+    q[:, joints] -= 2.0 * np.pi * away
+    return q, joints
 
 
 def put_forward(stamp_ns: Index) -> tuple[Index, list[str]]:

@@ -78,8 +78,8 @@ def matching(log: StoredLog, documented: SelfModel) -> StoredLog: ...
 def matching(log: AnyLog, documented: SelfModel) -> AnyLog:
     """The recording with the robot's joints in the robot's order, and its links' motion.
 
-    Names that differ in nothing but what stands before their number (fer_joint3 for
-    panda_joint3) are taken to mean the same joint, with a warning.
+    Names that differ in nothing but a namespace (left/panda_joint3), or in what stands before
+    their number (fer_joint3 for panda_joint3), are taken to mean the same joint, with a warning.
 
     Raises:
         DriverError: a joint of the robot is not in the recording; names both lists.
@@ -115,7 +115,15 @@ def corresponding(
     want: tuple[str, ...], have: tuple[str, ...], what: str
 ) -> tuple[list[str | None], list[str]]:
     """For each wanted name the one in `have` (None: not there), and warnings."""
-    if all(name in have for name in want) or len(have) != len(want):
+    if all(name in have for name in want):
+        return list(want), []
+    spaced = [
+        [x for x in have if x.endswith(name) and not x[-len(name) - 1].isalnum()] for name in want
+    ]
+    if all(len(x) == 1 for x in spaced):  # of a namespace, beside joints of other things
+        said = f"{what} names are taken without what stands before them: "
+        return [x[0] for x in spaced], [said + ", ".join(x[0] for x in spaced)]
+    if len(have) != len(want):
         return [name if name in have else None for name in want], []
     number = {_number(name): name for name in have}
     found = [number.get(_number(name)) for name in want]
