@@ -111,6 +111,11 @@ class Telling:
         """(m, n) N m of the model without corrections."""
         return np.asarray(self.arm.torque(rows.q, rows.dq, rows.ddq))
 
+    def apart(self, rows: Rows) -> float:
+        """How far the model without corrections is from rows; a true reading brings it nearer."""
+        apart = np.mean((rows.tau - self.torque(rows)) ** 2, axis=0)[self.alive]
+        return float(np.log(apart + SENSOR_NM**2).sum()) + rows.scaled
+
     def _columns(self, rows: Rows) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
@@ -213,8 +218,10 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Array]:
     now = telling.explained(rows)
     said: list[str] = []
     while len(said) < MOST:
-        trials = [(telling.explained(x), word, x) for word, x in joint_readings(rows, telling)]
-        best, word, changed = min(trials, key=lambda trial: trial[0].cost)
+        far = telling.apart(rows)
+        nearer = [x for x in joint_readings(rows, telling) if telling.apart(x[1]) < far]
+        trials = [(telling.explained(x), word, x) for word, x in nearer]
+        best, word, changed = min(trials, key=lambda trial: trial[0].cost, default=(now, "", rows))
         if best.cost > now.cost - EVIDENCE:
             break
         said.append(word)
