@@ -395,12 +395,6 @@ def _check_joints(
     telling = Telling(model, arm, alive, GRID_S * len(q), unit_known)
     rows = Rows(q[::every], dq[::every], ddq[::every], tau[::every])
     said, share = otherwise_told(rows, telling)
-    if said:
-        raise RecordingRefused(
-            RecordingFault.JOINT,
-            f"{log.path}: {'; '.join(said)}; the model explains the torques then and not as "
-            "recorded.",
-        )
     moving = [j for j in moving_joints(q, dq) if alive[j]]
     if explains_nothing(share[moving]):
         raise RecordingRefused(
@@ -408,6 +402,12 @@ def _check_joints(
             f"{log.path}: the torques are not those of this motion of {model.name}: whatever its "
             f"load, friction and inertias, the model explains {100 * np.median(share[moving]):.0f} "
             "% of how they change; are they measured, of this arm and of the same instants?",
+        )
+    if said:
+        raise RecordingRefused(
+            RecordingFault.JOINT,
+            f"{log.path}: {'; '.join(said)}; the model explains the torques then and not as "
+            "recorded.",
         )
 
 

@@ -100,6 +100,63 @@ WRONG = {
 }
 
 
+def turned(joint: int) -> Log:
+    way = 1.0 - 2.0 * np.eye(7)[joint]
+    return replace(base(), q=base().q * way, dq=base().dq * way, tau=base().tau * way)
+
+
+def swapped(a: int, b: int) -> Log:
+    order = [b if k == a else a if k == b else k for k in range(7)]
+    log = base()
+    return replace(log, q=log.q[:, order], dq=log.dq[:, order], tau=log.tau[:, order])
+
+
+def against_the_world(joint: int, carrier: int) -> Log:
+    """A joint told together with another that turns what carries it."""
+    told = np.eye(7)
+    told[joint, carrier] = 1.0
+    return replace(base(), q=base().q @ told.T, dq=base().dq @ told.T)
+
+
+AS_A_WHOLE = {
+    "panda_joint3 counts the other way": lambda: turned(2),
+    "zero of panda_joint4 is elsewhere": lambda: replace(base(), q=base().q + np.eye(7)[3] * 1.571),
+    "panda_joint1 and panda_joint3 are swapped": lambda: swapped(0, 2),
+    "panda_joint4 is told together with panda_joint2": lambda: against_the_world(3, 1),
+    "percent of each joint's rated": lambda: replace(
+        base(), tau=100.0 * base().tau / panda_model().limits.effort
+    ),
+    "not those of this motion": lambda: replace(base(), tau=base().tau[::-1]),
+    "torques are not those": lambda: replace(
+        base(), tau=5.0 * np.random.default_rng(0).standard_normal(base().tau.shape)
+    ),
+}
+
+
+@pytest.mark.parametrize("said", AS_A_WHOLE)
+def test_a_joint_that_is_told_otherwise_is_named(said: str) -> None:
+    with pytest.raises(RecordingRefused, match=said):
+        find_load(AS_A_WHOLE[said](), panda_model())
+
+
+def test_a_joint_told_within_one_turn_goes_on() -> None:
+    off = np.eye(7)[6] * (np.pi - float(np.median(base().q[:, 6])))
+    told = (base().q + off + np.pi) % (2.0 * np.pi) - np.pi - off
+    assert np.abs(np.diff(told, axis=0)).max() > 6.0
+    found = find_load(replace(base(), q=told), panda_model())
+    assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 0.3
+    assert any("panda_joint7 is told within one turn" in note for note in found.notes)
+
+
+def test_a_namespace_and_joints_of_a_gripper_are_no_other_robot() -> None:
+    log, n = base(), len(base())
+    named = ("left/finger1", *(f"left/{name}" for name in log.joint_names))
+    wide = [np.column_stack([np.zeros(n), x]) for x in (log.q, log.dq, log.tau)]
+    log = replace(log, joint_names=named, q=wide[0], dq=wide[1], tau=wide[2])
+    found = find_load(log, panda_model())
+    assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 0.3
+
+
 @pytest.mark.parametrize("kind", WRONG)
 def test_every_door_refuses_the_same_with_the_same_sentence(kind: str, tmp_path, capsys) -> None:
     log = replace(base(), tau=WRONG[kind](base().tau))
