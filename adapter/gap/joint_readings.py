@@ -159,7 +159,7 @@ def _coupled(rows: Rows, names: Sequence[str], i: int, j: int) -> Iterator[tuple
     Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or does not.
     """
     q, dq, ddq, tau, scaled = rows
-    for sign, word in ((-1.0, "less"), (1.0, "and")):
+    for sign, word in ((-1.0, "minus"), (1.0, "plus")):
         turn = np.eye(len(names))
         turn[j, i] = sign
         said = (
