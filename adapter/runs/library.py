@@ -311,9 +311,9 @@ def inverse_dynamics(
 ) -> Array:
     """Joint torque (n,) or (m, n) N m of a fixed-base model, tool included (eqs. 11 to 16).
 
-    Each row is an instant by itself, whatever stands beside it: torque sensors have settled, and
-    bristles are bent the way the joint moves. With stamps the rows are one motion, and the
-    model's effects know what came before: late sensors, elastic gears, play, bristles, drift.
+    Each row is an instant by itself: torque sensors have settled, bristles are bent the way the
+    joint moves. With stamps the rows are one motion, and effects know what came before (late
+    sensors, elastic gears, play, bristles, drift); rates less well within 50 ms of either end.
 
     Args:
         model: whose λ, θ, tool and gravity are used.
