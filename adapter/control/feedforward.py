@@ -71,7 +71,7 @@ class ModelFeedforward:
     What a model's effects do to a motion is computed from one instant: the links follow the
     encoders without the rates of a gear's twist, a gear with play leans on the flank that pushes
     it, and what needs time (a late sensor, friction that drifts) is left out. `torque.ModelTorque`
-    does all of it over tables. Bristles wind up along the motions asked for, one after the other.
+    does all of it over stamps. Bristles wind up along the motions asked for, one after the other.
 
     Args:
         tree: N and A.

@@ -64,16 +64,17 @@ class Backlash(MotionEffect):
     def link_side(self, motion: Motion, tau: Array, joint: int, values: Values) -> Motion:
         """The play operator driven by q: the link is pushed by one flank, then by the other.
 
-        Before the first instant the motor pushed the way it moves first. The motor runs through
-        the play at once and the link does not: what a crossing makes of the motor's measured
-        acceleration is no torque. A reversal that was smoothed looks as if it came earlier.
+        Before the first instant the motor pushed the way it moves first, at rows apart the way it
+        moves. The motor runs through the play at once and the link does not: what a crossing makes
+        of the motor's measured acceleration is no torque. A reversal that was smoothed looks as if
+        it came earlier.
         """
-        half = 0.5 * float(values["b"])
+        half, dq = 0.5 * float(values["b"]), motion.dq[:, joint]
         angles = motion.q if motion.sharp_q is None else motion.sharp_q
         q = np.ascontiguousarray(angles[:, joint])
-        link = np.empty_like(q)
-        if len(q):
-            play(q, half, q[0] - half * _pushed(motion.dq[:, joint]), link)
+        link = q - half * smooth_sign(dq)
+        if not motion.apart:
+            play(q, half, q[0] - half * _pushed(dq), link)
         behind = motion.as_smooth(link - q)
         rate = motion.rate(behind)
         return motion.moved(joint, behind, rate, motion.rate(rate))

@@ -36,6 +36,7 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 FEWEST_TO_FILTER = 100  # instants
 SMOOTH_HZ = 10.0  # low-pass of motions whose torques are compared as they are
 RATE_DIGITS = 3  # of a rate in Hz, beyond which two are the same
+EVEN, PAUSE_STEPS = 1e-3, 10  # share of a step by which even ones differ; most that a pause is
 
 START_ODDS, RARE_START_ODDS = -2.0, -10.0
 BODY_STD = (1.0, *[0.1] * 3, *[0.03] * 6)  # of ten inertial parameters: kg, kg m, kg m2
@@ -104,7 +105,7 @@ class Motion:
     """How an arm moves over m instants.
 
     Attributes:
-        t: (m,) s since the recording began, increasing.
+        t: (m,) s since the recording began, increasing; all alike where rows are `apart`.
         q, dq, ddq: (m, n) rad, rad/s, rad/s².
         arm: the rigid body that moves.
         bands_hz: (n,) above which what the joints' torques hold is noise of the motion; None where
@@ -123,6 +124,11 @@ class Motion:
     bands_hz: Array | None = None
     smooth_hz: float | None = None
     sharp_q: Array | None = None
+
+    @property
+    def apart(self) -> bool:
+        """Whether each row is an instant by itself, of which nobody knows what came before."""
+        return len(self.t) < 2 or bool(self.t[0] == self.t[-1])
 
     @property
     def direction(self) -> Array:
@@ -152,15 +158,23 @@ class Motion:
         return x if self.smooth_hz is None else self._below(self.smooth_hz, x)
 
     def _below(self, band_hz: float, x: Array) -> Array:
-        fs = 1.0 / (self.t[1] - self.t[0]) if len(self.t) >= FEWEST_TO_FILTER else 0.0
-        if not band_hz < 0.5 * fs:
+        if self.apart or len(x) < FEWEST_TO_FILTER:
+            return x
+        steps = np.diff(self.t)
+        step = float(np.median(steps))
+        if not band_hz * step < 0.5:
             return x
         from scipy.signal import sosfiltfilt  # long to load; no loop needs it
 
-        return np.asarray(sosfiltfilt(_low_pass(band_hz, round(fs, RATE_DIGITS)), x, axis=0))
+        low_pass = _low_pass(band_hz, round(1.0 / step, RATE_DIGITS))
+        if np.ptp(steps) < EVEN * step:
+            return np.asarray(sosfiltfilt(low_pass, x, axis=0))
+        at = np.append(0.0, np.cumsum(np.minimum(steps, PAUSE_STEPS * step)))
+        even = np.arange(0.0, at[-1] + step, step)
+        return np.interp(at, even, sosfiltfilt(low_pass, np.interp(even, at, x)))
 
     def rate(self, x: Array) -> Array:
-        """Time derivative of x (m, ...); zero where there is but one instant."""
+        """Time derivative of x (m, ...); zero where rows are `apart`."""
         rate = _rate(np.ascontiguousarray(x, dtype=np.float64).reshape(len(x), -1), self.t)
         return np.asarray(rate.reshape(np.shape(x)))
 
@@ -185,7 +199,7 @@ def late_jit(function: Kernel) -> Kernel:
 def _rate(x: Array, t: Array) -> Array:
     """Slope of x (m, c) at each instant t (m,) of the parabola through it and its neighbours.
 
-    That of a line at both ends; zero where there is but one instant.
+    That of a line at both ends; zero where no stamp differs from the ones beside it.
     """
     rows, columns = x.shape
     out = np.zeros((rows, columns))

@@ -101,10 +101,11 @@ class BristleFriction(LearnedEffect, JointTorque):
         return shares_of_ways(shape)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """Fc z, all of the motion behind it and z zero before it; of one instant as if it slid."""
-        z, _ = bending(motion.q[:, joint], float(values["s0"]))
-        if len(z) == 1:
+        """Fc z, z zero before the motion; of rows apart as if each slid."""
+        if motion.apart:
             z = smooth_sign(motion.dq[:, joint])
+        else:
+            z, _ = bending(motion.q[:, joint], float(values["s0"]))
         return on_joint(motion, joint, float(values["Fc"]) * z)
 
     def bristles(self, values: Values) -> tuple[float, float]:

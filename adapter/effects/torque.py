@@ -23,6 +23,8 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 
+RATES_HZ = 2.0 * SMOOTH_HZ  # above it, rates of torques are taken as noise of the motion
+
 
 def sensed_torque(motion: Motion, effects: Sequence[Active]) -> Array:
     """tau (m, n) that the sensors would read, stage by stage (see `effects.base`)."""
@@ -117,30 +119,28 @@ class ModelTorque:
     Args:
         model: whose λ, θ, tool, gravity and effects are used.
         base: (m, 12) motion of its base, for tables of those m samples; None where it rests.
+        own_log: whether motions are of the recording that the model's intervals are of: each
+            effect acts in its own. Else those act that have no end, all the time.
     """
 
-    def __init__(self, model: SelfModel, base: Array | None = None) -> None:
+    def __init__(self, model: SelfModel, base: Array | None = None, own_log: bool = False) -> None:
         arm = RigidArm.of(model)
         self._arm = arm if base is None else arm.moving(base)
-        self._effects = active_effects(model.effects, model.tree.n)
-        self._lasting = lasting_effects(model.effects, model.tree.n)
+        acting = active_effects if own_log else lasting_effects
+        self._effects = acting(model.effects, model.tree.n)
 
     def __call__(
-        self,
-        q: Array,
-        dq: Array,
-        ddq: Array,
-        t: Array | None = None,
-        sharp_q: Array | None = None,
+        self, q: Array, dq: Array, ddq: Array, t: Array | None = None, sharp_q: Array | None = None
     ) -> Array:
         """tau (m, n), N m, for q, dq, ddq (m, n) rad, rad/s, rad/s².
 
-        `t` (m,), s since the recording began, decides which effects act. Without it those act
-        that have no end, and rows are taken 1 ms apart where an effect needs rates. Where a joint
-        jumps, the motion is taken as smooth as the recipe of `signals.validation` makes it;
-        `sharp_q` (m, n), rad, are angles that were smoothed less, if at all.
+        With `t` (m,), s since the recording began, increasing, the rows are one motion: sensors
+        lag, gears twist, bristles wind up as it goes on. Without it each row is an instant by
+        itself: sensors have settled, bristles are bent the way the joint moves, nothing drifts.
+        Where a joint jumps, the motion is taken as smooth as the recipe of `signals.validation`
+        makes it; `sharp_q` (m, n), rad, are angles that were smoothed less, if at all.
         """
-        effects = self._lasting if t is None else self._effects
-        stamps = 1e-3 * np.arange(len(q), dtype=np.float64) if t is None else t
-        motion = Motion(stamps, q, dq, ddq, self._arm, smooth_hz=SMOOTH_HZ, sharp_q=sharp_q)
-        return sensed_torque(motion, effects)
+        t = np.zeros(len(q)) if t is None else t
+        bands = np.full(q.shape[1], RATES_HZ)
+        motion = Motion(t, q, dq, ddq, self._arm, bands, SMOOTH_HZ, sharp_q)
+        return sensed_torque(motion, self._effects)

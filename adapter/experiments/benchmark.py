@@ -77,7 +77,7 @@ def motion(robot: SelfModel, samples: int) -> tuple[Array, Array, Array, Array]:
     middle = 0.5 * (robot.limits.lower + robot.limits.upper)
     q, dq = middle + 0.3 * np.sin(w * t), 0.3 * w * np.cos(w * t)
     ddq = -0.3 * w**2 * np.sin(w * t)
-    return q, dq, ddq, ModelTorque(robot)(q, dq, ddq)
+    return q, dq, ddq, ModelTorque(robot)(q, dq, ddq, t[:, 0])
 
 
 def benchmark(repeats: int) -> list[dict[str, Any]]:

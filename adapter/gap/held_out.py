@@ -80,13 +80,13 @@ def torque_errors(
     q, dq, ddq, tau = smooth(recording.t, recording.q, recording.dq, recording.tau)
     t = recording.t[0] + 1e-3 * np.arange(len(q))
     sharp, _, _ = recording.smoothed().at(t)
-    old = tau - ModelTorque(before)(q, dq, ddq, t, sharp)
+    old = tau - ModelTorque(before, own_log=True)(q, dq, ddq, t, sharp)
     fold = fold_of(t, block) % len(after)
     new = np.empty_like(old)
     for f, model in enumerate(after):
         rows = fold == f
         if rows.any():
-            new[rows] = (tau - ModelTorque(model)(q, dq, ddq, t, sharp))[rows]
+            new[rows] = (tau - ModelTorque(model, own_log=True)(q, dq, ddq, t, sharp))[rows]
     edge = round(RECIPE_EDGE_S / 1e-3)
     return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])
 

@@ -456,9 +456,8 @@ def compared(
         smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
     """
     every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
-    t = GRID_S * np.arange(0.0, len(smoothed[0]))[EDGE:-EDGE:every]
     q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
-    return TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq, t)), tau
+    return TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq)), tau
 
 
 def _angle(a: Array, b: Array) -> float:

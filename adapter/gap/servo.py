@@ -44,7 +44,6 @@ BLOCK_S, FITTED_SHARE = (
 )  # of alternating blocks; of a recording, without held-out ones
 DRAWS = 8  # of inertias as wrong as the documentation may be
 OPEN_SHARE = 0.3  # standard deviation of a position gain, of its size, from which on it is open
-SEEN_RAD = 1e-9  # of tracking error: a recording whose two columns are the same
 NOISE_SHARE = 3.0  # of the encoders' noise: a tracking error within it is none
 SHORTEST_S = 5.0
 

@@ -81,7 +81,8 @@ def torque_fall(data: RunData) -> Fall | None:
     after, seen = rms_of([error[rows]]), "predicted before it was learned from"
     if data.documented.tree.floating:  # the base's motion is not kept for the page
         return Fall(None, after.value, None, after.std, size, seen)
-    first = rms_of([(tau - ModelTorque(data.documented)(q, dq, ddq))[rows]])
+    documented = ModelTorque(data.documented)(q, dq, ddq, data.times(data.score_trace))
+    first = rms_of([(tau - documented)[rows]])
     return Fall(first.value, after.value, first.std, after.std, size, seen)
 
 

@@ -203,22 +203,22 @@ def _listed(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def _motion(model: SelfModel, seed: int) -> tuple[Array, Array, Array]:
-    """q, dq, ddq (m, n) of smooth random motion inside the limits, 1 ms apart."""
+def _motion(model: SelfModel, seed: int) -> tuple[Array, Array, Array, Array]:
+    """q, dq, ddq (m, n) and t (m,) of smooth random motion inside the limits."""
     rng = np.random.default_rng(seed)
     limits, n = model.limits, model.tree.n
     bounded = limits.upper > limits.lower  # False where unknown
     middle = np.where(bounded, 0.5 * (limits.upper + limits.lower), 0.0)
     reach = np.where(bounded, SHARE * (limits.upper - limits.lower), FREE_RAD)
     speed = np.where(limits.velocity > 0.0, SHARE * limits.velocity, FREE_RAD_S)
-    t = STEP_S * np.arange(round(MOTION_S / STEP_S))
+    t: Array = STEP_S * np.arange(round(MOTION_S / STEP_S), dtype=np.float64)
     w = 2.0 * np.pi * rng.uniform(*BAND_HZ, (SINES, 1, n))
     angle = w * t[:, None] + rng.uniform(0.0, 2.0 * np.pi, (SINES, 1, n))
     size = rng.uniform(0.3, 1.0, (SINES, 1, n)) / w
     tables = (size * np.sin(angle), size * w * np.cos(angle), -size * w**2 * np.sin(angle))
     q, dq, ddq = (x.sum(axis=0) for x in tables)
     share = np.minimum(reach / np.abs(q).max(axis=0), speed / np.abs(dq).max(axis=0))
-    return middle + share * q, share * dq, share * ddq
+    return middle + share * q, share * dq, share * ddq, t
 
 
 def _hand(model: SelfModel, q: Array) -> Array:

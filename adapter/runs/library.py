@@ -33,6 +33,7 @@ from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
 from adapter.signals.matching import matching, most_moved, present
+from adapter.signals.records import stamps_of
 from drivers.files.html_table import html_table, plus_minus
 from drivers.files.mcap import AnyLog, Log, open_log
 from drivers.files.mcap import read_log as read_mcap
@@ -272,7 +273,7 @@ class Learner:
         return self._pipeline.step(JointSample(round(1e9 * time_s), q, dq, tau, motion))
 
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Array:
-        """Torque (n,) or (m, n) N m by what is learned so far, effects included.
+        """Torque (n,) or (m, n) N m by what is learned so far, as `inverse_dynamics` of instants.
 
         Args:
             q, dq, ddq: (n,) or (m, n) rad, rad/s, rad/s².
@@ -300,17 +301,29 @@ class Learner:
 
 
 def inverse_dynamics(
-    model: SelfModel, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, *, effects: bool = True
+    model: SelfModel,
+    q: ArrayLike,
+    dq: ArrayLike,
+    ddq: ArrayLike,
+    *,
+    effects: bool = True,
+    time_s: ArrayLike | None = None,
 ) -> Array:
     """Joint torque (n,) or (m, n) N m of a fixed-base model, tool included (eqs. 11 to 16).
+
+    Each row is an instant by itself: torque sensors have settled, bristles are bent the way the
+    joint moves. With stamps the rows are one motion, and effects know what came before (late
+    sensors, elastic gears, play, bristles, drift); rates less well within 50 ms of either end.
 
     Args:
         model: whose λ, θ, tool and gravity are used.
         q, dq, ddq: (n,) or (m, n) rad, rad/s, rad/s².
         effects: with the model's friction and other effects; False for the rigid body alone.
+        time_s: (m,) s since the recording began, increasing, as in what `filtered` returns.
 
     Raises:
         ModelError: the model's base floats.
+        SettingsError: stamps of another number than rows, or that do not increase.
 
     >>> import adapter, numpy as np
     >>> panda = adapter.load_model("panda")
@@ -319,8 +332,8 @@ def inverse_dynamics(
     True
     """
     tables = _joint_tables(model, q, dq, ddq)
-    torque = ModelTorque(model) if effects else RigidArm.of(model).torque
-    tau = torque(*tables)
+    stamps = () if time_s is None else (_stamps(time_s, len(tables[0])),)
+    tau = ModelTorque(model)(*tables, *stamps) if effects else RigidArm.of(model).torque(*tables)
     return tau[0] if np.ndim(q) == 1 else tau
 
 
@@ -386,8 +399,7 @@ def filtered(log: Log | str | Path, model: SelfModel | str | Path = "panda") -> 
     front_end = make_front_end(arm, PipelineSettings(filter=filter_settings))
     states = front_end.step_table(own.stamp_ns, own.q, own.dq, own.tau)
     at = front_end.layout
-    stamps = np.ascontiguousarray(states[:, 0]).view(np.int64)
-    since = 1e-9 * (stamps - own.stamp_ns[0]) if len(own) else np.zeros(0)
+    since = 1e-9 * (stamps_of(states) - own.stamp_ns[0]) if len(own) else np.zeros(0)
     return FilteredSignals(since, *(states[:, part] for part in (at.q, at.dq, at.ddq, at.tau)))
 
 
@@ -507,3 +519,15 @@ def _joint_tables(model: SelfModel, *signals: ArrayLike) -> tuple[Array, ...]:
         shapes = ", ".join(str(np.shape(x)) for x in signals)
         raise ModelError(f"q, dq, ddq need {model.tree.n} columns and as many rows; got {shapes}")
     return tables
+
+
+def _stamps(time_s: ArrayLike, rows: int) -> Array:
+    """Stamps (m,) of rows that are one motion."""
+    t = np.atleast_1d(np.asarray(time_s, float))
+    wanted = f"time_s needs rising stamps of {rows} rows (without it, rows are instants)"
+    if t.shape != (rows,):
+        raise SettingsError(f"{wanted}; got shape {t.shape}")
+    wrong = np.flatnonzero(~(np.isfinite(t) & (np.diff(t, prepend=-np.inf) > 0.0)))
+    if len(wrong):
+        raise SettingsError(f"{wanted}; row {wrong[0]} (from 0) has {t[wrong[0]]} s")
+    return t

@@ -24,6 +24,7 @@ from adapter.runs.outcome import Outcome, collect
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.signals.filters import noise_from_samples
 from adapter.signals.front_end import FrontEnd
+from adapter.signals.records import stamps_of
 from adapter.signals.settings import FilterSettings
 from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation_error
 from drivers.files.mcap import AnyLog, Log, StoredLog, stored
@@ -331,8 +332,8 @@ def held_out_rms(log: AnyLog, model: SelfModel, settings: PipelineSettings) -> R
     states = front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau, base=log.base)
     at = front_end.layout
     q, dq, ddq = (states[:, part] for part in (at.q, at.dq, at.ddq))
-    error = states[:, at.joint_tau] - ModelTorque(model, states[:, at.base])(q, dq, ddq)
-    return rms_of([error])
+    t: Array = 1e-9 * (stamps_of(states) - log.first_ns).astype(np.float64)
+    return rms_of([states[:, at.joint_tau] - ModelTorque(model, states[:, at.base])(q, dq, ddq, t)])
 
 
 def seconds(log: Log, since_ns: int | None = None) -> Array:

@@ -13,7 +13,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adapter.effects.by_joint import WAYS_RAD
 from adapter.model.spatial import Array
@@ -63,18 +62,3 @@ def wind(dt_s, q, dq, bristles, bent):
             edge[j], direction[j] = place[j], to
             for k in range(held.shape[0]):
                 held[k, j] = bent[k * n + j]
-
-
-@jit
-def wind_up(times, q, dq, bristles, bent):
-    """Take samples q, dq (m, n) at `times` (m,) s; fill bent (m, K n)."""
-    for i in range(q.shape[0]):
-        wind(times[i] - times[max(i - 1, 0)], q[i], dq[i], bristles, bent[i])
-
-
-def bent_along(times: NDArray[np.float64], q: Array, dq: Array) -> Array:
-    """(m, K, n) how far bristles are bent along a motion that begins with bristles at rest."""
-    n = q.shape[1]
-    bent = np.empty((len(q), len(WAYS_RAD) * n))
-    wind_up(times, np.ascontiguousarray(q), np.ascontiguousarray(dq), Bristles.unknown(n), bent)
-    return bent.reshape(len(q), -1, n)

@@ -19,16 +19,9 @@ EDGE_S = 0.3  # left out at either end, where the filter has no neighbours
 WINDOW_S, MARGIN_S = 60.0, 2.0
 BLOCKS = 10  # stretches of a table
 
-# (q, dq, ddq), each (m, n), to torque (m, n)
-TorqueModel = Callable[[Array, Array, Array], Array]
+# (q, dq, ddq), each (m, n), at stamps (m,) in s to torque (m, n)
+TorqueModel = Callable[[Array, Array, Array, Array], Array]
 Signals = tuple[Array, Array, Array, Array]
-
-
-def validation_torque_rmse(
-    stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel
-) -> Array:
-    """Torque RMSE (n,) of a model on a recording, N m; see `validation_error`."""
-    return np.sqrt(np.mean(validation_error(stamp_s, q, dq, tau, torque) ** 2, axis=0))
 
 
 def validation_error(stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel) -> Array:
@@ -47,7 +40,8 @@ def validation_error(stamp_s: Array, q: Array, dq: Array, tau: Array, torque: To
     """
     q, dq, ddq, tau = smooth(stamp_s, q, dq, tau)
     edge = round(EDGE_S / GRID_S)
-    return np.asarray((tau - torque(q, dq, ddq))[edge:-edge])
+    t = GRID_S * np.arange(len(q), dtype=np.float64)
+    return np.asarray((tau - torque(q, dq, ddq, t))[edge:-edge])
 
 
 def errors_of_pieces(pieces: Iterable[Signals], torque: TorqueModel) -> Iterator[Array]:
@@ -59,8 +53,11 @@ def errors_of_pieces(pieces: Iterable[Signals], torque: TorqueModel) -> Iterator
     Raises:
         ValueError: less than a second of data.
     """
+    begin = round(EDGE_S / GRID_S)
     for q, dq, ddq, tau in _windows(pieces):
-        yield tau - torque(q, dq, ddq)
+        end = begin + len(q)
+        yield tau - torque(q, dq, ddq, GRID_S * np.arange(begin, end, dtype=np.float64))
+        begin = end
 
 
 class Rms(NamedTuple):

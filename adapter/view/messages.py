@@ -25,7 +25,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.runs.terminal import json_ready
 from adapter.view.history import Recent, Whole
-from adapter.view.now import KnownRun, Now, Onlooker, Skeleton, skeleton
+from adapter.view.now import Now, Onlooker, Skeleton, skeleton
 
 DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
 ESTIMATE_S = 0.5
@@ -225,8 +225,3 @@ def reach(arm: SelfModel) -> float:
     """How far the arm reaches at most, m: for the scale of its picture."""
     lengths = np.linalg.norm(arm.lam[:, 3:], axis=1)
     return float(max(lengths.sum(), 1e-3))
-
-
-def messages_of(known: KnownRun) -> Messages:
-    """Of a run that is known."""
-    return Messages(Onlooker(known))

@@ -24,6 +24,7 @@ for name, values in found.effects.items():
 
 # The learned model works like any other.
 signals = adapter.filtered(arrays, panda)  # q, dq, ddq and tau of one instant per row
-predicted = adapter.inverse_dynamics(found.model, signals.q, signals.dq, signals.ddq)
+motion = signals.q, signals.dq, signals.ddq  # one motion by its stamps: bristles remember the way
+predicted = adapter.inverse_dynamics(found.model, *motion, time_s=signals.time_s)
 print("largest error anywhere, N m:", np.abs(signals.tau - predicted).max().round(2))
 print(adapter.export(found.model, "panda_learned.urdf"))

@@ -33,7 +33,7 @@ from adapter.runs.library import regressor
 from adapter.runs.outcome import completed_lambda, frame_errors, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, replay, seconds
-from adapter.signals.validation import EDGE_S, GRID_S, smooth, validation_torque_rmse
+from adapter.signals.validation import EDGE_S, GRID_S, rms_of, smooth, validation_error
 from drivers.files.mcap import Log
 from drivers.interface import Array, JointSample
 from drivers.pybullet_arm import PyBulletArm
@@ -183,7 +183,8 @@ def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]
     outcome, learner = done.outcome, done.pipeline.learner
     model = learned_model(outcome, robot)
     late = thin.take(seconds(thin) >= until_s)
-    error = validation_torque_rmse(seconds(late), late.q, late.dq, late.tau, ModelTorque(model))
+    signals = seconds(late), late.q, late.dq, late.tau
+    error = rms_of([validation_error(*signals, ModelTorque(model))]).value
     best = least_squares(thin, until_s, robot)
     theta = learner.theta
     excess = np.sqrt(theta.variance() / theta.variance(theta.least_squares()))

@@ -18,7 +18,7 @@ from adapter.gap.signals import COMMANDS, MEASURED, Recorded
 from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
-from adapter.signals.validation import validation_torque_rmse
+from adapter.signals.validation import rms_of, validation_error
 from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import read_log
 from sim.effects import Effect
@@ -104,7 +104,7 @@ def test_the_new_model_explains_more_and_the_old_one_stays(
     log = read_log(data / "two.mcap")
     signals = 1e-9 * log.stamp_ns, log.q, log.dq, log.tau
     old, new = (
-        validation_torque_rmse(*signals, ModelTorque(model))
+        rms_of([validation_error(*signals, ModelTorque(model))]).value
         for model in (documented(data / "arm.urdf"), load_model(figures["model_out"]))
     )
     assert new[3] < 0.2 * old[3] and (new < 1.05 * old).all()
@@ -185,7 +185,7 @@ def test_one_of_two_recordings_is_held_out(data: Path, tmp_path: Path) -> None:
     log = read_log(data / "one.mcap")
     signals = 1e-9 * log.stamp_ns, log.q, log.dq, log.tau
     model = ModelTorque(load_model(figures["model_out"]))
-    ours = validation_torque_rmse(*signals, model)
+    ours = rms_of([validation_error(*signals, model)]).value
     np.testing.assert_allclose(figures["after"]["torque_rmse_nm"], ours, rtol=1e-3)
 
 

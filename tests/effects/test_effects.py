@@ -391,13 +391,15 @@ def test_stages_work_on_each_other() -> None:
     assert relative(ours, theirs) < 1e-9
 
 
-def test_model_torque_without_time_takes_what_has_no_end() -> None:
+def test_model_torque_takes_what_has_no_end_but_in_its_own_recording() -> None:
     friction = {**entry("coulomb_friction", Fc=0.5), "interval_s": [2.0, None]}
     contact = {**entry("torque_offset", o=3.0), "interval_s": [1.0, 2.0]}
-    torque = ModelTorque(replace(MODEL, effects=(friction, contact)))
-    assert relative(torque(Q, DQ, DDQ), on_joint(0.5 * SIGN)) < 1e-9
+    model = replace(MODEL, effects=(friction, contact))
+    for stamps in ((), (T,)):
+        assert relative(ModelTorque(model)(Q, DQ, DDQ, *stamps), on_joint(0.5 * SIGN)) < 1e-9
     timed = 0.5 * SIGN * (T >= 2.0) + 3.0 * ((T >= 1.0) & (T < 2.0))
-    assert relative(torque(Q, DQ, DDQ, T), on_joint(timed)) < 1e-9
+    own = ModelTorque(model, own_log=True)
+    assert relative(own(Q, DQ, DDQ, T), on_joint(timed)) < 1e-9
 
 
 @pytest.mark.parametrize("name", CATALOGUE)

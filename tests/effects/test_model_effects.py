@@ -194,8 +194,9 @@ def plain() -> OnlineLearner:
 
 def held_out(learner: OnlineLearner, *effects: dict[str, object]) -> np.ndarray:
     """(n,) torque error of θ alone on another motion of an arm with effects, N m rms."""
-    q, dq, ddq = record(arm(), Motion(6.0, seed=104), noisy=False).true[:3]
-    tau = ModelTorque(with_effects(*effects))(q, dq, ddq)
+    data = record(arm(), Motion(6.0, seed=104), noisy=False)
+    q, dq, ddq = data.true[:3]
+    tau = ModelTorque(with_effects(*effects))(q, dq, ddq, 1e-9 * data.stamp_ns)
     theta = learner.theta.theta
     base = with_bodies(with_effects(*effects))  # gravity alone is taken of it
     return rms(tau - model_torque(base, learner.schema.lam, theta, q, dq, ddq))

@@ -25,7 +25,7 @@ from adapter.report.headline import Worth, headline
 from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import rotation_path
 from adapter.report.style import thin
-from adapter.report.worth import SLOW, slow_share
+from adapter.report.worth import SLOW, slow_share, torque_fall
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import Pipeline
@@ -225,6 +225,16 @@ def test_headline_says_what_changed_and_what_it_is_worth(data: RunData) -> None:
     for text, table in zip(found.groups(), (expected, error), strict=True):
         size = np.sqrt(np.mean(table[rows] ** 2, axis=0).sum())
         assert float(text) == pytest.approx(size, rel=0.05)
+
+
+def test_a_documented_low_pass_goes_by_the_stamps_of_the_rows(data: RunData) -> None:
+    """Rows of the score are 10 ms apart and more: taken as 1 ms, second rates are 100-fold."""
+    values = {"d": 0.0, "c": 1.5e-4}
+    lag = {"effect": "torque_filter", "joints": [], "parameters": values}
+    late = replace(data, documented=replace(data.documented, effects=(lag,)))
+    before, without = (torque_fall(x).before for x in (late, data))
+    assert (np.abs(before - without) > 1e-6).all()
+    assert (before < 1.2 * without + 0.02).all()
 
 
 def test_late_ticks_of_our_own_are_told_from_the_machine_s(data: RunData) -> None:

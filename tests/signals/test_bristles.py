@@ -4,7 +4,7 @@ import numpy as np
 
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import WAYS_RAD, shares_of_ways
-from adapter.signals.bristles import bent_along
+from adapter.signals.bristles import Bristles, wind
 
 T = 1e-3 * np.arange(6000)
 Q_NOISE, DQ_NOISE = 3e-4, 5e-3  # rad, rad/s, of a real Panda
@@ -16,6 +16,15 @@ def moved() -> tuple[np.ndarray, np.ndarray]:
     w = 2.0 * np.pi * np.array([0.5, 0.75])
     q = 0.3 * np.cos(w * t) + 1e-3 * np.sin(9.0 * w * t)
     return q, np.gradient(q, T, axis=0)
+
+
+def bent_along(t: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+    """(m, K, n) how far bristles are bent along a motion that begins with bristles at rest."""
+    m, n = q.shape
+    bristles, bent = Bristles.unknown(n), np.empty((m, len(WAYS_RAD) * n))
+    for i, dt_s in enumerate(np.diff(t, prepend=t[0])):
+        wind(dt_s, q[i], dq[i], bristles, bent[i])
+    return bent.reshape(m, -1, n)
 
 
 def expected(q: np.ndarray) -> np.ndarray:

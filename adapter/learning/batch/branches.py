@@ -9,9 +9,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-import numpy as np
-
-from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.tree import BASE, Tree
 
 _SIDES = {"l": "left", "left": "left", "r": "right", "right": "right"}
@@ -44,14 +41,6 @@ class Branch:
     joints: tuple[int, ...]
     tree: Tree
 
-    def data_of(self, data: TreeData) -> TreeData:
-        """The branch's part of samples of the whole tree."""
-        own = np.array(self.joints)
-        rows = own + 6 * int(data.tree.floating)
-        links = None if data.links is None else _links(data.links, own)
-        q, dq, ddq = (x[:, own] for x in (data.q, data.dq, data.ddq))
-        return TreeData(self.tree, q, dq, ddq, data.tau[:, rows], data.base, links)
-
 
 def branches(tree: Tree) -> tuple[Branch, ...]:
     """One branch for each child of the base, in the order of the tree."""
@@ -77,11 +66,6 @@ def _alone(tree: Tree, joints: tuple[int, ...]) -> Tree:
         tuple(tree.link_names[j] for j in joints),
         tree.base_name,
     )
-
-
-def _links(links: BodyMotion, own: np.ndarray) -> BodyMotion:
-    w, a, dw = (x[:, own] for x in (links.w, links.a, links.dw))
-    return BodyMotion(w, a, dw, None if links.v is None else links.v[:, own])
 
 
 def _name(tree: Tree, joints: tuple[int, ...]) -> str | None:
