@@ -14,7 +14,7 @@ from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
 from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds
-from adapter.gap.evidence import Carried, Moments, score
+from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
@@ -370,7 +370,7 @@ def disagreement(curves: Curves, noise_floor_nm: Array) -> tuple[dict[str, Any],
             {
                 "joint": j + 1,
                 "rmse_nm": rmse,
-                "times_noise": rmse / float(noise_floor_nm[j]),
+                "times_noise": rmse / max(float(noise_floor_nm[j]), LEAST_NM),
                 "follows": dict(sorted(shares.items(), key=lambda pair: -pair[1])),
             }
         )

@@ -197,8 +197,9 @@ class Model:
         return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
 
     def residual(self, recording: int) -> Array:
-        """(k, n) measured less predicted, N m."""
-        return self.recordings[recording].tau - self.predicted(recording)
+        """(k, n) measured less predicted, N m; zero where nothing was measured."""
+        own = self.recordings[recording]
+        return own.heard * (own.tau - self.predicted(recording))
 
     def residuals(self) -> list[Array]:
         """Of every recording."""
@@ -347,6 +348,13 @@ class Fit:
         return len(self.dtheta)
 
     @property
+    def heard(self) -> set[int]:
+        """Joints (from 0) whose torque is measured in some recording."""
+        return {
+            j for own in self.recordings for j in np.flatnonzero(own.heard.any(axis=0)).tolist()
+        }
+
+    @property
     def is_linear(self) -> bool:
         """Whether the predicted torque is linear in all coefficients (a delay of 1 ms is)."""
         return self.links_stay and not any(
@@ -424,7 +432,7 @@ class Fit:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
         for x, own in zip(white, self.recordings, strict=True):
-            if len(own.begins) > 1:
+            if not own.all_count:
                 x *= own.counted[ORDER:]
         if self.weights:
             for x, weight in zip(white, self.weights, strict=True):

@@ -19,7 +19,7 @@ from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
-from adapter.gap.signals import ROLLOUT_STEP_S, Recorded
+from adapter.gap.signals import COMMANDS, ROLLOUT_STEP_S, Recorded
 from adapter.gap.weighed import weighed
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -62,7 +62,10 @@ def held_out_models(
 
 @dataclass(frozen=True, eq=False)
 class ErrorsOverTime:
-    """Errors by the recipe of `adapter.signals.validation`, (m, n) N m, at t (m,) s."""
+    """Errors by the recipe of `adapter.signals.validation`, (m, n) N m, at t (m,) s.
+
+    NaN where the torque was not measured.
+    """
 
     t: Array
     before: Array
@@ -87,16 +90,20 @@ def torque_errors(
         rows = fold == f
         if rows.any():
             new[rows] = (tau - ModelTorque(model, own_log=True)(q, dq, ddq, t, sharp))[rows]
+    unheard = ~recording.heard_at(t)
+    old[unheard] = new[unheard] = np.nan
     edge = round(RECIPE_EDGE_S / 1e-3)
     return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])
 
 
 def rms(errors: Sequence[Array]) -> Array:
-    """(n,) root of the mean square over all rows of all tables; NaN where there is no row."""
+    """(n,) root of the mean square of all tables' rows (m, n), NaN left out; NaN where none is."""
     table = np.concatenate(list(errors))
-    if not len(table):
-        return np.full(table.shape[1], np.nan)
-    return np.sqrt(np.mean(np.square(table), axis=0))
+    told = np.isfinite(table)
+    square = np.where(told, table, 0.0) ** 2
+    return np.asarray(
+        np.sqrt(square.sum(axis=0) / np.where(told.any(axis=0), told.sum(axis=0), np.nan))
+    )
 
 
 class RolloutErrors(NamedTuple):
@@ -130,7 +137,12 @@ def rollout_errors(
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
-    segments = [s for s in _segments(len(t)) if recording.is_whole(t[s[0]], t[s[1] - 1])]
+    heard = np.logical_or(recording.heard_at(t).all(axis=1), drive == COMMANDS)
+    segments = [
+        (a, b)
+        for a, b in _segments(len(t))
+        if heard[a:b].all() and recording.is_whole(t[a], t[b - 1])
+    ]
     motion = DrivenMotion(t, q, dq, u)
     old_q, old_dq = _along(segments, [before], simulate, motion, drive, block)
     new_q, new_dq = _along(segments, after, simulate, motion, drive, block)
@@ -305,7 +317,8 @@ class _Scored:
     @property
     def cost(self) -> float:
         """Of all joints."""
-        return float(np.sum((self.after / self.level) ** 2))
+        heard = np.isfinite(self.after)
+        return float(np.sum((self.after[heard] / self.level[heard]) ** 2))
 
     @property
     def worse(self) -> NDArray[np.bool_]:

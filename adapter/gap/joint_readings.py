@@ -10,7 +10,7 @@ that is.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -43,6 +43,9 @@ LEAST_FACTOR = 1.5  # of one joint's torque; gains and friction explain less
 NEAR = 2  # joints up to which an axis may be told against another (parallel links)
 # Of the variance of torques: middle joint and best one. Real arms: 0.9 and 0.97 at least.
 EXPLAINED, BEST_EXPLAINED = 0.5, 0.85
+# Of torques that come late: steps in which it is sought and how many, ms; and from where on it is
+# no sensor's filter or bus, which `gap` names and weighs.
+LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 212, 0.04
 
 
 class Rows(NamedTuple):
@@ -59,10 +62,16 @@ class Rows(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """Twice the negative log-likelihood, and the share (n,) of the torques' variance explained."""
+    """How well rows are explained.
+
+    Attributes:
+        cost: twice the negative log-likelihood; share: (n,) of the torques' variance explained.
+        x: (10 n + 4 n,) corrections, in standard deviations.
+    """
 
     cost: float
     share: Array
+    x: Array
 
 
 @dataclass(frozen=True)
@@ -89,24 +98,32 @@ class Telling:
 
     def explained(self, rows: Rows) -> Explained:
         """How well the model explains rows, after corrections of a plausible size."""
+        return self.explaining(rows)(rows.tau)
+
+    def explaining(self, rows: Rows) -> Callable[[Array], Explained]:
+        """The same of any torques (m, n) of these instants."""
         columns, model = self._columns(rows)
-        apart = rows.tau - model
-        m = len(apart)
+        m, beyond = len(model), self._beyond(rows.q)
         size = np.sqrt(np.mean(model**2, axis=0))
-        floor, sigma = SENSOR_NM + SENSOR_SHARE * size, FLOOR_NM + FLOOR_SHARE * size
+        floor = SENSOR_NM + SENSOR_SHARE * size
         squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
-        products = np.einsum("mjk,mj->jk", columns, apart)
-        for _ in range(ROUNDS):
-            weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
-            normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
-            x = np.linalg.solve(normal, weight @ products)
-            left = np.mean((apart - columns @ x) ** 2, axis=0)
-            total = self.samples + SENSOR_WEIGHT
-            sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
-        noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
-        cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
-        share = 1.0 - left / np.maximum(rows.tau.var(axis=0), floor**2)
-        return Explained(cost + self._beyond(rows.q), share)
+
+        def of(tau: Array) -> Explained:
+            apart, sigma = tau - model, FLOOR_NM + FLOOR_SHARE * size
+            products = np.einsum("mjk,mj->jk", columns, apart)
+            for _ in range(ROUNDS):
+                weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
+                normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
+                x = np.linalg.solve(normal, weight @ products)
+                left = np.mean((apart - columns @ x) ** 2, axis=0)
+                total = self.samples + SENSOR_WEIGHT
+                sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
+            noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
+            cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
+            share = 1.0 - left / np.maximum(tau.var(axis=0), floor**2)
+            return Explained(cost + beyond, share, x)
+
+        return of
 
     def torque(self, rows: Rows) -> Array:
         """(m, n) N m of the model without corrections."""
@@ -192,6 +209,29 @@ def _divided(rows: Rows, factor: Array) -> Rows:
     """Rows whose torques were recorded so many times (n,) too large."""
     more = float(np.log(factor**2).sum())
     return rows._replace(tau=rows.tau / factor, scaled=rows.scaled + more)
+
+
+def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
+    """How much later than the motion torques come, s, where that is clear; 0 up to `LATE_S`.
+
+    Args:
+        signals: q, dq, ddq, tau (m, n), 1 ms apart.
+    """
+    q, dq, ddq, tau = signals
+    if len(q) < 2 * LATEST_MS + ROWS:
+        return 0.0
+    at = np.linspace(LATEST_MS, len(q) - 1 - LATEST_MS, ROWS).astype(int)
+
+    of = telling.explaining(Rows(q[at], dq[at], ddq[at], tau[at]))
+
+    def cost(late_ms: int) -> float:
+        return of(tau[at + late_ms]).cost
+
+    late_ms = 0
+    for step, reach in LATE_STEPS:
+        late_ms = min((late_ms + step * k for k in range(-reach, reach + 1)), key=cost)
+    clear = cost(late_ms) < cost(0) - EVIDENCE
+    return 1e-3 * late_ms if clear and abs(late_ms) > 1e3 * LATE_S else 0.0
 
 
 def joint_readings(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:

@@ -122,7 +122,7 @@ def find_load(
         [x.recorded for x in taken], model, inertia_prior, max(x.period_s for x in taken)
     )
     moving = {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq, STEP_S)}
-    arm = real_arm(start, sorted(moving), (0,), shares)
+    arm = real_arm(start, sorted(moving & start.heard), (0,), shares)
     whole = taken[0].recorded.whole
     if whole is not None and empty is None:
         known = moments_of(arm.fit, whole)

@@ -31,9 +31,11 @@ from adapter.gap.signals import (
     Smoothness,
     Splines,
     bands_of,
+    heard_in,
     low,
     on_grid,
     smoothness_of,
+    stuck,
     together,
 )
 from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
@@ -149,7 +151,7 @@ class LongRecording:
         log: with the joints of the model.
         survey: of it; span: the time that is used, s.
         smoothness: of the splines; dq_late_s: how much later dq is than q.
-        table: [q, dq, ddq, tau] at 250 Hz; runs: without holes in it.
+        table: [q, dq, ddq, tau, where tau was measured] at 250 Hz; runs: without holes in it.
     """
 
     log: AnyLog
@@ -170,9 +172,9 @@ class LongRecording:
         noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
         parts = []
         for run, begin, end in self._samples(spans):
-            motion, tau = self._motion(run.rows(begin, end), run, arm)
+            motion, tau, known = self._motion(run.rows(begin, end), run, arm)
             motion = replace(motion, bands_hz=bands_of(motion, noise))
-            parts.append(_banded(motion, tau, noise))
+            parts.append(_banded(motion, tau, known, noise))
         return together(parts)
 
     def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
@@ -186,9 +188,10 @@ class LongRecording:
             last = min(run.samples, run.sample(self.span[1]))
             for begin in range(max(before, run.sample(self.span[0])), last, size):
                 end = min(begin + size, last)
-                motion, tau = self._motion(run.rows(begin - before, end), run, like.motion.arm)
+                rows = run.rows(begin - before, end)
+                motion, tau, known = self._motion(rows, run, like.motion.arm)
                 motion = replace(motion, bands_hz=like.motion.bands_hz)
-                yield _banded(motion, tau, like.noise)
+                yield _banded(motion, tau, known, like.noise)
 
     def recorded(self, spans: Sequence[Span], name: str) -> Recorded:
         """Samples of some stretches, as they were recorded."""
@@ -223,10 +226,14 @@ class LongRecording:
                 out.append((run, a, b))
         return out
 
-    def _motion(self, rows: tuple[int, int], run: Run, arm: ArmDynamics) -> tuple[Motion, Array]:
-        q, dq, ddq, tau = map(np.ascontiguousarray, np.split(self.table.rows(*rows), 4, axis=1))
+    def _motion(
+        self, rows: tuple[int, int], run: Run, arm: ArmDynamics
+    ) -> tuple[Motion, Array, Array]:
+        """Of rows in the file, with their torque and where it was measured."""
+        parts = np.split(self.table.rows(*rows), 5, axis=1)
+        q, dq, ddq, tau, known = map(np.ascontiguousarray, parts)
         t = run.begin_s + np.arange(rows[0] - run.first, rows[1] - run.first) / RATE_HZ
-        return Motion(t, q, dq, ddq, arm), tau
+        return Motion(t, q, dq, ddq, arm), tau, known
 
     def samples(self, begin_s: float, end_s: float) -> Recorded:
         """Samples of a time, as they were recorded."""
@@ -251,10 +258,11 @@ _RAW = ("t", "q", "dq", "tau")
 _COMMANDS = "command_t", "commands"
 
 
-def _banded(motion: Motion, tau: Array, noise: Array) -> Signals:
-    """A stretch in the band, trimmed."""
+def _banded(motion: Motion, tau: Array, known: Array, noise: Array) -> Signals:
+    """A stretch in the band, trimmed; its torque and where that was measured (m, n) at 250 Hz."""
     t = motion.t[TAPS // 2 : -(TAPS // 2) : DECIMATION][TRIM:-TRIM]
-    return Signals(motion, noise, low(tau)[TRIM:-TRIM], t, trim=TRIM)
+    own, heard = (x[TRIM:-TRIM] for x in (low(tau), heard_in(known)))
+    return Signals(motion, noise, own, t, heard, trim=TRIM)
 
 
 def is_long(log: AnyLog) -> bool:
@@ -398,7 +406,7 @@ class _Smoother:
 
     def __init__(self, smoothness: Smoothness, dq_late_s: float, n: int) -> None:
         self.smoothness, self.late = smoothness, dq_late_s
-        self.table = RowsFile(4 * n)
+        self.table = RowsFile(5 * n)
         self.runs: list[Run] = []
         self._kept: list[tuple[Array, ...]] = []
         self._begin, self._done, self._first = 0.0, 0, 0
@@ -451,7 +459,9 @@ class _Smoother:
         count = int(np.ceil((end_s - self._next()) * RATE_HZ - 1e-9))
         grid = self._begin + EDGE_S + (self._done + np.arange(count)) / RATE_HZ
         told = splines.smoothed(self.smoothness).at(grid)
-        self.table.append(np.column_stack([*told, on_grid(grid, part, tau[used])]))
+        known = ~stuck(part, dq[used], tau[used])
+        torque = (on_grid(grid, part, x) for x in (tau[used], known.astype(float)))
+        self.table.append(np.column_stack([*told, *torque]))
         self._done += count
         keep = int(np.searchsorted(t, self._next() - OVERLAP_S))
         self._kept = [tuple(x[keep:] for x in (t, q, dq, tau))]

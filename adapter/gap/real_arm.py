@@ -236,7 +236,7 @@ def _assumed(effect: Effect, template: Template, joint: int) -> Named:
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
-    """With friction and motors of the joints (from 0) that move, and offsets of all, at zero."""
+    """With friction and motors of joints (from 0) that move and offsets of all torques, at zero."""
     own = [_assumed(effect, way, j) for effect, way in WHERE_IT_MOVES for j in joints]
-    own += [_assumed(OFFSET, OFFSET.templates()[0], j) for j in range(fit.n)]
+    own += [_assumed(OFFSET, OFFSET.templates()[0], j) for j in sorted(fit.heard)]
     return fit.with_named([*fit.named, *own])

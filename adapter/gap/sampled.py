@@ -69,7 +69,8 @@ class Sampled:
         """With stretches where something changes or is loud, see `changes`."""
         period_s, own = self.survey.clock.period_s, self.recorded()
         nominal = nominal_fit([own], self.model, inertia_prior, period_s)
-        fit = real_arm(nominal, self.moving(), (0,)).fit.with_noise()
+        told = sorted(nominal.heard.intersection(self.moving()))
+        fit = real_arm(nominal, told, (0,)).fit.with_noise()
         windows = Windows.of(fit, self.whole)
         spans = tuple(sorted([*self.spans, *windows.stretches()]))
         return replace(self, spans=spans, loads_s=tuple(windows.loads_s))

@@ -91,9 +91,10 @@ def rich_noise(
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it.
 
     Args:
-        own: the recording; None where it is in one stretch.
+        own: the recording; None where all its samples count.
     """
-    seams, counted = ((0,), 1.0) if own is None else (own.seams, own.counted[ORDER:])
+    seams, heard = ((0,), 1.0) if own is None else (own.seams, own.heard)
+    counted = 1.0 if own is None else own.counted[ORDER:]
     prior = np.zeros(len(X))
     for c in candidates:
         # patterns are so many that they would explain noise, but for a line that stands out
@@ -103,7 +104,7 @@ def rich_noise(
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
     sigma = FIRST_SHARE * residual.std(axis=0) + LEAST_NM
     white, data = X[used], (residual / sigma).ravel()
-    white /= sigma
+    white *= heard / sigma
     white = white.reshape(len(used), -1)
     for _ in range(RICH_ROUNDS):
         information = white @ white.T
@@ -143,7 +144,7 @@ class SignatureTable:
             table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                own = fit.recordings[i] if len(fit.recordings[i].begins) > 1 else None
+                own = None if fit.recordings[i].all_count else fit.recordings[i]
                 noise.append(rich_noise(table, self.candidates, fit.model.residual(i), own))
         if kind == PATTERNS:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]

@@ -14,7 +14,7 @@ from adapter.effects.torque import ModelTorque
 from adapter.gap.joint_readings import ROWS, Rows, Telling, explains_nothing, otherwise_told
 from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.motor_currents import torque_shares
-from adapter.gap.signals import pauses
+from adapter.gap.signals import pauses, stuck
 from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform, unwrapped
 from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.model.self_model import SelfModel
@@ -320,7 +320,7 @@ def standing(names: Sequence[str], moving: Sequence[int], q: Array, dq: Array) -
 
 
 def silent(log: Log, names: Sequence[str]) -> list[str]:
-    """A note on joints whose torque never changes. Raises Refusal where no torque does."""
+    """Notes on joints whose torque does not change. Raises Refusal where no torque ever does."""
     dead = [name for name, span in zip(names, np.ptp(log.tau, axis=0), strict=True) if span == 0]
     if len(dead) == len(names):
         raise RecordingRefused(
@@ -328,9 +328,15 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
             f"{log.path}: the torques never change ({', '.join(f'{x:.3g}' for x in log.tau[0])} "
             "N m throughout) though the arm moves; record measured joint torques.",
         )
-    if not dead:
-        return []
-    return [f"The torque of {', '.join(dead)} never changes: is it measured?"]
+    said = [f"The torque of {', '.join(dead)} never changes: is it measured?"] if dead else []
+    t = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    for name, rows in zip(names, stuck(t, log.dq, log.tau).T, strict=True):
+        if rows.any() and name not in dead:
+            said.append(
+                f"The torque of {name} stays the same for {np.diff(t)[rows[1:]].sum():.2g} s in "
+                f"motion, from {t[rows][0]:.2f} s on: left out."
+            )
+    return said
 
 
 def judge_torque(

@@ -203,7 +203,7 @@ def _total(found: Found) -> float:
     assert isinstance(known, Carried)  # while it is searched; moments come after it
     for noise, weight, own in zip(fit.noise, fit.weights, fit.recordings, strict=True):
         # around dates and seams none counts: as if they were as usual
-        rows = (weight if len(own.begins) == 1 else weight * own.counted)[ORDER:]
+        rows = (weight * own.counted)[ORDER:]
         width += float(np.log(np.where(rows > 0.0, rows, USUAL) / noise.sigma).sum())
     fits = score(known.G, known.g, known.prior_std).log_evidence - 0.5 * known.data @ known.data
     return float(width + fits + sum(price(e) for e in fit.named if not e.assumed))

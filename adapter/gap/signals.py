@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.ndimage import minimum_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
@@ -44,6 +45,9 @@ MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording
 CUT_S, CUT_PERIODS = 0.15, 6.0  # without samples: what is longer, and of more periods, is a pause
 STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
+# s, rad/s: a torque that stays so long while its joint moves is none; and so many usual stays
+STUCK_S, STUCK_DQ, STUCK_TIMES = 0.3, 0.05, 20.0
+HEARD = 0.999  # of a sample in the band: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
@@ -76,6 +80,29 @@ def pauses(t: Array) -> NDArray[np.int64]:
     return np.flatnonzero(steps_s > max(CUT_S, CUT_PERIODS * usual_s))
 
 
+def stuck(t: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
+    """(m, n) where a torque is not measured: it never changes, or not for long in a motion.
+
+    A value at the end of its range that it stays at so long is where the sensor ends: no reading
+    of that value is a measured one.
+
+    Args:
+        t: (m,) s; dq, tau: (m, n) rad/s, N m.
+    """
+    out = np.broadcast_to(np.ptp(tau, axis=0) == 0.0, tau.shape).copy()
+    for j in np.flatnonzero(~out.all(axis=0)):
+        x, edges = tau[:, j], np.flatnonzero(np.diff(tau[:, j])) + 1
+        first, last = np.r_[0, edges], np.r_[edges, len(t)] - 1
+        long_s = max(STUCK_S, STUCK_TIMES * float(np.median(t[last] - t[first])))
+        for k in np.flatnonzero(t[last] - t[first] > long_s):
+            rows = slice(first[k], last[k] + 1)
+            if np.median(np.abs(dq[rows, j])) > STUCK_DQ:
+                out[rows, j] = True
+                if x[first[k]] in (x.min(), x.max()):
+                    out[:, j] |= x == x[first[k]]
+    return out
+
+
 def low(x: Array) -> Array:
     """Signals (m, ...) at 250 Hz in the band, (k, ...) at 25 Hz; the ends are left out."""
     flat, shape = x.reshape(len(x), -1), x.shape[1:]
@@ -101,6 +128,7 @@ class Signals:
         noise: (n,) of its velocities, rad²/s²/Hz.
         tau: (k, n) measured torque in the band, N m.
         t: (k,) s, its instants.
+        heard: (k, n) one where the torque was measured, else zero.
         begins: rows of the motion at which its stretches begin; between these time is left out.
         trim: samples of the band that are left out at either end of each stretch, since what
             depends on the motion before (a filter, a rate) is not known there.
@@ -110,6 +138,7 @@ class Signals:
     noise: Array
     tau: Array
     t: Array
+    heard: Array
     begins: tuple[int, ...] = (0,)
     trim: int = 0
     _kept: dict[Hashable, Array] = field(default_factory=dict, init=False, repr=False)
@@ -143,14 +172,19 @@ class Signals:
 
     @property
     def counted(self) -> Array:
-        """(k, 1) zero for the first samples of each stretch, whose past is not known; else one."""
+        """(k, n) zero where a torque or what was before it is not known, else one."""
         return self.once("counted", self._counted)
 
     def _counted(self) -> Array:
-        out = np.ones((len(self.tau), 1))
-        for begin in self.seams:
+        out = minimum_filter1d(self.heard, ORDER + 1, axis=0, origin=ORDER // 2)
+        for begin in self.seams[1:]:
             out[begin : begin + ORDER] = 0.0
-        return out
+        return np.asarray(out)
+
+    @property
+    def all_count(self) -> bool:
+        """Whether all samples do that the noise's memory reaches."""
+        return bool(self.counted.all())
 
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
@@ -263,7 +297,13 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     motion = Motion(grid, q, dq, ddq, arm)
     motion = replace(motion, bands_hz=bands_of(motion, noise))
     band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
-    return Signals(motion, noise, low(on_grid(grid, t, recording.tau)), band_t)
+    tau, known = (on_grid(grid, t, x) for x in (recording.tau, recording.heard.astype(float)))
+    return Signals(motion, noise, low(tau), band_t, heard_in(known))
+
+
+def heard_in(known: Array) -> Array:
+    """(k, n) in the band where a torque was measured; `known` (m, n) at 250 Hz."""
+    return (low(known) > HEARD).astype(float)
 
 
 def together(parts: Sequence[Signals]) -> Signals:
@@ -272,10 +312,11 @@ def together(parts: Sequence[Signals]) -> Signals:
     t, q, dq, ddq = (np.concatenate([getattr(m, k) for m in motions]) for k in MOTION)
     bands = np.max([x.motion.bands_hz for x in parts if x.motion.bands_hz is not None], axis=0)
     begins = tuple(int(x) for x in np.cumsum([0, *(len(m.t) for m in motions[:-1])]))
-    tau, band_t = (np.concatenate([getattr(x, k) for x in parts]) for k in ("tau", "t"))
+    own = ("tau", "t", "heard")
+    tau, band_t, heard = (np.concatenate([getattr(x, k) for x in parts]) for k in own)
     motion = Motion(t, q, dq, ddq, motions[0].arm, bands_hz=bands)
     noise = np.mean([x.noise for x in parts], axis=0)
-    return Signals(motion, noise, tau, band_t, begins, parts[0].trim)
+    return Signals(motion, noise, tau, band_t, heard, begins, parts[0].trim)
 
 
 def bands_of(motion: Motion, noise: Array) -> Array:
@@ -393,6 +434,15 @@ class Recorded:
     def between(self, begin_s: float, end_s: float) -> Recorded:
         """Its samples from a time to another one (not included), cut at its pauses."""
         return self.part(np.flatnonzero((self.t >= begin_s) & (self.t < end_s))).cut()
+
+    @property
+    def heard(self) -> NDArray[np.bool_]:
+        """(m, n) where the torque was measured."""
+        return ~stuck(self.t, self.dq, self.tau)
+
+    def heard_at(self, t: Array) -> NDArray[np.bool_]:
+        """(k, n) the same at times t (k,), s."""
+        return self.heard[np.clip(np.searchsorted(self.t, t), 0, len(self.t) - 1)]
 
     @property
     def end_s(self) -> float:

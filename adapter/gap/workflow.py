@@ -136,7 +136,7 @@ def find_gap(
         progress("weighing what the hand picked up or put down")
         fit = loaded(fit, task.moving[0], task.fitted[0].loads_s)
     progress("searching")
-    moving = sorted({j for joints in task.moving for j in joints})
+    moving = sorted({j for joints in task.moving for j in joints} & fit.heard)
     measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
     result = replace(_result(task, measured, settings), model_in=name)
     if several is not None:

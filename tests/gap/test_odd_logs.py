@@ -65,6 +65,18 @@ def one_wild() -> Log:
     return replace(base(), tau=tau)
 
 
+def unheard(joint: int, begin: int, end: int) -> Log:
+    """A torque that stays as it was."""
+    tau = base().tau.copy()
+    tau[begin:end, joint] = tau[begin, joint]
+    return replace(base(), tau=tau)
+
+
+UNHEARD = {
+    "panda_joint2 never changes": lambda: unheard(1, 0, len(base())),
+    "panda_joint5 never changes": lambda: unheard(4, 0, len(base())),
+    "panda_joint4 stays the same for 2 s": lambda: unheard(3, 3000, 5000),
+}
 ODD = {
     "pause of 1 s": lambda: without(3.0, 4.0),
     "pause of 3 s": lambda: without(2.5, 5.5),
@@ -75,6 +87,7 @@ ODD = {
     "single torques of zero": lambda: spiked(0.0),
     "bursts of zeros": silent_bursts,
     "one torque of 2.7e154": one_wild,
+    **UNHEARD,
 }
 
 
@@ -90,6 +103,26 @@ def test_what_was_left_out_is_told(name: str, said: str) -> None:
     found = adapter.find_gap(ODD[name](), panda_model())
     assert any(said in note for note in found.notes)
     assert [x.effect for x in found.findings if x.effect == "payload"] == ["payload"]
+
+
+@cache
+def friction_of(name: str) -> tuple[dict[int, tuple[float, float]], set[str], str]:
+    """By joint, with its deviation; everything that is named; notes."""
+    found = adapter.find_gap(UNHEARD[name]() if name else base(), panda_model())
+    rubs = [x for x in found.findings if x.effect == "coulomb_friction"]
+    sizes = {x.joints[0]: (x.parameters["Fc"], x.std["Fc"]) for x in rubs}
+    return sizes, {x.effect for x in found.findings}, " ".join(found.notes)
+
+
+@pytest.mark.parametrize("said", UNHEARD)
+def test_a_torque_that_is_not_measured_costs_its_own_joint_and_time_alone(said: str) -> None:
+    sizes, named, notes = friction_of(said)
+    usual, as_ever, _ = friction_of("")
+    dead = int(said[11]) if "never" in said else 0
+    assert named == as_ever
+    assert set(sizes) == set(usual) - {dead}
+    assert all(abs(sizes[j][0] - usual[j][0]) < 3.0 * sizes[j][1] for j in sizes)
+    assert said in notes
 
 
 WRONG = {
