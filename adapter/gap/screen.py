@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import AnyLog, Log, StoredLog
+from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
@@ -186,15 +185,7 @@ def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
     )
 
 
-@overload
-def of_this_robot(log: Log, model: SelfModel) -> Log: ...
-
-
-@overload
-def of_this_robot(log: StoredLog, model: SelfModel) -> StoredLog: ...
-
-
-def of_this_robot(log: AnyLog, model: SelfModel) -> AnyLog:
+def of_this_robot(log: Log, model: SelfModel) -> Log:
     """A recording with the joints of the model in its order. Raises Refusal: another robot."""
     try:
         return matching(log, model)
@@ -206,7 +197,7 @@ def of_this_robot(log: AnyLog, model: SelfModel) -> AnyLog:
 
 
 def _another_robot(
-    log: AnyLog, model: SelfModel, recorded: Sequence[str], why: str
+    log: Log, model: SelfModel, recorded: Sequence[str], why: str
 ) -> RecordingRefused:
     return RecordingRefused(
         RecordingFault.ROBOT,

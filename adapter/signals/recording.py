@@ -15,7 +15,7 @@ from drivers.files.mcap import (
     Topic,
     derive_velocity,
     looks_like_degrees,
-    open_log,
+    read_log,
     sample_log,
     survey,
 )
@@ -95,12 +95,13 @@ class _Looked:
             said = [*sample.warnings, _judged(sample.parts, sample.samples)]
             about = sample.samples, commands, sample.topics, said, sample.holes
             return cls(sample.parts, *about)
-        log = open_log(path, topic=topic, frames=True)
-        if isinstance(log, Log):
+        log = read_log(path, topic=topic, frames=True)
+        if not log.is_mapped:
             return cls.whole(log)
         parts = log.spread(*_LOOKS)
         said = [*log.warnings, _judged(parts, len(log))]
-        return cls(parts, len(log), len(log.commands or ()), log.topics, said)
+        commands = 0 if log.commands is None else len(log.commands.stamp_ns)
+        return cls(parts, len(log), commands, log.topics, said)
 
 
 def _judged(parts: list[Log], samples: int) -> str:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import choices
 from drivers.files.mcap.bags import open_scan
-from drivers.files.mcap.joints import assemble_joints, fits, stamps
+from drivers.files.mcap.joints import Told, fits
 from drivers.files.mcap.series import Series, collect
 from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES
 from drivers.interface import Array, DriverError
@@ -74,13 +74,23 @@ def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog
         return None
     if not fits(read, effort=False) or _has_effort(read):
         return None
-    joints = assemble_joints(read, scan.path, None, effort=False)
-    asked = assemble_joints(commanded, scan.path, joints.names, effort=False)
-    order = [asked.names.index(name) for name in joints.names]
-    warnings = list(scan.warnings)
-    at, rows = _increasing(stamps(read, f"{path}: {states}", warnings), joints.q)
-    when, commands = _increasing(asked.stamp_ns, asked.q[:, order])
-    return PositionLog(scan.path, joints.names, at, rows, when, commands, tuple(warnings))
+    names, at, rows, said = _positions(read, scan.path, None)
+    asked, when, commands, _ = _positions(commanded, scan.path, names)
+    at, rows = _increasing(at, rows)
+    when, commands = _increasing(when, commands[:, [asked.index(name) for name in names]])
+    return PositionLog(scan.path, names, at, rows, when, commands, (*scan.warnings, *said))
+
+
+def _positions(
+    series: Series, path: Path, want: Sequence[str] | None
+) -> tuple[tuple[str, ...], NDArray[np.int64], Array, list[str]]:
+    """Joints, stamps (k,), positions (k, n) of a topic, and sentences on its clock."""
+    told, where = Told((0,)), f"{path}: {series.topic}"
+    told.take(series)
+    rows = told.chosen(series, where, want, [])
+    clock, said = rows.clock(where)
+    stamp_ns, q = (rows.columns[key].table(False) for key in (clock, "q"))
+    return rows.names, stamp_ns[:, 0], q, said
 
 
 def _is_of_another_kind(path: Path, states: str) -> bool:

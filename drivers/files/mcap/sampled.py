@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from drivers.files.mcap.log import Log, Topic, assembled
+from drivers.files.mcap.log import Log, Topic
+from drivers.files.mcap.read import assembled
 from drivers.files.mcap.records import HEAD, MAGIC, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
