@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from drivers.files.mcap import (
     JOINT_COMMANDS,
     Log,
-    Topic,
     derive_velocity,
     looks_like_degrees,
     read_log,
@@ -44,12 +43,13 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     """
     path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
     try:
-        looked = _Looked.at(path, topic) if log is None else _Looked.whole(log)
+        looked = _Looked.at(path, topic) if log is None else _Looked.of(log)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
     else:
-        topics, warnings, truncated = looked.topics, looked.warnings, looked.parts[0].truncated
+        first, warnings = looked.parts[0], looked.warnings
+        topics, truncated = first.topics, first.truncated
         facts = {"problem": None, **_joint_facts(looked), **_timing(looked)}
     return {
         "file": str(path),
@@ -68,40 +68,35 @@ class _Looked:
     Attributes:
         parts: all of it, or stretches in the order of time.
         samples, commands: of the whole.
-        topics, warnings: of the whole.
+        warnings: of the whole.
         holes: (s since the first sample, s) that are known beside those in the parts.
     """
 
     parts: list[Log]
     samples: int
     commands: int
-    topics: dict[str, Topic]
     warnings: list[str]
     holes: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
-    def whole(cls, log: Log) -> _Looked:
-        """A recording in memory."""
+    def of(cls, log: Log) -> _Looked:
+        """A recording, a mapped one by a sample."""
+        parts = log.spread(*_LOOKS)
+        said = [_judged(parts, len(log))] if log.is_mapped else []
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
-        return cls([log], len(log), commands, log.topics, log.warnings)
+        return cls(parts, len(log), commands, [*log.warnings, *said])
 
     @classmethod
     def at(cls, path: Path, topic: str | None) -> _Looked:
         """A recording, a long one by a sample. Raises DriverError."""
         sample = sample_log(path, topic, frames=True)
-        if sample is not None:
-            told = sample.topics.get(JOINT_COMMANDS)
-            commands = 0 if told is None or sample.parts[0].commands is None else told.messages
-            said = [*sample.warnings, _judged(sample.parts, sample.samples)]
-            about = sample.samples, commands, sample.topics, said, sample.holes
-            return cls(sample.parts, *about)
-        log = read_log(path, topic=topic, frames=True)
-        if not log.is_mapped:
-            return cls.whole(log)
-        parts = log.spread(*_LOOKS)
-        said = [*log.warnings, _judged(parts, len(log))]
-        commands = 0 if log.commands is None else len(log.commands.stamp_ns)
-        return cls(parts, len(log), commands, log.topics, said)
+        if sample is None:
+            return cls.of(read_log(path, topic=topic, frames=True))
+        parts, holes = sample
+        log, told = parts[0], parts[0].topics.get(JOINT_COMMANDS)
+        samples = log.topics[log.topic].messages
+        commands = 0 if told is None or log.commands is None else told.messages
+        return cls(parts, samples, commands, [*log.warnings, _judged(parts, samples)], holes)
 
 
 def _judged(parts: list[Log], samples: int) -> str:

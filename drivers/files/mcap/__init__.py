@@ -15,7 +15,7 @@ from drivers.files.mcap.imus import READERS
 from drivers.files.mcap.joints import derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
 from drivers.files.mcap.log import Commands, FrameMotion, Log, Topic, mapped
-from drivers.files.mcap.positions import PositionLog, read_position_log
+from drivers.files.mcap.positions import read_position_log
 from drivers.files.mcap.read import (
     IN_MEMORY,
     read_estimates,
@@ -25,7 +25,7 @@ from drivers.files.mcap.read import (
     survey,
 )
 from drivers.files.mcap.recover import Recovery, recover
-from drivers.files.mcap.sampled import SampledLog, sample_log
+from drivers.files.mcap.sampled import sample_log
 from drivers.files.mcap.writer import FLUSH_S, JOINT_COMMANDS, McapWriter, to_json
 
 __all__ = [
@@ -38,9 +38,7 @@ __all__ = [
     "FrameMotion",
     "Log",
     "McapWriter",
-    "PositionLog",
     "Recovery",
-    "SampledLog",
     "Topic",
     "derive_velocity",
     "is_recording",

@@ -49,10 +49,14 @@ class FrameMotion:
 
 @dataclass(frozen=True, slots=True)
 class Commands:
-    """Commanded joint torques: stamps (k,) ns, torques (k, n) N m in the log's joint order."""
+    """Commanded joint torques: stamps (k,) ns, torques (k, n) N m in the log's joint order.
+
+    Of an arm that takes positions `q` (k, n) rad, and torques that are not a number.
+    """
 
     stamp_ns: NDArray[np.int64]
     tau: Array
+    q: Array | None = None
 
     def between(self, begin_ns: int, end_ns: int) -> Commands:
         """A copy of those of a time, and one more before and behind it to interpolate between.
@@ -61,7 +65,8 @@ class Commands:
         """
         first, last = np.searchsorted(self.stamp_ns, (begin_ns, end_ns + 1)).tolist()
         rows = max(first - 1, 0), last + 1
-        return Commands(copied(self.stamp_ns, *rows), copied(self.tau, *rows))
+        q = None if self.q is None else copied(self.q, *rows)
+        return Commands(copied(self.stamp_ns, *rows), copied(self.tau, *rows), q)
 
 
 @dataclass(frozen=True)
@@ -210,8 +215,9 @@ class Log:
             warnings=warnings,
         )
         if self.commands is not None:
-            commands = Commands(self.commands.stamp_ns, _columns(self.commands.tau, columns))
-            log = replace(log, commands=commands)
+            tau, q = self.commands.tau, self.commands.q
+            q = None if q is None else _columns(q, columns)
+            log = replace(log, commands=replace(self.commands, tau=_columns(tau, columns), q=q))
         if link_names is None:
             link_names = self._links_moved_by(joint_names)
         return log if link_names is None else log._select_links(link_names)
