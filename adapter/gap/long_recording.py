@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.base import ArmDynamics, Motion
-from adapter.gap.screen import RecordingFault, RecordingRefused, at_source, rows_of
+from adapter.gap.screen import RecordingFault, RecordingRefused, at_source
 from adapter.gap.signals import (
     DECIMATION,
     EDGE_S,
@@ -279,7 +279,7 @@ def surveyed(log: Log) -> Survey:
         clock = check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau)
         if not len(rows):
             continue
-        own = rows_of(raw, rows)
+        own = raw.take(rows)
         own, clock, _ = at_source(own, clock)
         t = 1e-9 * (own.stamp_ns - begin_ns).astype(np.float64)
         clocks.append(clock)
@@ -371,7 +371,8 @@ def _read(log: Log, k: int) -> tuple[Log, np.ndarray]:
 
 def _piece(log: Log, k: int) -> Log:
     """The usable samples of the k-th piece."""
-    own = rows_of(*_read(log, k))
+    raw, rows = _read(log, k)
+    own = raw.take(rows)
     return replace(own, stamp_ns=source_stamps(own.stamp_ns, own.q, own.dq))
 
 

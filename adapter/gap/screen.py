@@ -143,7 +143,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         back.append(f"{names} is told within one turn: a step of a whole turn is taken for none.")
     log, signals = replace(log, stamp_ns=stamps, q=q), (q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
-    log = rows_of(log, uniform(log.stamp_ns, *signals))
+    log = log.take(uniform(log.stamp_ns, *signals))
     log, timing, said = at_source(log, timing)
     if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
@@ -170,19 +170,6 @@ def at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, li
         f"before. The times of the states are taken, up to {1e3 * moved_s:.2g} ms from the stamps."
     )
     return log, replace(timing, **late), [said]
-
-
-def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
-    """The recording with only these samples."""
-    return replace(
-        log,
-        stamp_ns=log.stamp_ns[rows],
-        q=log.q[rows],
-        dq=log.dq[rows],
-        tau=log.tau[rows],
-        twists=None if log.twists is None else log.twists[rows],
-        accels=None if log.accels is None else log.accels[rows],
-    )
 
 
 def of_this_robot(log: Log, model: SelfModel) -> Log:
@@ -430,7 +417,7 @@ def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
     rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
     if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
         return
-    log = rows_of(log, rows)
+    log = log.take(rows)
     smoothed = smoothed_rows(log)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
         return

@@ -34,7 +34,6 @@ FEWEST_FOR_NOISE = 50  # samples
 # States that pass the front end in one table: as much as a processor's cache holds. Of the exact
 # mode whole times `ADOPT_EVERY`.
 AT_ONCE = 2000
-STRETCHES = 64, 2000  # of a long recording, and samples of each, that tell its rate and noise
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
@@ -259,12 +258,12 @@ def _filtered(part: Log, front_end: FrontEnd) -> Array:
 def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
     """Filter settings for the rate of a recording and, where they leave it open, its noise.
 
-    Of a mapped recording both are told by stretches of it, see `STRETCHES`.
+    Of a mapped recording both are told by stretches of it, see `Log.spread`.
 
     Returns:
         The settings, and a sentence where the recording's rate is not the nominal one.
     """
-    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread(*STRETCHES)])
+    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread()])
     steps = steps[steps > 0]
     changes: dict[str, float] = {}
     warnings = []
@@ -288,9 +287,9 @@ def noise_levels(log: Log) -> dict[str, Array]:
     """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies.
 
     Not numbers where there are too few samples, or too few that are not the one before. Of a
-    mapped recording it is that of stretches, see `STRETCHES`.
+    mapped recording it is that of stretches, see `Log.spread`.
     """
-    found = [_noise_levels(part) for part in log.spread(*STRETCHES)]
+    found = [_noise_levels(part) for part in log.spread()]
     with np.errstate(invalid="ignore"):
         return {
             name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))

@@ -11,8 +11,6 @@ from adapter.model.self_model import SelfModel
 from drivers.files.mcap import IN_MEMORY, Log
 from drivers.interface import DriverError
 
-_LOOKS = 64, 2000  # at a recording, and samples of each, for where the arm moves
-
 
 def present(
     documented: SelfModel, names: Sequence[str], source: object
@@ -135,7 +133,7 @@ def most_moved(log: Log) -> Log:
     """A recording in memory as it is; of a mapped one a part in which the arm moves a lot."""
     if not log.is_mapped:
         return log
-    parts = log.spread(*_LOOKS)
+    parts = log.spread()
     speeds = [float(np.mean(np.nan_to_num(part.dq) ** 2)) for part in parts]
     middle = int(np.argmax(speeds)) * len(log) // len(parts)
     start = max(min(middle - IN_MEMORY // 2, len(log) - IN_MEMORY), 0)

@@ -21,7 +21,6 @@ from drivers.files.mcap import (
 from drivers.interface import DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
-_LOOKS = 64, 2000  # at a long recording that must be read whole, and samples of each
 _LISTED = 10  # gaps and topics that are listed one by one
 _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
@@ -81,7 +80,7 @@ class _Looked:
     @classmethod
     def of(cls, log: Log) -> _Looked:
         """A recording, a mapped one by a sample."""
-        parts = log.spread(*_LOOKS)
+        parts = log.spread()
         said = [_judged(parts, len(log))] if log.is_mapped else []
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
         return cls(parts, len(log), commands, [*log.warnings, *said])

@@ -6,9 +6,8 @@ What is decoded waits in files while a recording is read, so that no length need
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,25 +24,12 @@ _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
 _DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
 _NEED = "learning needs positions and measured joint torques (effort)"
 _NEED_POSITION = "discovery needs the positions of the joints"
-_RUNS = {"q": 0, "dq": 1, "tau": 2}  # of doubles in a message
-_CLOCKS = "header_ns", "log_ns"  # of the messages, and of the recorder
-STATES, COMMANDS = (*_CLOCKS, "q", "dq", "tau"), (*_CLOCKS, "place", "tau")
+Q, DQ, TAU = range(3)  # runs of doubles in a message
 _Stamps = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
-class Joints:
-    """Arrays (m,) and (m, n): stamps ns, positions rad, velocities rad/s, torques N m."""
-
-    names: tuple[str, ...]
-    stamp_ns: _Stamps
-    q: Array
-    dq: Array
-    tau: Array
-
-
-class Clock:
-    """What stamps tell that come part by part.
+class StampsFile(RowsFile):
+    """Stamps (m, 1) ns, and what they tell while they come.
 
     Attributes:
         back: how often time runs backwards; first_back: (place, ns) of the first time.
@@ -51,51 +37,49 @@ class Clock:
     """
 
     def __init__(self) -> None:
-        self.back, self.first_back, self.silent = 0, (0, 0), True
-        self._count, self._last = 0, 0
+        super().__init__(1, _IN_MEMORY, np.int64)
+        self.back, self.first_back, self.silent, self._last = 0, (0, 0), True, 0
 
-    def take(self, stamp_ns: _Stamps) -> None:
-        """Take (k,) stamps that follow."""
-        if not len(stamp_ns):
+    def append(self, table: _Stamps) -> None:
+        """Take (k, 1) stamps that follow."""
+        if not len(table):
             return
-        steps = np.diff(stamp_ns, prepend=self._last if self._count else stamp_ns[0])
+        steps = np.diff(table[:, 0], prepend=self._last if len(self) else table[0, 0])
         places = np.flatnonzero(steps < 0)
         if places.size and not self.back:
-            self.first_back = self._count + int(places[0]), -int(steps[places[0]])
+            self.first_back = len(self) + int(places[0]), -int(steps[places[0]])
         self.back += places.size
-        self.silent = self.silent and not stamp_ns.any()
-        self._count, self._last = self._count + len(stamp_ns), int(stamp_ns[-1])
+        self.silent = self.silent and not table.any()
+        self._last = int(table[-1, 0])
+        super().append(table)
 
 
-def _stamps_told(header: Clock, log: Clock, count: int, where: str) -> tuple[int, list[str]]:
-    """Which clock of a topic is used, 0 its headers' and 1 the recorder's, and sentences."""
-    said, which = [], 0
-    if count > 1 and header.silent:
-        which = 1
-        said.append(f"{where}: header stamps are 0; the recorder's log times are used")
-    clock = (header, log)[which]
+def in_use(header: StampsFile, log: StampsFile, where: str, warnings: list[str]) -> StampsFile:
+    """The stamps of the messages' headers; the recorder's where every one of these is 0."""
+    clock = header
+    if len(header) > 1 and header.silent:
+        clock = log
+        warnings.append(f"{where}: header stamps are 0; the recorder's log times are used")
     if clock.back:
         place, step_ns = clock.first_back
-        said.append(
+        warnings.append(
             f"{where}: time runs backwards {clock.back} times, first by {step_ns / 1e6:.3f} ms at "
             f"sample {place}"
         )
-    return which, said
+    return clock
 
 
-def _stamps_of(header_ns: _Stamps, log_ns: _Stamps, where: str, warnings: list[str]) -> _Stamps:
-    clocks = Clock(), Clock()
-    for clock, times in zip(clocks, (header_ns, log_ns), strict=True):
-        clock.take(times)
-    which, said = _stamps_told(*clocks, len(header_ns), where)
-    warnings += said
-    return (header_ns, log_ns)[which]
+def _stamps_of(clocks: Sequence[_Stamps], where: str, warnings: list[str]) -> _Stamps:
+    files = StampsFile(), StampsFile()
+    for file, stamp_ns in zip(files, clocks, strict=True):
+        file.append(stamp_ns[:, None])
+    return in_use(*files, where, warnings).table(False)[:, 0]
 
 
 def stamps(series: Series, where: str, warnings: list[str]) -> _Stamps:
     """(m,) header stamps; log times where every header stamp is 0."""
-    header_ns = series.in_order([block.stamp_ns for block in series.blocks])
-    return _stamps_of(header_ns, series.in_order(series.log_ns), where, warnings)
+    clocks = [block.stamp_ns for block in series.blocks], series.log_ns
+    return _stamps_of([series.in_order(parts) for parts in clocks], where, warnings)
 
 
 def check_type(series: Series, path: Path) -> None:
@@ -114,7 +98,7 @@ def _is_of_joints(series: Series) -> bool:
 
 def fits(series: Series, effort: bool) -> bool:
     """Whether a topic tells positions (and efforts) of joints."""
-    needed = (0, 2) if effort else (0,)
+    needed = (Q, TAU) if effort else (Q,)
     return _is_of_joints(series) and any(
         b.layout.names and all(_run(b, run) is not None for run in needed) for b in series.blocks
     )
@@ -131,91 +115,69 @@ class JointRows:
 
     Attributes:
         names: of the joints.
-        columns: a file of each of `STATES` or `COMMANDS`.
-        clocks: of the headers and of the recorder.
+        clocks: stamps of the headers and of the recorder; place: in the topic's order.
+        runs: (m, n) files of the runs of doubles that are kept.
         messages: how many there were, with those that lack something.
-        present: runs (0 q, 1 dq, 2 tau) that any message has; lengths: of each, any of all.
+        present: runs that any message has; lengths: of each, any of all.
     """
 
-    def __init__(self, names: tuple[str, ...], columns: Sequence[str]) -> None:
+    def __init__(self, names: tuple[str, ...], kept: Sequence[int]) -> None:
         self.names, self.messages = names, 0
-        self.columns = {
-            key: RowsFile(len(names), _IN_MEMORY)
-            if key in _RUNS
-            else RowsFile(1, _IN_MEMORY, np.int64)
-            for key in columns
-        }
-        self.clocks = Clock(), Clock()
+        self.clocks = StampsFile(), StampsFile()
+        self.place = StampsFile()
+        self.runs = {run: RowsFile(len(names), _IN_MEMORY) for run in kept}
         self.present: set[int] = set()
-        self.lengths: dict[int, set[int]] = {0: set(), 1: set(), 2: set()}
+        self.lengths: dict[int, set[int]] = {Q: set(), DQ: set(), TAU: set()}
 
     def __len__(self) -> int:
-        return len(self.columns[_CLOCKS[0]])
+        return len(self.place)
 
     def take(self, series: Series, needed: Sequence[int]) -> None:
         """Take messages that follow."""
         kept = []
         for i, block in enumerate(series.blocks):
             self.messages += len(block.index)
-            runs = {run for run in range(3) if _run(block, run) is not None}
+            runs = {run for run in self.lengths if _run(block, run) is not None}
             self.present |= runs
-            for run in range(3):
-                self.lengths[run].add(block.values[run].shape[1])
+            for run, lengths in self.lengths.items():
+                lengths.add(block.values[run].shape[1])
             if runs >= set(needed):
                 kept.append(i)
         if not kept:
             return
         part = series.at(kept)
-        numbers = {
-            "header_ns": [block.stamp_ns for block in part.blocks],
-            "log_ns": part.log_ns,
-            "place": part.places,
-        }
-        for key, file in self.columns.items():
-            if key in _RUNS:
-                file.append(self._doubles(part, _RUNS[key]))
-            else:
-                table = part.in_order(numbers[key])
-                file.append(table[:, None])
-                if key in _CLOCKS:
-                    self.clocks[_CLOCKS.index(key)].take(table)
+        header_ns = [block.stamp_ns for block in part.blocks]
+        for file, own in zip(
+            (*self.clocks, self.place), (header_ns, part.log_ns, part.places), strict=True
+        ):
+            file.append(part.in_order(own)[:, None])
+        for run, table in self.runs.items():
+            table.append(part.in_order([self._doubles(block, run) for block in part.blocks]))
 
-    def _doubles(self, series: Series, run: int) -> Array:
-        parts = []
-        for block in series.blocks:
-            values, names = _run(block, run), block.layout.names
-            if values is None:
-                values = np.full((len(block.index), len(names)), np.nan)
-            elif names != self.names:
-                values = values[:, [names.index(name) for name in self.names]]
-            parts.append(values)
-        return series.in_order(parts)
+    def _doubles(self, block: Block, run: int) -> Array:
+        values, names = _run(block, run), block.layout.names
+        if values is None:
+            return np.full((len(block.index), len(names)), np.nan)
+        if names == self.names:
+            return values
+        return values[:, [names.index(name) for name in self.names]]
 
-    def clock(self, where: str) -> tuple[str, list[str]]:
-        """The column of the stamps in use, and sentences."""
-        which, said = _stamps_told(*self.clocks, len(self), where)
-        return _CLOCKS[which], said
-
-    def runs_backwards(self) -> bool:
-        """Whether the stamps in use do."""
-        return self.clocks[_CLOCKS.index(self.clock("")[0])].back > 0
-
-    def stretches(self, *keys: str) -> Iterator[list[NDArray[Any]]]:
-        """Columns, so many rows at a time."""
+    def stretches(self, *runs: int) -> Iterator[list[Array]]:
+        """Runs of doubles, so many rows at a time."""
         for start in range(0, len(self), AT_ONCE):
-            yield [self.columns[key].rows(start, start + AT_ONCE) for key in keys]
+            yield [self.runs[run].rows(start, start + AT_ONCE) for run in runs]
 
 
 class Told:
     """What a topic tells of joints, part by part, by the set of joints that messages are of.
 
     Args:
-        needed: runs without which a message is of no use; columns: that are kept.
+        needed: runs without which a message is of no use; kept: runs that are.
     """
 
-    def __init__(self, needed: Sequence[int], columns: Sequence[str] = STATES) -> None:
+    def __init__(self, needed: Sequence[int], kept: Sequence[int] = (Q, DQ, TAU)) -> None:
         self.sets: dict[frozenset[str], JointRows] = {}
-        self._needed, self._columns = needed, columns
+        self._needed, self._kept = needed, kept
         self._messages, self._names = 0, set[str]()
 
     def take(self, series: Series) -> None:
@@ -230,7 +192,7 @@ class Told:
         for key, places in found.items():
             part = series.at(places)
             if key not in self.sets:
-                self.sets[key] = JointRows(part.blocks[0].layout.names, self._columns)
+                self.sets[key] = JointRows(part.blocks[0].layout.names, self._kept)
             self.sets[key].take(part, self._needed)
 
     def chosen(
@@ -269,8 +231,8 @@ class Told:
 
     def _check_complete(self, own: JointRows, where: str, warnings: list[str]) -> None:
         """Say which messages lack positions (or efforts). Raises DriverError where all do."""
-        need = _NEED if 2 in self._needed else _NEED_POSITION
-        what_of = {0: "position", 2: "effort"}
+        need = _NEED if TAU in self._needed else _NEED_POSITION
+        what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
             if run not in own.present:
                 lengths = ", ".join(map(str, sorted(own.lengths[run])))
@@ -308,8 +270,8 @@ class _Seen(NamedTuple):
     def of(cls, rows: JointRows) -> _Seen:
         varied = moving = known = torque = False
         silent, furthest, beyond = 0, 0.0, np.zeros(len(rows.names), dtype=np.int64)
-        first = rows.columns["q"].rows(0, 1)
-        for q, dq, tau in rows.stretches("q", "dq", "tau"):
+        first = rows.runs[Q].rows(0, 1)
+        for q, dq, tau in rows.stretches(Q, DQ, TAU):
             varied = varied or bool(np.any(q != first))
             moving = moving or bool(np.any(dq))
             known = known or not np.isnan(tau).all()
@@ -323,8 +285,8 @@ class _Seen(NamedTuple):
 
 def joints_told(
     rows: JointRows, where: str, effort: bool, mapped: bool, warnings: list[str]
-) -> Joints:
-    """Joint states as arrays, with sentences on what looks wrong.
+) -> tuple[_Stamps, Array, Array, Array]:
+    """Stamps (m,), positions, velocities and efforts (m, n); sentences on what looks wrong.
 
     Args:
         rows, where: the states, file and topic.
@@ -335,19 +297,17 @@ def joints_told(
     Raises:
         DriverError: efforts that are needed are not a number throughout.
     """
-    seen, count, velocity = _Seen.of(rows), len(rows), rows.columns["dq"]
+    seen, count, velocity = _Seen.of(rows), len(rows), rows.runs[DQ]
     if effort and not seen.torque_known:
         raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
-    clock, said = rows.clock(where)
-    warnings += said
+    clock = in_use(*rows.clocks, where, warnings)
     if not seen.torque_known:
         warnings.append(f"{where} has no efforts: nothing is learned from torques")
     if not effort and seen.varied and (seen.silent == count or not seen.moving):
-        nothing = (np.full_like(q, np.nan) for (q,) in rows.stretches("q"))
-        velocity = gathered(len(rows.names), nothing)
+        velocity = gathered(velocity.width, (np.full_like(q, np.nan) for (q,) in rows.stretches(Q)))
         warnings.append(f"{where} has no velocities: they are those of the filtered positions")
     elif seen.silent:
-        velocity = gathered(len(rows.names), _velocities(rows, clock))
+        velocity = gathered(velocity.width, _velocities(rows, clock))
         warnings.append(
             f"{where}: {seen.silent} of {count} messages have no velocity; "
             "derived from the positions"
@@ -359,51 +319,46 @@ def joints_told(
             f"{where}: positions reach {seen.furthest:.0f} rad; are these degrees? "
             "Recordings hold radians (`adapter import` converts)"
         )
-    files = rows.columns[clock], rows.columns["q"], velocity, rows.columns["tau"]
-    stamp_ns, q, dq, tau = (file.table(mapped) for file in files)
-    return Joints(rows.names, stamp_ns[:, 0], q, dq, tau)
+    q, dq, tau = (file.table(mapped) for file in (rows.runs[Q], velocity, rows.runs[TAU]))
+    return clock.table(mapped)[:, 0], q, dq, tau
 
 
-def _velocities(rows: JointRows, clock: str) -> Iterator[Array]:
+def _velocities(rows: JointRows, clock: StampsFile) -> Iterator[Array]:
     """Velocities, the positions' slope where a sample has none."""
-    stamps, positions, velocities = (rows.columns[key] for key in (clock, "q", "dq"))
-    begin_ns = int(stamps.rows(0, 1)[0, 0])
+    begin_ns = int(clock.rows(0, 1)[0, 0])
     for start in range(0, len(rows), AT_ONCE):
         before = min(start, AT_ONCE)  # neighbours, of which one that moves forward is needed
         wide = start - before, start + 2 * AT_ONCE
-        slope = derive_velocity(stamps.rows(*wide)[:, 0], positions.rows(*wide), begin_ns)
-        dq = velocities.rows(start, start + AT_ONCE)
+        slope = derive_velocity(clock.rows(*wide)[:, 0], rows.runs[Q].rows(*wide), begin_ns)
+        dq = rows.runs[DQ].rows(start, start + AT_ONCE)
         silent = np.all(np.isnan(dq), axis=1)
         yield np.where(silent[:, None], slope[before : before + AT_ONCE], dq)
 
 
 def commands_told(
-    told: Told, where: str, names: Sequence[str], mapped: bool, warnings: list[str]
+    sets: Sequence[JointRows], where: str, names: Sequence[str], mapped: bool, warnings: list[str]
 ) -> Commands | None:
     """Commanded torques in the order of `names`; joints without a command are not a number.
 
     Args:
-        told: by the topic; where: file and topic; mapped: of one set of joints, in files.
+        sets: that command any of them; where: file and topic; mapped: one set, in files.
     """
-    sets = told.of(names)
     if not sets:
         warnings.append(f"{where}: no message commands a torque of these joints; left out")
         return None
-    if mapped:
+    if len(sets) == 1:
         (rows,) = sets
-        clock, said = rows.clock(where)
-        warnings += said
-        tau = (_commanded(rows, names, table) for (table,) in rows.stretches("tau"))
-        stamp_ns = rows.columns[clock].table(mapped)[:, 0]
-        return Commands(stamp_ns, gathered(len(names), tau).table(mapped))
-    place, header_ns, log_ns = (
-        np.concatenate([x.columns[key].table(False)[:, 0] for x in sets])
-        for key in ("place", *_CLOCKS)
-    )
-    tables = [_commanded(x, names, x.columns["tau"].table(False)) for x in sets]
-    order = np.argsort(place, kind="stable")
-    stamp_ns = _stamps_of(header_ns[order], log_ns[order], where, warnings)
-    return Commands(stamp_ns, np.concatenate(tables)[order])
+        clock = in_use(*rows.clocks, where, warnings)
+        tau = gathered(len(names), (_commanded(rows, names, x) for (x,) in rows.stretches(TAU)))
+        return Commands(clock.table(mapped)[:, 0], tau.table(mapped))
+    order = np.argsort(_joined([x.place for x in sets]), kind="stable")
+    clocks = [_joined(files)[order] for files in zip(*(x.clocks for x in sets), strict=True)]
+    tables = [_commanded(x, names, x.runs[TAU].table(False)) for x in sets]
+    return Commands(_stamps_of(clocks, where, warnings), np.concatenate(tables)[order])
+
+
+def _joined(files: Sequence[StampsFile]) -> _Stamps:
+    return np.concatenate([file.table(False)[:, 0] for file in files])
 
 
 def _commanded(rows: JointRows, names: Sequence[str], tau: Array) -> Array:

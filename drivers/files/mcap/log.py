@@ -165,7 +165,7 @@ class Log:
         for start in range(0, len(self), rows):
             yield self.piece(start, start + rows)
 
-    def spread(self, count: int, samples: int) -> list[Log]:
+    def spread(self, count: int = 64, samples: int = 2000) -> list[Log]:
         """What tells of the whole: all of it; where it is mapped so many stretches of so many
         samples each, from the first to the last, evenly spread.
         """
@@ -222,7 +222,7 @@ class Log:
             link_names = self._links_moved_by(joint_names)
         return log if link_names is None else log._select_links(link_names)
 
-    def take(self, rows: NDArray[np.bool_] | slice) -> Log:
+    def take(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Log:
         """The same recording with these samples only."""
         links = (None if x is None else x[rows] for x in (self.twists, self.accels, self.base))
         twists, accels, base = links

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.mcap.bags import open_scan
-from drivers.files.mcap.joints import Told, fits
+from drivers.files.mcap.joints import Q, Told, fits, in_use
 from drivers.files.mcap.log import Commands, Log
 from drivers.files.mcap.series import Series, collect
 from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES
@@ -57,12 +57,11 @@ def _positions(
     series: Series, path: Path, want: Sequence[str] | None
 ) -> tuple[tuple[str, ...], NDArray[np.int64], Array, list[str]]:
     """Joints, stamps (k,), positions (k, n) of a topic, and sentences on its clock."""
-    told, where = Told((0,)), f"{path}: {series.topic}"
+    told, where, said = Told((Q,), (Q,)), f"{path}: {series.topic}", list[str]()
     told.take(series)
     rows = told.chosen(series, where, want, [])
-    clock, said = rows.clock(where)
-    stamp_ns, q = (rows.columns[key].table(False) for key in (clock, "q"))
-    return rows.names, stamp_ns[:, 0], q, said
+    stamp_ns = in_use(*rows.clocks, where, said).table(False)[:, 0]
+    return rows.names, stamp_ns, rows.runs[Q].table(False), said
 
 
 def _is_of_another_kind(path: Path, states: str) -> bool:

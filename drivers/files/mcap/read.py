@@ -15,12 +15,13 @@ from drivers.files.estimates import estimate_values, values_of_json
 from drivers.files.mcap.bags import open_scan
 from drivers.files.mcap.imus import READERS, frame_motions, with_imus
 from drivers.files.mcap.joints import (
-    COMMANDS,
-    Joints,
+    TAU,
+    Q,
     Told,
     check_type,
     commands_told,
     fits,
+    in_use,
     joints_told,
 )
 from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
@@ -106,7 +107,7 @@ def assembled(
     """What a scan tells, see `read_log`."""
     tell = tuple(READERS) if frames else (IMU,) if imus else ()
     kinds = (*tell, IMU) if sensors else tell
-    told = _Told((0,) if sensors else (0, 2))
+    told = _Told((Q,) if sensors else (Q, TAU))
     topics = collect(scan, lambda series: _is_wanted(series, topic, kinds), told.take)
     series = _choose_topic(scan, topics, topic, not sensors)
     check_type(series, scan.path)
@@ -118,25 +119,23 @@ def assembled(
     mapped = (
         len(rows) > IN_MEMORY
         and not any(s.count for s in topics.values() if _is_of_links(s) or s.schema in kinds)
-        and (not orders or (len(orders) == 1 and not orders[0].runs_backwards()))
+        and not (len(orders) > 1 or any(in_use(*x.clocks, where, []).back for x in orders))
     )
     metadata = _decoded_metadata(scan)
     with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are found by their size
-        joints = joints_told(rows, where, not sensors, mapped, warnings)
-        links = _links(topics, joints, metadata.get("link_names"), scan.path, warnings, sensors)
+        samples = joints_told(rows, where, not sensors, mapped, warnings)
+        onto = Onto(samples[0], scan.path, warnings)
+        links = _links(topics, metadata.get("link_names"), onto, sensors)
         found = frame_motions(topics, tell, scan.path, warnings)
     commands = None
     if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
         check_type(topics[JOINT_COMMANDS], scan.path)
-        about = f"{scan.path}: {JOINT_COMMANDS}", joints.names, mapped, warnings
-        commands = commands_told(told.commands, *about)
+        where = f"{scan.path}: {JOINT_COMMANDS}"
+        commands = commands_told(orders, where, rows.names, mapped, warnings)
     log = Log(
-        path=scan.path,
-        joint_names=joints.names,
-        stamp_ns=joints.stamp_ns,
-        q=joints.q,
-        dq=joints.dq,
-        tau=joints.tau,
+        scan.path,
+        rows.names,
+        *samples,
         link_names=links.names,
         twists=links.twists,
         accels=links.accels,
@@ -161,7 +160,7 @@ class _Told:
 
     def __init__(self, needed: Sequence[int]) -> None:
         self.joints = defaultdict[str, Told](lambda: Told(needed))
-        self.commands = Told((2,), COMMANDS)
+        self.commands = Told((TAU,), (TAU,))
 
     def take(self, series: Series, least: int = AT_ONCE) -> None:
         """Take what was decoded of joints, once it is so much that it is worth it."""
@@ -260,21 +259,14 @@ def _is_of_links(series: Series) -> bool:
     return series.topic.startswith((LINK_TWISTS, LINK_ACCELS))
 
 
-def _links(
-    topics: Mapping[str, Series],
-    joints: Joints,
-    order: Any,
-    path: Path,
-    warnings: list[str],
-    sensors: bool,
-) -> Links:
+def _links(topics: Mapping[str, Series], order: Any, onto: Onto, sensors: bool) -> Links:
     names = order if isinstance(order, list) else []
     if not sensors:
-        return assemble_links(topics, names, Onto(joints.stamp_ns, path, warnings))
-    carrier = Carrier(joints.stamp_ns, path, warnings)
+        return assemble_links(topics, names, onto)
+    carrier = Carrier(*onto[:3])
     others = {name: series for name, series in topics.items() if series.schema != IMU}
-    links = assemble_links(others, names, Onto(joints.stamp_ns, path, warnings, carrier))
-    links = with_imus(links, topics, carrier, path, warnings)
+    links = assemble_links(others, names, onto._replace(carrier=carrier))
+    links = with_imus(links, topics, carrier, onto.path, onto.warnings)
     carrier.tell()
     return links
 
