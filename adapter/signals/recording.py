@@ -18,7 +18,7 @@ from drivers.files.mcap import (
     sample_log,
     survey,
 )
-from drivers.interface import DriverError
+from drivers.interface import Array, DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
 _LISTED = 10  # gaps and topics that are listed one by one
@@ -155,35 +155,33 @@ def _range_line(name: str, found: dict[str, list[float]]) -> str:
     return f"{name}: " + "  ".join(f"{low:.3g}..{high:.3g}" for low, high in pairs)
 
 
-def _units(parts: list[Log]) -> str:
+def _units(parts: list[Log], q: Array, dq: Array, tau: Array) -> str:
     """What the numbers look like; a joint's torque has no size that all arms share."""
-    q = np.concatenate([part.q for part in parts])
     said = ["positions look like degrees" if looks_like_degrees(q) else "positions rad"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = [np.abs(derive_velocity(part.stamp_ns, part.q)) for part in parts]
-        slope, speed = np.concatenate(slopes), np.abs(np.concatenate([x.dq for x in parts]))
+        slope = np.abs(np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST
-        ratio = float(np.median((speed / slope)[fast])) if fast.any() else np.nan
+        ratio = float(np.median((np.abs(dq) / slope)[fast])) if fast.any() else np.nan
     if not np.isfinite(ratio):
         said.append("velocities cannot be judged")
     elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
         said.append("velocities rad/s")
     else:
         said.append(f"velocities {ratio:.3g} times the slope of the positions")
-    most = max(float(np.nanmax(np.abs(part.tau), initial=0.0)) for part in parts)
+    most = float(np.nanmax(np.abs(tau), initial=0.0))
     return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m"])
 
 
-def _teaches(looked: _Looked) -> str:
+def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
     log = looked.parts[0]
     with np.errstate(invalid="ignore"):
-        moving = np.concatenate([np.abs(part.dq) > _REST for part in looked.parts])
+        moving = np.abs(dq) > _REST
     resting = [n for j, n in enumerate(log.joint_names) if not moving[:, j].any()]
     seconds = float(moving.any(axis=1).mean()) * _duration_s(looked)
     said = [f"{seconds:.3g} s of motion"]
     if resting:
         said.append(f"at rest: {', '.join(resting)}")
-    if not any(np.any(np.nan_to_num(part.tau)) for part in looked.parts):
+    if not np.any(np.nan_to_num(tau)):
         said.append("no torques: nothing of inertias and friction")
     if log.twists is None and not log.frames:
         said.append("no link motion is recorded: it is synthesized from the documented lengths")
@@ -192,17 +190,15 @@ def _teaches(looked: _Looked) -> str:
 
 def _joint_facts(looked: _Looked) -> dict[str, Any]:
     log, parts = looked.parts[0], looked.parts
-    signals = {
-        "q_rad": np.concatenate([part.q for part in parts]),
-        "dq_rad_s": np.concatenate([part.dq for part in parts]),
-        "tau_nm": np.concatenate([part.tau for part in parts]),
-    }
+    tables = (np.concatenate([getattr(x, key) for x in parts]) for key in ("q", "dq", "tau"))
+    signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
+    q, dq, tau = signals.values()
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
         "joints": list(log.joint_names),
         "source": log.topic,
-        "units": _units(parts),
-        "teaches": _teaches(looked),
+        "units": _units(parts, q, dq, tau),
+        "teaches": _teaches(looked, dq, tau),
         "links": list(log.link_names),
         "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],
         "samples": looked.samples,

@@ -59,10 +59,6 @@ class RowsFile:
         content = mmap.mmap(self._file.fileno(), 8 * self.width * self._count)
         return np.ndarray((self._count, self.width), self._dtype, content)
 
-    def close(self) -> None:
-        """Give the file up."""
-        self._file.close()
-
 
 def is_mapped(table: NDArray[Any]) -> bool:
     """Whether a table is one of `RowsFile.table` that lies in a file, or a part of it."""
