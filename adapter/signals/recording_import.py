@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from adapter.signals.importer import ALL, ImportReport, ImportSpec, imported_by,
 from adapter.signals.matching import corresponding
 from adapter.signals.plausible import refuse_wild, value_doubts, velocity_doubts
 from drivers.errors import choices
-from drivers.files.mcap import Log, McapWriter, is_recording, read_log, read_position_log
-from drivers.interface import Array, DriverError, LinkMotion
+from drivers.files.mcap import Log, is_recording, read_log, read_position_log, write_log
+from drivers.interface import Array, DriverError
 
 _OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
 
@@ -55,7 +54,7 @@ def import_recording(spec: ImportSpec, out: Path) -> ImportReport:
     metadata["imported"]["topic"] = log.topic
     warnings = log.warnings + _left_behind(log)
     with whole_file(out) as part:
-        _write(log, part, metadata)
+        write_log(log, part, metadata)
     return ImportReport.of(out, log.joint_names, log.stamp_ns, warnings)
 
 
@@ -149,27 +148,3 @@ def _left_behind(log: Log) -> list[str]:
         f"{log.path}: not taken: {', '.join(frames + halves)} (`adapter discover` reads the "
         "recording itself)"
     ]
-
-
-def _write(log: Log, out: Path, metadata: dict[str, Any]) -> None:
-    links = log.link_names if log.twists is not None and log.accels is not None else ()
-    if links and not log.pairs_links:  # the copy must not say that link i is moved by joint i
-        metadata["link_names"] = []
-    with McapWriter(out, log.joint_names, links, metadata, overwrite=True) as writer:
-        orders = log.commands
-        if orders is not None and orders.q is not None:
-            for stamp_ns, q in zip(log.stamp_ns.tolist(), log.q, strict=True):
-                writer.write_position(stamp_ns, q)
-            for stamp_ns, q in zip(orders.stamp_ns.tolist(), orders.q, strict=True):
-                writer.write_position_command(stamp_ns, q)
-            return
-        for i, stamp_ns in enumerate(log.stamp_ns.tolist()):
-            writer.write_joint_state(stamp_ns, log.q[i], log.dq[i], log.tau[i])
-            if not links:
-                continue
-            assert log.twists is not None and log.accels is not None
-            if not np.isnan(log.twists[i]).all() or not np.isnan(log.accels[i]).all():
-                writer.write_links(stamp_ns, LinkMotion(log.twists[i], log.accels[i]))
-        if orders is not None:
-            for stamp_ns, tau in zip(orders.stamp_ns.tolist(), orders.tau, strict=True):
-                writer.write_command(stamp_ns, tau)

@@ -14,7 +14,7 @@ from drivers.files.mcap.bags import is_recording
 from drivers.files.mcap.imus import READERS
 from drivers.files.mcap.joints import derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
-from drivers.files.mcap.log import Commands, FrameMotion, Log, Topic, mapped
+from drivers.files.mcap.log import Commands, FrameMotion, Log, Topic, mapped, write_log
 from drivers.files.mcap.positions import read_position_log
 from drivers.files.mcap.read import (
     IN_MEMORY,
@@ -53,4 +53,5 @@ __all__ = [
     "sample_log",
     "survey",
     "to_json",
+    "write_log",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from drivers.errors import choices
 from drivers.files.html_table import NOTHING, html_table
-from drivers.files.mcap.writer import JOINT_STATES
+from drivers.files.mcap.writer import JOINT_STATES, McapWriter
 from drivers.files.rows import AT_ONCE, RowsFile, copied, gathered, is_mapped, stretches
-from drivers.interface import Array, DriverError
+from drivers.interface import Array, DriverError, LinkMotion
 
 _SAMPLES = "stamp_ns", "q", "dq", "tau"
 
@@ -265,6 +265,35 @@ def mapped(like: Log, pieces: Iterable[Log]) -> Log:
             file.append(getattr(piece, key).reshape(len(piece), file.width))
     stamp_ns, q, dq, tau = (file.table(mapped=True) for file in files)
     return replace(like, stamp_ns=stamp_ns[:, 0], q=q, dq=dq, tau=tau, commands=None)
+
+
+def write_log(log: Log, path: Path, metadata: Mapping[str, Any]) -> None:
+    """Write samples, commands and links' motion, of which a sample has both kinds or none.
+
+    Args:
+        path: overwritten; metadata: goes with them.
+    """
+    links = log.link_names if log.twists is not None and log.accels is not None else ()
+    if links and not log.pairs_links:  # the copy must not say that link i is moved by joint i
+        metadata = {**metadata, "link_names": []}
+    with McapWriter(path, log.joint_names, links, metadata, overwrite=True) as writer:
+        orders = log.commands
+        if orders is not None and orders.q is not None:
+            for stamp_ns, q in zip(log.stamp_ns.tolist(), log.q, strict=True):
+                writer.write_position(stamp_ns, q)
+            for stamp_ns, q in zip(orders.stamp_ns.tolist(), orders.q, strict=True):
+                writer.write_position_command(stamp_ns, q)
+            return
+        for i, stamp_ns in enumerate(log.stamp_ns.tolist()):
+            writer.write_joint_state(stamp_ns, log.q[i], log.dq[i], log.tau[i])
+            if not links:
+                continue
+            assert log.twists is not None and log.accels is not None
+            if not np.isnan(log.twists[i]).all() or not np.isnan(log.accels[i]).all():
+                writer.write_links(stamp_ns, LinkMotion(log.twists[i], log.accels[i]))
+        if orders is not None:
+            for stamp_ns, tau in zip(orders.stamp_ns.tolist(), orders.tau, strict=True):
+                writer.write_command(stamp_ns, tau)
 
 
 def _columns(values: Array, columns: list[int]) -> Array:
