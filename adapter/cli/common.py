@@ -17,7 +17,7 @@ from adapter.learning.known_effects import learnable, not_taken_off
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_recorded, config_table, read_config
 from adapter.runs.terminal import program_version, warn
-from drivers.files.mcap import AnyLog
+from drivers.files.mcap import Log
 
 
 def robot_of(args: argparse.Namespace, name: str | None, floating: bool = False) -> SelfModel:
@@ -25,7 +25,7 @@ def robot_of(args: argparse.Namespace, name: str | None, floating: bool = False)
     return read_robot(name or "panda", joints_of(args), floating, lock=locks_of(args))
 
 
-def robot_of_log(args: argparse.Namespace, log: AnyLog, floating: bool = False) -> SelfModel:
+def robot_of_log(args: argparse.Namespace, log: Log, floating: bool = False) -> SelfModel:
     """The robot asked for, else the one that the recording carries, else the Panda."""
     carried = log.attachments.get("documented.json")
     if args.robot is not None or carried is None:

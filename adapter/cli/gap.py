@@ -37,7 +37,7 @@ from adapter.runs.terminal import (
     write_json,
 )
 from adapter.simulate import Rollouts
-from drivers.files.mcap import AnyLog, open_log
+from drivers.files.mcap import Log, read_log
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,11 +89,11 @@ def _rollouts(args: argparse.Namespace) -> Rollouts | None:
 
 def _opened(
     args: argparse.Namespace,
-) -> tuple[Sequence[Path | AnyLog], tuple[Path | AnyLog, ...]]:
+) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
     """The recordings and those held out; read here where a topic was named. Raises DriverError."""
     if args.topic is None:
         return args.logs, tuple(args.hold_out)
-    read = {path: open_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
+    read = {path: read_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
     return [read[path] for path in args.logs], tuple(read[path] for path in args.hold_out)
 
 

@@ -10,21 +10,18 @@ from adapter.gap.load_words import as_json, robot_lines, sentence
 from adapter.gap.torque_gains import in_newton_metres
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
-from drivers.files.mcap import Log, open_log
+from drivers.files.mcap import read_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = open_log(args.log, topic=args.topic)
-    empty = None if args.empty is None else open_log(args.empty, topic=args.topic)
+    log = read_log(args.log, topic=args.topic)
+    empty = None if args.empty is None else read_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
     unit = effort_unit_of(args)
     given = [log] if empty is None else [log, empty]
-    if unit.learn:  # from all samples at once
-        given = [x if isinstance(x, Log) else x.in_memory() for x in given]
-    taught = [x for x in given[1:] if isinstance(x, Log)]
-    (log, *others), gains = in_newton_metres(given, robot, unit, taught)
+    (log, *others), gains = in_newton_metres(given, robot, unit, given[1:])
     warn([] if gains is None else [*gains.notes, *gains.words()])
     empty = others[0] if others else None
     load = find_load(log, robot, empty, args.frame, args.inertia_prior)

@@ -36,7 +36,7 @@ from adapter.runs.terminal import console, labelled, results_folder, say, show, 
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching, most_moved, present
-from drivers.files.mcap import AnyLog, Log, StoredLog, open_log
+from drivers.files.mcap import Log, read_log
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 
@@ -44,7 +44,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     first, *more = args.logs
-    whole = open_log(first, topic=args.topic, frames=args.base is not None, imus=True)
+    whole = read_log(first, topic=args.topic, frames=args.base is not None, imus=True)
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -52,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
     robot, locked = present(config.apply(robot), whole.joint_names, whole.path)
     reference = reference_from(args.truth, robot)
     logs = [_joined(args, whole, robot)]
-    logs += [matching(open_log(path, topic=args.topic), robot) for path in more]
+    logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
     logs, gains = _in_newton_metres(args, logs, robot)
     log = one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
-    if args.base is None and (isinstance(log, Log) or args.imu):
-        log, imus = with_link_imus(_in_memory(log), robot, args.imu)
+    if args.base is None:
+        log, imus = with_link_imus(log, robot, args.imu)
     log.warnings.extend(locked)
     warn(log.warnings)
     fitted, notes = fitted_to(log, config.pipeline.filter)
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _figures(
-    args: argparse.Namespace, log: AnyLog, robot: SelfModel, reference: Reference, result: Replay
+    args: argparse.Namespace, log: Log, robot: SelfModel, reference: Reference, result: Replay
 ) -> dict[str, Any]:
     front_end = result.pipeline.front_end
     course = Course(
@@ -126,11 +126,9 @@ def _figures(
 
 
 def _in_newton_metres(
-    args: argparse.Namespace, logs: list[AnyLog], robot: SelfModel
-) -> tuple[list[AnyLog], TorqueGains | None]:
+    args: argparse.Namespace, logs: list[Log], robot: SelfModel
+) -> tuple[list[Log], TorqueGains | None]:
     """Recordings with efforts in N m, and the gains where they were learned.
-
-    Gains are learned from what lies in memory: recordings in a file are brought there for it.
 
     Raises:
         RecordingRefused: nobody says a unit, and efforts are motor currents.
@@ -141,12 +139,11 @@ def _in_newton_metres(
     if unit.learn and robot.tree.floating:
         raise SettingsError("--tau-gain fit needs a fixed base; give --tau-gain G1,G2,...")
     until = args.validate_from
-    taught = logs if until is None else [from_s(x, 0.0, until) for x in logs]
+    taught: list[Log] = []
     if unit.learn:
         say("learning the gains of the drives")
-        logs = [_in_memory(x) for x in logs]
-    known = [_in_memory(x) for x in taught] if unit.learn else []
-    logs, gains = in_newton_metres(logs, robot, unit, known)
+        taught = logs if until is None else [from_s(x, 0.0, until) for x in logs]
+    logs, gains = in_newton_metres(logs, robot, unit, taught)
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
     if not robot.tree.floating:
@@ -156,8 +153,8 @@ def _in_newton_metres(
 
 
 def _as_understood(
-    args: argparse.Namespace, log: AnyLog, robot: SelfModel, gains: TorqueGains | None
-) -> AnyLog:
+    args: argparse.Namespace, log: Log, robot: SelfModel, gains: TorqueGains | None
+) -> Log:
     """Another recording with efforts in N m as those that were learned from."""
     factors = effort_unit_of(args).factors(robot.tree.joint_names)
     if gains is not None:
@@ -165,17 +162,13 @@ def _as_understood(
     return log.changed(lambda piece: replace(piece, tau=piece.tau * factors))
 
 
-def _joined(args: argparse.Namespace, log: AnyLog, robot: SelfModel) -> AnyLog:
+def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:
     """The recording as the robot has it, with the base's motion where it floats."""
     log = matching(log, robot)
-    return log if args.base is None else with_base_motion(_in_memory(log), robot, args.base)
+    return log if args.base is None else with_base_motion(log, robot, args.base)
 
 
-def _in_memory(log: AnyLog) -> Log:
-    return log.in_memory() if isinstance(log, StoredLog) else log
-
-
-def _learn(args: argparse.Namespace, log: AnyLog, robot: SelfModel, config: Config) -> Replay:
+def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config) -> Replay:
     if args.validate_from is not None and not 0.0 < args.validate_from < last_s(log):
         raise SettingsError(
             f"--validate-from {args.validate_from} is outside the recording "
@@ -208,12 +201,12 @@ def tell(line: str) -> None:
     labelled("new disagreement:", "yellow", line)
 
 
-def _held_out(args: argparse.Namespace, log: AnyLog, robot: SelfModel) -> AnyLog | None:
+def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:
     """What to score on, or None."""
     if args.validate_from is not None:
         return from_s(log, args.validate_from)
     if args.validate is not None:
-        other = open_log(args.validate, topic=args.topic, frames=args.base is not None)
+        other = read_log(args.validate, topic=args.topic, frames=args.base is not None)
         return _joined(args, other, robot)
     return None
 

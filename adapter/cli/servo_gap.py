@@ -18,12 +18,12 @@ from adapter.gap.servo_model import read_servos
 from adapter.gap.servo_words import as_json, lines
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import complain, console, output, results_folder, say, write_json
-from drivers.files.mcap import PositionLog, read_position_log
+from drivers.files.mcap import Log, read_position_log
 
 WITH_TORQUE = ("validate_from", "rounds", "tau_gain", "gear", "known_load")  # options
 
 
-def position_logs(args: argparse.Namespace) -> tuple[list[PositionLog], list[PositionLog]] | None:
+def position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | None:
     """The recordings and those held out; None where they are not of such an arm.
 
     Raises:
@@ -48,7 +48,7 @@ def position_logs(args: argparse.Namespace) -> tuple[list[PositionLog], list[Pos
     return [found[path] for path in args.logs], [found[path] for path in args.hold_out]
 
 
-def run(args: argparse.Namespace, logs: list[PositionLog], hold_out: list[PositionLog]) -> int:
+def run(args: argparse.Namespace, logs: list[Log], hold_out: list[Log]) -> int:
     """Carry it out; returns the exit code."""
     unusable = [name for name in WITH_TORQUE if getattr(args, name) is not None]
     if unusable:

@@ -10,12 +10,12 @@ from adapter.control.teachable import teachable
 from adapter.gap.screen import RecordingRefused, check_torque
 from adapter.model.self_model import SelfModel
 from adapter.signals.matching import matching, most_moved, present
-from drivers.files.mcap import AnyLog, Log, open_log
+from drivers.files.mcap import Log, read_log
 
 
 def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str, Any], list[str]]:
     """What the recording teaches of a robot: figures and lines."""
-    whole: AnyLog = log or open_log(args.file, topic=args.topic)
+    whole = log or read_log(args.file, topic=args.topic)
     robot = robot_of(args, args.robot)
     robot, locked = present(robot, whole.joint_names, whole.path)
     log = matching(most_moved(whole), robot)

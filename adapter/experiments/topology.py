@@ -169,9 +169,4 @@ def _log_of(arm: PyBulletArm, samples: Sequence[JointSample]) -> Log:
 
 def _first(log: Log) -> Log:
     """The first seconds of a recording."""
-    stop = int(np.searchsorted(log.stamp_ns, log.stamp_ns[0] + round(1e9 * MOTION_S)))
-    assert log.twists is not None and log.accels is not None
-    return Log(
-        log.path, log.joint_names, log.stamp_ns[:stop], log.q[:stop], log.dq[:stop],
-        log.tau[:stop], log.link_names, log.twists[:stop], log.accels[:stop],
-    )  # fmt: skip
+    return log.piece(0, int(np.searchsorted(log.stamp_ns, log.first_ns + round(1e9 * MOTION_S))))

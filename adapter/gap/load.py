@@ -36,7 +36,7 @@ from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
-from drivers.files.mcap import AnyLog, Log
+from drivers.files.mcap import Log
 
 DOCUMENTED_STD, SHARED_STD = 0.02, 0.2  # of the inertias: alone, and with a log without the load
 MOVES_S = 1.0  # of motion, or the arm hardly moves
@@ -88,9 +88,9 @@ class HandLoad:
 
 
 def find_load(
-    log: AnyLog,
+    log: Log,
     model: SelfModel,
-    empty: AnyLog | None = None,
+    empty: Log | None = None,
     frame: str | None = None,
     inertia_prior: float | None = None,
 ) -> HandLoad:
@@ -148,13 +148,13 @@ class _Taken(NamedTuple):
     notes: list[str]
 
 
-def _taken(log: AnyLog, model: SelfModel) -> _Taken:
+def _taken(log: Log, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
     if is_long(log):
         long = Sampled.of(log, log.path.name, model)
         part, _, said = cleaned(long.busiest(log), model)
         return _Taken(long.recorded(), part, long.survey.clock.period_s, said)
-    own, clock, said = cleaned(log if isinstance(log, Log) else log.in_memory(), model)
+    own, clock, said = cleaned(log, model)
     return _Taken(Recorded.of(own, lateness(clock)).cut(), own, clock.period_s, said)
 
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.base import ArmDynamics, Motion
-from adapter.gap.screen import RecordingFault, RecordingRefused, at_source, rows_of
+from adapter.gap.screen import RecordingFault, RecordingRefused, at_source
 from adapter.gap.signals import (
     DECIMATION,
     EDGE_S,
@@ -41,7 +41,7 @@ from adapter.gap.signals import (
 from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.model.spatial import Array
 from adapter.signals.source_clock import source_stamps
-from drivers.files.mcap import AnyLog, Log
+from drivers.files.mcap import Log
 from drivers.files.rows import RowsFile
 
 LONG_S = 60.0  # what is longer is searched in stretches
@@ -154,7 +154,7 @@ class LongRecording:
         table: [q, dq, ddq, tau, where tau was measured] at 250 Hz; runs: without holes in it.
     """
 
-    log: AnyLog
+    log: Log
     survey: Survey
     span: Span
     smoothness: Smoothness
@@ -265,14 +265,14 @@ def _banded(motion: Motion, tau: Array, known: Array, noise: Array) -> Signals:
     return Signals(motion, noise, own, t, heard, trim=TRIM)
 
 
-def is_long(log: AnyLog) -> bool:
+def is_long(log: Log) -> bool:
     """Whether a recording is searched in stretches: by its samples, for one stamp may be wrong."""
     if len(log) < FEWEST or 1e-9 * (log.end_ns - log.begin_ns) <= LONG_S:
         return False
     return len(log) * _step_s(log) > LONG_S
 
 
-def surveyed(log: AnyLog) -> Survey:
+def surveyed(log: Log) -> Survey:
     """A first look at a recording with the joints of its model.
 
     Raises:
@@ -287,7 +287,7 @@ def surveyed(log: AnyLog) -> Survey:
         clock = check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau)
         if not len(rows):
             continue
-        own = rows_of(raw, rows)
+        own = raw.take(rows)
         own, clock, _ = at_source(own, clock)
         t = 1e-9 * (own.stamp_ns - begin_ns).astype(np.float64)
         clocks.append(clock)
@@ -341,22 +341,22 @@ class _Windows:
         return windows[there], self.rows[there], moments[there]
 
 
-def _step_s(log: AnyLog) -> float:
+def _step_s(log: Log) -> float:
     """The usual step between stamps."""
     steps = np.diff(log.piece(0, FIRST).stamp_ns)
     return 1e-9 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
 
 
-def _size(log: AnyLog) -> int:
+def _size(log: Log) -> int:
     """Samples of a piece."""
     return max(round(PIECE_S / _step_s(log)), FEWEST)
 
 
-def _count(log: AnyLog) -> int:
+def _count(log: Log) -> int:
     return int(np.ceil(len(log) / _size(log)))
 
 
-def _ends(log: AnyLog) -> tuple[int, int]:
+def _ends(log: Log) -> tuple[int, int]:
     """The first usable stamp and the last, ns. Raises RecordingRefused."""
     kept = (raw.stamp_ns[rows] for raw, rows in (_read(log, k) for k in range(_count(log))))
     first = next((x for x in kept if len(x)), None)
@@ -369,7 +369,7 @@ def _ends(log: AnyLog) -> tuple[int, int]:
     return int(first[0]), int(last[-1])
 
 
-def _read(log: AnyLog, k: int) -> tuple[Log, np.ndarray]:
+def _read(log: Log, k: int) -> tuple[Log, np.ndarray]:
     """The k-th piece as it is, and its rows worth keeping."""
     start, size = k * _size(log), _size(log)
     seen = log.piece(start, start + size + AHEAD)
@@ -377,13 +377,14 @@ def _read(log: AnyLog, k: int) -> tuple[Log, np.ndarray]:
     return seen.piece(0, size), rows[rows < size]
 
 
-def _piece(log: AnyLog, k: int) -> Log:
+def _piece(log: Log, k: int) -> Log:
     """The usable samples of the k-th piece."""
-    own = rows_of(*_read(log, k))
+    raw, rows = _read(log, k)
+    own = raw.take(rows)
     return replace(own, stamp_ns=source_stamps(own.stamp_ns, own.q, own.dq))
 
 
-def _pieces(log: AnyLog, survey: Survey) -> Iterator[tuple[Array, Array, Array, Array]]:
+def _pieces(log: Log, survey: Survey) -> Iterator[tuple[Array, Array, Array, Array]]:
     """t, q, dq, tau of usable samples, in order."""
     last = -np.inf
     for k in range(_count(log)):
@@ -467,7 +468,7 @@ class _Smoother:
         self._kept = [tuple(x[keep:] for x in (t, q, dq, tau))]
 
 
-def long_recording(log: AnyLog, survey: Survey) -> LongRecording:
+def long_recording(log: Log, survey: Survey) -> LongRecording:
     """Smooth a recording.
 
     Args:

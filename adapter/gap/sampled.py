@@ -22,7 +22,7 @@ from adapter.gap.screen import Screened, moving_joints, of_this_robot, refuse, s
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from drivers.files.mcap import AnyLog, Log
+from drivers.files.mcap import Log
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Sampled:
     loads_s: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, log: AnyLog, name: str, model: SelfModel) -> Sampled:
+    def of(cls, log: Log, name: str, model: SelfModel) -> Sampled:
         """A recording of a model's arm. Raises RecordingRefused: of another robot."""
         own = of_this_robot(log, model)
         whole = long_recording(own, surveyed(own))
@@ -80,11 +80,11 @@ class Sampled:
         motion = self.whole.signals(self.spans, RigidArm.of(self.model)).motion
         return moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ)
 
-    def busiest(self, log: AnyLog) -> Log:
+    def busiest(self, log: Log) -> Log:
         """The part in one piece in which most moves, of the recording as it was read."""
         return log.piece(*self.survey.busiest(SCREENED_S))
 
-    def screened(self, log: AnyLog, unit_known: bool) -> Screened:
+    def screened(self, log: Log, unit_known: bool) -> Screened:
         """Let the recording pass, as `screen.refuse` does. Raises RecordingRefused.
 
         Args:
@@ -97,8 +97,8 @@ class Sampled:
         return replace(seen, timing=self.survey.clock, moving=moving, standing=said)
 
 
-def part_of(log: AnyLog, model: SelfModel, end_s: float | None = None) -> Log:
-    """Of a long recording the part in one piece in which most moves, in memory; a short one whole.
+def part_of(log: Log, model: SelfModel, end_s: float | None = None) -> Log:
+    """Of a long recording the part in one piece in which most moves; a short one whole.
 
     Args:
         model: of the arm; end_s: the part lies before it, s.
@@ -109,10 +109,9 @@ def part_of(log: AnyLog, model: SelfModel, end_s: float | None = None) -> Log:
     if is_long(log):
         survey = surveyed(of_this_robot(log, model))
         return log.piece(*survey.busiest(SCREENED_S, end_s))
-    own = log if isinstance(log, Log) else log.in_memory()
     if end_s is None:
-        return own
-    return own.take(own.stamp_ns < own.stamp_ns[0] + round(1e9 * end_s))
+        return log
+    return log.take(log.stamp_ns < log.first_ns + round(1e9 * end_s))
 
 
 def sampling(recordings: Sequence[Recorded]) -> tuple[dict[str, Any], ...]:

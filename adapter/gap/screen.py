@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +22,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.validation import GRID_S, smooth
-from drivers.files.mcap import AnyLog, Log, StoredLog
+from drivers.files.mcap import Log
 from drivers.interface import DriverError
 
 MOVES_RAD, MOVES_DQ = 0.1, 0.1  # range and 95th percentile of speed below which a joint stands
@@ -144,7 +143,7 @@ def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]
         back.append(f"{names} is told within one turn: a step of a whole turn is taken for none.")
     log, signals = replace(log, stamp_ns=stamps, q=q), (q, log.dq, log.tau)
     timing = check_timing(log.stamp_ns, *signals)
-    log = rows_of(log, uniform(log.stamp_ns, *signals))
+    log = log.take(uniform(log.stamp_ns, *signals))
     log, timing, said = at_source(log, timing)
     if timing.span_s < SHORTEST_S or len(log) < FEWEST:
         raise RecordingRefused(
@@ -173,28 +172,7 @@ def at_source(log: Log, timing: RecordingClock) -> tuple[Log, RecordingClock, li
     return log, replace(timing, **late), [said]
 
 
-def rows_of(log: Log, rows: NDArray[np.int64]) -> Log:
-    """The recording with only these samples."""
-    return replace(
-        log,
-        stamp_ns=log.stamp_ns[rows],
-        q=log.q[rows],
-        dq=log.dq[rows],
-        tau=log.tau[rows],
-        twists=None if log.twists is None else log.twists[rows],
-        accels=None if log.accels is None else log.accels[rows],
-    )
-
-
-@overload
-def of_this_robot(log: Log, model: SelfModel) -> Log: ...
-
-
-@overload
-def of_this_robot(log: StoredLog, model: SelfModel) -> StoredLog: ...
-
-
-def of_this_robot(log: AnyLog, model: SelfModel) -> AnyLog:
+def of_this_robot(log: Log, model: SelfModel) -> Log:
     """A recording with the joints of the model in its order. Raises Refusal: another robot."""
     try:
         return matching(log, model)
@@ -206,7 +184,7 @@ def of_this_robot(log: AnyLog, model: SelfModel) -> AnyLog:
 
 
 def _another_robot(
-    log: AnyLog, model: SelfModel, recorded: Sequence[str], why: str
+    log: Log, model: SelfModel, recorded: Sequence[str], why: str
 ) -> RecordingRefused:
     return RecordingRefused(
         RecordingFault.ROBOT,
@@ -445,7 +423,7 @@ def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
     rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
     if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
         return
-    log = rows_of(log, rows)
+    log = log.take(rows)
     smoothed = smoothed_rows(log)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
         return

@@ -29,7 +29,7 @@ from adapter.gap.servo_signals import Track, loads
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from drivers.files.mcap import PositionLog
+from drivers.files.mcap import Log
 
 ROUNDS = 2  # in which the load follows from the arm's simulated motion
 SURE = 4.0  # standard deviations from the documented value, from which on it is another one
@@ -148,10 +148,10 @@ class _Arm:
 
 
 def explain(
-    logs: Sequence[PositionLog],
+    logs: Sequence[Log],
     model: SelfModel,
     documented: ServoModel | None = None,
-    hold_out: Sequence[PositionLog] = (),
+    hold_out: Sequence[Log] = (),
     inertia_prior: float = 0.02,
     progress: Callable[[str], None] = lambda text: None,
 ) -> ServoGap:
@@ -196,13 +196,14 @@ def explain(
     )
 
 
-def _track(log: PositionLog, names: tuple[str, ...]) -> Track:
+def _track(log: Log, names: tuple[str, ...]) -> Track:
     log = log.select(names)
     span = 1e-9 * float(np.ptp(log.stamp_ns)) if len(log.stamp_ns) else 0.0
-    if span < SHORTEST_S or len(log.command_ns) < 2:
+    orders = 0 if log.commands is None else len(log.commands.stamp_ns)
+    if span < SHORTEST_S or orders < 2:
         raise RecordingRefused(
             RecordingFault.DATA,
-            f"{log.path}: {span:.2g} s with {len(log.command_ns)} commands; record at least "
+            f"{log.path}: {span:.2g} s with {orders} commands; record at least "
             f"{SHORTEST_S:g} s of motion, better 20 s, with its position commands.",
         )
     track = Track.of(log)

@@ -12,7 +12,7 @@ from scipy.signal import butter, sosfiltfilt
 from adapter.gap.servo_kernels import Load
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from drivers.files.mcap import PositionLog
+from drivers.files.mcap import Log
 
 LONGEST_STEP_S = 1e-3  # of the simulation
 CUT_HZ, CUT_SHARE = 20.0, 0.2  # of the smoothing; of the sample rate at most
@@ -43,15 +43,16 @@ class Track:
     smooth: Array
 
     @classmethod
-    def of(cls, log: PositionLog) -> Track:
-        """Prepare a recording."""
-        first = log.stamp_ns[0]
+    def of(cls, log: Log) -> Track:
+        """Prepare a recording whose commands are positions."""
+        first, orders = log.stamp_ns[0], log.commands
+        assert orders is not None and orders.q is not None
         stamp_s = 1e-9 * (log.stamp_ns - first).astype(float)
         period = float(np.median(np.diff(stamp_s)))
         step = period / np.ceil(period / LONGEST_STEP_S - 1e-6)
         count = round(stamp_s[-1] / step)
         grid = step * np.arange(count + 1)
-        at, held, gained = _integrals(1e-9 * (log.command_ns - first), log.q_command)
+        at, held, gained = _integrals(1e-9 * (orders.stamp_ns - first), orders.q)
         smooth = smoothed(columns(grid, stamp_s, log.q), step, period)
         return cls(log.path.name, grid[1:], step, stamp_s, log.q, at, held, gained, smooth)
 

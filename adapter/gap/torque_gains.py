@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching, present
-from drivers.files.mcap import AnyLog, Log, read_log
+from drivers.files.mcap import Log, read_log
 
 DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a known mass
 GAIN_STD = 0.5  # of a gain, as a share of what one joint's regression says
@@ -47,7 +47,6 @@ SHOWN_SHARE = 0.25  # one standard deviation, above which a gain is not shown
 LEARNED_SHARE = 2.0 / 3.0  # of every recording, for the check on the rest
 SLIDES_RAD_S, AROUND_S = 0.1, 0.1  # slower, so long before or after, a joint sticks
 GAIN = CATALOGUE["torque_gain"]
-_Log = TypeVar("_Log", bound=AnyLog)
 
 
 @dataclass(frozen=True)
@@ -99,12 +98,12 @@ def _per_joint(values: tuple[float, ...], names: Sequence[str], option: str) -> 
 
 
 def in_newton_metres(
-    logs: Sequence[_Log], model: SelfModel, unit: EffortUnit, learned_from: Sequence[Log] = ()
-) -> tuple[list[_Log], TorqueGains | None]:
+    logs: Sequence[Log], model: SelfModel, unit: EffortUnit, learned_from: Sequence[Log] = ()
+) -> tuple[list[Log], TorqueGains | None]:
     """Recordings with efforts in N m, as somebody said they are to be understood.
 
     Args:
-        logs: as read, in memory where gains are learned; model: of the arm; unit: of them all.
+        logs: as read; model: of the arm; unit: of them all.
         learned_from: which gains are learned from, where not from all; those that carry the
             known load are read beside them.
 
@@ -122,7 +121,7 @@ def in_newton_metres(
     factors = unit.factors(model.tree.joint_names)
     if not unit.learn:
         return [converted(log, model, factors) for log in logs], None
-    taught: list[Log] = list(learned_from) or [log for log in logs if isinstance(log, Log)]
+    taught = list(learned_from or logs)
     held = [path.resolve() for path in unit.loaded]
     taught += [read_log(path) for path in unit.loaded if path.resolve() not in _paths(taught)]
     loaded = [unit.load_kg is not None and (not held or p in held) for p in _paths(taught)]
@@ -131,15 +130,15 @@ def in_newton_metres(
     return [converted(log, model, factors * gains.gain) for log in logs], gains
 
 
-def _paths(logs: Sequence[AnyLog]) -> list[Path]:
+def _paths(logs: Sequence[Log]) -> list[Path]:
     return [log.path.resolve() for log in logs]
 
 
-def converted(log: _Log, model: SelfModel, factors: Array) -> _Log:
+def converted(log: Log, model: SelfModel, factors: Array) -> Log:
     """A recording with efforts times factors (n,), joints in the model's order."""
     model, _ = present(model, log.joint_names, log.path)
-    own: AnyLog = matching(cast(Log, log), model)
-    return cast(_Log, own.changed(lambda piece: replace(piece, tau=piece.tau * factors)))
+    own = matching(log, model)
+    return own.changed(lambda piece: replace(piece, tau=piece.tau * factors))
 
 
 @dataclass(frozen=True, eq=False)

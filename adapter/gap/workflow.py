@@ -41,7 +41,7 @@ from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
-from drivers.files.mcap import AnyLog, Log, open_log
+from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
 NO_NAME = 0.5  # probability below which an effect is not told by name
@@ -74,7 +74,7 @@ class GapSettings:
 
     inertia_prior: float = 0.02
     validate_from_s: float | None = None
-    hold_out: tuple[Path | str | AnyLog, ...] = ()
+    hold_out: tuple[Path | str | Log, ...] = ()
     rounds: int = ROUNDS
     unit: EffortUnit = field(default_factory=EffortUnit)
 
@@ -88,7 +88,7 @@ class GapSettings:
 
 
 def find_gap(
-    logs: Sequence[Path | str | AnyLog],
+    logs: Sequence[Path | str | Log],
     model: Path | str | SelfModel,
     settings: GapSettings | None = None,
     simulate: Simulate | None = None,
@@ -151,10 +151,10 @@ def find_gap(
 
 
 def _with_what_is_held(
-    untold: GapResult, log: Path | str | AnyLog, model: SelfModel, inertia_prior: float
+    untold: GapResult, log: Path | str | Log, model: SelfModel, inertia_prior: float
 ) -> GapResult:
     """A load at the hand shows in an arm at rest as well."""
-    whole = log if isinstance(log, AnyLog) else open_log(Path(log))
+    whole = log if isinstance(log, Log) else read_log(Path(log))
     own = part_of(whole, present(model, whole.joint_names, whole.path.name)[0])
     load = held_at_rest(own, model, inertia_prior)
     if load is None:
@@ -164,7 +164,7 @@ def _with_what_is_held(
 
 
 def _task(
-    logs: Sequence[Path | str | AnyLog], model: SelfModel, settings: GapSettings, progress: Progress
+    logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
 ) -> tuple[GapTask, TorqueGains | None]:
     """Read, convert and screen. Raises Refusal."""
     held = settings.hold_out
@@ -176,7 +176,7 @@ def _task(
     read, locked, names = [], [], names_of([*kept, *held])
     for log, name in zip([*kept, *held], names, strict=True):
         progress(f"reading {name}")
-        read.append(log if isinstance(log, AnyLog) else open_log(Path(log)))
+        read.append(log if isinstance(log, Log) else read_log(Path(log)))
         model, said = present(model, read[-1].joint_names, name)
         locked += said
     if settings.unit.learn:
@@ -215,7 +215,7 @@ def _task(
 class _Taken(NamedTuple):
     """A recording, screened, and what of it is fitted; what is scored where that is another part.
 
-    `sampled` is None where all of it is in memory.
+    `sampled` is None where all of it is taken.
     """
 
     screened: Screened
@@ -224,13 +224,12 @@ class _Taken(NamedTuple):
     scored: Recorded | None = None
 
 
-def _taken(log: AnyLog, name: str, model: SelfModel, unit_known: bool) -> _Taken:
+def _taken(log: Log, name: str, model: SelfModel, unit_known: bool) -> _Taken:
     """Raises RecordingRefused."""
     if is_long(log):
         sampled = Sampled.of(log, name, model)
         return _Taken(sampled.screened(log, unit_known), sampled.recorded(), sampled)
-    own = log if isinstance(log, Log) else log.in_memory()
-    seen = refuse(own, model, RigidArm.of(model), unit_known)
+    seen = refuse(log, model, RigidArm.of(model), unit_known)
     fitted = replace(Recorded.of(seen.log, lateness(seen.timing)).cut(), name=name)
     return _Taken(seen, fitted, None)
 
@@ -256,18 +255,18 @@ def _divided(taken: _Taken, settings: GapSettings, progress: Progress) -> _Taken
     return taken._replace(fitted=sampled.with_changes(settings.inertia_prior).recorded())
 
 
-def names_of(logs: Sequence[Path | str | AnyLog]) -> list[str]:
+def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
     """What recordings are called: their files' names, with folders where two have the same."""
-    paths = [log.path if isinstance(log, AnyLog) else Path(log) for log in logs]
+    paths = [log.path if isinstance(log, Log) else Path(log) for log in logs]
     short = [path.name for path in paths]
     names = [str(p) if short.count(p.name) > 1 else p.name for p in paths]
     again = [names[:k].count(name) for k, name in enumerate(names)]
     return [f"{name} ({k + 1})" if k else name for name, k in zip(names, again, strict=True)]
 
 
-def _same(one: Path | str | AnyLog, other: Path | str | AnyLog) -> bool:
+def _same(one: Path | str | Log, other: Path | str | Log) -> bool:
     """Whether two stand for one recording."""
-    if isinstance(one, AnyLog) or isinstance(other, AnyLog):
+    if isinstance(one, Log) or isinstance(other, Log):
         return one is other
     return Path(one).resolve() == Path(other).resolve()
 

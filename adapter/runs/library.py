@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,13 +35,12 @@ from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, 
 from adapter.signals.matching import matching, most_moved, present
 from adapter.signals.records import stamps_of
 from drivers.files.html_table import html_table, plus_minus
-from drivers.files.mcap import AnyLog, Log, open_log
+from drivers.files.mcap import Log
 from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion
 
 HELD_OUT_SHARE = 0.25  # of a recording, at its end
 EXPORTED = (".urdf", ".xml", ".json")
-_AnyLog = TypeVar("_AnyLog", bound=AnyLog)
 
 
 def load_model(
@@ -187,7 +186,7 @@ def learn(
     """Learn λ and θ of a fixed-base arm from a recording, as `adapter replay` does.
 
     Args:
-        log: a file, of any length (see `open_log`), or what `read_log` or `make_log` returned.
+        log: a file, of any length, or what `read_log` or `make_log` returned.
         model: the documented arm; the learner gets its topology, gravity, tool and limits.
         effects: names learned beside θ, () for none; those of a real arm where None.
         every: samples per update; 1 is what the live process does, up to 50 is faster.
@@ -206,7 +205,7 @@ def learn(
     >>> bool((found.held_out_rmse_nm < 0.2).all())
     True
     """
-    arm, own = _fitting(model, log if isinstance(log, Log) else open_log(log))
+    arm, own = _fitting(model, _log(log))
     end_s = last_s(own) if len(own) else 0.0
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
@@ -498,13 +497,12 @@ def _model(model: SelfModel | str | Path) -> SelfModel:
     return model if isinstance(model, SelfModel) else read_robot(model)
 
 
-def _fitting(model: SelfModel | str | Path, log: _AnyLog) -> tuple[SelfModel, _AnyLog]:
+def _fitting(model: SelfModel | str | Path, log: Log) -> tuple[SelfModel, Log]:
     """Model and recording with the same joints; a warning where the recording lacks some."""
     arm, locked = present(_model(model), log.joint_names, log.path)
     for sentence in locked:
         warnings.warn(sentence, ModelWarning, stacklevel=3)
-    own: AnyLog = matching(cast(Log, log), arm)
-    return arm, cast(_AnyLog, own)
+    return arm, matching(log, arm)
 
 
 def _log(log: Log | str | Path) -> Log:

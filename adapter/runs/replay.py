@@ -27,14 +27,13 @@ from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import stamps_of
 from adapter.signals.settings import FilterSettings
 from adapter.signals.validation import Rms, errors_of_pieces, rms_of, validation_error
-from drivers.files.mcap import AnyLog, Log, StoredLog, stored
+from drivers.files.mcap import Log, mapped
 from drivers.interface import DriverError
 
 FEWEST_FOR_NOISE = 50  # samples
 # States that pass the front end in one table: as much as a processor's cache holds. Of the exact
 # mode whole times `ADOPT_EVERY`.
 AT_ONCE = 2000
-STRETCHES = 64, 2000  # of a long recording, and samples of each, that tell its rate and noise
 BETWEEN_NS = 10**9  # of several recordings, more than any filter bridges
 MOST_PER_UPDATE = 50  # ms-samples; more per update leaves ADAM too few steps to arrive
 
@@ -95,7 +94,7 @@ class Replay:
     contacts: list[dict[str, Any]] = field(default_factory=list)
 
 
-def one_after_other(logs: Sequence[AnyLog]) -> AnyLog:
+def one_after_other(logs: Sequence[Log]) -> Log:
     """Recordings of one arm as one, in the order given, with a hole between them.
 
     The filter starts anew behind the hole, and what the hand carries may have changed in it; all
@@ -115,15 +114,14 @@ def one_after_other(logs: Sequence[AnyLog]) -> AnyLog:
         later_ns.append(end_ns + BETWEEN_NS - log.begin_ns if later_ns else 0)
         end_ns = log.end_ns + later_ns[-1]
     warnings = [text for log in logs for text in log.warnings]
-    in_memory = [log for log in logs if isinstance(log, Log)]
-    if len(in_memory) == len(logs):
-        return replace(_joined(in_memory, later_ns), warnings=warnings)
+    if not any(log.is_mapped for log in logs):
+        return replace(_joined(logs, later_ns), warnings=warnings)
     pieces = (
         replace(piece, stamp_ns=piece.stamp_ns + later)
         for log, later in zip(logs, later_ns, strict=True)
         for piece in log.pieces()
     )
-    return replace(stored(logs[0], pieces), warnings=warnings)
+    return replace(mapped(logs[0], pieces), warnings=warnings)
 
 
 def _joined(logs: Sequence[Log], later_ns: Sequence[int]) -> Log:
@@ -158,7 +156,7 @@ class ReplayOptions(NamedTuple):
 
 
 def replay(
-    log: AnyLog,
+    log: Log,
     documented: SelfModel,
     settings: PipelineSettings,
     options: ReplayOptions | None = None,
@@ -210,7 +208,7 @@ def replay(
 
 
 def _exact(
-    log: AnyLog,
+    log: Log,
     stop: int,
     pipeline: Pipeline,
     progress: Progress,
@@ -241,7 +239,7 @@ def _exact_piece(
     ticks.add(tick_ns)
 
 
-def filtered_tables(log: AnyLog, stop: int, front_end: FrontEnd) -> Iterator[Array]:
+def filtered_tables(log: Log, stop: int, front_end: FrontEnd) -> Iterator[Array]:
     """Filtered states (m, size) of the first `stop` samples of a recording, a table at a time."""
     at_once = max(AT_ONCE // front_end.filter.settings.states_per_sample, 1)
     for start in range(0, stop, at_once):
@@ -257,15 +255,15 @@ def _filtered(part: Log, front_end: FrontEnd) -> Array:
     return front_end.step_table(*joints, links, part.base)
 
 
-def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
+def fitted_to(log: Log, settings: FilterSettings) -> tuple[FilterSettings, list[str]]:
     """Filter settings for the rate of a recording and, where they leave it open, its noise.
 
-    Of a recording in a file both are told by stretches of it, see `STRETCHES`.
+    Of a mapped recording both are told by stretches of it, see `Log.spread`.
 
     Returns:
         The settings, and a sentence where the recording's rate is not the nominal one.
     """
-    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread(*STRETCHES)])
+    steps = np.concatenate([np.diff(part.stamp_ns) for part in log.spread()])
     steps = steps[steps > 0]
     changes: dict[str, float] = {}
     warnings = []
@@ -285,13 +283,13 @@ def fitted_to(log: AnyLog, settings: FilterSettings) -> tuple[FilterSettings, li
     return replace(settings, **changes), warnings
 
 
-def noise_levels(log: AnyLog) -> dict[str, Array]:
+def noise_levels(log: Log) -> dict[str, Array]:
     """White-noise level (n,) of q, dq and tau of a recording, from its high frequencies.
 
     Not numbers where there are too few samples, or too few that are not the one before. Of a
-    recording in a file it is that of stretches, see `STRETCHES`.
+    mapped recording it is that of stretches, see `Log.spread`.
     """
-    found = [_noise_levels(part) for part in log.spread(*STRETCHES)]
+    found = [_noise_levels(part) for part in log.spread()]
     with np.errstate(invalid="ignore"):
         return {
             name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))
@@ -316,13 +314,13 @@ def _noise_levels(log: Log) -> dict[str, Array]:
     }
 
 
-def held_out_rms(log: AnyLog, model: SelfModel, settings: PipelineSettings) -> Rms:
+def held_out_rms(log: Log, model: SelfModel, settings: PipelineSettings) -> Rms:
     """Torque error of a model on a recording it has not seen, N m.
 
     Of a base that floats, on the states that the front end makes of the recording; else by the
     recipe of `validation`.
     """
-    if isinstance(log, StoredLog):
+    if log.is_mapped:
         signals = ((seconds(x, log.first_ns), x.q, x.dq, x.tau) for x in log.pieces())
         return rms_of(errors_of_pieces(signals, ModelTorque(model)))
     if not model.tree.floating:
@@ -341,12 +339,12 @@ def seconds(log: Log, since_ns: int | None = None) -> Array:
     return 1e-9 * (log.stamp_ns - (log.stamp_ns[0] if since_ns is None else since_ns))
 
 
-def last_s(log: AnyLog) -> float:
+def last_s(log: Log) -> float:
     """Seconds from the first sample of a recording to the last one."""
     return float(seconds(log.piece(len(log) - 1, len(log)), log.first_ns)[0])
 
 
-def from_s(log: AnyLog, begin_s: float, end_s: float = np.inf) -> AnyLog:
+def from_s(log: Log, begin_s: float, end_s: float = np.inf) -> Log:
     """Samples of a recording from a time after its first one to another (not included), s."""
     first_ns = log.first_ns
 

@@ -27,7 +27,7 @@ from adapter.signals.source_table import (
     read_table,
 )
 from drivers.errors import choices
-from drivers.files.mcap import Log, McapWriter, derive_velocity
+from drivers.files.mcap import Log, derive_velocity, write_log
 from drivers.interface import Array, DriverError
 
 SIGNALS = ("time", "q", "dq", "tau")
@@ -175,7 +175,8 @@ def import_table(spec: ImportSpec, out: Path) -> ImportReport:
     log = table_log(spec)
     if out.exists() and not spec.overwrite:
         raise DriverError(f"{out}: exists; choose another name or delete it")
-    _write(spec, out, log.joint_names, (log.stamp_ns, log.q, log.dq, log.tau))
+    with whole_file(out) as part:
+        write_log(log, part, imported_by(spec))
     return ImportReport.of(out, log.joint_names, log.stamp_ns, log.warnings)
 
 
@@ -199,21 +200,6 @@ def table_log(spec: ImportSpec) -> Log:
     warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
     columns = reader.taken
     return Log(Path(where), names, stamp_ns, q, dq, tau, warnings=warnings, topic=columns)
-
-
-def _write(
-    spec: ImportSpec,
-    out: Path,
-    names: tuple[str, ...],
-    signals: tuple[NDArray[np.int64], Array, Array, Array],
-) -> None:
-    metadata = imported_by(spec)
-    with (
-        whole_file(out) as part,
-        McapWriter(part, names, metadata=metadata, overwrite=True) as writer,
-    ):
-        for stamp_ns, q, dq, tau in zip(*signals, strict=True):
-            writer.write_joint_state(int(stamp_ns), q, dq, tau)
 
 
 def imported_by(spec: ImportSpec) -> dict[str, Any]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import overload
 
 import numpy as np
 
 from adapter.model.locking import locked
 from adapter.model.self_model import SelfModel
-from drivers.files.mcap import IN_MEMORY, AnyLog, Log, StoredLog
+from drivers.files.mcap import IN_MEMORY, Log
 from drivers.interface import DriverError
-
-_LOOKS = 64, 2000  # at a recording, and samples of each, for where the arm moves
 
 
 def present(
@@ -67,15 +64,7 @@ def counted(documented: SelfModel, source: object, count: int | None) -> tuple[s
     return rows[0]
 
 
-@overload
-def matching(log: Log, documented: SelfModel) -> Log: ...
-
-
-@overload
-def matching(log: StoredLog, documented: SelfModel) -> StoredLog: ...
-
-
-def matching(log: AnyLog, documented: SelfModel) -> AnyLog:
+def matching(log: Log, documented: SelfModel) -> Log:
     """The recording with the robot's joints in the robot's order, and its links' motion.
 
     Names that differ in nothing but a namespace (left/panda_joint3), or in what stands before
@@ -140,11 +129,11 @@ def _number(name: str) -> str:
     return name[len(name.rstrip("0123456789")) :]
 
 
-def most_moved(log: AnyLog) -> Log:
-    """A recording in memory as it is; of one in a file a part in which the arm moves a lot."""
-    if isinstance(log, Log):
+def most_moved(log: Log) -> Log:
+    """A recording in memory as it is; of a mapped one a part in which the arm moves a lot."""
+    if not log.is_mapped:
         return log
-    parts = log.spread(*_LOOKS)
+    parts = log.spread()
     speeds = [float(np.mean(np.nan_to_num(part.dq) ** 2)) for part in parts]
     middle = int(np.argmax(speeds)) * len(log) // len(parts)
     start = max(min(middle - IN_MEMORY // 2, len(log) - IN_MEMORY), 0)

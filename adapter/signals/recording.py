@@ -12,17 +12,15 @@ from numpy.typing import NDArray
 from drivers.files.mcap import (
     JOINT_COMMANDS,
     Log,
-    Topic,
     derive_velocity,
     looks_like_degrees,
-    open_log,
+    read_log,
     sample_log,
     survey,
 )
-from drivers.interface import DriverError
+from drivers.interface import Array, DriverError
 
 GAP_S, _HOLE = 0.05, 3.0  # a longer step between samples, and usual steps, is called a gap
-_LOOKS = 64, 2000  # at a long recording that must be read whole, and samples of each
 _LISTED = 10  # gaps and topics that are listed one by one
 _FAST, _REST = 0.1, 0.02  # rad/s: from which a slope says something, below which a joint rests
 _PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
@@ -44,12 +42,13 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     """
     path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
     try:
-        looked = _Looked.at(path, topic) if log is None else _Looked.whole(log)
+        looked = _Looked.at(path, topic) if log is None else _Looked.of(log)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
     else:
-        topics, warnings, truncated = looked.topics, looked.warnings, looked.parts[0].truncated
+        first, warnings = looked.parts[0], looked.warnings
+        topics, truncated = first.topics, first.truncated
         facts = {"problem": None, **_joint_facts(looked), **_timing(looked)}
     return {
         "file": str(path),
@@ -68,39 +67,35 @@ class _Looked:
     Attributes:
         parts: all of it, or stretches in the order of time.
         samples, commands: of the whole.
-        topics, warnings: of the whole.
+        warnings: of the whole.
         holes: (s since the first sample, s) that are known beside those in the parts.
     """
 
     parts: list[Log]
     samples: int
     commands: int
-    topics: dict[str, Topic]
     warnings: list[str]
     holes: list[tuple[float, float]] = field(default_factory=list)
 
     @classmethod
-    def whole(cls, log: Log) -> _Looked:
-        """A recording in memory."""
+    def of(cls, log: Log) -> _Looked:
+        """A recording, a mapped one by a sample."""
+        parts = log.spread()
+        said = [_judged(parts, len(log))] if log.is_mapped else []
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
-        return cls([log], len(log), commands, log.topics, log.warnings)
+        return cls(parts, len(log), commands, [*log.warnings, *said])
 
     @classmethod
     def at(cls, path: Path, topic: str | None) -> _Looked:
         """A recording, a long one by a sample. Raises DriverError."""
         sample = sample_log(path, topic, frames=True)
-        if sample is not None:
-            told = sample.topics.get(JOINT_COMMANDS)
-            commands = 0 if told is None or sample.parts[0].commands is None else told.messages
-            said = [*sample.warnings, _judged(sample.parts, sample.samples)]
-            about = sample.samples, commands, sample.topics, said, sample.holes
-            return cls(sample.parts, *about)
-        log = open_log(path, topic=topic, frames=True)
-        if isinstance(log, Log):
-            return cls.whole(log)
-        parts = log.spread(*_LOOKS)
-        said = [*log.warnings, _judged(parts, len(log))]
-        return cls(parts, len(log), len(log.commands or ()), log.topics, said)
+        if sample is None:
+            return cls.of(read_log(path, topic=topic, frames=True))
+        parts, holes = sample
+        log, told = parts[0], parts[0].topics.get(JOINT_COMMANDS)
+        samples = log.topics[log.topic].messages
+        commands = 0 if told is None or log.commands is None else told.messages
+        return cls(parts, samples, commands, [*log.warnings, _judged(parts, samples)], holes)
 
 
 def _judged(parts: list[Log], samples: int) -> str:
@@ -160,35 +155,33 @@ def _range_line(name: str, found: dict[str, list[float]]) -> str:
     return f"{name}: " + "  ".join(f"{low:.3g}..{high:.3g}" for low, high in pairs)
 
 
-def _units(parts: list[Log]) -> str:
+def _units(parts: list[Log], q: Array, dq: Array, tau: Array) -> str:
     """What the numbers look like; a joint's torque has no size that all arms share."""
-    q = np.concatenate([part.q for part in parts])
     said = ["positions look like degrees" if looks_like_degrees(q) else "positions rad"]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slopes = [np.abs(derive_velocity(part.stamp_ns, part.q)) for part in parts]
-        slope, speed = np.concatenate(slopes), np.abs(np.concatenate([x.dq for x in parts]))
+        slope = np.abs(np.concatenate([derive_velocity(x.stamp_ns, x.q) for x in parts]))
         fast = slope > _FAST
-        ratio = float(np.median((speed / slope)[fast])) if fast.any() else np.nan
+        ratio = float(np.median((np.abs(dq) / slope)[fast])) if fast.any() else np.nan
     if not np.isfinite(ratio):
         said.append("velocities cannot be judged")
     elif _PLAUSIBLE < ratio < 1.0 / _PLAUSIBLE:
         said.append("velocities rad/s")
     else:
         said.append(f"velocities {ratio:.3g} times the slope of the positions")
-    most = max(float(np.nanmax(np.abs(part.tau), initial=0.0)) for part in parts)
+    most = float(np.nanmax(np.abs(tau), initial=0.0))
     return ", ".join([*said, f"efforts up to {most:.3g}, taken as N m"])
 
 
-def _teaches(looked: _Looked) -> str:
+def _teaches(looked: _Looked, dq: Array, tau: Array) -> str:
     log = looked.parts[0]
     with np.errstate(invalid="ignore"):
-        moving = np.concatenate([np.abs(part.dq) > _REST for part in looked.parts])
+        moving = np.abs(dq) > _REST
     resting = [n for j, n in enumerate(log.joint_names) if not moving[:, j].any()]
     seconds = float(moving.any(axis=1).mean()) * _duration_s(looked)
     said = [f"{seconds:.3g} s of motion"]
     if resting:
         said.append(f"at rest: {', '.join(resting)}")
-    if not any(np.any(np.nan_to_num(part.tau)) for part in looked.parts):
+    if not np.any(np.nan_to_num(tau)):
         said.append("no torques: nothing of inertias and friction")
     if log.twists is None and not log.frames:
         said.append("no link motion is recorded: it is synthesized from the documented lengths")
@@ -197,17 +190,15 @@ def _teaches(looked: _Looked) -> str:
 
 def _joint_facts(looked: _Looked) -> dict[str, Any]:
     log, parts = looked.parts[0], looked.parts
-    signals = {
-        "q_rad": np.concatenate([part.q for part in parts]),
-        "dq_rad_s": np.concatenate([part.dq for part in parts]),
-        "tau_nm": np.concatenate([part.tau for part in parts]),
-    }
+    tables = (np.concatenate([getattr(x, key) for x in parts]) for key in ("q", "dq", "tau"))
+    signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
+    q, dq, tau = signals.values()
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
         "joints": list(log.joint_names),
         "source": log.topic,
-        "units": _units(parts),
-        "teaches": _teaches(looked),
+        "units": _units(parts, q, dq, tau),
+        "teaches": _teaches(looked, dq, tau),
         "links": list(log.link_names),
         "frames": [f"{m.topic} ({m.frame})" for m in log.frames if m.frame not in log.link_names],
         "samples": looked.samples,

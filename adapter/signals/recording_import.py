@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,17 +16,9 @@ from adapter.signals.importer import ALL, ImportReport, ImportSpec, imported_by,
 from adapter.signals.matching import corresponding
 from adapter.signals.plausible import refuse_wild, value_doubts, velocity_doubts
 from drivers.errors import choices
-from drivers.files.mcap import (
-    Log,
-    McapWriter,
-    PositionLog,
-    is_recording,
-    read_log,
-    read_position_log,
-)
-from drivers.interface import Array, DriverError, LinkMotion
+from drivers.files.mcap import Log, is_recording, read_log, read_position_log, write_log
+from drivers.interface import Array, DriverError
 
-_AnyLog = TypeVar("_AnyLog", Log, PositionLog)
 _OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
 
 
@@ -57,17 +48,13 @@ def import_recording(spec: ImportSpec, out: Path) -> ImportReport:
     """
     if out.exists() and not spec.overwrite:
         raise DriverError(f"{out}: exists; choose another name or delete it")
-    log = position_log(spec) or recording_log(spec)
+    log = position_log(spec)
+    log = recording_log(spec) if log is None else log
     metadata = imported_by(spec)
-    if isinstance(log, PositionLog):
-        metadata["imported"]["topic"] = spec.topic
-        with whole_file(out) as part:
-            _write_positions(log, part, metadata)
-        return ImportReport.of(out, log.joint_names, log.stamp_ns, list(log.warnings))
     metadata["imported"]["topic"] = log.topic
     warnings = log.warnings + _left_behind(log)
     with whole_file(out) as part:
-        _write(log, part, metadata)
+        write_log(log, part, metadata)
     return ImportReport.of(out, log.joint_names, log.stamp_ns, warnings)
 
 
@@ -96,7 +83,7 @@ def recording_log(spec: ImportSpec) -> Log:
     return log
 
 
-def position_log(spec: ImportSpec) -> PositionLog | None:
+def position_log(spec: ImportSpec) -> Log | None:
     """The same of an arm that takes positions and tells no efforts; None of any other."""
     path = _source(spec)
     factor = _factors(spec)["q"]
@@ -104,9 +91,10 @@ def position_log(spec: ImportSpec) -> PositionLog | None:
     if log is None:
         return None
     log, said = _with_joints(log, spec.joint_names)
-    log = replace(log, q=log.q * factor, q_command=log.q_command * factor)
-    doubts = _doubts(spec, str(path), {"q": log.q})
-    return replace(log, warnings=(*log.warnings, *said, *doubts))
+    assert log.commands is not None and log.commands.q is not None
+    commands = replace(log.commands, q=log.commands.q * factor)
+    log = replace(log, q=log.q * factor, commands=commands)
+    return replace(log, warnings=log.warnings + said + _doubts(spec, str(path), {"q": log.q}))
 
 
 def _source(spec: ImportSpec) -> Path:
@@ -127,7 +115,7 @@ def _factors(spec: ImportSpec) -> dict[str, float]:
     return {signal: unit_factor(spec.units, signal) for signal in ("q", "dq", "tau")}
 
 
-def _with_joints(log: _AnyLog, want: tuple[str, ...]) -> tuple[_AnyLog, list[str]]:
+def _with_joints(log: Log, want: tuple[str, ...]) -> tuple[Log, list[str]]:
     """These joints under these names, and what to say where they were called otherwise.
 
     Names that differ in nothing but what stands before their number mean the same joint.
@@ -160,28 +148,3 @@ def _left_behind(log: Log) -> list[str]:
         f"{log.path}: not taken: {', '.join(frames + halves)} (`adapter discover` reads the "
         "recording itself)"
     ]
-
-
-def _write(log: Log, out: Path, metadata: dict[str, Any]) -> None:
-    links = log.link_names if log.twists is not None and log.accels is not None else ()
-    if links and not log.pairs_links:  # the copy must not say that link i is moved by joint i
-        metadata["link_names"] = []
-    with McapWriter(out, log.joint_names, links, metadata, overwrite=True) as writer:
-        for i, stamp_ns in enumerate(log.stamp_ns.tolist()):
-            writer.write_joint_state(stamp_ns, log.q[i], log.dq[i], log.tau[i])
-            if not links:
-                continue
-            assert log.twists is not None and log.accels is not None
-            if not np.isnan(log.twists[i]).all() or not np.isnan(log.accels[i]).all():
-                writer.write_links(stamp_ns, LinkMotion(log.twists[i], log.accels[i]))
-        if log.commands is not None:
-            for stamp_ns, tau in zip(log.commands.stamp_ns.tolist(), log.commands.tau, strict=True):
-                writer.write_command(stamp_ns, tau)
-
-
-def _write_positions(log: PositionLog, out: Path, metadata: dict[str, Any]) -> None:
-    with McapWriter(out, log.joint_names, metadata=metadata, overwrite=True) as writer:
-        for stamp_ns, q in zip(log.stamp_ns.tolist(), log.q, strict=True):
-            writer.write_position(stamp_ns, q)
-        for stamp_ns, q in zip(log.command_ns.tolist(), log.q_command, strict=True):
-            writer.write_position_command(stamp_ns, q)

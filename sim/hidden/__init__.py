@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from sim.hidden.record import Recording, pybullet_recording, simulate, write, write_files
+from sim.hidden.record import pybullet_recording, simulate, write, write_files
 from sim.hidden.trial import KINDS, SHARES, Trial, draw, nominal_urdf, seal, unseal
 
 __all__ = [
     "KINDS",
     "SHARES",
-    "Recording",
     "Trial",
     "draw",
     "nominal_urdf",

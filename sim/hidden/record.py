@@ -6,15 +6,13 @@ feedback of the links' true motion, so that no sensor effect shakes the arm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap import Log, McapWriter
-from drivers.files.mcap.joints import Commands
+from drivers.files.mcap import Commands, Log, write_log
 from drivers.interface import JointSample
 from sim.dynamics import torques
 from sim.hidden.trial import Trial, nominal_urdf, seal
@@ -25,31 +23,6 @@ from sim.truth import Array
 RATE_S = 35.0  # 1/s, the double pole of the feedback
 INTEGRAL_S = 8.0  # 1/s, pole of the slow part that carries friction and payloads
 PERIOD_S = 1e-3
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """What a recording holds.
-
-    Attributes:
-        joint_names: order of the columns.
-        stamp_ns: (m,).
-        q, dq, tau: (m, n) measured, rad, rad/s, N m.
-        commands: (m, n) torque commanded upon each sample, N m; None where it isn't recorded.
-    """
-
-    joint_names: tuple[str, ...]
-    stamp_ns: NDArray[np.int64]
-    q: Array
-    dq: Array
-    tau: Array
-    commands: Array | None = None
-
-    def log(self) -> Log:
-        """As a recording in memory."""
-        commands = None if self.commands is None else Commands(self.stamp_ns, self.commands)
-        signals = (self.stamp_ns, self.q, self.dq, self.tau)
-        return Log(Path("recording.mcap"), self.joint_names, *signals, commands=commands)
 
 
 class Follower:
@@ -104,14 +77,14 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
     return out[0], out[1], out[2], out[3]
 
 
-def pybullet_recording(trial: Trial) -> Recording:
+def pybullet_recording(trial: Trial) -> Log:
     """The recording of a trial, noise of the sensors added."""
     q, dq, tau, commands = simulate(trial)
     noise = SensorNoise(trial.noise, trial.arm.n, trial.seed)
     rows = enumerate(zip(q, dq, tau, strict=True))
     arrived = [noise.measure(k, JointSample(k * PERIOD_NS, *row)) for k, row in rows]
     kept = [sample for sample in arrived if sample is not None]
-    return Recording(
+    return log_of(
         trial.arm.joint_names,
         np.array([sample.stamp_ns for sample in kept], np.int64),
         np.array([sample.q for sample in kept]),
@@ -121,20 +94,23 @@ def pybullet_recording(trial: Trial) -> Recording:
     )
 
 
-def write_recording(recording: Recording, path: Path) -> None:
-    """As an MCAP file: joint states and, where there are any, commands; nothing else."""
-    rows = zip(recording.stamp_ns.tolist(), recording.q, recording.dq, recording.tau, strict=True)
-    with McapWriter(path, recording.joint_names, overwrite=True) as writer:
-        for k, row in enumerate(rows):
-            writer.write_joint_state(*row)
-            if recording.commands is not None:
-                writer.write_command(row[0], recording.commands[k])
+def log_of(
+    joint_names: tuple[str, ...],
+    stamp_ns: NDArray[np.int64],
+    q: Array,
+    dq: Array,
+    tau: Array,
+    commands: Array | None = None,
+) -> Log:
+    """A recording of what was measured (m, n), and commanded (m, n) upon each sample."""
+    told = None if commands is None else Commands(stamp_ns, commands)
+    return Log(Path("recording.mcap"), joint_names, stamp_ns, q, dq, tau, commands=told)
 
 
 def write(
     trial: Trial,
     folder: Path | str,
-    recording: Recording | None = None,
+    recording: Log | None = None,
     simulator: str = "pybullet",
 ) -> tuple[Path, Path, Path]:
     """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths.
@@ -145,18 +121,18 @@ def write(
         recording: made by another simulator; by PyBullet where None.
         simulator: its name, for the truth file.
     """
-    recording = recording or pybullet_recording(trial)
+    recording = pybullet_recording(trial) if recording is None else recording
     truth = {**trial.as_dict(), "simulator": simulator}
     return write_files(recording, nominal_urdf(trial.nominal), truth, Path(folder))
 
 
 def write_files(
-    recording: Recording, model: str, truth: dict[str, Any], folder: Path
+    recording: Log, model: str, truth: dict[str, Any], folder: Path
 ) -> tuple[Path, Path, Path]:
     """The three files of a trial: recording, URDF text, contents of the truth file."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = folder / "recording.mcap", folder / "nominal.urdf", folder / "truth.json"
-    write_recording(recording, paths[0])
+    write_log(recording, paths[0], {})
     paths[1].write_text(model, "utf-8")
     paths[2].write_text(seal(truth), "utf-8")
     return paths

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from drivers.files.mcap import Log
 from sim.hidden.bristles import Bristles, draw_bristles, sizes
 from sim.hidden.motion import MARGIN_RAD, hand, points
-from sim.hidden.record import Recording
+from sim.hidden.record import log_of
 from sim.hidden.sizes import FLANGE_M, WRIST, WRIST_SHARE, log_uniform
 from sim.hidden.trial import ATTEMPTS, first_order, possible
 from sim.noise import levels_of
@@ -164,7 +165,7 @@ def _sines(rng: np.random.Generator, t: Array, n: int) -> Array:
     return np.asarray((rng.standard_normal((SINES, 1, n)) / np.sqrt(w) * sines).sum(axis=0))
 
 
-def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Recording:
+def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Log:
     """What the recorder makes of clean q, dq and drive torque (m, n), a row each `STEP_S`."""
     rng = np.random.default_rng([twin.seed, NOISE_STREAM, twin.motion_number, twin.load_number])
     m, n = q.shape
@@ -189,7 +190,7 @@ def recorded(twin: Twin, q: Array, dq: Array, tau: Array) -> Recording:
     step = np.asarray(levels.tau_step)
     start_ns = int(rng.integers(0, 10**9)) * 10**9
     stamp_ns = start_ns + np.round(1e9 * stamps).astype(np.int64)
-    return Recording(twin.arm.joint_names, stamp_ns, q, dq, np.round(tau / step) * step)
+    return log_of(twin.arm.joint_names, stamp_ns, q, dq, np.round(tau / step) * step)
 
 
 def _stamps(rng: np.random.Generator, end_s: float) -> tuple[Array, NDArray[np.intp]]:

@@ -19,15 +19,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from drivers.files.mcap import Log
 from sim.hidden import Trial, draw, unseal
-from sim.hidden.record import Recording, pybullet_recording, write
+from sim.hidden.record import pybullet_recording, write
 from tests.helpers.gap_judges import torque_judge
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import detectability
 from tests.helpers.gap_scorer import Row, score_trial, summary, table
 from tests.helpers.gap_tools import pinocchio_recording
 
-SIMULATORS: dict[str, Callable[[Trial], Recording]] = {
+SIMULATORS: dict[str, Callable[[Trial], Log]] = {
     "pybullet": pybullet_recording,
     "mujoco": mujoco_recording,
     "pinocchio": pinocchio_recording,
@@ -35,7 +36,7 @@ SIMULATORS: dict[str, Callable[[Trial], Recording]] = {
 BY_SEED = ("pinocchio", "mujoco")  # even seeds, odd seeds
 Analyse = Callable[..., Any]
 # Judges a result beyond its names: (trial, recording, result, its folder) -> figures for the row.
-Judge = Callable[[Trial, Recording, dict[str, Any], Path], Row]
+Judge = Callable[[Trial, Log, dict[str, Any], Path], Row]
 
 
 def workflow() -> Analyse:

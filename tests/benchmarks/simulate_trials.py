@@ -29,13 +29,14 @@ from adapter.model.model_file import load_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.simulate import SIMULATORS, Rollouts
+from drivers.files.mcap import Log
 from sim.hidden import Trial, draw
-from sim.hidden.record import Recording, pybullet_recording
+from sim.hidden.record import pybullet_recording
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import second
 from tests.helpers.gap_tools import pinocchio_recording
 
-MAKERS: dict[str, Callable[[Trial], Recording]] = {
+MAKERS: dict[str, Callable[[Trial], Log]] = {
     "pybullet": pybullet_recording,
     "mujoco": mujoco_recording,
     "pinocchio": pinocchio_recording,
@@ -52,10 +53,10 @@ def true_model(trial: Trial) -> SelfModel:
     return replace(documented("panda"), theta=trial.arm.theta, effects=tuple(entries))
 
 
-def errors(log: Recording, truth: SelfModel, model: SelfModel, simulator: str) -> dict[str, Any]:
+def errors(log: Log, truth: SelfModel, model: SelfModel, simulator: str) -> dict[str, Any]:
     """Position errors by joint (n,) mrad of the true and of the learned model along a recording."""
     simulate = Rollouts(simulator)
-    off = rollout_errors(Recorded.of(log.log()), truth, [model], simulate)
+    off = rollout_errors(Recorded.of(log), truth, [model], simulate)
     true, ours = (1e3 * rms([x]) for x in (off.before_q, off.after_q))
     return {
         "true_mrad": true.tolist(),
@@ -71,7 +72,7 @@ def run_trial(seed: int, effect: str, maker: str) -> dict[str, Any]:
     trial, begun = draw(seed, effect=effect, rubs=False), time.perf_counter()
     with TemporaryDirectory() as folder:
         path = Path(folder) / "model.json"
-        found = find_gap([MAKERS[maker](trial).log()], "panda", model_out=path)
+        found = find_gap([MAKERS[maker](trial)], "panda", model_out=path)
         model = load_model(path)
     unseen = MAKERS[maker](second(trial))
     row: dict[str, Any] = {"seed": seed, "effect": effect, "maker": maker}

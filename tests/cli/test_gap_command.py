@@ -20,10 +20,9 @@ from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel, Tool
 from adapter.signals.validation import rms_of, validation_error
 from adapter.simulate import SIMULATORS, Rollouts
-from drivers.files.mcap import read_log
+from drivers.files.mcap import Log, read_log, write_log
 from sim.effects import Effect
-from sim.hidden import Recording, Trial, draw, nominal_urdf, pybullet_recording
-from sim.hidden.record import write_recording
+from sim.hidden import Trial, draw, nominal_urdf, pybullet_recording
 from tests.helpers.gap_tools import believed, pinocchio_recording
 
 COULOMB = Effect("coulomb_friction", (4,), {"Fc": 2.0})
@@ -53,9 +52,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gap")
     first = trial(5, 12.0)
     (folder / "arm.urdf").write_text(nominal_urdf(first.nominal))
-    write_recording(pinocchio_recording(first), folder / "one.mcap")
+    write_log(pinocchio_recording(first), folder / "one.mcap", {})
     again = replace(first, motion=trial(6, 12.0).motion, seconds=8.0)
-    write_recording(pinocchio_recording(again), folder / "two.mcap")
+    write_log(pinocchio_recording(again), folder / "two.mcap", {})
     return folder
 
 
@@ -67,9 +66,7 @@ def found(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, d
 
 def changed(data: Path, to: Path, **signals: Any) -> Path:
     """The first recording with other signals."""
-    log = read_log(data / "one.mcap")
-    fields = {name: getattr(log, name) for name in ("joint_names", "stamp_ns", "q", "dq", "tau")}
-    write_recording(Recording(**{**fields, **signals}), to)
+    write_log(replace(read_log(data / "one.mcap"), **signals), to, {})
     return to
 
 
@@ -190,29 +187,29 @@ def test_one_of_two_recordings_is_held_out(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def hidden() -> tuple[Trial, Recording]:
+def hidden() -> tuple[Trial, Log]:
     """What PyBullet recorded with its commands, without the torque that disturbs the arm."""
     arm = replace(trial(3, 6.0), commands=True, disturbance_nm=np.zeros(7))
     return arm, pybullet_recording(arm)
 
 
 @pytest.fixture(scope="module")
-def simulated(hidden: tuple[Trial, Recording]) -> tuple[Recorded, SelfModel, SelfModel]:
+def simulated(hidden: tuple[Trial, Log]) -> tuple[Recorded, SelfModel, SelfModel]:
     """The recording, and the arm's model without and with its effect."""
     nominal = replace(documented("panda"), theta=hidden[0].arm.theta)
-    recorded = Recorded.of(hidden[1].log())
+    recorded = Recorded.of(hidden[1])
     return recorded, nominal, replace(nominal, effects=(COULOMB.as_dict(),))
 
 
-def test_rollouts_of_the_command(hidden: tuple[Trial, Recording], tmp_path: Path) -> None:
-    write_recording(hidden[1], tmp_path / "log.mcap")
+def test_rollouts_of_the_command(hidden: tuple[Trial, Log], tmp_path: Path) -> None:
+    write_log(hidden[1], tmp_path / "log.mcap", {})
     figures = gap(tmp_path, "panda", [tmp_path / "log.mcap"], "--simulator", "mujoco")
     assert coulomb_on_joint_4(figures) == pytest.approx(2.0, rel=0.05)
     assert figures["simulator"] == "mujoco"
     before, after = (np.array(figures[x]["rollout_rmse_rad"]) for x in ("before", "after"))
     assert after[3] < 0.2 * before[3] and (after < 0.3 * before).all()
     assert "forward simulation by mujoco" in (tmp_path / "out" / "report.html").read_text()
-    recorded, model = Recorded.of(hidden[1].log()), load_model(figures["model_out"])
+    recorded, model = Recorded.of(hidden[1]), load_model(figures["model_out"])
     nominal = documented("panda")
     both = [rollout_errors(recorded, nominal, [model], Rollouts(name)) for name in SIMULATORS]
     for key in ("before_q", "after_q"):

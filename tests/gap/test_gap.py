@@ -17,14 +17,15 @@ import numpy as np
 import pytest
 
 from adapter.gap.workflow import find_gap
+from drivers.files.mcap import Log
 from sim.effects import Effect
-from sim.hidden import Recording, Trial, draw, pybullet_recording, write
+from sim.hidden import Trial, draw, pybullet_recording, write
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import SECOND, detectability, second
 from tests.helpers.gap_scorer import covers, same_joints, score_trial
 from tests.helpers.gap_tools import pinocchio_recording
 
-Simulator = Callable[[Trial], Recording]
+Simulator = Callable[[Trial], Log]
 Z_LEAST, WIDE_RAD = 12.0, 1.2
 DATE_S = 0.3
 ANOTHER_SEED = 2 * SECOND  # noise of a repeat, apart from that of any other recording here

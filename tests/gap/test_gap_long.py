@@ -19,7 +19,7 @@ from adapter.gap.weighed import moments_of
 from adapter.gap.workflow import find_gap
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
-from drivers.files.mcap import Log, stored
+from drivers.files.mcap import Log, mapped
 from tests.helpers.long_arm import DRIFTING, LOAD_KG, Hidden, log_of
 
 SECONDS, HZ = 96.0, 200
@@ -123,7 +123,7 @@ def test_nothing_changes_where_nothing_does() -> None:
 def test_what_is_hidden_in_a_long_recording_is_named_and_dated(seed: int, holds: bool) -> None:
     hidden = Hidden(SECONDS, holds)
     made = log_of(SECONDS, hidden, HZ, seed)
-    own = stored(made, made.pieces(5000))
+    own = mapped(made, made.pieces(5000))
     assert is_long(own)
     result = find_gap([own], documented("panda"))
     loads = [f for f in result.findings if f.effect == "payload"]

@@ -18,7 +18,7 @@ from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
-from sim.hidden.record import Recording
+from sim.hidden.record import log_of
 from sim.hidden.trial import nominal_urdf
 from sim.truth import Array, panda
 from tests.helpers.gap_effects import regressor
@@ -56,7 +56,7 @@ def loaded(signals: tuple[Array, ...], mass: float, piece: tuple[float, float]) 
     tau = tau + np.column_stack([np.interp(t, grid, x) for x in more.T])
     on = (t >= piece[0]) & (t < piece[1])
     stamps = np.round(1e9 * t[on]).astype(np.int64)
-    return Recording(panda().joint_names, stamps, q[on], dq[on], tau[on]).log()
+    return log_of(panda().joint_names, stamps, q[on], dq[on], tau[on])
 
 
 def weighed(log: Log, model: SelfModel) -> RealArm:

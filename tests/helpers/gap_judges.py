@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from adapter.model.model_file import load_model
+from drivers.files.mcap import Log
 from sim.effects import effect_from
-from sim.hidden import Recording, Trial
+from sim.hidden import Trial
 from tests.helpers.gap_oracle import Oracle, rms, second
 from tests.helpers.gap_scorer import Row
 from tests.helpers.gap_tools import pinocchio_recording
 
 
-def torque_judge(trial: Trial, recording: Recording, result: dict[str, Any], folder: Path) -> Row:
+def torque_judge(trial: Trial, recording: Log, result: dict[str, Any], folder: Path) -> Row:
     """Torque RMSE at 25 Hz of the model that was written, against that of the oracle's fit.
 
     Both are fitted to `recording` and judged on a second recording of the same arm. The effects

@@ -13,9 +13,9 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 
+from drivers.files.mcap import Log
 from sim.effects import Effect
 from sim.hidden import Trial
-from sim.hidden.record import Recording
 from sim.truth import Truth, body_of
 from tests.helpers.gap_effects import (
     Array,
@@ -184,7 +184,7 @@ def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
     return q + error, dq + slope(t, error), tau, command
 
 
-def mujoco_recording(trial: Trial) -> Recording:
+def mujoco_recording(trial: Trial) -> Log:
     """The recording of a trial."""
     q, dq, tau, commands = simulate(trial)
     return recorded(trial, q, dq, tau, commands if trial.commands else None)

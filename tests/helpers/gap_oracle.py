@@ -16,12 +16,13 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import fftconvolve, firwin
 
+from drivers.files.mcap import Log
 from sim.effects import Effect
 from sim.hidden import Trial
 from sim.hidden.motion import draw_motion
 from sim.truth import Truth
 from tests.helpers.gap_effects import Array, predict, regressor, rnea, sense, slope
-from tests.helpers.gap_tools import Recording, sensor_noise
+from tests.helpers.gap_tools import sensor_noise
 
 TAPS, EDGE, STEP = 1001, 500, 40  # at 1 kHz: transition of 3 Hz; half a filter; to 25 Hz
 LOWPASS = firwin(TAPS, 10.0, fs=1000.0)[:, None]
@@ -209,7 +210,7 @@ class Oracle:
         recording: made of it, by whatever simulator.
     """
 
-    def __init__(self, trial: Trial, recording: Recording) -> None:
+    def __init__(self, trial: Trial, recording: Log) -> None:
         self._trial = trial
         self._t = trial.times[: len(recording.q)]
         self._q, self._dq, self._tau = map(smooth, (recording.q, recording.dq, recording.tau))

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.signal import butter, sosfilt
 
+from drivers.files.mcap import Log
 from sim.hidden import Trial, draw, nominal_urdf
 from sim.hidden.motion import DrawnMotion, draw_motion
-from sim.hidden.record import Recording, write_files
+from sim.hidden.record import log_of, write_files
 from sim.hidden.sizes import WRIST, WRIST_SHARE, log_uniform
 from sim.hidden.trial import DISTURBANCE_HZ, DISTURBANCE_NM, TRIAL_STREAM, wrong_bodies
 from sim.noise_levels import NoiseLevels
@@ -72,17 +73,17 @@ def sensor_noise(levels: NoiseLevels, shape: tuple[int, int], seed: int) -> tupl
     return q, dq, white + np.sqrt(np.maximum(power, 0)) * band / band.std(axis=0)
 
 
-def recorded(trial: Trial, q: Array, dq: Array, tau: Array, commands: Array | None) -> Recording:
+def recorded(trial: Trial, q: Array, dq: Array, tau: Array, commands: Array | None) -> Log:
     """Noise-free readings (m, n) as they are recorded."""
     more = sensor_noise(trial.noise, q.shape, trial.seed)
     q, dq, tau = (x + e for x, e in zip((q, dq, tau), more, strict=True))
     step = np.asarray(trial.noise.tau_step)
     stamps = 1_000_000 * np.arange(len(q), dtype=np.int64)
     names = trial.arm.joint_names
-    return Recording(names, stamps, q, dq, np.round(tau / step) * step, commands)
+    return log_of(names, stamps, q, dq, np.round(tau / step) * step, commands)
 
 
-def pinocchio_recording(trial: Trial) -> Recording:
+def pinocchio_recording(trial: Trial) -> Log:
     """The recording of a trial, by Pinocchio alone."""
     motion = trial.motion.at(trial.times)
     rubs = 0.0 if trial.friction is None else trial.friction.along(motion[1], 1e-3)
@@ -92,7 +93,7 @@ def pinocchio_recording(trial: Trial) -> Recording:
 
 def pinocchio_trial(
     seed: int, kind: str | None = None, effect: str | None = None
-) -> tuple[Recording, str, dict[str, Any]]:
+) -> tuple[Log, str, dict[str, Any]]:
     """Recording, nominal URDF and truth of a seed; see `sim.hidden.draw`."""
     trial = draw(seed, kind, effect)
     return pinocchio_recording(trial), nominal_urdf(trial.nominal), truth_of(trial, "pinocchio")
@@ -104,7 +105,7 @@ def truth_of(trial: Trial, simulator: str) -> dict[str, Any]:
 
 
 def write_trial(
-    trial: tuple[Recording, str, dict[str, Any]], folder: Path | str
+    trial: tuple[Log, str, dict[str, Any]], folder: Path | str
 ) -> tuple[Path, Path, Path]:
     """Write recording.mcap, nominal.urdf and the sealed truth.json; returns their paths."""
     recording, urdf, truth = trial

@@ -9,7 +9,7 @@ import numpy as np
 
 from adapter.gap.servo import UNITS, ServoGap
 from adapter.gap.servo_model import ServoModel
-from drivers.files.mcap import PositionLog
+from drivers.files.mcap import Commands, Log
 from sim.dynamics import mass_matrix
 from sim.hidden.motion import draw_motion
 from sim.position_arm import PositionRecording, Servos, draw_servos, record
@@ -84,10 +84,11 @@ def position_arm(seed: int, drawn: Drawn | None = None) -> PositionArm:
     return PositionArm(truth.with_changes(theta=truth.theta * factor), servos, drawn)
 
 
-def as_log(recording: PositionRecording, name: str = "arm.mcap") -> PositionLog:
+def as_log(recording: PositionRecording, name: str = "arm.mcap") -> Log:
     """In memory."""
-    r = recording
-    return PositionLog(Path(name), r.joint_names, r.stamp_ns, r.q, r.stamp_ns, r.q_command)
+    r, none = recording, np.full_like(recording.q, np.nan)
+    orders = Commands(r.stamp_ns, np.full_like(r.q_command, np.nan), r.q_command)
+    return Log(Path(name), r.joint_names, r.stamp_ns, r.q, none, none, commands=orders)
 
 
 def named(gap: ServoGap) -> set[tuple[str, int]]:

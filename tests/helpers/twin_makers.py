@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from sim.hidden.record import Recording
+from drivers.files.mcap import Log
 from sim.hidden.twins import STEP_S, Twin, recorded
 from tests.helpers.gap_effects import Array, rnea
 from tests.helpers.gap_mujoco import mjcf
@@ -14,14 +14,14 @@ STIFF, DAMP, SLOW = 3600.0, 120.0, 6.0  # 1/s2, 1/s and 1/s of the controller
 SUBSTEPS = 4
 
 
-def by_pinocchio(twin: Twin) -> Recording:
+def by_pinocchio(twin: Twin) -> Log:
     """The arm does exactly what it is told."""
     q, dq, ddq = twin.motion
     tau = rnea(twin.arm, q, dq, ddq) + twin.friction.along(dq, STEP_S)
     return recorded(twin, q, dq, tau)
 
 
-def by_mujoco(twin: Twin) -> Recording:
+def by_mujoco(twin: Twin) -> Log:
     """The arm under computed torque of the nominal model, simulated forward.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from sim.hidden.record import Recording
+from drivers.files.mcap import Log
 from sim.truth import Truth
 from tests.helpers.gap_effects import regressor, rnea
 
@@ -16,7 +16,7 @@ PRIOR = np.array([PRIOR_KG, *[PRIOR_KGM] * 3, *[0.1] * 6])
 ROUNDS = 5  # of the joints' weights
 
 
-def weighed(recording: Recording, nominal: Truth) -> float:
+def weighed(recording: Log, nominal: Truth) -> float:
     """Mass kg of a load on the last link, friction and offsets of all joints learned beside it."""
     t = 1e-9 * (recording.stamp_ns - recording.stamp_ns[0])
     grid = np.arange(t[0], t[-1], 1 / RATE_HZ)

@@ -30,7 +30,7 @@ from adapter.runs.replay import (
 )
 from adapter.signals import validation
 from adapter.signals.matching import matching, most_moved
-from drivers.files.mcap import Log, StoredLog, stored
+from drivers.files.mcap import Log, mapped
 from drivers.interface import Array
 
 SETTINGS = PipelineSettings(learner=LearnerSettings(effects=REAL_ARM_EFFECTS))
@@ -59,8 +59,8 @@ def moving(seconds: float, seed: int) -> Log:
     return Log(Path("arm.mcap"), panda().tree.joint_names, stamps, *noisy)
 
 
-def in_file(log: Log) -> StoredLog:
-    return stored(log, log.pieces(3_000))
+def in_file(log: Log) -> Log:
+    return mapped(log, log.pieces(3_000))
 
 
 def information(found: Replay) -> tuple[Array, Array]:
@@ -119,21 +119,20 @@ def test_parts_of_a_recording_in_a_file() -> None:
     whole = in_file(log)
     assert last_s(whole) == last_s(log) == pytest.approx(11.999)
     late, theirs = from_s(whole, 8.0), from_s(log, 8.0)
-    assert isinstance(late, StoredLog) and isinstance(theirs, Log)
-    assert np.array_equal(late.in_memory().tau, theirs.tau)
+    assert late.is_mapped and not theirs.is_mapped
+    assert np.array_equal(late.tau, theirs.tau)
     for name, level in noise_levels(whole).items():
         assert level == pytest.approx(noise_levels(log)[name], rel=0.1)
     assert len(most_moved(whole)) == len(log)
     mixed = replace(log, joint_names=tuple(reversed(log.joint_names)))
-    assert np.array_equal(matching(in_file(mixed), panda()).in_memory().q, log.q[:, ::-1])
+    assert np.array_equal(matching(in_file(mixed), panda()).q, log.q[:, ::-1])
 
 
 def test_recordings_one_after_the_other_in_a_file() -> None:
     log = moving(3.0, 1)
     ours, theirs = one_after_other([in_file(log), log]), one_after_other([log, log])
-    assert isinstance(ours, StoredLog) and isinstance(theirs, Log)
-    whole = ours.in_memory()
-    assert np.array_equal(whole.stamp_ns, theirs.stamp_ns) and np.array_equal(whole.q, theirs.q)
+    assert ours.is_mapped and not theirs.is_mapped
+    assert np.array_equal(ours.stamp_ns, theirs.stamp_ns) and np.array_equal(ours.q, theirs.q)
 
 
 def test_tick_times_in_bins() -> None:

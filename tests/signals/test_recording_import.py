@@ -211,5 +211,5 @@ def test_an_arm_that_takes_positions(tmp_path):
     assert log.joint_names == ("b", "a")
     turned = np.radians(np.column_stack([-np.arange(50.0), np.arange(50.0)]))
     assert np.allclose(log.q, turned)
-    assert np.array_equal(log.command_ns, 10**9 + np.arange(50) * 10**7 + 3)
-    assert np.allclose(log.q_command[:, 1], np.radians(np.arange(50) + 1.0))
+    assert np.array_equal(log.commands.stamp_ns, 10**9 + np.arange(50) * 10**7 + 3)
+    assert np.allclose(log.commands.q[:, 1], np.radians(np.arange(50) + 1.0))

@@ -12,7 +12,7 @@ import pytest
 from adapter.model.model_file import save_model
 from adapter.model.robots import documented
 from adapter.model.urdf import read_urdf
-from drivers.files.mcap import read_log
+from drivers.files.mcap import Commands, read_log
 from sim.hidden import SHARES, draw, motion, unseal
 from sim.hidden.record import pybullet_recording, simulate, write
 from sim.hidden.sizes import CATALOGUE, OUTSIDE, WIDER, WRIST, WRIST_SHARE, draw_effect
@@ -131,7 +131,10 @@ def test_motions_keep_the_limits(trials):
 
 def test_recording_tells_nothing_but_what_was_measured(tmp_path):
     trial = next(t for t in map(draw, SEEDS) if t.kind == "single" and t.commands)
-    recording = replace(pinocchio_recording(trial), commands=np.zeros((20000, 7)))
+    recording = replace(
+        pinocchio_recording(trial),
+        commands=Commands(np.arange(20000) * 10**6, np.zeros((20000, 7))),
+    )
     log, model, truth = write(trial, tmp_path, recording, "pinocchio")
     data = log.read_bytes() + model.read_bytes()
     read = read_log(log)

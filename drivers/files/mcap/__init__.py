@@ -11,30 +11,21 @@ topic.
 """
 
 from drivers.files.mcap.bags import is_recording
-from drivers.files.mcap.imus import READERS, FrameMotion
-from drivers.files.mcap.joint_rows import derive_velocity, looks_like_degrees
-from drivers.files.mcap.joints import Commands
+from drivers.files.mcap.imus import READERS
+from drivers.files.mcap.joints import derive_velocity, looks_like_degrees
 from drivers.files.mcap.links import Carrier
-from drivers.files.mcap.log import (
-    Log,
-    Topic,
+from drivers.files.mcap.log import Commands, FrameMotion, Log, Topic, mapped, write_log
+from drivers.files.mcap.positions import read_position_log
+from drivers.files.mcap.read import (
+    IN_MEMORY,
     read_estimates,
     read_log,
     read_messages,
     read_sensors,
     survey,
 )
-from drivers.files.mcap.positions import PositionLog, read_position_log
 from drivers.files.mcap.recover import Recovery, recover
-from drivers.files.mcap.sampled import SampledLog, sample_log
-from drivers.files.mcap.stored_log import (
-    IN_MEMORY,
-    AnyLog,
-    StoredCommands,
-    StoredLog,
-    open_log,
-    stored,
-)
+from drivers.files.mcap.sampled import sample_log
 from drivers.files.mcap.writer import FLUSH_S, JOINT_COMMANDS, McapWriter, to_json
 
 __all__ = [
@@ -42,22 +33,17 @@ __all__ = [
     "IN_MEMORY",
     "JOINT_COMMANDS",
     "READERS",
-    "AnyLog",
     "Carrier",
     "Commands",
     "FrameMotion",
     "Log",
     "McapWriter",
-    "PositionLog",
     "Recovery",
-    "SampledLog",
-    "StoredCommands",
-    "StoredLog",
     "Topic",
     "derive_velocity",
     "is_recording",
     "looks_like_degrees",
-    "open_log",
+    "mapped",
     "read_estimates",
     "read_log",
     "read_messages",
@@ -65,7 +51,7 @@ __all__ = [
     "read_sensors",
     "recover",
     "sample_log",
-    "stored",
     "survey",
     "to_json",
+    "write_log",
 ]

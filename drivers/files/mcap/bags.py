@@ -29,6 +29,7 @@ import zstandard
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
+from drivers.files import names
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
 from drivers.files.mcap.series import PARSERS, schema_name
@@ -47,7 +48,6 @@ _OWN_SCHEMAS = 2**16  # beyond the numbers that a file can give its schemas
 _TOGETHER = 4096  # messages of one region
 _STEP = 2**20
 _REGION_BYTES = 2**24  # beyond them a region ends
-METADATA = "metadata.yaml"  # beside the files of a rosbag2
 _COMPUTED = """
 SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%'
 UNION ALL SELECT t.name || '.' || x.name FROM sqlite_master t, pragma_table_xinfo(t.name) x
@@ -55,7 +55,6 @@ WHERE t.type = 'table' AND x.hidden <> 0"""
 _QOS = "offered_qos_profiles"
 _FILES = "relative_file_paths"
 _METADATA_LIMIT = 2**20  # bytes; a topic has some hundred
-_OF_BAGS = (".db3", ".bag", ".mcap")
 
 
 def open_scan(path: Path) -> Scan:
@@ -80,18 +79,13 @@ def open_scan(path: Path) -> Scan:
     return McapOfAnyRos(path)
 
 
-def is_rosbag2(path: Path) -> bool:
-    """Whether a folder is one recording of rosbag2."""
-    return (path / METADATA).is_file()
-
-
 def is_recording(path: Path) -> bool:
     """Whether a file is one by its first bytes, packed or not, or by its name, or a folder has one.
 
     A damaged recording is one, too. False of what cannot be opened.
     """
     if path.is_dir():
-        return is_rosbag2(path) or any(p.suffix in _OF_BAGS for p in path.iterdir())
+        return names.is_recording(path) or any(p.suffix in names.RECORDINGS for p in path.iterdir())
     try:
         with path.open("rb") as file:
             head = file.read(len(_SQLITE))
@@ -101,14 +95,13 @@ def is_recording(path: Path) -> bool:
                 head = unpack(file).read(len(_SQLITE))
     except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError):
         head = b""
-    named = path.with_suffix("") if path.suffix in (".gz", ".zst", ".zstd") else path
-    return head.startswith((_SQLITE, _ROS1, MAGIC)) or named.suffix in _OF_BAGS
+    return head.startswith((_SQLITE, _ROS1, MAGIC)) or names.is_recording(path)
 
 
 def _open_folder(path: Path) -> Scan:
-    if is_rosbag2(path):
+    if names.is_recording(path):
         return FolderScan(path)
-    files = sorted(p for p in path.iterdir() if p.suffix in _OF_BAGS)
+    files = sorted(p for p in path.iterdir() if p.suffix in names.RECORDINGS)
     if len(files) == 1:
         return open_scan(files[0])
     inside = ", ".join(p.name for p in files) or "no recording"
@@ -117,7 +110,7 @@ def _open_folder(path: Path) -> Scan:
 
 def _files_of(folder: Path) -> list[Path]:
     """The files of a rosbag2, in their order. Raises DriverError where one is not there."""
-    about = folder / METADATA
+    about = folder / names.METADATA
     try:
         text = read_text(about, _METADATA_LIMIT)
         # Composed and not constructed: a few merged mappings would fill the memory.
@@ -128,10 +121,10 @@ def _files_of(folder: Path) -> list[Path]:
     try:
         told = {k.value: v for k, v in root.value}["rosbag2_bagfile_information"]
         listed = {k.value: v for k, v in told.value}[_FILES]
-        names = [PurePath(x.value).name for x in listed.value]
+        inside = [PurePath(x.value).name for x in listed.value]
     except (AttributeError, TypeError, ValueError, KeyError) as error:
         raise DriverError(f"{about}: has no list of files ({_FILES})") from error
-    files = [folder / name for name in dict.fromkeys(names)]
+    files = [folder / name for name in dict.fromkeys(inside)]
     for file in files:
         if not file.is_file():
             raise DriverError(f"{about}: names the file {file.name}, which is not there")
@@ -226,7 +219,7 @@ class FolderScan(Scan):
         try:
             self._files = _files_of(path)
         except DriverError as error:
-            self._files = sorted(p for p in path.iterdir() if p.suffix in _OF_BAGS)
+            self._files = sorted(p for p in path.iterdir() if p.suffix in names.RECORDINGS)
             if len(self._files) != 1:
                 raise
             self.warnings.append(f"{error}; the only file there is read, {self._files[0].name}")

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.files.mcap.joints import stamps
 from drivers.files.mcap.links import Carrier, Links
+from drivers.files.mcap.log import FrameMotion
 from drivers.files.mcap.series import Series
 from drivers.files.ros_types import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
 from drivers.interface import Array
@@ -29,25 +28,6 @@ _MOST_W = 200.0  # rad/s; gyroscopes end at 70 (4000 °/s)
 _MOST_A = 5000.0  # m/s²; accelerometers of robots end at 2000 (200 g)
 _AT_REST = (5.0, 15.0)  # m/s², the median of what an accelerometer reads lies around 9.81
 _RARE = 0.05  # of a topic's messages; a frame named less often comes from damaged ones
-
-
-@dataclass(frozen=True, slots=True)
-class FrameMotion:
-    """What one topic says of one frame, in its axes; not a number where not measured.
-
-    Attributes:
-        topic, schema, frame: their names.
-        stamp_ns: (k,) ns.
-        w, a, v: (k, 3) angular velocity rad/s, what an accelerometer reads m/s², velocity m/s.
-    """
-
-    topic: str
-    schema: str
-    frame: str
-    stamp_ns: NDArray[np.int64]
-    w: Array
-    a: Array
-    v: Array
 
 
 def with_imus(

@@ -1,84 +1,90 @@
-"""JointState messages, from whatever recorder, as arrays of one order of joints."""
+"""JointState messages, from whatever recorder, as arrays of one order of joints.
+
+What is decoded waits in files while a recording is read, so that no length needs more memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.files.mcap.joint_rows import (
-    Clock,
-    CommandRows,
-    JointRows,
-    States,
-    stamps_told,
-    topic_at,
-)
+from drivers.files.mcap.log import Commands
 from drivers.files.mcap.series import JOINT_SCHEMAS, Series
 from drivers.files.ros import Block
 from drivers.files.ros_types import JOINT_STATE
+from drivers.files.rows import AT_ONCE, RowsFile, gathered
 from drivers.interface import Array, DriverError
 
-MOST_SETS = 32  # of joints of one topic that are taken part by part
+_IN_MEMORY = 2**22  # bytes of a column that stay in memory
+_RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
+_DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
 _NEED = "learning needs positions and measured joint torques (effort)"
 _NEED_POSITION = "discovery needs the positions of the joints"
+Q, DQ, TAU = range(3)  # runs of doubles in a message
+_Stamps = NDArray[np.int64]
 
 
-class TooManySetsError(ValueError):
-    """Messages are of so many sets of joints that they cannot be told apart part by part."""
+class StampsFile(RowsFile):
+    """Stamps (m, 1) ns, and what they tell while they come.
 
-
-@dataclass(frozen=True, slots=True)
-class Joints:
-    """Arrays (m,) and (m, n): stamps ns, positions rad, velocities rad/s, torques N m."""
-
-    names: tuple[str, ...]
-    stamp_ns: NDArray[np.int64]
-    q: Array
-    dq: Array
-    tau: Array
-    warnings: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class Commands:
-    """Commanded joint torques: stamps (k,) ns, torques (k, n) N m in the log's joint order."""
-
-    stamp_ns: NDArray[np.int64]
-    tau: Array
-
-
-def assemble_joints(
-    series: Series, path: Path, want: Sequence[str] | None, *, effort: bool = True
-) -> Joints:
-    """The joint states of a topic, in the order of the file.
-
-    Messages of other joints than the chosen ones (those of `want`, else the most frequent set)
-    are left out with a warning; a permuted order of joints is put straight.
-
-    Args:
-        series, path: the topic, its file.
-        want: names of joints that must be there.
-        effort: whether messages without efforts are of no use. If not, torques are not a number
-            where there are none, velocities where no message has any; 0 throughout is none.
-
-    Raises:
-        DriverError: no message has the joints asked for, or none has positions (and efforts).
+    Attributes:
+        back: how often time runs backwards; first_back: (place, ns) of the first time.
+        silent: whether all are 0.
     """
-    check_type(series, path)
-    told = ToldJoints(effort)
-    told.take(series)
-    rows = told.chosen(series, path, want)
-    stamp_ns, q, dq, tau = rows.tables(0, len(rows))
-    return Joints(rows.names, stamp_ns, q, dq, tau, rows.warnings)
+
+    def __init__(self) -> None:
+        super().__init__(1, _IN_MEMORY, np.int64)
+        self.back, self.first_back, self.silent, self._last = 0, (0, 0), True, 0
+
+    def append(self, table: _Stamps) -> None:
+        """Take (k, 1) stamps that follow."""
+        if not len(table):
+            return
+        steps = np.diff(table[:, 0], prepend=self._last if len(self) else table[0, 0])
+        places = np.flatnonzero(steps < 0)
+        if places.size and not self.back:
+            self.first_back = len(self) + int(places[0]), -int(steps[places[0]])
+        self.back += places.size
+        self.silent = self.silent and not table.any()
+        self._last = int(table[-1, 0])
+        super().append(table)
+
+
+def in_use(header: StampsFile, log: StampsFile, where: str, warnings: list[str]) -> StampsFile:
+    """The stamps of the messages' headers; the recorder's where every one of these is 0."""
+    clock = header
+    if len(header) > 1 and header.silent:
+        clock = log
+        warnings.append(f"{where}: header stamps are 0; the recorder's log times are used")
+    if clock.back:
+        place, step_ns = clock.first_back
+        warnings.append(
+            f"{where}: time runs backwards {clock.back} times, first by {step_ns / 1e6:.3f} ms at "
+            f"sample {place}"
+        )
+    return clock
+
+
+def _stamps_of(clocks: Sequence[_Stamps], where: str, warnings: list[str]) -> _Stamps:
+    files = StampsFile(), StampsFile()
+    for file, stamp_ns in zip(files, clocks, strict=True):
+        file.append(stamp_ns[:, None])
+    return in_use(*files, where, warnings).table(False)[:, 0]
+
+
+def stamps(series: Series, where: str, warnings: list[str]) -> _Stamps:
+    """(m,) header stamps; log times where every header stamp is 0."""
+    clocks = [block.stamp_ns for block in series.blocks], series.log_ns
+    return _stamps_of([series.in_order(parts) for parts in clocks], where, warnings)
 
 
 def check_type(series: Series, path: Path) -> None:
     """Raises DriverError where a topic doesn't hold the state of joints in CDR."""
-    if series.encoding != "cdr" or series.schema not in JOINT_SCHEMAS:
+    if not _is_of_joints(series):
         raise DriverError(
             f"{path}: {series.topic} holds {series.schema or 'messages without a type'} encoded "
             f"as {series.encoding or 'unknown'}; need {JOINT_STATE} as cdr "
@@ -86,37 +92,16 @@ def check_type(series: Series, path: Path) -> None:
         )
 
 
+def _is_of_joints(series: Series) -> bool:
+    return series.encoding == "cdr" and series.schema in JOINT_SCHEMAS
+
+
 def fits(series: Series, effort: bool) -> bool:
     """Whether a topic tells positions (and efforts) of joints."""
-    if series.encoding != "cdr" or series.schema not in JOINT_SCHEMAS:
-        return False
-    needed = (0, 2) if effort else (0,)
-    return any(
+    needed = (Q, TAU) if effort else (Q,)
+    return _is_of_joints(series) and any(
         b.layout.names and all(_run(b, run) is not None for run in needed) for b in series.blocks
     )
-
-
-def _unreadable(series: Series, where: str) -> list[str]:
-    if not series.bad:
-        return []
-    place, reason = series.bad[0]
-    return [f"{where}: {len(series.bad)} messages are unreadable, first number {place}: {reason}"]
-
-
-def _natural(names: frozenset[str]) -> list[str]:
-    return sorted(names, key=lambda n: (len(n), n))
-
-
-def _column(series: Series, run: int, names: tuple[str, ...]) -> Array:
-    parts = []
-    for block in series.blocks:
-        values = _run(block, run)
-        if values is None:
-            values = np.full((len(block.index), len(names)), np.nan)
-        elif block.layout.names != names:
-            values = values[:, [block.layout.names.index(name) for name in names]]
-        parts.append(values)
-    return np.ascontiguousarray(series.in_order(parts))
 
 
 def _run(block: Block, run: int) -> Array | None:
@@ -125,35 +110,78 @@ def _run(block: Block, run: int) -> Array | None:
     return values if values.shape[1] == len(block.layout.names) else None
 
 
-def stamps(series: Series, where: str, warnings: list[str]) -> NDArray[np.int64]:
-    """(m,) header stamps; log times where every header stamp is 0."""
-    clocks = Clock(), Clock()
-    times = [series.in_order([block.stamp_ns for block in series.blocks])]
-    clocks[0].take(times[0])
-    if clocks[0].silent:
-        times.append(series.in_order(series.log_ns))
-        clocks[1].take(times[1])
-    which, said = stamps_told(*clocks, len(times[0]), where)
-    warnings += said
-    return times[which]
+class JointRows:
+    """Messages of one set of joints that have all that is needed, in the order of the file.
+
+    Attributes:
+        names: of the joints.
+        clocks: stamps of the headers and of the recorder; place: in the topic's order.
+        runs: (m, n) files of the runs of doubles that are kept.
+        messages: how many there were, with those that lack something.
+        present: runs that any message has; lengths: of each, any of all.
+    """
+
+    def __init__(self, names: tuple[str, ...], kept: Sequence[int]) -> None:
+        self.names, self.messages = names, 0
+        self.clocks = StampsFile(), StampsFile()
+        self.place = StampsFile()
+        self.runs = {run: RowsFile(len(names), _IN_MEMORY) for run in kept}
+        self.present: set[int] = set()
+        self.lengths: dict[int, set[int]] = {Q: set(), DQ: set(), TAU: set()}
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def take(self, series: Series, needed: Sequence[int]) -> None:
+        """Take messages that follow."""
+        kept = []
+        for i, block in enumerate(series.blocks):
+            self.messages += len(block.index)
+            runs = {run for run in self.lengths if _run(block, run) is not None}
+            self.present |= runs
+            for run, lengths in self.lengths.items():
+                lengths.add(block.values[run].shape[1])
+            if runs >= set(needed):
+                kept.append(i)
+        if not kept:
+            return
+        part = series.at(kept)
+        header_ns = [block.stamp_ns for block in part.blocks]
+        for file, own in zip(
+            (*self.clocks, self.place), (header_ns, part.log_ns, part.places), strict=True
+        ):
+            file.append(part.in_order(own)[:, None])
+        for run, table in self.runs.items():
+            table.append(part.in_order([self._doubles(block, run) for block in part.blocks]))
+
+    def _doubles(self, block: Block, run: int) -> Array:
+        values, names = _run(block, run), block.layout.names
+        if values is None:
+            return np.full((len(block.index), len(names)), np.nan)
+        if names == self.names:
+            return values
+        return values[:, [names.index(name) for name in self.names]]
+
+    def stretches(self, *runs: int) -> Iterator[list[Array]]:
+        """Runs of doubles, so many rows at a time."""
+        for start in range(0, len(self), AT_ONCE):
+            yield [self.runs[run].rows(start, start + AT_ONCE) for run in runs]
 
 
-class ToldJoints:
+class Told:
     """What a topic tells of joints, part by part, by the set of joints that messages are of.
 
     Args:
-        effort: whether messages without efforts are of no use, see `assemble_joints`.
-        most_sets: more of them are refused; None for any number.
+        needed: runs without which a message is of no use; kept: runs that are.
     """
 
-    def __init__(self, effort: bool = True, most_sets: int | None = None) -> None:
-        self._sets: dict[frozenset[str], _Set] = {}
-        self._most_sets = most_sets
-        self._effort, self._messages, self._names = effort, 0, set[str]()
-        self._needed = (0, 2) if effort else (0,)
+    def __init__(self, needed: Sequence[int], kept: Sequence[int] = (Q, DQ, TAU)) -> None:
+        self.sets: dict[frozenset[str], JointRows] = {}
+        self._needed, self._kept = needed, kept
+        self._messages, self._names = 0, set[str]()
 
     def take(self, series: Series) -> None:
-        """Take messages that follow in the file. Raises TooManySets."""
+        """Take messages that follow in the file."""
         found: dict[frozenset[str], list[int]] = {}
         for i, block in enumerate(series.blocks):
             names = block.layout.names
@@ -162,36 +190,31 @@ class ToldJoints:
             if names and len(set(names)) == len(names):
                 found.setdefault(frozenset(names), []).append(i)
         for key, places in found.items():
-            own = self._sets.get(key)
-            if own is None:
-                if len(self._sets) == self._most_sets:
-                    raise TooManySetsError(f"{series.topic}: messages of ever other joints")
-                own = self._sets[key] = _Set(series.blocks[places[0]].layout.names)
-            own.take(series, places, self._needed)
+            part = series.at(places)
+            if key not in self.sets:
+                self.sets[key] = JointRows(part.blocks[0].layout.names, self._kept)
+            self.sets[key].take(part, self._needed)
 
-    def chosen(self, series: Series, path: Path, want: Sequence[str] | None) -> JointRows:
-        """The states of the chosen joints, with sentences on what was left out or looks wrong.
+    def chosen(
+        self, series: Series, where: str, want: Sequence[str] | None, warnings: list[str]
+    ) -> JointRows:
+        """The messages of the joints of `want`, else of the most frequent set.
 
         Raises:
-            DriverError: see `assemble_joints`.
+            DriverError: no message has these joints, or none has positions (and efforts).
         """
-        where = topic_at(path, series.topic)
-        warnings = _unreadable(series, where)
-        own = self._one_set(where, want, warnings)
-        self._check_complete(own, where, warnings)
-        rows = own.rows
-        if rows.no_torque and self._effort:
-            raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
-        rows.warnings = warnings
-        return rows.judge(where, self._effort)
-
-    def _one_set(self, where: str, want: Sequence[str] | None, warnings: list[str]) -> _Set:
-        sets = self._sets
+        if series.bad:
+            place, reason = series.bad[0]
+            warnings.append(
+                f"{where}: {len(series.bad)} messages are unreadable, first number {place}: "
+                f"{reason}"
+            )
+        sets = self.sets
         if not sets:
             raise DriverError(f"{where} has no readable message that names joints")
         fitting = [s for s in sets if want is None or s.issuperset(want)]
         if not fitting:
-            have = "; ".join(", ".join(_natural(s)) for s in sets)
+            have = "; ".join(", ".join(sorted(s, key=lambda n: (len(n), n))) for s in sets)
             missing = [n for n in want or () if not any(n in s for s in sets)]
             lack = f"has no joint {', '.join(missing)}" if missing else "never has these together"
             raise DriverError(f"{where} {lack}; have: {have}")
@@ -203,110 +226,172 @@ class ToldJoints:
                 f"{where}: {left_out} messages are of other joints "
                 f"({others or 'a part of these, or twice'}); left out"
             )
+        self._check_complete(sets[chosen], where, warnings)
         return sets[chosen]
 
-    def _check_complete(self, own: _Set, where: str, warnings: list[str]) -> None:
+    def _check_complete(self, own: JointRows, where: str, warnings: list[str]) -> None:
         """Say which messages lack positions (or efforts). Raises DriverError where all do."""
-        need = _NEED if self._effort else _NEED_POSITION
-        what_of = {0: "position", 2: "effort"}
+        need = _NEED if TAU in self._needed else _NEED_POSITION
+        what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
             if run not in own.present:
                 lengths = ", ".join(map(str, sorted(own.lengths[run])))
                 raise DriverError(
                     f"{where} has no {what_of[run]} ({lengths} values for "
-                    f"{len(own.rows.names)} joints); {need}"
+                    f"{len(own.names)} joints); {need}"
                 )
-        if not len(own.rows):
+        if not len(own):
             raise DriverError(f"{where} has no message with both position and effort; {_NEED}")
-        if len(own.rows) < own.messages:
+        if len(own) < own.messages:
             warnings.append(
-                f"{where}: {own.messages - len(own.rows)} messages lack "
+                f"{where}: {own.messages - len(own)} messages lack "
                 f"{' or '.join(what_of[run] for run in self._needed)}; left out"
             )
 
+    def of(self, names: Sequence[str]) -> list[JointRows]:
+        """The messages that tell something of these joints."""
+        return [x for x in self.sets.values() if len(x) and {*x.names} & {*names}]
 
-class _Set:
-    """Messages of one set of joints.
 
-    Attributes:
-        rows: those with all that is needed.
-        messages: how many there were.
-        present: runs (0 q, 1 dq, 2 tau) that any message has; lengths: of each, any of all.
+class _Seen(NamedTuple):
+    """What all samples tell: whether positions and velocities vary and torques are known or not
+    0, samples without velocities, the largest position, samples beyond any arm's angle by joint.
     """
 
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self.rows, self.messages = JointRows(names), 0
-        self.present: set[int] = set()
-        self.lengths: dict[int, set[int]] = {0: set(), 1: set(), 2: set()}
+    varied: bool
+    moving: bool
+    torque_known: bool
+    torque: bool
+    silent: int
+    furthest: float
+    beyond: NDArray[np.int64]
 
-    def take(self, series: Series, places: list[int], needed: tuple[int, ...]) -> None:
-        """Take the blocks at these places."""
-        kept = []
-        for i in places:
-            block = series.blocks[i]
-            self.messages += len(block.index)
-            runs = {run for run in range(3) if _run(block, run) is not None}
-            self.present |= runs
-            for run in range(3):
-                self.lengths[run].add(block.values[run].shape[1])
-            if runs >= set(needed):
-                kept.append(i)
-        if not kept:
-            return
-        part = series.at(kept)
-        stamp_ns = part.in_order([block.stamp_ns for block in part.blocks])
-        q, dq, tau = (_column(part, run, self.rows.names) for run in range(3))
-        self.rows.append(States(stamp_ns, q, dq, tau), part.in_order(part.log_ns))
+    @classmethod
+    def of(cls, rows: JointRows) -> _Seen:
+        varied = moving = known = torque = False
+        silent, furthest, beyond = 0, 0.0, np.zeros(len(rows.names), dtype=np.int64)
+        first = rows.runs[Q].rows(0, 1)
+        for q, dq, tau in rows.stretches(Q, DQ, TAU):
+            varied = varied or bool(np.any(q != first))
+            moving = moving or bool(np.any(dq))
+            known = known or not np.isnan(tau).all()
+            torque = torque or bool(np.any(tau))
+            silent += int(np.isnan(dq).all(axis=1).sum())
+            size = np.abs(q)
+            furthest = float(np.fmax(furthest, np.fmax.reduce(size, axis=None)))
+            beyond += (size > _RAD_MAX).sum(axis=0)
+        return cls(varied, moving, known, torque, silent, furthest, beyond)
 
 
-class ToldCommands:
-    """Commanded torques that a topic tells, part by part.
+def joints_told(
+    rows: JointRows, where: str, effort: bool, mapped: bool, warnings: list[str]
+) -> tuple[_Stamps, Array, Array, Array]:
+    """Stamps (m,), positions, velocities and efforts (m, n); sentences on what looks wrong.
+
+    Args:
+        rows, where: the states, file and topic.
+        effort: whether states without efforts are of no use. If not, velocities are not a number
+            where no message has any; 0 throughout is none. Else the positions' slope is taken.
+        mapped: whether arrays lie in files.
 
     Raises:
-        TooManySetsError: from `take`, where messages command several sets of joints in turn.
+        DriverError: efforts that are needed are not a number throughout.
     """
+    seen, count, velocity = _Seen.of(rows), len(rows), rows.runs[DQ]
+    if effort and not seen.torque_known:
+        raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
+    clock = in_use(*rows.clocks, where, warnings)
+    if not seen.torque_known:
+        warnings.append(f"{where} has no efforts: nothing is learned from torques")
+    if not effort and seen.varied and (seen.silent == count or not seen.moving):
+        velocity = gathered(velocity.width, (np.full_like(q, np.nan) for (q,) in rows.stretches(Q)))
+        warnings.append(f"{where} has no velocities: they are those of the filtered positions")
+    elif seen.silent:
+        velocity = gathered(velocity.width, _velocities(rows, clock))
+        warnings.append(
+            f"{where}: {seen.silent} of {count} messages have no velocity; "
+            "derived from the positions"
+        )
+    if count > 1 and not seen.torque:
+        warnings.append(f"{where}: all efforts are 0; does this arm measure torque?")
+    if _are_degrees(seen.beyond, count):
+        warnings.append(
+            f"{where}: positions reach {seen.furthest:.0f} rad; are these degrees? "
+            "Recordings hold radians (`adapter import` converts)"
+        )
+    q, dq, tau = (file.table(mapped) for file in (rows.runs[Q], velocity, rows.runs[TAU]))
+    return clock.table(mapped)[:, 0], q, dq, tau
 
-    def __init__(self) -> None:
-        self.rows: CommandRows | None = None
 
-    def take(self, series: Series) -> None:
-        """Take messages that follow in the file."""
-        places = [
-            i
-            for i, block in enumerate(series.blocks)
-            if block.layout.names and _run(block, 2) is not None
-        ]
-        if not places:
-            return
-        names = series.blocks[places[0]].layout.names
-        rows = self.rows = self.rows or CommandRows(names)
-        if any({*series.blocks[i].layout.names} != {*rows.names} for i in places):
-            raise TooManySetsError(f"{series.topic}: commands of several sets of joints")
-        part = series.at(places)
-        stamp_ns = part.in_order([block.stamp_ns for block in part.blocks])
-        rows.append(stamp_ns, part.in_order(part.log_ns), _column(part, 2, rows.names))
+def _velocities(rows: JointRows, clock: StampsFile) -> Iterator[Array]:
+    """Velocities, the positions' slope where a sample has none."""
+    begin_ns = int(clock.rows(0, 1)[0, 0])
+    for start in range(0, len(rows), AT_ONCE):
+        before = min(start, AT_ONCE)  # neighbours, of which one that moves forward is needed
+        wide = start - before, start + 2 * AT_ONCE
+        slope = derive_velocity(clock.rows(*wide)[:, 0], rows.runs[Q].rows(*wide), begin_ns)
+        dq = rows.runs[DQ].rows(start, start + AT_ONCE)
+        silent = np.all(np.isnan(dq), axis=1)
+        yield np.where(silent[:, None], slope[before : before + AT_ONCE], dq)
 
 
-def read_commands(
-    series: Series, path: Path, names: tuple[str, ...], warnings: list[str]
+def commands_told(
+    sets: Sequence[JointRows], where: str, names: Sequence[str], mapped: bool, warnings: list[str]
 ) -> Commands | None:
-    """Commanded torques in the order of `names`; joints without a command are not a number."""
-    where = f"{path}: {series.topic}"
-    check_type(series, path)
-    part = series.only(lambda b: _run(b, 2) is not None and bool(set(names) & set(b.layout.names)))
-    if not part.blocks:
-        warnings.append(no_commands(where))
+    """Commanded torques in the order of `names`; joints without a command are not a number.
+
+    Args:
+        sets: that command any of them; where: file and topic; mapped: one set, in files.
+    """
+    if not sets:
+        warnings.append(f"{where}: no message commands a torque of these joints; left out")
         return None
-    parts = []
-    for block in part.blocks:
-        tau = np.full((len(block.index), len(names)), np.nan)
-        for i, name in enumerate(names):
-            if name in block.layout.names:
-                tau[:, i] = block.values[2][:, block.layout.names.index(name)]
-        parts.append(tau)
-    return Commands(stamps(part, where, warnings), part.in_order(parts))
+    if len(sets) == 1:
+        (rows,) = sets
+        clock = in_use(*rows.clocks, where, warnings)
+        tau = gathered(len(names), (_commanded(rows, names, x) for (x,) in rows.stretches(TAU)))
+        return Commands(clock.table(mapped)[:, 0], tau.table(mapped))
+    order = np.argsort(_joined([x.place for x in sets]), kind="stable")
+    clocks = [_joined(files)[order] for files in zip(*(x.clocks for x in sets), strict=True)]
+    tables = [_commanded(x, names, x.runs[TAU].table(False)) for x in sets]
+    return Commands(_stamps_of(clocks, where, warnings), np.concatenate(tables)[order])
 
 
-def no_commands(where: str) -> str:
-    """A sentence on a topic of commands that are of no use."""
-    return f"{where}: no message commands a torque of these joints; left out"
+def _joined(files: Sequence[StampsFile]) -> _Stamps:
+    return np.concatenate([file.table(False)[:, 0] for file in files])
+
+
+def _commanded(rows: JointRows, names: Sequence[str], tau: Array) -> Array:
+    out = np.full((len(tau), len(names)), np.nan)
+    for i, name in enumerate(names):
+        if name in rows.names:
+            out[:, i] = tau[:, rows.names.index(name)]
+    return out
+
+
+def derive_velocity(stamp_ns: _Stamps, q: Array, begin_ns: int | None = None) -> Array:
+    """(m, n) central differences of the positions, over times that move forward.
+
+    Args:
+        stamp_ns: (m,); q: (m, n) rad; begin_ns: of the recording that they are a part of.
+    """
+    latest = np.maximum.accumulate(stamp_ns)
+    forward = np.concatenate([[True], latest[1:] > latest[:-1]])
+    if forward.sum() < 2:
+        return np.zeros_like(q)
+    seconds = (stamp_ns[forward] - (stamp_ns[0] if begin_ns is None else begin_ns)) * 1e-9
+    derived = np.gradient(q[forward], seconds, axis=0)
+    return derived[np.cumsum(forward) - 1]
+
+
+def looks_like_degrees(q: Array) -> bool:
+    """Whether a third of the joints stay long beyond what an arm can turn in radians."""
+    return _are_degrees((np.abs(q) > _RAD_MAX).sum(axis=0), len(q))
+
+
+def _are_degrees(beyond: NDArray[np.int64], count: int) -> bool:
+    """The same by how many of `count` samples each joint (n,) spends beyond."""
+    if count == 0:
+        return False
+    suspects = beyond / count > _DEGREE_SHARE
+    return bool(suspects.sum() >= max(1, len(suspects) // 3))

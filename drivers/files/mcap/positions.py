@@ -3,63 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import choices
 from drivers.files.mcap.bags import open_scan
-from drivers.files.mcap.joints import assemble_joints, fits, stamps
+from drivers.files.mcap.joints import Q, Told, fits, in_use
+from drivers.files.mcap.log import Commands, Log
 from drivers.files.mcap.series import Series, collect
 from drivers.files.mcap.writer import JOINT_COMMANDS, JOINT_STATES
-from drivers.interface import Array, DriverError
+from drivers.interface import Array
 
 GLANCE_S = 5.0  # that tell of most recordings that they are of another kind
 
 
-@dataclass(frozen=True, eq=False)
-class PositionLog:
-    """Commanded and measured positions.
-
-    Attributes:
-        path: where they came from; joint_names: order of the columns.
-        stamp_ns: (m,) of the encoders' readings, strictly increasing; q: (m, n) rad.
-        command_ns: (k,) of the commands, strictly increasing; q_command: (k, n) rad.
-        warnings: what was left out or looks wrong, one sentence each.
-    """
-
-    path: Path
-    joint_names: tuple[str, ...]
-    stamp_ns: NDArray[np.int64]
-    q: Array
-    command_ns: NDArray[np.int64]
-    q_command: Array
-    warnings: tuple[str, ...] = ()
-
-    def select(self, joint_names: Sequence[str]) -> PositionLog:
-        """The same with these joints in this order. Raises DriverError where it lacks one."""
-        missing = [name for name in joint_names if name not in self.joint_names]
-        if missing:
-            raise DriverError(
-                f"{self.path}: has no joint {', '.join(missing)}; "
-                f"{choices(missing[0], self.joint_names)}"
-            )
-        at = [self.joint_names.index(name) for name in joint_names]
-        q, q_command = self.q[:, at], self.q_command[:, at]
-        return replace(self, joint_names=tuple(joint_names), q=q, q_command=q_command)
-
-
-def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog | None:
+def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
     """The positions of a recording whose `/joint_commands` hold positions, without any efforts.
 
     Args:
         path: as `read_log` takes it; topic: of the joint states, `/joint_states` where None.
 
     Returns:
-        None for every other recording: those whose joint states have efforts, or whose commands
-        are not positions.
+        Finite positions, stamps of the encoders and of the commands strictly increasing; None for
+        every other recording: those whose joint states have efforts, or whose commands are not
+        positions.
 
     Raises:
         DriverError: the file is unreadable, or positions and commands are of other joints.
@@ -74,13 +43,25 @@ def read_position_log(path: str | Path, topic: str | None = None) -> PositionLog
         return None
     if not fits(read, effort=False) or _has_effort(read):
         return None
-    joints = assemble_joints(read, scan.path, None, effort=False)
-    asked = assemble_joints(commanded, scan.path, joints.names, effort=False)
-    order = [asked.names.index(name) for name in joints.names]
-    warnings = list(scan.warnings)
-    at, rows = _increasing(stamps(read, f"{path}: {states}", warnings), joints.q)
-    when, commands = _increasing(asked.stamp_ns, asked.q[:, order])
-    return PositionLog(scan.path, joints.names, at, rows, when, commands, tuple(warnings))
+    names, at, rows, said = _positions(read, scan.path, None)
+    asked, when, commands, _ = _positions(commanded, scan.path, names)
+    at, rows = _increasing(at, rows)
+    when, commands = _increasing(when, commands[:, [asked.index(name) for name in names]])
+    nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
+    orders = Commands(when, np.full_like(commands, np.nan), commands)
+    log = Log(scan.path, names, at, rows, nothing, nothing, topic=states, warnings=warnings)
+    return replace(log, commands=orders)
+
+
+def _positions(
+    series: Series, path: Path, want: Sequence[str] | None
+) -> tuple[tuple[str, ...], NDArray[np.int64], Array, list[str]]:
+    """Joints, stamps (k,), positions (k, n) of a topic, and sentences on its clock."""
+    told, where, said = Told((Q,), (Q,)), f"{path}: {series.topic}", list[str]()
+    told.take(series)
+    rows = told.chosen(series, where, want, [])
+    stamp_ns = in_use(*rows.clocks, where, said).table(False)[:, 0]
+    return rows.names, stamp_ns, rows.runs[Q].table(False), said
 
 
 def _is_of_another_kind(path: Path, states: str) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex
 from mcap.summary import Summary
 
-from drivers.files.mcap.log import Log, Topic, assembled
+from drivers.files.mcap.log import Log, Topic
+from drivers.files.mcap.read import assembled
 from drivers.files.mcap.records import HEAD, MAGIC, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
@@ -28,33 +29,18 @@ _OTHERS = (Opcode.METADATA, Opcode.ATTACHMENT)
 STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
 
 
-@dataclass(frozen=True)
-class SampledLog:
-    """A sample of a recording.
-
-    Attributes:
-        parts: stretches of it in the order of time, of the same joints and topic.
-        topics: all topics of the file, with the counts of the whole.
-        holes: (s since the first sample, s) between chunks, outside of the parts.
-        warnings: a sentence each.
-    """
-
-    parts: list[Log]
-    topics: dict[str, Topic]
-    holes: list[tuple[float, float]]
-    warnings: list[str]
-
-    @property
-    def samples(self) -> int:
-        """Of the whole, as the index counts them."""
-        return self.topics[self.parts[0].topic].messages
-
-
-def sample_log(path: str | Path, topic: str | None = None, **read: Any) -> SampledLog | None:
+def sample_log(
+    path: str | Path, topic: str | None = None, **read: Any
+) -> tuple[list[Log], list[tuple[float, float]]] | None:
     """A sample of a long MCAP file with an index; None of every other recording.
 
     Args:
         path: of the file; topic: of the joint states; read: as `read_log` takes it.
+
+    Returns:
+        Stretches in the order of time, of the same joints and topic, whose topics count the
+        messages of the whole, and the holes (s since the first sample, s) between chunks outside
+        of the stretches.
     """
     file = Path(path)
     if not file.is_file() or file.stat().st_size < SAMPLED_FROM:
@@ -78,9 +64,14 @@ def sample_log(path: str | Path, topic: str | None = None, **read: Any) -> Sampl
     if not found or not scan.sound:
         return None
     first = found[0]
-    parts = [x for x in found if (x.joint_names, x.topic) == (first.joint_names, first.topic)]
     warnings = list(dict.fromkeys(text for part in found for text in part.warnings))
-    return SampledLog(parts, _topics(scan, summary), _holes(chunks, stretches), warnings)
+    topics = _topics(scan, summary)
+    parts = [
+        replace(part, topics=topics, warnings=warnings)
+        for part in found
+        if (part.joint_names, part.topic) == (first.joint_names, first.topic)
+    ]
+    return parts, _holes(chunks, stretches)
 
 
 def _summary(path: Path) -> Summary | None:

@@ -1,4 +1,4 @@
-"""Recordings that wait in a file are those in memory, to the last bit and word."""
+"""Recordings that are mapped are those in memory, to the last bit and word."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from drivers.files.mcap import Log, McapWriter, StoredLog, open_log, read_log, records
+from drivers.files.mcap import Log, McapWriter, read, read_log, records
 
 NAMES = ("a", "b", "c")
 
@@ -25,9 +25,15 @@ def write(path: Path, samples: int, seed: int = 3) -> Path:
     return path
 
 
-def assert_same(stored: Log | StoredLog, log: Log) -> None:
+def mapped_log(path: Path, monkeypatch: pytest.MonkeyPatch) -> Log:
+    """Read as a long one."""
+    with monkeypatch.context() as patched:
+        patched.setattr(read, "IN_MEMORY", 0)
+        return read_log(path)
+
+
+def assert_same(whole: Log, log: Log) -> None:
     """All that a recording tells."""
-    whole = stored.in_memory() if isinstance(stored, StoredLog) else stored
     for name in ("stamp_ns", "q", "dq", "tau"):
         assert np.array_equal(getattr(whole, name), getattr(log, name), equal_nan=True), name
     assert whole.commands is not None and log.commands is not None
@@ -37,36 +43,36 @@ def assert_same(stored: Log | StoredLog, log: Log) -> None:
         assert getattr(whole, name) == getattr(log, name), name
 
 
-def test_a_stored_recording_is_the_one_in_memory(tmp_path: Path) -> None:
+def test_a_mapped_recording_is_the_one_in_memory(tmp_path: Path, monkeypatch) -> None:
     path = write(tmp_path / "log.mcap", 40_000)
-    log, stored = read_log(path), open_log(path, in_memory=0)
-    assert isinstance(stored, StoredLog) and isinstance(open_log(path), Log)
+    log, long = read_log(path), mapped_log(path, monkeypatch)
+    assert long.is_mapped and not log.is_mapped
     assert any("backwards 1 times, first by 4.000 ms at sample 700" in w for w in log.warnings)
     assert any("8000 of 40000 messages have no velocity" in w for w in log.warnings)
-    assert_same(stored, log)
-    assert (stored.begin_ns, stored.end_ns) == (log.begin_ns, log.end_ns)
+    assert_same(long, log)
+    assert (long.begin_ns, long.end_ns) == (log.begin_ns, log.end_ns)
     turned = ("c", "a")
-    assert_same(stored.select(turned), log.select(turned))
-    pieces = list(stored.pieces(7_000))
+    assert_same(long.select(turned), log.select(turned))
+    pieces = list(long.pieces(7_000))
     assert np.array_equal(np.concatenate([p.q for p in pieces]), log.q)
     assert np.array_equal(np.concatenate([p.q for p in log.pieces(7_000)]), log.q)
-    late = stored.changed(lambda piece: piece.take(piece.stamp_ns > 2 * 10**10))
+    late = long.changed(lambda piece: piece.take(piece.stamp_ns > 2 * 10**10))
     assert np.array_equal(late.piece(0, 10).q, log.take(log.stamp_ns > 2 * 10**10).q[:10])
 
 
-def test_a_piece_has_the_commands_of_its_time_and_one_to_either_side(tmp_path: Path) -> None:
-    stored = open_log(write(tmp_path / "log.mcap", 600), in_memory=0)
-    piece = stored.piece(100, 200)
-    assert piece.commands is not None and stored.commands is not None
-    every = stored.commands.all().stamp_ns
+def test_a_piece_has_the_commands_of_its_time_and_more(tmp_path: Path, monkeypatch) -> None:
+    long = mapped_log(write(tmp_path / "log.mcap", 600), monkeypatch)
+    piece = long.piece(100, 200)
+    assert piece.commands is not None and long.commands is not None
+    every = long.commands.stamp_ns
     inside = (every >= piece.begin_ns) & (every <= piece.end_ns)
     first, last = np.flatnonzero(inside)[[0, -1]]
     assert np.array_equal(piece.commands.stamp_ns, every[first - 1 : last + 2])
-    assert len(stored.piece(0, 3).commands.stamp_ns) == 2  # type: ignore[union-attr]
+    assert len(long.piece(0, 3).commands.stamp_ns) == 2  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("cut", [0, 5_000])
-def test_others_joints_and_a_cut_are_told_alike(tmp_path: Path, cut: int) -> None:
+def test_others_joints_and_a_cut_are_told_alike(tmp_path: Path, monkeypatch, cut: int) -> None:
     path = tmp_path / "log.mcap"
     rng = np.random.default_rng(1)
     with McapWriter(path, NAMES) as writer, McapWriter(tmp_path / "x.mcap", ("g",)) as other:
@@ -78,20 +84,19 @@ def test_others_joints_and_a_cut_are_told_alike(tmp_path: Path, cut: int) -> Non
                 writer._states = own
         writer.write_command(0, np.zeros(3))
     path.write_bytes(path.read_bytes()[: -cut or None])
-    log, stored = read_log(path), open_log(path, in_memory=0)
-    assert isinstance(stored, StoredLog) and log.truncated == bool(cut)
+    log, long = read_log(path), mapped_log(path, monkeypatch)
+    assert long.is_mapped and log.truncated == bool(cut)
     assert any("messages are of other joints (g)" in w for w in log.warnings)
-    whole = stored.in_memory()
-    assert np.array_equal(whole.q, log.q) and whole.warnings == log.warnings
+    assert np.array_equal(long.q, log.q) and long.warnings == log.warnings
 
 
-def test_commands_that_run_backwards_come_in_memory(tmp_path: Path) -> None:
+def test_commands_that_run_backwards_come_in_memory(tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "log.mcap"
     with McapWriter(path, NAMES) as writer:
         for i in (1, 2, 3):
             writer.write_joint_state(i, *np.zeros((3, 3)))
             writer.write_command(-i + 10, np.ones(3))
-    assert isinstance(open_log(path, in_memory=0), Log)
+    assert not mapped_log(path, monkeypatch).is_mapped
 
 
 def test_messages_outside_of_chunks_come_in_several_regions(tmp_path: Path, monkeypatch) -> None:
