@@ -8,9 +8,11 @@ from pathlib import Path
 from adapter.cli.options import (
     add_joints,
     add_json,
+    add_told,
     add_topic,
     check_files,
     check_robot,
+    check_told,
     locks_of,
 )
 
@@ -71,12 +73,14 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
     _add_tables(parser)
     parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
     add_joints(parser)
+    add_told(parser)
     add_json(parser)
     parser.set_defaults(check=_check_info)
 
 
 def _check_info(args: argparse.Namespace) -> None:
     locks_of(args)
+    check_told(args)
     if args.robot is not None:
         check_robot(args.robot)
     if not args.file.is_dir():

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -34,17 +37,21 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
         help="effects learned beside θ: none, real, or names with commas between (a name that "
         "does not exist lists them)",
     )
-    add(
+    add("--seed", type=int, help="of every random choice")
+    add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
+    add_results(parser)
+    add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
+
+
+def add_gravity(parser: argparse.ArgumentParser) -> None:
+    """How the arm is mounted."""
+    parser.add_argument(
         "--gravity",
         type=float,
         nargs=3,
         metavar=("X", "Y", "Z"),
         help="in base axes, m/s², of an arm that does not stand upright: on a wall 9.81 0 0",
     )
-    add("--seed", type=int, help="of every random choice")
-    add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
-    add_results(parser)
-    add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
 
 
 def add_joints(parser: argparse.ArgumentParser) -> None:
@@ -77,16 +84,16 @@ def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
 
 def locks_of(args: argparse.Namespace) -> dict[str, float]:
     """Values given to `--lock` by joint. Raises UsageError."""
-    values = {}
-    for option in args.lock:
-        name, _, text = option.rpartition("=")
-        try:
-            values[name.strip()] = float(text)
-        except ValueError:
-            name = ""
-        if not name.strip() or not math.isfinite(values[name.strip()]):
-            raise UsageError(f"--lock '{option}' is not JOINT=VALUE, a number in rad or m")
-    return values
+    return dict(_joint_value("--lock", told, "rad or m") for told in args.lock)
+
+
+def _joint_value(option: str, told: str, unit: str) -> tuple[str, float]:
+    """The joint and its value. Raises UsageError."""
+    name, _, text = told.rpartition("=")
+    with suppress(ValueError):
+        if name.strip() and math.isfinite(float(text)):
+            return name.strip(), float(text)
+    raise UsageError(f"{option} '{told}' is not JOINT=VALUE, a number in {unit}")
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:
@@ -137,14 +144,41 @@ def add_topic(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_effort_unit(parser: argparse.ArgumentParser) -> None:
-    """In which unit recordings tell the joints' efforts, where it is not N m at the link."""
+def add_told(parser: argparse.ArgumentParser) -> None:
+    """How recordings tell joints and efforts, where it is not as the model has them."""
     add = parser.add_argument
+    add_gravity(parser)
+    for option, metavar, said in (
+        ("--turn", "JOINT,...", "joints that LOG counts the other way: q, dq and tau are turned"),
+        ("--zero", "JOINT=RAD,...", "what LOG tells where the model's joint is at zero"),
+    ):
+        add(
+            option,
+            dest="turn_or_zero",
+            action="extend",
+            default=[],
+            type=partial(_joints_told, option),
+            metavar=metavar,
+            help=f"{said}; taken in the order of --turn and --zero",
+        )
+    add(
+        "--tau",
+        choices=("gravity-compensated",),
+        help="the controller took the arm's gravity off the efforts: the model's is added "
+        "(--gravity 0 0 0: also that of the load)",
+    )
+    add(
+        "--trust-log",
+        action="store_true",
+        help="joints and efforts are as the model has them: what speaks against it is a warning",
+    )
     add(
         "--tau-gain",
+        action="append",
         metavar="G1,G2,...|fit",
         help="N m per recorded unit (motor current: N m/A), one per joint of the model or one for "
-        "all; fit: learn them beside θ against the documented masses",
+        "all, negative where the sign is wrong; those of several multiply; fit: learn them beside "
+        "θ against the documented masses",
     )
     add(
         "--gear",
@@ -170,12 +204,21 @@ def add_effort_unit(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_effort_unit(args: argparse.Namespace) -> None:
+def _joints_told(option: str, text: str) -> list[tuple[str, float, float]]:
+    """As `Told.joints` has them. Raises ArgumentTypeError."""
+    if option == "--turn":
+        return [(name.strip(), -1.0, 0.0) for name in text.split(",")]
+    try:
+        told = [_joint_value(option, part, "rad") for part in text.split(",")]
+    except UsageError as error:
+        raise argparse.ArgumentTypeError(str(error).removeprefix(f"{option} ")) from None
+    return [(name, 1.0, zero_rad) for name, zero_rad in told]
+
+
+def check_told(args: argparse.Namespace) -> None:
     """Refuse what is no number and what goes with another option. Raises UsageError."""
-    learn = args.tau_gain == "fit"
-    args.gain = (
-        () if args.tau_gain is None or learn else numbers("--tau-gain", args.tau_gain, "fit")
-    )
+    learn = args.learn_gains = args.tau_gain == ["fit"]
+    args.gain = () if learn else _product(args.tau_gain or ())
     args.gears = () if args.gear is None else numbers("--gear", args.gear)
     args.loaded = check_logs(*args.loaded)
     if args.loaded and args.known_load is None:
@@ -184,6 +227,15 @@ def check_effort_unit(args: argparse.Namespace) -> None:
         raise UsageError("--known-load fixes the scale of learned gains; give --tau-gain fit too")
     if args.known_load is not None and not 0.0 < args.known_load < math.inf:
         raise UsageError(f"--known-load takes a mass above zero in kg, got {args.known_load}")
+
+
+def _product(texts: Sequence[str]) -> tuple[float, ...]:
+    """Of several `--tau-gain`, joint by joint. Raises UsageError."""
+    gains = [numbers("--tau-gain", text, "fit") for text in texts]
+    count = max(map(len, gains), default=0)
+    if not {len(gain) for gain in gains} <= {1, count}:
+        raise UsageError("--tau-gain: one number for all joints or one for each")
+    return tuple(math.prod(gain[j % len(gain)] for gain in gains) for j in range(count))
 
 
 def numbers(option: str, text: str, *words: str) -> tuple[float, ...]:
