@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from adapter.cli.names import effects_named
-from adapter.cli.options import joints_of, locks_of
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
 from adapter.learning.known_effects import learnable, not_taken_off
@@ -22,8 +21,7 @@ from drivers.files.mcap import AnyLog
 
 def robot_of(args: argparse.Namespace, name: str | None, floating: bool = False) -> SelfModel:
     """The documented robot by name or file, with the joints that the command line asks for."""
-    gravity = getattr(args, "gravity", None)
-    return read_robot(name or "panda", joints_of(args), floating, gravity, locks_of(args))
+    return read_robot(name or "panda", args.joints, floating, args.gravity, dict(args.lock))
 
 
 def robot_of_log(args: argparse.Namespace, log: AnyLog, floating: bool = False) -> SelfModel:
@@ -87,9 +85,7 @@ def configure(
 def with_motion(args: argparse.Namespace, config: Config) -> Config:
     """The same with the motion that the command line asks for. Raises SettingsError."""
     asked = {"kind": args.excitation, "share": args.speed, "range_share": args.range}
-    if args.move is not None:
-        asked["move"] = tuple(name.strip() for name in args.move.split(",") if name.strip())
-    said = {key: value for key, value in asked.items() if value is not None}
+    said = {k: value for k, value in {**asked, "move": args.move}.items() if value is not None}
     return dataclasses.replace(config, excitation=dataclasses.replace(config.excitation, **said))
 
 

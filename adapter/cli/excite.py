@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     robot = robot_of(args, args.robot)
     config = with_motion(args, read_config(args.config))
+    config = replace(config, gravity=args.gravity or config.gravity)
     robot, settings = config.apply(robot), config.excitation
     if args.seed is not None:
         settings = replace(settings, seed=args.seed)

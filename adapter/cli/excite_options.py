@@ -12,7 +12,6 @@ from adapter.cli.options import (
     check_files,
     check_logs,
     check_robot,
-    locks_of,
 )
 from adapter.control.settings import DESIGNED
 from adapter.errors import UsageError
@@ -74,7 +73,6 @@ def numbers(option: str, text: str | None) -> list[float] | None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
     if args.robot is not None:
         check_robot(args.robot)
     check_files(args.config, args.gap)

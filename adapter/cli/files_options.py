@@ -13,7 +13,7 @@ from adapter.cli.options import (
     check_files,
     check_robot,
     check_told,
-    locks_of,
+    names_in,
 )
 
 
@@ -30,7 +30,7 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     _add_tables(parser)
     add_topic(parser)
     add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
-    add("--joints", default="", metavar="LIST", help="joint names, commas between")
+    add("--joints", type=names_in, default=(), metavar="LIST", help="joint names, commas between")
     add("--flat", action="store_true", help="one value per line")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add_json(parser)
@@ -79,7 +79,6 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
 
 
 def _check_info(args: argparse.Namespace) -> None:
-    locks_of(args)
     check_told(args)
     if args.robot is not None:
         check_robot(args.robot)

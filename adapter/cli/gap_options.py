@@ -13,7 +13,6 @@ from adapter.cli.options import (
     check_logs,
     check_robot,
     check_told,
-    locks_of,
 )
 from adapter.errors import UsageError
 
@@ -85,6 +84,5 @@ def _check(args: argparse.Namespace) -> None:
     args.logs, args.hold_out = check_logs(*args.logs), check_logs(*args.hold_out)
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
-    locks_of(args)
     check_told(args)
     check_robot(args.model)

@@ -13,7 +13,6 @@ from adapter.cli.options import (
     check_logs,
     check_robot,
     check_told,
-    locks_of,
 )
 from adapter.errors import UsageError
 
@@ -45,7 +44,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
     check_told(args)
     if args.learn_gains and args.empty is None:
         raise UsageError("--tau-gain fit needs --empty LOG: gains and load cannot be told apart")

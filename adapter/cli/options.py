@@ -10,7 +10,6 @@ import argparse
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -43,9 +42,23 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
     add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
 
 
-def add_gravity(parser: argparse.ArgumentParser) -> None:
-    """How the arm is mounted."""
-    parser.add_argument(
+def add_joints(parser: argparse.ArgumentParser) -> None:
+    """How the arm is mounted, and which of the model's joints move.
+
+    Those that a recording lacks are locked at zero.
+    """
+    add = parser.add_argument
+    said = "joints of the model that move; the others are locked"
+    add("--joints", type=names_in, metavar="A,B,C", help=said)
+    add(
+        "--lock",
+        action="append",
+        default=[],
+        type=_joint_value,
+        metavar="JOINT=VALUE",
+        help="lock a joint at a value, rad or m (default: zero where a recording lacks it)",
+    )
+    add(
         "--gravity",
         type=float,
         nargs=3,
@@ -54,17 +67,13 @@ def add_gravity(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_joints(parser: argparse.ArgumentParser) -> None:
-    """Which joints of the model move; those that a recording lacks are locked at zero."""
-    add = parser.add_argument
-    add("--joints", metavar="A,B,C", help="joints of the model that move; the others are locked")
-    add(
-        "--lock",
-        action="append",
-        default=[],
-        metavar="JOINT=VALUE",
-        help="lock a joint at a value, rad or m (default: zero where a recording lacks it)",
-    )
+def _joint_value(text: str) -> tuple[str, float]:
+    """A joint and its value. Raises ArgumentTypeError."""
+    name, _, value = text.rpartition("=")
+    with suppress(ValueError):
+        if name.strip() and math.isfinite(float(value)):
+            return name.strip(), float(value)
+    raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=VALUE, a number in rad or m")
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -72,28 +81,13 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--speed", type=float, metavar="SHARE", help="of the joints' speed limits, at most")
     add("--range", type=float, metavar="SHARE", help="of the joints' ranges, at most")
-    add("--move", metavar="A,B,C", help="joints that move; the others stand still")
+    said = "joints that move; the others stand still"
+    add("--move", type=names_in, metavar="A,B,C", help=said)
 
 
-def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
-    """Names given to `--joints`."""
-    if args.joints is None:
-        return None
-    return tuple(name.strip() for name in args.joints.split(",") if name.strip())
-
-
-def locks_of(args: argparse.Namespace) -> dict[str, float]:
-    """Values given to `--lock` by joint. Raises UsageError."""
-    return dict(_joint_value("--lock", told, "rad or m") for told in args.lock)
-
-
-def _joint_value(option: str, told: str, unit: str) -> tuple[str, float]:
-    """The joint and its value. Raises UsageError."""
-    name, _, text = told.rpartition("=")
-    with suppress(ValueError):
-        if name.strip() and math.isfinite(float(text)):
-            return name.strip(), float(text)
-    raise UsageError(f"{option} '{told}' is not JOINT=VALUE, a number in {unit}")
+def names_in(text: str) -> tuple[str, ...]:
+    """Names with commas between."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:
@@ -113,7 +107,6 @@ def add_json(parser: argparse.ArgumentParser, or_output: bool = False) -> None:
 
 def check_learning(args: argparse.Namespace) -> None:
     """What is wrong with options of everything that learns. Raises UsageError, SettingsError."""
-    locks_of(args)
     if args.robot is not None:
         check_robot(args.robot)
     check_files(args.config, args.truth, args.resume)
@@ -147,20 +140,23 @@ def add_topic(parser: argparse.ArgumentParser) -> None:
 def add_told(parser: argparse.ArgumentParser) -> None:
     """How recordings tell joints and efforts, where it is not as the model has them."""
     add = parser.add_argument
-    add_gravity(parser)
-    for option, metavar, said in (
-        ("--turn", "JOINT,...", "joints that LOG counts the other way: q, dq and tau are turned"),
-        ("--zero", "JOINT=RAD,...", "what LOG tells where the model's joint is at zero"),
-    ):
-        add(
-            option,
-            dest="turn_or_zero",
-            action="extend",
-            default=[],
-            type=partial(_joints_told, option),
-            metavar=metavar,
-            help=f"{said}; taken in the order of --turn and --zero",
-        )
+    add(
+        "--turn",
+        dest="turn_or_zero",
+        action="extend",
+        default=[],
+        type=_turned,
+        metavar="JOINT,...",
+        help="joints that LOG counts the other way: q, dq and tau get the other sign",
+    )
+    add(
+        "--zero",
+        dest="turn_or_zero",
+        action="extend",
+        type=_zeros,
+        metavar="JOINT=RAD,...",
+        help="what LOG tells where the model's joint is at zero, once turned by a --turn before",
+    )
     add(
         "--tau",
         choices=("gravity-compensated",),
@@ -204,15 +200,13 @@ def add_told(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _joints_told(option: str, text: str) -> list[tuple[str, float, float]]:
-    """As `Told.joints` has them. Raises ArgumentTypeError."""
-    if option == "--turn":
-        return [(name.strip(), -1.0, 0.0) for name in text.split(",")]
-    try:
-        told = [_joint_value(option, part, "rad") for part in text.split(",")]
-    except UsageError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix(f"{option} ")) from None
-    return [(name, 1.0, zero_rad) for name, zero_rad in told]
+def _turned(text: str) -> list[tuple[str, float, float]]:
+    """As `Told.joints` has them."""
+    return [(name, -1.0, 0.0) for name in names_in(text)]
+
+
+def _zeros(text: str) -> list[tuple[str, float, float]]:
+    return [(name, 1.0, zero_rad) for name, zero_rad in map(_joint_value, text.split(","))]
 
 
 def check_told(args: argparse.Namespace) -> None:

@@ -6,14 +6,7 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import (
-    NAMES,
-    add_gravity,
-    add_learning,
-    add_motion,
-    check_files,
-    check_learning,
-)
+from adapter.cli.options import NAMES, add_learning, add_motion, check_files, check_learning
 from adapter.control.settings import KINDS
 from adapter.errors import UsageError
 from adapter.model.robot_names import robot_names
@@ -109,7 +102,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--no-record", action="store_true", help="keep no recording")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
     add_learning(parser)
-    add_gravity(parser)
     parser.set_defaults(check=_check)
 
 

@@ -151,6 +151,7 @@ def test_given_gains_and_gears_convert() -> None:
         (["--tau-gain", "soon"], "fit"),
         (["--tau-gain", "1,0"], "other than zero"),
         (["--gear", "x"], "--gear 'x'"),
+        (["--tau-gain", "1,2", "--tau-gain=1,2,3"], "or one for each"),
         (["--known-load", "2"], "--tau-gain fit"),
         (["--tau-gain", "fit", "--known-load", "-2"], "above zero"),
         (["--tau-gain", "1", "--loaded", "LOG"], "--known-load KG"),
