@@ -213,7 +213,7 @@ def check_told(args: argparse.Namespace) -> None:
     """Refuse what is no number and what goes with another option. Raises UsageError."""
     learn = args.learn_gains = args.tau_gain == ["fit"]
     args.gain = () if learn else _product(args.tau_gain or ())
-    args.gears = () if args.gear is None else numbers("--gear", args.gear)
+    args.gears = numbers("--gear", args.gear)
     args.loaded = check_logs(*args.loaded)
     if args.loaded and args.known_load is None:
         raise UsageError("--loaded names recordings of the known load; give its --known-load KG")
@@ -232,16 +232,16 @@ def _product(texts: Sequence[str]) -> tuple[float, ...]:
     return tuple(math.prod(gain[j % len(gain)] for gain in gains) for j in range(count))
 
 
-def numbers(option: str, text: str, *words: str) -> tuple[float, ...]:
-    """Numbers with commas between, none of them zero. Raises UsageError."""
-    try:
-        values = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        values = ()
-    if not values or not all(math.isfinite(x) and x != 0.0 for x in values):
-        choices = " or ".join(("numbers other than zero, with commas between", *words))
-        raise UsageError(f"{option} '{text}': takes {choices}")
-    return values
+def numbers(
+    option: str, text: str | None, *words: str, what: str = "numbers other than zero"
+) -> tuple[float, ...]:
+    """Numbers with commas between; none where nothing is given. Raises UsageError."""
+    with suppress(ValueError):
+        values = tuple(float(word) for word in ([] if text is None else text.split(",")))
+        if all(math.isfinite(x) and (what == "numbers" or x != 0.0) for x in values):
+            return values
+    choices = " or ".join((f"{what}, with commas between", *words))
+    raise UsageError(f"{option} '{text}': takes {choices}")
 
 
 def check_logs(*paths: Path | None) -> list[Path]:

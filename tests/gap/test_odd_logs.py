@@ -125,13 +125,8 @@ def against_the_world(joint: int, carrier: int) -> Log:
 
 
 AS_A_WHOLE = {
-    "panda_joint3 counts the other way": lambda: turned(2),
-    "zero of panda_joint4 is elsewhere": lambda: replace(base(), q=base().q + np.eye(7)[3] * 1.571),
     "panda_joint1 and panda_joint3 are swapped": lambda: swapped(0, 2),
     "panda_joint4 is told together with panda_joint2": lambda: against_the_world(3, 1),
-    "percent of each joint's rated": lambda: replace(
-        base(), tau=100.0 * base().tau / panda_model().limits.effort
-    ),
     "not those of this motion": lambda: replace(base(), tau=base().tau[::-1]),
     "torques are not those": lambda: replace(
         base(), tau=5.0 * np.random.default_rng(0).standard_normal(base().tau.shape)
@@ -176,8 +171,8 @@ def without_gravity() -> Log:
     return replace(log, tau=log.tau - RigidArm.of(model).torque(log.q, still, still))
 
 
-def zero_of_a_turned_joint() -> Log:
-    return replace(turned(3), q=turned(3).q + np.eye(7)[3] * np.pi / 4.0)
+def zero_moved(log: Log, by_rad: float) -> Log:
+    return replace(log, q=log.q + by_rad * np.eye(7)[3])
 
 
 def larger(factor: np.ndarray) -> Log:
@@ -186,14 +181,16 @@ def larger(factor: np.ndarray) -> Log:
 
 MENDED = {
     "--turn panda_joint3": lambda: turned(2),
-    "--zero panda_joint4=1.5708": AS_A_WHOLE["zero of panda_joint4 is elsewhere"],
-    "--turn panda_joint4 --zero panda_joint4=-0.785398": zero_of_a_turned_joint,
+    "--zero panda_joint4=1.5708": lambda: zero_moved(base(), np.pi / 2.0),
+    "--turn panda_joint4 --zero panda_joint4=-0.785398": lambda: zero_moved(turned(3), np.pi / 4.0),
     "--tau gravity-compensated": without_gravity,
     "--gravity 9.81 0 0": lambda: base((9.81, 0.0, 0.0)),
     "--gravity 0 0 9.81": lambda: base((0.0, 0.0, 9.81)),
     "--tau-gain=1,-1,1,1,1,1,1": lambda: larger(1.0 - 2.0 * np.eye(7)[1]),
     "--tau-gain=0.001": lambda: larger(np.full(7, 1000.0)),
-    "--tau-gain=0.87,0.87,0.87,0.87,0.12,0.12,0.12": AS_A_WHOLE["percent of each joint's rated"],
+    "--tau-gain=0.87,0.87,0.87,0.87,0.12,0.12,0.12": lambda: larger(
+        100.0 / panda_model().limits.effort
+    ),
     "--tau-gain=1,1,1,0.": lambda: larger(1.0 + 1.5 * np.eye(7)[3]),
 }
 
@@ -222,7 +219,7 @@ def test_the_sentence_says_the_option_that_mends_the_log(option, tmp_path, capsy
 
 def test_a_mended_log_has_the_names_of_the_clean_one() -> None:
     told = adapter.Told((("panda_joint4", -1.0, 0.0), ("panda_joint4", 1.0, -np.pi / 4.0)))
-    log = told.log(zero_of_a_turned_joint(), panda_model())
+    log = told.log(zero_moved(turned(3), np.pi / 4.0), panda_model())
     np.testing.assert_allclose(log.q, base().q, atol=1e-12)
     plain, mended = (adapter.find_gap(x, panda_model()) for x in (base(), log))
     assert [x.title for x in mended.findings] == [x.title for x in plain.findings]
