@@ -36,6 +36,7 @@ if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` fi
         read_log,
         regressor,
     )
+    from adapter.signals.told import Told
     from drivers.files.mcap import Log
 
 keep_apart()  # before anything asks for `drivers` or `sim`
@@ -57,6 +58,7 @@ _FROM = {
     # what they take and return
     "SelfModel": "adapter.model.self_model",
     "Log": "drivers.files.mcap",
+    "Told": "adapter.signals.told",
     "LearnResult": "adapter.runs.library",
     "FilteredSignals": "adapter.runs.library",
     "GapResult": "adapter.gap.result",
@@ -74,6 +76,7 @@ __all__ = [
     "SelfModel",
     "Snapshot",
     "SnapshotReader",
+    "Told",
     "discover",
     "export",
     "filtered",

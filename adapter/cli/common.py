@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from adapter.cli.names import effects_named
-from adapter.cli.options import joints_of, locks_of
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.effects.robots import read_robot
-from adapter.gap.torque_gains import EffortUnit
 from adapter.learning.known_effects import learnable, not_taken_off
 from adapter.model.self_model import SelfModel
 from adapter.runs.config import Config, config_recorded, config_table, read_config
 from adapter.runs.terminal import program_version, warn
+from adapter.signals.told import Told
 from drivers.files.mcap import Log
 
 
 def robot_of(args: argparse.Namespace, name: str | None, floating: bool = False) -> SelfModel:
     """The documented robot by name or file, with the joints that the command line asks for."""
-    return read_robot(name or "panda", joints_of(args), floating, lock=locks_of(args))
+    return read_robot(name or "panda", args.joints, floating, args.gravity, dict(args.lock))
 
 
 def robot_of_log(args: argparse.Namespace, log: Log, floating: bool = False) -> SelfModel:
@@ -36,10 +35,11 @@ def robot_of_log(args: argparse.Namespace, log: Log, floating: bool = False) -> 
         return robot_of(args, str(path), floating)
 
 
-def effort_unit_of(args: argparse.Namespace) -> EffortUnit:
-    """The unit of recorded efforts that the command line tells."""
-    learn = args.tau_gain == "fit"
-    return EffortUnit(args.gain, learn, args.gears, args.known_load, tuple(args.loaded))
+def told_of(args: argparse.Namespace) -> Told:
+    """What the command line says of recordings, see `check_told`."""
+    efforts = args.gain, args.gears, args.tau is not None, args.trust_log
+    load = args.known_load, tuple(args.loaded)
+    return Told(tuple(args.turn_or_zero), *efforts, args.learn_gains, *load)
 
 
 def configure(
@@ -85,9 +85,7 @@ def configure(
 def with_motion(args: argparse.Namespace, config: Config) -> Config:
     """The same with the motion that the command line asks for. Raises SettingsError."""
     asked = {"kind": args.excitation, "share": args.speed, "range_share": args.range}
-    if args.move is not None:
-        asked["move"] = tuple(name.strip() for name in args.move.split(",") if name.strip())
-    said = {key: value for key, value in asked.items() if value is not None}
+    said = {k: value for k, value in {**asked, "move": args.move}.items() if value is not None}
     return dataclasses.replace(config, excitation=dataclasses.replace(config.excitation, **said))
 
 

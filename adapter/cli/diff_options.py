@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from adapter.cli.options import add_joints, add_json, check_robot, locks_of
+from adapter.cli.options import add_joints, add_json, check_robot
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
     for name in (args.first, args.second):
         if name is not None:
             check_robot(name)

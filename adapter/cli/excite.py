@@ -14,7 +14,6 @@ import numpy as np
 
 from adapter.cli.agreement import PLAN_PAGE
 from adapter.cli.common import robot_of, with_motion
-from adapter.cli.excite_options import numbers
 from adapter.cli.exit_codes import ExitCode
 from adapter.control.designed import DesignedMotion, Designer
 from adapter.control.excitation import RandomMotion, plan_lines
@@ -60,12 +59,13 @@ def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     robot = robot_of(args, args.robot)
     config = with_motion(args, read_config(args.config))
+    config = replace(config, gravity=args.gravity or config.gravity)
     robot, settings = config.apply(robot), config.excitation
     if args.seed is not None:
         settings = replace(settings, seed=args.seed)
     need_complete(robot)
     limits, arm = MotionLimits.of(robot), ArmInCell(robot, config.cell)
-    std = _of_joints("--noise", numbers("--noise", args.noise), robot)
+    std = _of_joints("--noise", args.noise, robot)
     told = Information(robot, config.pipeline.filter, torque_std=std)
     tables = [_table(path, robot, told) for path in args.logs]
     known = _known(tables, told) if tables else Known()
@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _start(args: argparse.Namespace, arm: ArmInCell, limits: MotionLimits, known: Known) -> Array:
     """Where the motion starts, (n,) rad. Raises SettingsError where it is not free there."""
-    q0 = _of_joints("--at", numbers("--at", args.at), arm.model)
+    q0 = _of_joints("--at", args.at, arm.model)
     if q0 is None:
         q0 = known.start if known.start is not None else 0.5 * (limits.lower + limits.upper)
     nearest, margin = arm.at(q0), arm.cell.margin
@@ -120,12 +120,10 @@ def _swept(
     return swept
 
 
-def _of_joints(option: str, values: list[float] | None, robot: SelfModel) -> Array | None:
-    if values is None:
-        return None
-    if len(values) != robot.tree.n or not np.isfinite(values).all():
+def _of_joints(option: str, values: Sequence[float], robot: SelfModel) -> Array | None:
+    if len(values) not in (0, robot.tree.n):
         raise SettingsError(f"{option} needs {robot.tree.n} finite numbers, got {len(values)}")
-    return np.array(values)
+    return np.array(values) if values else None
 
 
 def _table(path: Path, robot: SelfModel, told: Information) -> tuple[Array, Array, Array, Array]:

@@ -12,7 +12,7 @@ from adapter.cli.options import (
     check_files,
     check_logs,
     check_robot,
-    locks_of,
+    numbers,
 )
 from adapter.control.settings import DESIGNED
 from adapter.errors import UsageError
@@ -63,24 +63,13 @@ def declare(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(check=_check, excitation=DESIGNED)
 
 
-def numbers(option: str, text: str | None) -> list[float] | None:
-    """Numbers with commas between. Raises UsageError."""
-    if text is None:
-        return None
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise UsageError(f"{option} '{text}' is not numbers with commas between") from None
-
-
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
     if args.robot is not None:
         check_robot(args.robot)
     check_files(args.config, args.gap)
     args.logs = check_logs(*args.logs)
-    numbers("--at", args.at)
-    numbers("--noise", args.noise)
+    args.at = numbers("--at", args.at, what="numbers")
+    args.noise = numbers("--noise", args.noise)
     for name, least in (("std", 0.0), ("longest", 1.0), ("rate", 1.0)):
         if not getattr(args, name) > least:
             raise UsageError(f"--{name} must be above {least:g}, got {getattr(args, name)}")

@@ -24,9 +24,7 @@ TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
 
 def run_import(args: argparse.Namespace) -> int:
     """Carry `import` out."""
-    joints = tuple(name for name in args.joints.split(",") if name)
-    if args.robot is not None:
-        joints = read_robot(args.robot).tree.joint_names
+    joints = args.joints if args.robot is None else read_robot(args.robot).tree.joint_names
     spec = ImportSpec.from_options(
         args.sources,
         args.columns,

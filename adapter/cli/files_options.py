@@ -8,10 +8,12 @@ from pathlib import Path
 from adapter.cli.options import (
     add_joints,
     add_json,
+    add_told,
     add_topic,
     check_files,
     check_robot,
-    locks_of,
+    check_told,
+    names_in,
 )
 
 
@@ -28,7 +30,7 @@ def declare_import(parser: argparse.ArgumentParser) -> None:
     _add_tables(parser)
     add_topic(parser)
     add("--robot", metavar="NAME|FILE", help="take the joint names from this robot, in its order")
-    add("--joints", default="", metavar="LIST", help="joint names, commas between")
+    add("--joints", type=names_in, default=(), metavar="LIST", help="joint names, commas between")
     add("--flat", action="store_true", help="one value per line")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add_json(parser)
@@ -71,12 +73,13 @@ def declare_info(parser: argparse.ArgumentParser) -> None:
     _add_tables(parser)
     parser.add_argument("--robot", metavar="NAME|FILE", help="predict what the recording teaches")
     add_joints(parser)
+    add_told(parser)
     add_json(parser)
     parser.set_defaults(check=_check_info)
 
 
 def _check_info(args: argparse.Namespace) -> None:
-    locks_of(args)
+    check_told(args)
     if args.robot is not None:
         check_robot(args.robot)
     if not args.file.is_dir():

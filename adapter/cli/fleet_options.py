@@ -12,7 +12,6 @@ from adapter.cli.options import (
     add_topic,
     check_files,
     check_robot,
-    locks_of,
 )
 from adapter.errors import UsageError
 
@@ -71,7 +70,6 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
     check_robot(args.model)
     if not args.logs and args.out is None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")

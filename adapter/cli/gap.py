@@ -13,7 +13,7 @@ import numpy as np
 from rich.text import Text
 
 from adapter.cli import servo_gap
-from adapter.cli.common import effort_unit_of, robot_of
+from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_robot
 from adapter.effects.export import robot_urdf
@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     if positions is not None:
         return servo_gap.run(args, *positions)
     logs, hold_out = _opened(args)
-    unit = effort_unit_of(args)
-    settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, unit=unit)
+    told = told_of(args)
+    settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, told=told)
     if args.inertia_prior is not None:
         settings = replace(settings, inertia_prior=args.inertia_prior)
     if args.rounds is not None:

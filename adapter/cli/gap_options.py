@@ -6,14 +6,13 @@ import argparse
 from pathlib import Path
 
 from adapter.cli.options import (
-    add_effort_unit,
     add_joints,
     add_results,
+    add_told,
     add_topic,
-    check_effort_unit,
     check_logs,
     check_robot,
-    locks_of,
+    check_told,
 )
 from adapter.errors import UsageError
 
@@ -46,7 +45,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
         "documented them, commands should be where the arm is)",
     )
-    add_effort_unit(parser)
+    add_told(parser)
     add(
         "--inertia-prior",
         type=float,
@@ -85,6 +84,5 @@ def _check(args: argparse.Namespace) -> None:
     args.logs, args.hold_out = check_logs(*args.logs), check_logs(*args.hold_out)
     if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
-    locks_of(args)
-    check_effort_unit(args)
+    check_told(args)
     check_robot(args.model)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from adapter.cli.common import effort_unit_of, robot_of_log
+from adapter.cli.common import robot_of_log, told_of
 from adapter.gap.load import find_load
 from adapter.gap.load_words import as_json, robot_lines, sentence
-from adapter.gap.torque_gains import in_newton_metres
+from adapter.gap.torque_gains import as_told
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import console, output, say, warn, write_json
 from drivers.files.mcap import read_log
@@ -19,9 +19,9 @@ def run(args: argparse.Namespace) -> int:
     log = read_log(args.log, topic=args.topic)
     empty = None if args.empty is None else read_log(args.empty, topic=args.topic)
     robot = robot_of_log(args, log)
-    unit = effort_unit_of(args)
+    told = told_of(args)
     given = [log] if empty is None else [log, empty]
-    (log, *others), gains = in_newton_metres(given, robot, unit, given[1:])
+    (log, *others), gains = as_told(given, robot, told, given[1:])
     warn([] if gains is None else [*gains.notes, *gains.words()])
     empty = others[0] if others else None
     load = find_load(log, robot, empty, args.frame, args.inertia_prior)

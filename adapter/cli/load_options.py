@@ -6,14 +6,13 @@ import argparse
 from pathlib import Path
 
 from adapter.cli.options import (
-    add_effort_unit,
     add_joints,
     add_json,
+    add_told,
     add_topic,
-    check_effort_unit,
     check_logs,
     check_robot,
-    locks_of,
+    check_told,
 )
 from adapter.errors import UsageError
 
@@ -31,7 +30,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
     add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
     add_joints(parser)
-    add_effort_unit(parser)
+    add_told(parser)
     add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
     add(
         "--inertia-prior",
@@ -45,9 +44,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 
 def _check(args: argparse.Namespace) -> None:
-    locks_of(args)
-    check_effort_unit(args)
-    if args.tau_gain == "fit" and args.empty is None:
+    check_told(args)
+    if args.learn_gains and args.empty is None:
         raise UsageError("--tau-gain fit needs --empty LOG: gains and load cannot be told apart")
     if args.inertia_prior is not None and not 0.0 < args.inertia_prior <= 1.0:
         raise UsageError(f"--inertia-prior must be in (0, 1], got {args.inertia_prior}")

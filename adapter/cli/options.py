@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -34,13 +36,6 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
         help="effects learned beside θ: none, real, or names with commas between (a name that "
         "does not exist lists them)",
     )
-    add(
-        "--gravity",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "Z"),
-        help="in base axes, m/s², of an arm that does not stand upright: on a wall 9.81 0 0",
-    )
     add("--seed", type=int, help="of every random choice")
     add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
     add_results(parser)
@@ -48,16 +43,37 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
 
 
 def add_joints(parser: argparse.ArgumentParser) -> None:
-    """Which joints of the model move; those that a recording lacks are locked at zero."""
+    """How the arm is mounted, and which of the model's joints move.
+
+    Those that a recording lacks are locked at zero.
+    """
     add = parser.add_argument
-    add("--joints", metavar="A,B,C", help="joints of the model that move; the others are locked")
+    said = "joints of the model that move; the others are locked"
+    add("--joints", type=names_in, metavar="A,B,C", help=said)
     add(
         "--lock",
         action="append",
         default=[],
+        type=_joint_value,
         metavar="JOINT=VALUE",
         help="lock a joint at a value, rad or m (default: zero where a recording lacks it)",
     )
+    add(
+        "--gravity",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="in base axes, m/s², of an arm that does not stand upright: on a wall 9.81 0 0",
+    )
+
+
+def _joint_value(text: str) -> tuple[str, float]:
+    """A joint and its value. Raises ArgumentTypeError."""
+    name, _, value = text.rpartition("=")
+    with suppress(ValueError):
+        if name.strip() and math.isfinite(float(value)):
+            return name.strip(), float(value)
+    raise argparse.ArgumentTypeError(f"'{text}' is not JOINT=VALUE, a number in rad or m")
 
 
 def add_motion(parser: argparse.ArgumentParser) -> None:
@@ -65,28 +81,13 @@ def add_motion(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--speed", type=float, metavar="SHARE", help="of the joints' speed limits, at most")
     add("--range", type=float, metavar="SHARE", help="of the joints' ranges, at most")
-    add("--move", metavar="A,B,C", help="joints that move; the others stand still")
+    said = "joints that move; the others stand still"
+    add("--move", type=names_in, metavar="A,B,C", help=said)
 
 
-def joints_of(args: argparse.Namespace) -> tuple[str, ...] | None:
-    """Names given to `--joints`."""
-    if args.joints is None:
-        return None
-    return tuple(name.strip() for name in args.joints.split(",") if name.strip())
-
-
-def locks_of(args: argparse.Namespace) -> dict[str, float]:
-    """Values given to `--lock` by joint. Raises UsageError."""
-    values = {}
-    for option in args.lock:
-        name, _, text = option.rpartition("=")
-        try:
-            values[name.strip()] = float(text)
-        except ValueError:
-            name = ""
-        if not name.strip() or not math.isfinite(values[name.strip()]):
-            raise UsageError(f"--lock '{option}' is not JOINT=VALUE, a number in rad or m")
-    return values
+def names_in(text: str) -> tuple[str, ...]:
+    """Names with commas between."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def add_results(parser: argparse.ArgumentParser) -> None:
@@ -106,7 +107,6 @@ def add_json(parser: argparse.ArgumentParser, or_output: bool = False) -> None:
 
 def check_learning(args: argparse.Namespace) -> None:
     """What is wrong with options of everything that learns. Raises UsageError, SettingsError."""
-    locks_of(args)
     if args.robot is not None:
         check_robot(args.robot)
     check_files(args.config, args.truth, args.resume)
@@ -137,14 +137,44 @@ def add_topic(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_effort_unit(parser: argparse.ArgumentParser) -> None:
-    """In which unit recordings tell the joints' efforts, where it is not N m at the link."""
+def add_told(parser: argparse.ArgumentParser) -> None:
+    """How recordings tell joints and efforts, where it is not as the model has them."""
     add = parser.add_argument
     add(
+        "--turn",
+        dest="turn_or_zero",
+        action="extend",
+        default=[],
+        type=_turned,
+        metavar="JOINT,...",
+        help="joints that LOG counts the other way: q, dq and tau get the other sign",
+    )
+    add(
+        "--zero",
+        dest="turn_or_zero",
+        action="extend",
+        type=_zeros,
+        metavar="JOINT=RAD,...",
+        help="what LOG tells where the model's joint is at zero, once turned by a --turn before",
+    )
+    add(
+        "--tau",
+        choices=("gravity-compensated",),
+        help="the controller took the arm's gravity off the efforts: the model's is added "
+        "(--gravity 0 0 0: also that of the load)",
+    )
+    add(
+        "--trust-log",
+        action="store_true",
+        help="joints and efforts are as the model has them: what speaks against it is a warning",
+    )
+    add(
         "--tau-gain",
+        action="append",
         metavar="G1,G2,...|fit",
         help="N m per recorded unit (motor current: N m/A), one per joint of the model or one for "
-        "all; fit: learn them beside θ against the documented masses",
+        "all, negative where the sign is wrong; those of several multiply; fit: learn them beside "
+        "θ against the documented masses",
     )
     add(
         "--gear",
@@ -170,13 +200,20 @@ def add_effort_unit(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_effort_unit(args: argparse.Namespace) -> None:
+def _turned(text: str) -> list[tuple[str, float, float]]:
+    """As `Told.joints` has them."""
+    return [(name, -1.0, 0.0) for name in names_in(text)]
+
+
+def _zeros(text: str) -> list[tuple[str, float, float]]:
+    return [(name, 1.0, zero_rad) for name, zero_rad in map(_joint_value, text.split(","))]
+
+
+def check_told(args: argparse.Namespace) -> None:
     """Refuse what is no number and what goes with another option. Raises UsageError."""
-    learn = args.tau_gain == "fit"
-    args.gain = (
-        () if args.tau_gain is None or learn else numbers("--tau-gain", args.tau_gain, "fit")
-    )
-    args.gears = () if args.gear is None else numbers("--gear", args.gear)
+    learn = args.learn_gains = args.tau_gain == ["fit"]
+    args.gain = () if learn else _product(args.tau_gain or ())
+    args.gears = numbers("--gear", args.gear)
     args.loaded = check_logs(*args.loaded)
     if args.loaded and args.known_load is None:
         raise UsageError("--loaded names recordings of the known load; give its --known-load KG")
@@ -186,16 +223,25 @@ def check_effort_unit(args: argparse.Namespace) -> None:
         raise UsageError(f"--known-load takes a mass above zero in kg, got {args.known_load}")
 
 
-def numbers(option: str, text: str, *words: str) -> tuple[float, ...]:
-    """Numbers with commas between, none of them zero. Raises UsageError."""
-    try:
-        values = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        values = ()
-    if not values or not all(math.isfinite(x) and x != 0.0 for x in values):
-        choices = " or ".join(("numbers other than zero, with commas between", *words))
-        raise UsageError(f"{option} '{text}': takes {choices}")
-    return values
+def _product(texts: Sequence[str]) -> tuple[float, ...]:
+    """Of several `--tau-gain`, joint by joint. Raises UsageError."""
+    gains = [numbers("--tau-gain", text, "fit") for text in texts]
+    count = max(map(len, gains), default=0)
+    if not {len(gain) for gain in gains} <= {1, count}:
+        raise UsageError("--tau-gain: one number for all joints or one for each")
+    return tuple(math.prod(gain[j % len(gain)] for gain in gains) for j in range(count))
+
+
+def numbers(
+    option: str, text: str | None, *words: str, what: str = "numbers other than zero"
+) -> tuple[float, ...]:
+    """Numbers with commas between; none where nothing is given. Raises UsageError."""
+    with suppress(ValueError):
+        values = tuple(float(word) for word in ([] if text is None else text.split(",")))
+        if all(math.isfinite(x) and (what == "numbers" or x != 0.0) for x in values):
+            return values
+    choices = " or ".join((f"{what}, with commas between", *words))
+    raise UsageError(f"{option} '{text}': takes {choices}")
 
 
 def check_logs(*paths: Path | None) -> list[Path]:

@@ -9,12 +9,12 @@ from typing import Any
 
 from rich.progress import Progress
 
-from adapter.cli.common import configure, effort_unit_of, robot_of_log
+from adapter.cli.common import configure, robot_of_log, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import Learned, conclude
 from adapter.errors import SettingsError
 from adapter.gap.screen import check_torque
-from adapter.gap.torque_gains import TorqueGains, in_newton_metres
+from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
 from adapter.runs.config import Config, with_imus
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     reference = reference_from(args.truth, robot)
     logs = [_joined(args, whole, robot)]
     logs += [matching(read_log(path, topic=args.topic), robot) for path in more]
-    logs, gains = _in_newton_metres(args, logs, robot)
+    logs, gains = _as_told(args, logs, robot)
     log = one_after_other(logs) if more else logs[0]
     imus: tuple[str, ...] = ()
     if args.base is None:
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     numbers["torque_gains"] = None if gains is None else gains.as_dict()
     held_out = _held_out(args, log, robot)
     if held_out is not None and args.validate is not None:
-        held_out = _as_understood(args, held_out, robot, gains)
+        held_out = told_of(args).log(held_out, robot, 1.0 if gains is None else gains.gain)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
         for key, judged in (("", model), ("documented_", robot)):
@@ -125,41 +125,29 @@ def _figures(
     )
 
 
-def _in_newton_metres(
+def _as_told(
     args: argparse.Namespace, logs: list[Log], robot: SelfModel
 ) -> tuple[list[Log], TorqueGains | None]:
-    """Recordings with efforts in N m, and the gains where they were learned.
+    """Recordings as the robot means them, and the gains where they were learned.
 
     Raises:
-        RecordingRefused: nobody says a unit, and efforts are motor currents.
+        RecordingRefused: joints or efforts are not the robot's, and nobody says how they are told.
     """
-    unit = effort_unit_of(args)
-    if robot.tree.floating and not unit.is_given:
-        return logs, None
-    if unit.learn and robot.tree.floating:
+    told = told_of(args)
+    if told.learn and robot.tree.floating:
         raise SettingsError("--tau-gain fit needs a fixed base; give --tau-gain G1,G2,...")
     until = args.validate_from
     taught: list[Log] = []
-    if unit.learn:
+    if told.learn:
         say("learning the gains of the drives")
         taught = logs if until is None else [from_s(x, 0.0, until) for x in logs]
-    logs, gains = in_newton_metres(logs, robot, unit, taught)
+    logs, gains = as_told(logs, robot, told, taught)
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
     if not robot.tree.floating:
         for log in logs:
-            check_torque(most_moved(log), robot, unit.is_given and gains is None)
+            logs[0].warnings.extend(check_torque(most_moved(log), robot))
     return logs, gains
-
-
-def _as_understood(
-    args: argparse.Namespace, log: Log, robot: SelfModel, gains: TorqueGains | None
-) -> Log:
-    """Another recording with efforts in N m as those that were learned from."""
-    factors = effort_unit_of(args).factors(robot.tree.joint_names)
-    if gains is not None:
-        factors = factors * gains.gain
-    return log.changed(lambda piece: replace(piece, tau=piece.tau * factors))
 
 
 def _joined(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log:

@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 
 from adapter.cli.options import (
-    add_effort_unit,
     add_learning,
+    add_told,
     add_topic,
-    check_effort_unit,
     check_learning,
     check_logs,
+    check_told,
 )
 from adapter.errors import UsageError
 
@@ -33,7 +33,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
     )
     add_topic(parser)
     add_learning(parser)
-    add_effort_unit(parser)
+    add_told(parser)
     add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
     add(
         "--base",
@@ -72,6 +72,6 @@ def _check(args: argparse.Namespace) -> None:
     args.logs = check_logs(*args.logs)
     if given and len(args.logs) > 1:
         raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
-    check_effort_unit(args)
+    check_told(args)
     check_learning(args)
     check_logs(args.validate)

@@ -20,7 +20,10 @@ from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import complain, console, output, results_folder, say, write_json
 from drivers.files.mcap import Log, read_position_log
 
-WITH_TORQUE = ("validate_from", "rounds", "tau_gain", "gear", "known_load")  # options
+WITH_TORQUE = (  # options
+    *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
+    *("tau_gain", "gear", "known_load"),
+)
 
 
 def position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | None:
@@ -50,7 +53,7 @@ def position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | Non
 
 def run(args: argparse.Namespace, logs: list[Log], hold_out: list[Log]) -> int:
     """Carry it out; returns the exit code."""
-    unusable = [name for name in WITH_TORQUE if getattr(args, name) is not None]
+    unusable = [name for name in WITH_TORQUE if getattr(args, name)]
     if unusable:
         options = ", ".join("--" + name.replace("_", "-") for name in unusable)
         raise UsageError(f"{options}: for recordings with torques; these have commands alone")

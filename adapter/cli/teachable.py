@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from adapter.cli.common import robot_of
+from adapter.cli.common import robot_of, told_of
 from adapter.control.teachable import teachable
 from adapter.gap.screen import RecordingRefused, check_torque
 from adapter.model.self_model import SelfModel
@@ -18,7 +18,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
     whole = log or read_log(args.file, topic=args.topic)
     robot = robot_of(args, args.robot)
     robot, locked = present(robot, whole.joint_names, whole.path)
-    log = matching(most_moved(whole), robot)
+    log = told_of(args).log(matching(most_moved(whole), robot), robot)
     if len(log) < len(whole):
         locked.append(f"predicted for {len(log)} of its {len(whole)} samples, where it moves most")
     doubt = _doubt(log, robot)
@@ -51,10 +51,9 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
 def _doubt(log: Log, robot: SelfModel) -> list[str]:
     """A sentence where efforts are no joint torques of this arm."""
     try:
-        check_torque(log, robot)
+        return check_torque(log, robot)
     except RecordingRefused as refusal:
         return [str(refusal)]
-    return []
 
 
 def _by_part(parameters: dict[str, Any]) -> list[str]:

@@ -26,6 +26,7 @@ from adapter.gap.torque_units import (
     SEEN_NM,
     SMOOTHING_S,
     inertial_std,
+    tau_gain,
 )
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -39,6 +40,7 @@ MOST = 3  # readings in one recording
 ROWS = 100  # instants that are judged
 ZEROS = np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0])
 BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it costs
+SIZE_ROUNDS = 4  # of one joint's size beside all else
 LEAST_FACTOR = 1.5  # of one joint's torque; gains and friction explain less
 NEAR = 2  # joints up to which an axis may be told against another (parallel links)
 # Of the variance of torques: middle joint and best one. Real arms: 0.9 and 0.97 at least.
@@ -65,12 +67,15 @@ class Explained(NamedTuple):
     """How well rows are explained.
 
     Attributes:
-        cost: twice the negative log-likelihood; share: (n,) of the torques' variance explained.
+        cost: twice the negative log-likelihood.
+        share, size: of each joint's torque the share (n,) of its variance that is explained, and
+            its size (n,) as a multiple of the model's.
         x: (10 n + 4 n,) corrections, in standard deviations.
     """
 
     cost: float
     share: Array
+    size: Array
     x: Array
 
 
@@ -104,12 +109,12 @@ class Telling:
         """The same of any torques (m, n) of these instants."""
         columns, model = self._columns(rows)
         m, beyond = len(model), self._beyond(rows.q)
-        size = np.sqrt(np.mean(model**2, axis=0))
-        floor = SENSOR_NM + SENSOR_SHARE * size
+        usual = np.sqrt(np.mean(model**2, axis=0))
+        floor = SENSOR_NM + SENSOR_SHARE * usual
         squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
 
         def of(tau: Array) -> Explained:
-            apart, sigma = tau - model, FLOOR_NM + FLOOR_SHARE * size
+            apart, sigma = tau - model, FLOOR_NM + FLOOR_SHARE * usual
             products = np.einsum("mjk,mj->jk", columns, apart)
             for _ in range(ROUNDS):
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
@@ -121,7 +126,8 @@ class Telling:
             noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
             cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
             share = 1.0 - left / np.maximum(tau.var(axis=0), floor**2)
-            return Explained(cost + beyond, share, x)
+            size = 1.0 + FRICTION[-1] * x[-len(share) :]
+            return Explained(cost + beyond, share, size, x)
 
         return of
 
@@ -158,14 +164,15 @@ def _own(rows: Rows, names: Sequence[str], j: int) -> Iterator[tuple[str, Rows]]
     (q, dq, ddq, tau, scaled), unit = rows, np.eye(len(names))[j]
     turn = 1.0 - 2.0 * unit
     yield (
-        f"{names[j]} counts the other way round: turn its position, velocity and torque",
+        f"{names[j]} counts the other way round: --turn {names[j]}",
         Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled),
     )
     for zero in ZEROS:
         way = "more" if zero > 0.0 else "less"
         yield (
             f"the zero of {names[j]} is elsewhere than the model's: its own angle is "
-            f"{abs(np.degrees(zero)):.0f} degrees {way} than what is recorded",
+            f"{abs(np.degrees(zero)):.0f} degrees {way} than what is recorded: "
+            f"--zero {names[j]}={-zero:.6g}",
             Rows(q + zero * unit, dq, ddq, tau, scaled),
         )
 
@@ -197,12 +204,17 @@ def _sizes(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
         factor = float(rows.tau[:, j] @ model[:, j]) / size if size else 0.0
         seen = telling.alive[j] and factor > 0.0 and size > len(model) * SEEN_NM**2
         if seen and abs(np.log(factor)) > np.log(LEAST_FACTOR):
-            said = f"the torque of {name} is {factor:.3g} times what the model needs: its unit"
-            yield said, _divided(rows, np.where(np.arange(len(names)) == j, factor, 1.0))
+            times = np.ones(len(names))
+            times[j] = factor
+            for _ in range(SIZE_ROUNDS):  # a load, which the model lacks, is no size
+                times[j] *= telling.explained(_divided(rows, times)).size[j]
+            if abs(np.log(times[j])) > np.log(LEAST_FACTOR):
+                said = f"the torque of {name} is {times[j]:.3g} times what the model needs"
+                yield f"{said}: {tau_gain(1.0 / times)}", _divided(rows, times)
     if np.all(np.isfinite(rated) & (rated > 0.0)):
         for whole, word in ((1.0, "shares"), (100.0, "percent"), (1000.0, "per mille")):
-            said = f"the torques are {word} of each joint's rated torque: convert them to N m"
-            yield said, _divided(rows, whole / rated)
+            said = f"the torques are {word} of each joint's rated torque"
+            yield f"{said}: {tau_gain(rated / whole)}", _divided(rows, whole / rated)
 
 
 def _divided(rows: Rows, factor: Array) -> Rows:

@@ -22,7 +22,7 @@ from adapter.gap.sampled import Sampled, sampling_words
 from adapter.gap.screen import (
     MOVES_DQ,
     cleaned,
-    judge_torque,
+    doubts,
     moving_joints,
     silent,
     smoothed_rows,
@@ -110,7 +110,7 @@ def find_load(
     logs, notes = [log] if empty is None else [log, empty], []
     for one in logs:
         model, said = present(model, one.joint_names, one.path.name)
-        notes += said
+        notes += [*one.warnings, *said]
     riding = hand_frame(model, frame)
     if inertia_prior is None:
         inertia_prior, shares = (DOCUMENTED_STD, SHARES) if empty is None else (SHARED_STD, (1.0,))
@@ -153,8 +153,9 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
     if is_long(log):
         long = Sampled.of(log, log.path.name, model)
         part, _, said = cleaned(long.busiest(log), model)
-        return _Taken(long.recorded(), part, long.survey.clock.period_s, said)
+        return _Taken(long.recorded(), part, long.survey.clock.period_s, part.warnings + said)
     own, clock, said = cleaned(log, model)
+    said = own.warnings + said
     return _Taken(Recorded.of(own, lateness(clock)).cut(), own, clock.period_s, said)
 
 
@@ -167,8 +168,7 @@ def _judged(log: Log, model: SelfModel) -> tuple[bool, list[str]]:
     if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
         return False, ["the arm hardly moves: static friction in its joints counts as load"]
     dead = silent(log, model.tree.joint_names)
-    judge_torque(log, model, RigidArm.of(model), smoothed)
-    return True, dead
+    return True, dead + doubts(log, model, RigidArm.of(model), smoothed)
 
 
 def _changed(fit: Fit) -> list[str]:

@@ -84,13 +84,13 @@ class Sampled:
         """The part in one piece in which most moves, of the recording as it was read."""
         return log.piece(*self.survey.busiest(SCREENED_S))
 
-    def screened(self, log: Log, unit_known: bool) -> Screened:
+    def screened(self, log: Log) -> Screened:
         """Let the recording pass, as `screen.refuse` does. Raises RecordingRefused.
 
         Args:
             log: as it was read.
         """
-        seen = refuse(self.busiest(log), self.model, RigidArm.of(self.model), unit_known)
+        seen = refuse(self.busiest(log), self.model, RigidArm.of(self.model))
         motion = self.whole.signals(self.spans, RigidArm.of(self.model)).motion
         moving = self.moving() or seen.moving
         said = standing(self.model.tree.joint_names, moving, motion.q, motion.dq)

@@ -21,6 +21,7 @@ from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import matching
 from adapter.signals.source_clock import source_stamps
+from adapter.signals.told import told_of
 from adapter.signals.validation import GRID_S, smooth
 from drivers.files.mcap import Log
 from drivers.interface import DriverError
@@ -100,12 +101,11 @@ class Screened:
         return [*self.timing.words(), *self.beyond, *self.standing, *self.silent]
 
 
-def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) -> Screened:
+def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     """Let a recording pass or say in one sentence why not.
 
     Args:
         log: as read; model: whose joints it should have; arm: the model's rigid body.
-        unit_known: somebody says that torques are in N m, however large they are.
 
     Raises:
         Refusal: another robot; no second of data; units or sign of velocities or positions;
@@ -118,7 +118,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm, unit_known: bool = False) 
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
     dead = silent(log, names)
-    judge_torque(log, model, arm, (q, dq, ddq, tau), recorded if renamed else (), unit_known)
+    dead += doubts(log, model, arm, (q, dq, ddq, tau), recorded if renamed else ())
     return Screened(log, timing, moving, outside, standing(names, moving, q, dq), dead)
 
 
@@ -395,6 +395,25 @@ def _check_joints(
         )
 
 
+def doubts(
+    log: Log,
+    model: SelfModel,
+    arm: RigidArm,
+    smoothed: tuple[Array, Array, Array, Array],
+    renamed: Sequence[str] = (),
+) -> list[str]:
+    """What `judge_torque` says against a recording that is trusted; any other is refused."""
+    told = told_of(log)
+    try:
+        judge_torque(log, model, arm, smoothed, renamed, told.unit_known)
+    except RecordingRefused as refusal:
+        if told.trusted:
+            return [f"{refusal} It is trusted all the same."]
+        said = f"{refusal} If it is as the model has it, --trust-log takes it so."
+        raise RecordingRefused(refusal.kind, said) from None
+    return []
+
+
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     """q, dq, ddq, tau (m, n) of `validation.smooth`, without what its filter makes of a pause."""
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
@@ -410,25 +429,27 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     return q, dq, ddq, tau
 
 
-def check_torque(log: Log, model: SelfModel, unit_known: bool = False) -> None:
+def check_torque(log: Log, model: SelfModel) -> list[str]:
     """Refuse efforts that are no joint torques of this arm, where there is motion enough to tell.
 
     Args:
         log: joints in the model's order; model: of an arm whose base is fixed.
-        unit_known: somebody says that torques are in N m, however large they are.
+
+    Returns:
+        What speaks against a trusted recording.
 
     Raises:
         Refusal: units, sign, order or meaning of the torques.
     """
     rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
     if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
-        return
+        return []
     log = log.take(rows)
     smoothed = smoothed_rows(log)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
-        return
+        return []
     silent(log, model.tree.joint_names)
-    judge_torque(log, model, RigidArm.of(model), smoothed, (), unit_known)
+    return doubts(log, model, RigidArm.of(model), smoothed)
 
 
 def compared(

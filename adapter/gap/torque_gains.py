@@ -35,7 +35,8 @@ from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.matching import matching, present
+from adapter.signals.matching import present
+from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log
 
 DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a known mass
@@ -49,96 +50,38 @@ SLIDES_RAD_S, AROUND_S = 0.1, 0.1  # slower, so long before or after, a joint st
 GAIN = CATALOGUE["torque_gain"]
 
 
-@dataclass(frozen=True)
-class EffortUnit:
-    """What the efforts of recordings are.
-
-    Attributes:
-        gain: N m per recorded unit, one per joint of the model or one for all; empty: N m.
-        learn: the gains; what `gain` says is not used then.
-        gear: turns of the motor per turn of the link, one per joint or one for all, where efforts
-            are those of the motors; positions and velocities are those of the links anyway.
-        load_kg: mass of a body that the hand carries in `loaded`, and nowhere else.
-        loaded: recordings; all where empty.
-    """
-
-    gain: tuple[float, ...] = ()
-    learn: bool = False
-    gear: tuple[float, ...] = ()
-    load_kg: float | None = None
-    loaded: tuple[Path, ...] = ()
-
-    def __post_init__(self) -> None:
-        for option, values in (("--tau-gain", self.gain), ("--gear", self.gear)):
-            if not all(np.isfinite(x) and x != 0.0 for x in values):
-                raise SettingsError(f"{option} takes finite numbers other than zero, got {values}")
-        if self.load_kg is not None and not (np.isfinite(self.load_kg) and self.load_kg > 0.0):
-            raise SettingsError(f"--known-load takes a mass above zero, kg, got {self.load_kg}")
-        if self.load_kg is not None and not self.learn:
-            raise SettingsError("--known-load goes with --tau-gain fit: it fixes the gains' scale")
-
-    @property
-    def is_given(self) -> bool:
-        """Whether somebody said which unit it is, be it N m."""
-        return bool(self.gain or self.gear) or self.learn
-
-    def factors(self, joint_names: Sequence[str]) -> Array:
-        """(n,) N m per recorded unit, before any gain is learned. Raises SettingsError."""
-        gain = _per_joint(() if self.learn else self.gain, joint_names, "--tau-gain")
-        return gain * _per_joint(self.gear, joint_names, "--gear")
-
-
-def _per_joint(values: tuple[float, ...], names: Sequence[str], option: str) -> Array:
-    if len(values) not in (0, 1, len(names)):
-        raise SettingsError(
-            f"{option} takes one number for all joints or one for each of {', '.join(names)} "
-            f"({len(names)}), got {len(values)}"
-        )
-    return np.asarray(np.broadcast_to(np.array(values or (1.0,)), len(names)), dtype=float)
-
-
-def in_newton_metres(
-    logs: Sequence[Log], model: SelfModel, unit: EffortUnit, learned_from: Sequence[Log] = ()
+def as_told(
+    logs: Sequence[Log], model: SelfModel, told: Told, learned_from: Sequence[Log] = ()
 ) -> tuple[list[Log], TorqueGains | None]:
-    """Recordings with efforts in N m, as somebody said they are to be understood.
+    """Recordings as the model means them, as somebody said they are to be understood.
 
     Args:
-        logs: as read; model: of the arm; unit: of them all.
+        logs: as read; model: of the arm; told: of them all.
         learned_from: which gains are learned from, where not from all; those that carry the
             known load are read beside them.
 
     Returns:
-        The recordings, as they were where nobody said a unit, and what was learned.
+        The recordings, as they were where nobody said anything, and what was learned.
 
     Raises:
-        SettingsError: not one number per joint, or no known load in the recordings.
+        SettingsError: see `Told.log`; no known load in the recordings.
         Refusal: what gains cannot be learned from.
     """
-    if not unit.is_given:
-        return list(logs), None
     for log in logs:
         model, _ = present(model, log.joint_names, log.path)
-    factors = unit.factors(model.tree.joint_names)
-    if not unit.learn:
-        return [converted(log, model, factors) for log in logs], None
+    if not told.learn:
+        return [told.log(log, model) for log in logs], None
     taught = list(learned_from or logs)
-    held = [path.resolve() for path in unit.loaded]
-    taught += [read_log(path) for path in unit.loaded if path.resolve() not in _paths(taught)]
-    loaded = [unit.load_kg is not None and (not held or p in held) for p in _paths(taught)]
-    taught = [converted(log, model, factors) for log in taught]
-    gains = learn_gains(taught, model, loaded, unit.load_kg)
-    return [converted(log, model, factors * gains.gain) for log in logs], gains
+    held = [path.resolve() for path in told.loaded]
+    taught += [read_log(path) for path in told.loaded if path.resolve() not in _paths(taught)]
+    loaded = [told.load_kg is not None and (not held or p in held) for p in _paths(taught)]
+    taught = [told.log(log, model) for log in taught]
+    gains = learn_gains(taught, model, loaded, told.load_kg)
+    return [told.log(log, model, gains.gain) for log in logs], gains
 
 
 def _paths(logs: Sequence[Log]) -> list[Path]:
     return [log.path.resolve() for log in logs]
-
-
-def converted(log: Log, model: SelfModel, factors: Array) -> Log:
-    """A recording with efforts times factors (n,), joints in the model's order."""
-    model, _ = present(model, log.joint_names, log.path)
-    own = matching(log, model)
-    return own.changed(lambda piece: replace(piece, tau=piece.tau * factors))
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,6 +47,7 @@ UNITS = {
     0.01: "torque of the motors before gears of 1:100",
     0.001: "kN m",
 }
+G, ASKEW_RAD = 9.81, np.deg2rad(15.0)  # m/s²; a load bends what torques say of gravity so far
 SEEN_NM = 0.3  # rms of a joint's model torque below which nothing is read from it
 
 
@@ -284,7 +285,7 @@ def _mounting(comparison: TorqueComparison, tau: Array) -> TorqueReading:
     rows = (axes / comparison.sigma[None, :, None]).reshape(-1, 3)
     found = np.linalg.lstsq(rows, ((tau - dynamic) / comparison.sigma).ravel(), rcond=None)[0]
     size = float(np.linalg.norm(found))
-    gravity = found * (9.81 / size) if size else found
+    gravity = found * (G / size) if size else found
     read = tau + gravity_only - axes @ gravity
     return TorqueReading("mounting", read, comparison.cost(read), tuple(range(n)), gravity)
 
@@ -309,20 +310,25 @@ def in_words(
         which = "all joints" if len(names) == tree.n else ", ".join(names)
         return (
             f"the torque of {which} has the wrong sign: {worst} there as recorded and by "
-            f"{rms(after[joints]):.3g} N m with the sign turned; turn it in the recording, tau "
-            "is positive along the joint's axis and holds the arm against gravity."
+            f"{rms(after[joints]):.3g} N m with the sign turned; tau is positive along the "
+            f"joint's axis and holds the arm against gravity: {tau_gain(best.detail)} turns it."
         )
     if best.kind == "gravity":
         return (
             f"the torques hold no gravity: {worst} as recorded and by {rms(after):.3g} N m when "
-            "the model's gravity torque is added; record the measured joint torques, gravity "
-            "included."
+            "the model's gravity torque is added; record them with gravity, or "
+            "--tau gravity-compensated adds the model's (--gravity 0 0 0 where that of the load "
+            "was taken off, too)."
         )
     if best.kind == "mounting":
         g = ", ".join(f"{x:.1f}" for x in best.detail)
+        upright = np.where(np.abs(best.detail) > G * np.cos(ASKEW_RAD), G, 0.0)
+        mounted = np.copysign(upright, best.detail) if upright.any() else best.detail
+        given = " ".join(f"{x:.4g}" for x in mounted + 0.0)
         return (
             f"gravity acts along [{g}] m/s² of the base and not as in the model: {worst} as "
-            f"recorded and by {rms(after):.3g} N m so; give the model the gravity of the mounting."
+            f"recorded and by {rms(after):.3g} N m so; say how the arm is mounted, as in "
+            f"--gravity {given}."
         )
     held = [tree.joint_names[int(k)] for k in best.detail]
     pairs = ", ".join(f"{held[j]} holds that of {tree.joint_names[j]}" for j in best.joints)
@@ -343,8 +349,14 @@ def _scale_words(best: TorqueReading, recorded: float, model: float, after: floa
     return (
         f"the torques are {what} what the model needs{turned} (rms {recorded:.3g} against "
         f"{model:.3g} N m, {after:.3g} N m off after division): {guess}? "
-        "Convert them to N m at the link side (`adapter import` does)."
+        f"{tau_gain(1.0 / best.detail)} makes N m at the link of them."
     )
+
+
+def tau_gain(gain: Array) -> str:
+    """The option for gains (n,), in N m per recorded unit."""
+    told = gain[:1] if np.ptp(gain) == 0 else gain
+    return "--tau-gain=" + ",".join(f"{x:.4g}" for x in told)
 
 
 def rms(x: Array) -> float:

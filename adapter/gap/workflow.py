@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,11 +36,12 @@ from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import Recorded
 from adapter.gap.timing import lateness
-from adapter.gap.torque_gains import EffortUnit, TorqueGains, in_newton_metres
+from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.matching import present
+from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log
 
 SEARCHED_S = 20.0  # of several recordings
@@ -67,7 +68,7 @@ class GapSettings:
         validate_from_s: with one recording: fit before it, score after it; None: by blocks.
         hold_out: recordings to score on, among those that are given or not. All others are
             fitted; where none is held out, blocks of time of all are in turn.
-        unit: of the recordings' efforts; N m where nobody says otherwise.
+        told: how the recordings tell joints and efforts, where it is not as the model has them.
         rounds: of the search, each of which may name something; where they do not suffice the
             result says so. Counted, not timed: the same log gives the same result anywhere.
     """
@@ -76,7 +77,7 @@ class GapSettings:
     validate_from_s: float | None = None
     hold_out: tuple[Path | str | Log, ...] = ()
     rounds: int = ROUNDS
-    unit: EffortUnit = field(default_factory=EffortUnit)
+    told: Told = AS_RECORDED
 
     def __post_init__(self) -> None:
         if not 0.0 < self.inertia_prior <= 1.0:
@@ -123,7 +124,7 @@ def find_gap(
         untold = GapResult.untold(nominal.tree.joint_names, nominal.name, names, name, str(refusal))
         if refusal.kind is not RecordingFault.MOTION or len(logs) > 1:
             return untold
-        return _with_what_is_held(untold, logs[0], nominal, settings.inertia_prior)
+        return _with_what_is_held(untold, logs[0], nominal, settings)
     progress("smoothing")
     prior = settings.inertia_prior
     fit = nominal_fit(task.fitted, task.model, prior, task.period_s, task.scored)
@@ -151,12 +152,12 @@ def find_gap(
 
 
 def _with_what_is_held(
-    untold: GapResult, log: Path | str | Log, model: SelfModel, inertia_prior: float
+    untold: GapResult, log: Path | str | Log, model: SelfModel, settings: GapSettings
 ) -> GapResult:
     """A load at the hand shows in an arm at rest as well."""
     whole = log if isinstance(log, Log) else read_log(Path(log))
     own = part_of(whole, present(model, whole.joint_names, whole.path.name)[0])
-    load = held_at_rest(own, model, inertia_prior)
+    load = held_at_rest(settings.told.log(own, model), model, settings.inertia_prior)
     if load is None:
         return untold
     said = f"{untold.problem} The hand holds {load.parameters['m']:.2g} ± {load.std['m']:.2g} kg."
@@ -179,18 +180,17 @@ def _task(
         read.append(log if isinstance(log, Log) else read_log(Path(log)))
         model, said = present(model, read[-1].joint_names, name)
         locked += said
-    if settings.unit.learn:
+    if settings.told.learn:
         progress("learning the gains of the drives")
         taught = [part_of(log, model, settings.validate_from_s) for log in read[: len(kept)]]
     else:
         taught = []
-    read, gains = in_newton_metres(read, model, settings.unit, taught)
-    unit_known = settings.unit.is_given and gains is None
+    read, gains = as_told(read, model, settings.told, taught)
     taken = []
     for log, name in zip(read, names, strict=True):
         if is_long(log):
             progress(f"reading {name} in pieces")
-        taken.append(_taken(log, name, model, unit_known))
+        taken.append(_taken(log, name, model))
     if len(kept) == 1:
         taken[0] = _divided(taken[0], settings, progress)
     fitted = tuple(x.fitted for x in taken[: len(kept)])
@@ -224,12 +224,12 @@ class _Taken(NamedTuple):
     scored: Recorded | None = None
 
 
-def _taken(log: Log, name: str, model: SelfModel, unit_known: bool) -> _Taken:
+def _taken(log: Log, name: str, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
     if is_long(log):
         sampled = Sampled.of(log, name, model)
-        return _Taken(sampled.screened(log, unit_known), sampled.recorded(), sampled)
-    seen = refuse(log, model, RigidArm.of(model), unit_known)
+        return _Taken(sampled.screened(log), sampled.recorded(), sampled)
+    seen = refuse(log, model, RigidArm.of(model))
     fitted = replace(Recorded.of(seen.log, lateness(seen.timing)).cut(), name=name)
     return _Taken(seen, fitted, None)
 

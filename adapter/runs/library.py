@@ -210,7 +210,8 @@ def learn(
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
-    check_torque(most_moved(own), arm)
+    for doubt in check_torque(most_moved(own), arm):
+        warnings.warn(doubt, ModelWarning, stacklevel=2)
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)
     names = learnable(arm, REAL_ARM_EFFECTS if effects is None else tuple(effects))
     settings = PipelineSettings(filter=filter_settings, learner=LearnerSettings(effects=names))

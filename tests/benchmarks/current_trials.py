@@ -21,7 +21,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from adapter.effects.robots import read_robot
 from adapter.gap import GapSettings, find_gap
-from adapter.gap.torque_gains import EffortUnit
+from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log
 
 SHARE, WIDE = 0.1, 100.0  # prior of inertias, of their kind's size; of all else
@@ -86,7 +86,7 @@ def main() -> None:
     log = read_log(args.bag).select(list(model.tree.joint_names), [])
     log = replace(log, tau=log.tau / stated)
     split_s = 2.0 / 3.0 * 1e-9 * float(np.ptp(log.stamp_ns))
-    settings = GapSettings(validate_from_s=split_s, unit=EffortUnit(learn=True))
+    settings = GapSettings(validate_from_s=split_s, told=Told(learn=True))
     found = find_gap([log], model, settings)
     assert found.torque_gains is not None
     gain = np.array(found.torque_gains["gain_nm_per_unit"])

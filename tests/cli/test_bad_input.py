@@ -268,8 +268,6 @@ def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> 
         (["run", "--scenario", "payload_at_20s", "--set", "weight=1"], "mass"),
         (["run", "--duration", "-1"], "--duration"),
         (["run", "--effects", "magic"], "coulomb_friction"),
-        (["run", "--lock", "panda_joint7"], "JOINT=VALUE"),
-        (["run", "--lock", "panda_joint7=nan"], "JOINT=VALUE"),
         (["run", "--truth", "nowhere.json"], "nowhere.json"),
         (["run", "--config", "nowhere.toml"], "nowhere.toml"),
         (["export", "nowhere.json", "--urdf", "x.urdf"], "nowhere.json"),
@@ -290,3 +288,11 @@ def test_urdfs_that_cannot_be_an_arm(tmp_path, capsys, body: str, said: str) -> 
 def test_wrong_use(tmp_path, capsys, monkeypatch, arguments: list[str], said: str) -> None:
     monkeypatch.chdir(tmp_path)
     assert said in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize("value", ["panda_joint7", "panda_joint7=nan"])
+@pytest.mark.parametrize("words", [["run", "--lock"], ["load", "a.mcap", "--zero"]])
+def test_a_joint_without_a_value(capsys, words: list[str], value: str) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, value])
+    assert f"'{value}' is not JOINT=VALUE" in capsys.readouterr().err

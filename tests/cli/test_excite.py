@@ -75,7 +75,7 @@ def test_makes_the_motion_that_a_gap_report_asks_for(tmp_path, capsys):
     ("options", "said"),
     [
         (["--at", "0,1"], "needs 7 finite numbers, got 2"),
-        (["--at", "a,b"], "is not numbers with commas between"),
+        (["--at", "a,b"], "takes numbers, with commas between"),
         (["--at", "0,1.5,0,-0.2,0,1.5,0"], "no motion can start at 0.00, 1.50"),
         (["--std", "0"], "--std must be above 0"),
         (["--gap", LOG], "not the JSON of `adapter gap`"),

@@ -8,7 +8,8 @@ from tests.helpers.pages import NOT_GIVEN, PAGES, PYTHON, ROOT, blocks, every_co
 
 DRAWN = "figures/"  # when the site is built, by docs/site/figures.py
 # What a block of Python in a page calls, and so which test of test_commands.py runs it
-RUN = ("adapter.learn(", "find_gap", "MujocoArm", "SnapshotReader", "hour.mcap", "AnyReader")
+CALLS = ("adapter.learn(", "find_gap", "MujocoArm", "SnapshotReader", "hour.mcap", "AnyReader")
+RUN = (*CALLS, "adapter.Told(")
 
 
 @pytest.mark.parametrize("page", PAGES)

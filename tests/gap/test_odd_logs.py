@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import adapter
 from adapter.cli import main
-from adapter.gap.load import find_load
+from adapter.errors import ModelWarning
+from adapter.gap.load import HandLoad, find_load
 from adapter.gap.screen import RecordingRefused
+from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log, McapWriter
 from sim.effects import payload, per_joint
 from tests.helpers.arm_data import Motion, arm, panda_model, record
@@ -21,11 +26,12 @@ SPIKES = 40
 
 
 @cache
-def base() -> Log:
+def base(gravity: tuple[float, ...] = (0.0, 0.0, -9.81)) -> Log:
     """8 s of an arm with friction and 1 kg in its hand."""
     held = payload(LOAD_KG, np.array(AT), 1e-3 * np.eye(3))
     rubbing = per_joint("coulomb_friction", "Fc", [0.3] * 7)
-    return record(arm().with_changes(effects=[*rubbing, held]), Motion(8.0, 5)).log()
+    truth = arm().with_changes(effects=[*rubbing, held], gravity=np.array(gravity))
+    return record(truth, Motion(8.0, 5)).log()
 
 
 def without(begin_s: float, end_s: float) -> Log:
@@ -152,13 +158,8 @@ def against_the_world(joint: int, carrier: int) -> Log:
 
 
 AS_A_WHOLE = {
-    "panda_joint3 counts the other way": lambda: turned(2),
-    "zero of panda_joint4 is elsewhere": lambda: replace(base(), q=base().q + np.eye(7)[3] * 1.571),
     "panda_joint1 and panda_joint3 are swapped": lambda: swapped(0, 2),
     "panda_joint4 is told together with panda_joint2": lambda: against_the_world(3, 1),
-    "percent of each joint's rated": lambda: replace(
-        base(), tau=100.0 * base().tau / panda_model().limits.effort
-    ),
     "not those of this motion": lambda: replace(base(), tau=base().tau[::-1]),
     "torques are not those": lambda: replace(
         base(), tau=5.0 * np.random.default_rng(0).standard_normal(base().tau.shape)
@@ -190,6 +191,83 @@ def test_a_namespace_and_joints_of_a_gripper_are_no_other_robot() -> None:
     assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 0.3
 
 
+def written(log: Log, path: Path) -> Path:
+    with McapWriter(path, log.joint_names) as writer:
+        for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
+            writer.write_joint_state(stamp_ns, *signals)
+    return path
+
+
+def without_gravity() -> Log:
+    model, log = panda_model(), base()
+    still = np.zeros_like(log.q)
+    return replace(log, tau=log.tau - RigidArm.of(model).torque(log.q, still, still))
+
+
+def zero_moved(log: Log, by_rad: float) -> Log:
+    return replace(log, q=log.q + by_rad * np.eye(7)[3])
+
+
+def larger(factor: np.ndarray) -> Log:
+    return replace(base(), tau=factor * base().tau)
+
+
+MENDED = {
+    "--turn panda_joint3": lambda: turned(2),
+    "--zero panda_joint4=1.5708": lambda: zero_moved(base(), np.pi / 2.0),
+    "--turn panda_joint4 --zero panda_joint4=-0.785398": lambda: zero_moved(turned(3), np.pi / 4.0),
+    "--tau gravity-compensated": without_gravity,
+    "--gravity 9.81 0 0": lambda: base((9.81, 0.0, 0.0)),
+    "--gravity 0 0 9.81": lambda: base((0.0, 0.0, 9.81)),
+    "--tau-gain=1,-1,1,1,1,1,1": lambda: larger(1.0 - 2.0 * np.eye(7)[1]),
+    "--tau-gain=0.001": lambda: larger(np.full(7, 1000.0)),
+    "--tau-gain=0.87,0.87,0.87,0.87,0.12,0.12,0.12": lambda: larger(
+        100.0 / panda_model().limits.effort
+    ),
+    "--tau-gain=1,1,1,0.": lambda: larger(1.0 + 1.5 * np.eye(7)[3]),
+}
+
+
+@cache
+def clean() -> HandLoad:
+    return find_load(base(), panda_model())
+
+
+@pytest.mark.parametrize("option", MENDED)
+def test_the_sentence_says_the_option_that_mends_the_log(option, tmp_path, capsys) -> None:
+    path, out = written(MENDED[option](), tmp_path / "odd.mcap"), tmp_path / "load.json"
+    load = ["load", str(path), "--robot", "panda", "--json", str(out)]
+    assert main(load) == 2
+    said = re.sub(r"\(.*?\)", "", " ".join(capsys.readouterr().err.split()))
+    found = re.findall(
+        r"--(?:turn|zero|tau) [\w.=-]+|--tau-gain=[\d.,-]+|--gravity(?: [\d.-]+){3}", said
+    )
+    given = " ".join(x.rstrip(".,;") for x in found)
+    assert given.startswith(option)
+    assert main([*load, *given.split()]) == 0
+    mended = json.loads(out.read_text())
+    assert abs(mended["mass_kg"] - clean().mass) < clean().mass_std
+    assert mended["mass_std_kg"] < 1.5 * clean().mass_std or "gravity-" in option
+
+
+def test_a_mended_log_has_the_names_of_the_clean_one() -> None:
+    told = adapter.Told((("panda_joint4", -1.0, 0.0), ("panda_joint4", 1.0, -np.pi / 4.0)))
+    log = told.log(zero_moved(turned(3), np.pi / 4.0), panda_model())
+    np.testing.assert_allclose(log.q, base().q, atol=1e-12)
+    plain, mended = (adapter.find_gap(x, panda_model()) for x in (base(), log))
+    assert [x.title for x in mended.findings] == [x.title for x in plain.findings]
+
+
+def test_a_trusted_log_is_taken_with_a_warning(tmp_path, capsys) -> None:
+    path = written(turned(2), tmp_path / "odd.mcap")
+    for door in (["load"], ["replay", "--every", "50", "--out", str(tmp_path / "out")]):
+        assert main([*door, str(path), "--robot", "panda", "--trust-log"]) == 0
+        assert "panda_joint3 counts the other way" in " ".join(capsys.readouterr().err.split())
+    trusted = adapter.Told(trusted=True).log(turned(2), panda_model())
+    with pytest.warns(ModelWarning, match="It is trusted"):
+        adapter.learn(trusted, panda_model(), every=50)
+
+
 @pytest.mark.parametrize("kind", WRONG)
 def test_every_door_refuses_the_same_with_the_same_sentence(kind: str, tmp_path, capsys) -> None:
     log = replace(base(), tau=WRONG[kind](base().tau))
@@ -200,10 +278,7 @@ def test_every_door_refuses_the_same_with_the_same_sentence(kind: str, tmp_path,
     with pytest.raises(RecordingRefused) as of_load:
         find_load(log, panda_model())
     assert of_gap.value.kind == of_learn.value.kind == of_load.value.kind == kind
-    path = tmp_path / "wrong.mcap"
-    with McapWriter(path, log.joint_names) as writer:
-        for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
-            writer.write_joint_state(stamp_ns, *signals)
+    path = written(log, tmp_path / "wrong.mcap")
     assert main(["replay", str(path), "--robot", "panda", "--out", str(tmp_path / "out")]) == 2
     sentence = str(of_learn.value).split(": ", 1)[1]
     words = "".join(capsys.readouterr().err.split())

@@ -12,11 +12,12 @@ from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import SettingsError
 from adapter.gap.screen import RecordingRefused, check_torque, refuse
-from adapter.gap.torque_gains import EffortUnit, in_newton_metres, learn_gains
+from adapter.gap.torque_gains import as_told, learn_gains
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.signals.importer import ImportSpec, table_log
 from adapter.signals.matching import matching
+from adapter.signals.told import Told
 from drivers.files.mcap import Log, McapWriter, read_log
 from drivers.interface import JointSample
 from tests.benchmarks.lambda_trials import robots_folder
@@ -132,16 +133,16 @@ def test_without_a_known_mass_the_scale_is_open() -> None:
 def test_given_gains_and_gears_convert() -> None:
     log = currents(driven_arm(0), 0, 5.0)
     gains = tuple(np.arange(1.0, JOINTS + 1.0))
-    (read,), _ = in_newton_metres([log], six_joints(), EffortUnit(gain=gains, gear=(100.0,)))
+    (read,), _ = as_told([log], six_joints(), Told(gain=gains, gear=(100.0,)))
     np.testing.assert_allclose(read.tau, 100.0 * log.tau * gains)
     np.testing.assert_array_equal(read.q, log.q)
     turned = log.select(list(reversed(NAMES)), [])  # the recording's order is another
-    (again,), _ = in_newton_metres([turned], six_joints(), EffortUnit(gain=gains))
+    (again,), _ = as_told([turned], six_joints(), Told(gain=gains))
     np.testing.assert_allclose(again.tau, log.tau * gains)
-    (same,), _ = in_newton_metres([log], six_joints(), EffortUnit())
+    (same,), _ = as_told([log], six_joints(), Told())
     assert same is log
     with pytest.raises(SettingsError, match="panda_joint6"):
-        in_newton_metres([log], six_joints(), EffortUnit(gain=(1.0, 2.0)))
+        as_told([log], six_joints(), Told(gain=(1.0, 2.0)))
 
 
 @pytest.mark.parametrize(
@@ -150,6 +151,7 @@ def test_given_gains_and_gears_convert() -> None:
         (["--tau-gain", "soon"], "fit"),
         (["--tau-gain", "1,0"], "other than zero"),
         (["--gear", "x"], "--gear 'x'"),
+        (["--tau-gain", "1,2", "--tau-gain=1,2,3"], "or one for each"),
         (["--known-load", "2"], "--tau-gain fit"),
         (["--tau-gain", "fit", "--known-load", "-2"], "above zero"),
         (["--tau-gain", "1", "--loaded", "LOG"], "--known-load KG"),

@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 HEAVY = {"torch", "numba", "pybullet", "matplotlib", "scipy", "clarabel", "sklearn", "filterpy"}
 TYPES = (
     *("Discovery", "FilteredSignals", "GapResult", "LearnResult", "Log", "SelfModel", "Snapshot"),
+    "Told",
 )
 OPTIONS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
