@@ -131,10 +131,8 @@ def test_motions_keep_the_limits(trials):
 
 def test_recording_tells_nothing_but_what_was_measured(tmp_path):
     trial = next(t for t in map(draw, SEEDS) if t.kind == "single" and t.commands)
-    recording = replace(
-        pinocchio_recording(trial),
-        commands=Commands(np.arange(20000) * 10**6, np.zeros((20000, 7))),
-    )
+    orders = Commands(np.arange(20000) * 10**6, np.zeros((20000, 7)))
+    recording = replace(pinocchio_recording(trial), commands=orders)
     log, model, truth = write(trial, tmp_path, recording, "pinocchio")
     data = log.read_bytes() + model.read_bytes()
     read = read_log(log)

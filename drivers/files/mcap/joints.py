@@ -19,7 +19,7 @@ from drivers.files.ros_types import JOINT_STATE
 from drivers.files.rows import AT_ONCE, RowsFile, gathered
 from drivers.interface import Array, DriverError
 
-_IN_MEMORY = 2**22  # bytes of a column that stay in memory
+_IN_MEMORY = 2**20  # bytes of a column that stay in memory
 _RAD_MAX = 4 * np.pi  # no arm joint turns further than two turns either way
 _DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspected
 _NEED = "learning needs positions and measured joint torques (effort)"
