@@ -35,7 +35,7 @@ from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
-from adapter.signals.matching import matching, most_moved, present
+from adapter.signals.matching import matching, present
 from drivers.files.mcap import Log, read_log
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
@@ -145,8 +145,9 @@ def _as_told(
     if gains is not None:
         logs[0].warnings.extend([*gains.notes, *gains.words()])
     if not robot.tree.floating:
-        for log in logs:
-            logs[0].warnings.extend(check_torque(most_moved(log), robot))
+        for k, log in enumerate(logs):
+            logs[k], said = check_torque(log, robot)
+            logs[0].warnings.extend(said)
     return logs, gains
 
 

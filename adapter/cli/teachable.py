@@ -8,7 +8,6 @@ from typing import Any
 from adapter.cli.common import robot_of, told_of
 from adapter.control.teachable import teachable
 from adapter.gap.screen import RecordingRefused, check_torque
-from adapter.model.self_model import SelfModel
 from adapter.signals.matching import matching, most_moved, present
 from drivers.files.mcap import Log, read_log
 
@@ -21,7 +20,11 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
     log = told_of(args).log(matching(most_moved(whole), robot), robot)
     if len(log) < len(whole):
         locked.append(f"predicted for {len(log)} of its {len(whole)} samples, where it moves most")
-    doubt = _doubt(log, robot)
+    unit = "N m"
+    try:
+        log, doubt = check_torque(log, robot)
+    except RecordingRefused as refusal:
+        unit, doubt = str(refusal), [str(refusal)]
     told = teachable(log, robot)
     expected = told.expected
     figures = {
@@ -29,7 +32,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         "full_rank": told.full_rank,
         "torque_std_nm": told.torque_std.tolist(),
         "missing": list(told.missing),
-        "effort_unit": doubt[0] if doubt else "N m",
+        "effort_unit": unit,
         "parameters": {
             name: {"std": float(std), "unit": unit, "shown": bool(shown)}
             for name, unit, std, shown in zip(
@@ -46,14 +49,6 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
         *_by_part(figures["parameters"]),
     ]
     return figures, [*locked, *doubt, *lines]
-
-
-def _doubt(log: Log, robot: SelfModel) -> list[str]:
-    """A sentence where efforts are no joint torques of this arm."""
-    try:
-        return check_torque(log, robot)
-    except RecordingRefused as refusal:
-        return [str(refusal)]
 
 
 def _by_part(parameters: dict[str, Any]) -> list[str]:

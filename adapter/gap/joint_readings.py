@@ -135,6 +135,15 @@ class Telling:
         """(m, n) N m of the model without corrections."""
         return np.asarray(self.arm.torque(rows.q, rows.dq, rows.ddq))
 
+    def corrected(self, x: Array, rows: Rows) -> Array:
+        """(m, n) N m of the model with corrections x, see `Explained`; `rows.tau` is not used."""
+        n, model = self.arm.n, self.torque(rows)
+        own = x[10 * n :].reshape(len(FRICTION), n) * np.array(FRICTION)[:, None]
+        arm = self.arm.changed(self.arm.theta + inertial_std(self.arm) * x[: 10 * n].reshape(n, 10))
+        step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
+        friction = own[0] + own[1] * step + own[2] * rows.dq + own[3] * model
+        return np.asarray(arm.torque(rows.q, rows.dq, rows.ddq) + friction)
+
     def apart(self, rows: Rows) -> float:
         """How far the model without corrections is from rows; a true reading brings it nearer."""
         apart = np.mean((rows.tau - self.torque(rows)) ** 2, axis=0)[self.alive]
@@ -261,12 +270,12 @@ def joint_readings(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
         yield from _sizes(rows, telling)
 
 
-def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Array]:
+def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Explained]:
     """How the joints are told, where the recording is clear on it.
 
     Returns:
-        A sentence for each reading, at most `MOST`; and the share (n,) of each joint's torque that
-        the model explains with them.
+        A sentence for each reading, at most `MOST`; and how well the model explains the torques
+        with them.
     """
     now = telling.explained(rows)
     said: list[str] = []
@@ -279,7 +288,7 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Array]:
             break
         said.append(word)
         now, rows = best, changed
-    return said, now.share
+    return said, now
 
 
 def explains_nothing(share: Array) -> bool:

@@ -21,8 +21,9 @@ from adapter.gap.real_arm import SHARES, real_arm
 from adapter.gap.sampled import Sampled, sampling_words
 from adapter.gap.screen import (
     MOVES_DQ,
+    Judged,
     cleaned,
-    doubts,
+    judged,
     moving_joints,
     silent,
     smoothed_rows,
@@ -34,7 +35,7 @@ from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, 
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.matching import present
+from adapter.signals.matching import matching, present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
 
@@ -131,8 +132,7 @@ def find_load(
     turn = fit.named[0].candidate.theta
     theta = fit.coefficients[at] @ turn
     covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
-    moves, said = _judged(taken[0].judged, model)
-    notes += [*said, *_changed(fit)] if moves else said
+    notes += _changed(fit) if taken[0].moves else []
     notes += sampling_words([x.recorded for x in taken])
     before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
     found = load_of(theta, covariance, riding)
@@ -140,35 +140,42 @@ def find_load(
 
 
 class _Taken(NamedTuple):
-    """A recording as it is fitted, the part in which its units are judged, and notes."""
+    """A recording as it is fitted, whether the arm moves in it, and notes."""
 
     recorded: Recorded
-    judged: Log
+    moves: bool
     period_s: float
     notes: list[str]
 
 
 def _taken(log: Log, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
-    if is_long(log):
-        long = Sampled.of(log, log.path.name, model)
-        part, _, said = cleaned(long.busiest(log), model)
-        return _Taken(long.recorded(), part, long.survey.clock.period_s, part.warnings + said)
-    own, clock, said = cleaned(log, model)
-    said = own.warnings + said
-    return _Taken(Recorded.of(own, lateness(clock)).cut(), own, clock.period_s, said)
+    if not is_long(log):
+        own, clock, said = cleaned(log, model)
+        moves, torque, more = _judged(own, model)
+        recorded = Recorded.of(torque.in_time(own), lateness(clock)).cut()
+        return _Taken(recorded, moves, clock.period_s, own.warnings + said + more)
+    long = Sampled.of(log, log.path.name, model)
+    part, _, said = cleaned(long.busiest(log), model)
+    moves, torque, more = _judged(part, model)
+    if torque.late_s:
+        long = Sampled.of(torque.in_time(matching(log, model)), log.path.name, model)
+    period_s = long.survey.clock.period_s
+    return _Taken(long.recorded(), moves, period_s, log.warnings + said + more)
 
 
-def _judged(log: Log, model: SelfModel) -> tuple[bool, list[str]]:
-    """Whether the arm moves, and notes. Refuses torques in another unit, sign or order.
+def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:
+    """Whether the arm moves, its torques, and notes. Refuses another unit, sign or order.
 
-    Asked of the arm without what was just fitted: a load of 90 kg explains N cm.
+    Asked of the arm without what is fitted: a load of 90 kg explains N cm.
     """
     smoothed = smoothed_rows(log)
     if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
-        return False, ["the arm hardly moves: static friction in its joints counts as load"]
+        rests = ["the arm hardly moves: static friction in its joints counts as load"]
+        return False, Judged(), rests
     dead = silent(log, model.tree.joint_names)
-    return True, dead + doubts(log, model, RigidArm.of(model), smoothed)
+    torque = judged(log, model, RigidArm.of(model), smoothed)
+    return True, torque, dead + torque.notes
 
 
 def _changed(fit: Fit) -> list[str]:

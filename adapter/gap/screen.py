@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
-from adapter.gap.joint_readings import ROWS, Rows, Telling, explains_nothing, otherwise_told
+from adapter.gap.joint_readings import (
+    ROWS,
+    Rows,
+    Telling,
+    explains_nothing,
+    lateness_s,
+    otherwise_told,
+)
 from adapter.gap.motor_currents import in_words as currents_in_words
 from adapter.gap.motor_currents import torque_shares
 from adapter.gap.signals import pauses, stuck
@@ -19,7 +27,7 @@ from adapter.gap.torque_units import TorqueComparison, convincing, in_words, rea
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.matching import matching
+from adapter.signals.matching import matching, most_moved
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of
 from adapter.signals.validation import GRID_S, smooth
@@ -39,6 +47,7 @@ NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than th
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
 FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
 PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
+DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
 
@@ -77,6 +86,61 @@ class RecordingRefused(ValueError):
 
 
 @dataclass(frozen=True)
+class Judged:
+    """The torques of a recording that passes.
+
+    Attributes:
+        late_s: how much later than the motion they come; more than a sensor's filter or none.
+        model: of them, after corrections of a plausible size, by instants; None where unknown.
+        doubts: what speaks against a recording that is trusted.
+    """
+
+    late_s: float = 0.0
+    model: Callable[[Rows], Array] | None = None
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def notes(self) -> list[str]:
+        """What to know of them, a sentence each."""
+        side = "after" if self.late_s > 0.0 else "before"
+        late = f"The torques come {1e3 * abs(self.late_s):.0f} ms {side} the motion: put in time."
+        return [*self.doubts, *([late] if self.late_s else [])]
+
+    def in_time(self, log: Log) -> Log:
+        """A recording with torques at their own instants, without samples that have none then."""
+        if not self.late_s:
+            return log
+        log = log.take(uniform(log.stamp_ns, log.q, log.dq, log.tau))
+        t = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+        at = t + self.late_s
+        behind = np.searchsorted(t, at)
+        kept = (behind > 0) & (behind < len(t)) & ~np.isin(behind - 1, pauses(t))
+        tau = np.column_stack([np.interp(at, t, column) for column in log.tau.T])
+        return replace(log, tau=tau).take(kept)
+
+    def whole(self, log: Log) -> Log:
+        """A recording with the model's torques where none were measured: they teach nothing new."""
+        torque_of = self.model
+        if torque_of is None:
+            return log
+
+        def told(piece: Log) -> Log:
+            t = 1e-9 * (piece.stamp_ns - piece.stamp_ns[0])
+            missing = stuck(t, piece.dq, piece.tau)
+            if not missing.any():
+                return piece
+            around = max(round(DDQ_S / max(float(np.median(np.diff(t))), 1e-9)), 1)
+            back, ahead = (np.clip(np.arange(len(t)) + k, 0, len(t) - 1) for k in (-around, around))
+            span = np.maximum(t[ahead] - t[back], GRID_S)[:, None]
+            ddq = (piece.dq[ahead] - piece.dq[back]) / span
+            model = torque_of(Rows(piece.q, piece.dq, ddq, piece.tau))
+            return replace(piece, tau=np.where(missing, model, piece.tau))
+
+        unheard = (stuck(1e-9 * x.stamp_ns.astype(float), x.dq, x.tau).any() for x in log.pieces())
+        return log.changed(told) if any(unheard) else log
+
+
+@dataclass(frozen=True)
 class Screened:
     """A recording that can be used.
 
@@ -85,7 +149,8 @@ class Screened:
         timing: of the recording as it was.
         moving: joints (from 0) that move enough to tell anything of them.
         beyond, standing, silent: what to report of joints beyond their limits, of joints that do
-            not move and of torques that never change, a sentence each.
+            not move and of torques, a sentence each.
+        torque: what was found of the torques.
     """
 
     log: Log
@@ -94,6 +159,7 @@ class Screened:
     beyond: list[str]
     standing: list[str]
     silent: list[str]
+    torque: Judged
 
     @property
     def notes(self) -> list[str]:
@@ -118,8 +184,9 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
     dead = silent(log, names)
-    dead += doubts(log, model, arm, (q, dq, ddq, tau), recorded if renamed else ())
-    return Screened(log, timing, moving, outside, standing(names, moving, q, dq), dead)
+    torque = judged(log, model, arm, (q, dq, ddq, tau), recorded if renamed else ())
+    said = standing(names, moving, q, dq)
+    return Screened(log, timing, moving, outside, said, dead + torque.notes, torque)
 
 
 def cleaned(log: Log, model: SelfModel) -> tuple[Log, RecordingClock, list[str]]:
@@ -324,7 +391,7 @@ def judge_torque(
     smoothed: tuple[Array, Array, Array, Array],
     renamed: Sequence[str] = (),
     unit_known: bool = False,
-) -> None:
+) -> Judged:
     """Refuse torques in another unit, sign, order or without gravity.
 
     Args:
@@ -357,8 +424,7 @@ def judge_torque(
             said = currents_in_words(shares, model.tree.joint_names)
             raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
     if not convinced:
-        _check_joints(log, model, arm, smoothed, alive, unit_known)
-        return
+        return _check_joints(log, model, arm, smoothed, alive, unit_known)
     raise RecordingRefused(
         RecordingFault(best.kind),
         f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}",
@@ -372,19 +438,30 @@ def _check_joints(
     smoothed: tuple[Array, Array, Array, Array],
     alive: NDArray[np.bool_],
     unit_known: bool,
-) -> None:
+) -> Judged:
     """Refuse joints told otherwise than the model has them, and torques of no such arm."""
-    q, dq, ddq, tau = (x[EDGE:-EDGE] for x in smoothed)
-    every = max(EVERY, len(q) // ROWS)
+    q, dq, ddq, tau = signals = [x[EDGE:-EDGE] for x in smoothed]
     telling = Telling(model, arm, alive, GRID_S * len(q), unit_known)
-    rows = Rows(q[::every], dq[::every], ddq[::every], tau[::every])
-    said, share = otherwise_told(rows, telling)
+    at = np.arange(0, len(q), max(EVERY, len(q) // ROWS))
+    rows = Rows(q[at], dq[at], ddq[at], tau[at])
+    said, now = otherwise_told(rows, telling)
+    late_s = lateness_s(signals, telling)
+    if late_s:
+        late = at + round(late_s / GRID_S)
+        at, late = (x[(late >= 0) & (late < len(q))] for x in (at, late))
+        rows = Rows(q[at], dq[at], ddq[at], tau[late])
+        said_then, then = otherwise_told(rows, telling)
+        if then.cost < now.cost:
+            said, now = said_then, then
+        else:
+            late_s = 0.0
     moving = [j for j in moving_joints(q, dq) if alive[j]]
-    if explains_nothing(share[moving]):
+    share = now.share[moving]
+    if explains_nothing(share):
         raise RecordingRefused(
             RecordingFault.TORQUE,
             f"{log.path}: the torques are not those of this motion of {model.name}: whatever its "
-            f"load, friction and inertias, the model explains {100 * np.median(share[moving]):.0f} "
+            f"load, friction and inertias, the model explains {100 * np.median(share):.0f} "
             "% of how they change; are they measured, of this arm and of the same instants?",
         )
     if said:
@@ -393,29 +470,32 @@ def _check_joints(
             f"{log.path}: {'; '.join(said)}; the model explains the torques then and not as "
             "recorded.",
         )
+    return Judged(late_s, partial(telling.corrected, now.x))
 
 
-def doubts(
+def judged(
     log: Log,
     model: SelfModel,
     arm: RigidArm,
     smoothed: tuple[Array, Array, Array, Array],
     renamed: Sequence[str] = (),
-) -> list[str]:
-    """What `judge_torque` says against a recording that is trusted; any other is refused."""
+) -> Judged:
+    """The same of a recording as it was told; one that is trusted is never refused."""
     told = told_of(log)
     try:
-        judge_torque(log, model, arm, smoothed, renamed, told.unit_known)
+        return judge_torque(log, model, arm, smoothed, renamed, told.unit_known)
     except RecordingRefused as refusal:
         if told.trusted:
-            return [f"{refusal} It is trusted all the same."]
+            return Judged(doubts=(f"{refusal} It is trusted all the same.",))
         said = f"{refusal} If it is as the model has it, --trust-log takes it so."
         raise RecordingRefused(refusal.kind, said) from None
-    return []
 
 
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
-    """q, dq, ddq, tau (m, n) of `validation.smooth`, without what its filter makes of a pause."""
+    """q, dq, ddq, tau (m, n) of `validation.smooth`, without what its filter makes of a pause.
+
+    Instants at which a torque that is measured else was not are left out too.
+    """
     stamps_s = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
     behind = pauses(stamps_s)
     stamps_s[1:] -= np.cumsum(
@@ -425,31 +505,37 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     t, clear = GRID_S * np.arange(len(signals[0])), np.ones(len(signals[0]), dtype=bool)
     for k in behind:
         clear &= (t < stamps_s[k] - GRID_S * EDGE) | (t > stamps_s[k + 1] + GRID_S * EDGE)
+    missing = stuck(stamps_s, log.dq, log.tau)
+    held = np.flatnonzero(missing[:, ~missing.all(axis=0)].any(axis=1))
+    clear &= ~np.isin(np.searchsorted(stamps_s, t), held)
     q, dq, ddq, tau = (x[clear] for x in signals)
     return q, dq, ddq, tau
 
 
-def check_torque(log: Log, model: SelfModel) -> list[str]:
-    """Refuse efforts that are no joint torques of this arm, where there is motion enough to tell.
+def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
+    """A recording as it is learned from; refuses efforts that are no joint torques of this arm.
 
     Args:
         log: joints in the model's order; model: of an arm whose base is fixed.
 
     Returns:
-        What speaks against a trusted recording.
+        The recording with torques in time, and the model's where none were measured; notes on it.
+        Where there is too little motion to tell, it is as it was.
 
     Raises:
         Refusal: units, sign, order or meaning of the torques.
     """
-    rows = uniform(log.stamp_ns, log.q, log.dq, log.tau)
-    if len(rows) < FEWEST or 1e-9 * np.ptp(log.stamp_ns[rows]) < SHORTEST_S:
-        return []
-    log = log.take(rows)
-    smoothed = smoothed_rows(log)
+    part = most_moved(log)
+    rows = uniform(part.stamp_ns, part.q, part.dq, part.tau)
+    if len(rows) < FEWEST or 1e-9 * np.ptp(part.stamp_ns[rows]) < SHORTEST_S:
+        return log, []
+    part = part.take(rows)
+    smoothed = smoothed_rows(part)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
-        return []
-    silent(log, model.tree.joint_names)
-    return doubts(log, model, RigidArm.of(model), smoothed)
+        return log, []
+    said = silent(part, model.tree.joint_names)
+    torque = judged(part, model, RigidArm.of(model), smoothed)
+    return torque.whole(torque.in_time(log)), [*said, *torque.notes]
 
 
 def compared(

@@ -40,7 +40,7 @@ from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.matching import present
+from adapter.signals.matching import matching, present
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log
 
@@ -228,9 +228,13 @@ def _taken(log: Log, name: str, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
     if is_long(log):
         sampled = Sampled.of(log, name, model)
-        return _Taken(sampled.screened(log), sampled.recorded(), sampled)
+        seen = sampled.screened(log)
+        if seen.torque.late_s:
+            sampled = Sampled.of(seen.torque.in_time(matching(log, model)), name, model)
+        return _Taken(seen, sampled.recorded(), sampled)
     seen = refuse(log, model, RigidArm.of(model))
-    fitted = replace(Recorded.of(seen.log, lateness(seen.timing)).cut(), name=name)
+    own = seen.torque.in_time(seen.log)
+    fitted = replace(Recorded.of(own, lateness(seen.timing)).cut(), name=name)
     return _Taken(seen, fitted, None)
 
 

@@ -32,7 +32,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
-from adapter.signals.matching import matching, most_moved, present
+from adapter.signals.matching import matching, present
 from adapter.signals.records import stamps_of
 from drivers.files.html_table import html_table, plus_minus
 from drivers.files.mcap import Log
@@ -210,8 +210,9 @@ def learn(
     split_s = (1.0 - HELD_OUT_SHARE) * end_s if validate_from_s is None else validate_from_s
     if not 0.0 < split_s < end_s:
         raise SettingsError(f"validation from {split_s} s is outside 0 to {end_s:.1f} s")
-    for doubt in check_torque(most_moved(own), arm):
-        warnings.warn(doubt, ModelWarning, stacklevel=2)
+    own, said = check_torque(own, arm)
+    for note in said:
+        warnings.warn(note, ModelWarning, stacklevel=2)
     filter_settings, _ = fitted_to(own, PipelineSettings().filter)
     names = learnable(arm, REAL_ARM_EFFECTS if effects is None else tuple(effects))
     settings = PipelineSettings(filter=filter_settings, learner=LearnerSettings(effects=names))
