@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.progress import Progress
 from rich.table import Table
 
-from adapter.cli.common import robot_of
+from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.effects.export import robot_urdf
 from adapter.errors import MeansError, ModelError
@@ -47,7 +47,9 @@ def run(args: argparse.Namespace) -> int:
     given = found_logs(args.logs)
     folder = results_folder(args.out, "fleet")
     manifest = Manifest({}, {}) if args.manifest is None else read_manifest(args.manifest)
-    settings = Settings(folder, args.workers, args.cluster, args.by, manifest, args.topic)
+    settings = Settings(
+        folder, args.workers, args.cluster, args.by, manifest, args.topic, told_of(args)
+    )
     forget(args.forget, robot, settings)
     recall(args.remember, robot, settings)
     say(f"{len(given)} recordings; moments are kept in {folder}")

@@ -9,9 +9,11 @@ from pathlib import Path
 from adapter.cli.options import (
     add_joints,
     add_results,
+    add_told,
     add_topic,
     check_files,
     check_robot,
+    check_told,
 )
 from adapter.errors import UsageError
 
@@ -37,6 +39,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--model", required=True, metavar="MODEL", help="self model, .urdf, MJCF, or a robot's name"
     )
     add_joints(parser)
+    add_told(parser)
     add(
         "--by",
         choices=("log", "folder"),
@@ -71,6 +74,9 @@ def declare(parser: argparse.ArgumentParser) -> None:
 
 def _check(args: argparse.Namespace) -> None:
     check_robot(args.model)
+    check_told(args)
+    if args.learn_gains:
+        raise UsageError("--tau-gain fit: learn gains with `gap` or `replay`, and give them here")
     if not args.logs and args.out is None:
         raise UsageError("give LOGs, or --out FOLDER with those of before")
     for option in ("forget", "remember"):

@@ -258,6 +258,13 @@ def test_a_mended_log_has_the_names_of_the_clean_one() -> None:
     assert [x.title for x in mended.findings] == [x.title for x in plain.findings]
 
 
+def test_a_fleet_takes_what_it_left_out(tmp_path) -> None:
+    path, out = written(turned(2), tmp_path / "odd.mcap"), str(tmp_path / "out")
+    fleet = ["fleet", str(path), "--model", "panda", "--workers", "0", "--out", out]
+    assert main([*fleet, "--no-report"]) == 8
+    assert main([*fleet, "--no-report", "--turn", "panda_joint3"]) == 0
+
+
 def test_a_trusted_log_is_taken_with_a_warning(tmp_path, capsys) -> None:
     path = written(turned(2), tmp_path / "odd.mcap")
     for door in (["load"], ["replay", "--every", "50", "--out", str(tmp_path / "out")]):

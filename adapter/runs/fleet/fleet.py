@@ -23,6 +23,7 @@ from adapter.runs.fleet.moments import (
     opened,
 )
 from adapter.runs.fleet.store import Store, mark_of
+from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.names import RECORDINGS, is_recording
 
 LOG_COLUMNS, ARM_COLUMN = ("log", "path", "file"), "arm"
@@ -50,7 +51,7 @@ class Settings(NamedTuple):
         cluster: address of a Dask scheduler, None for this machine.
         by: "log": logs tell their arm; "folder": those of one folder are of one arm.
         manifest: goes before both.
-        topic: of the joint states.
+        topic: of the joint states; told: how all tell joints and efforts, gains not learned.
         progress: called with recordings done, and how many there are.
     """
 
@@ -60,6 +61,7 @@ class Settings(NamedTuple):
     by: str = "log"
     manifest: Manifest = Manifest({}, {})
     topic: str | None = None
+    told: Told = AS_RECORDED
     progress: Callable[[int, int], None] = lambda done, whole: None
 
 
@@ -187,8 +189,8 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
             f"a fleet is of arms whose base stands; that of {documented.name} floats"
         )
     model = model_file.dumps(documented)
-    store = Store(settings.folder, model)
-    tasks = [Task(path, model, settings.topic) for path in dict.fromkeys(given)]
+    store = _store(documented, settings)
+    tasks = [Task(path, model, settings.topic, settings.told) for path in dict.fromkeys(given)]
     work = _Work(store, {task.path: mark_of(task.path) for task in tasks})
     work.look_up(tasks, settings)
     left = work.left(tasks)
@@ -208,6 +210,12 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
     gone = tuple(path for path, content in work.contents.items() if store.forgotten(content))
     arms = _arms(store, heads, documented, settings)
     return Fleet(arms, tuple(work.broken), read, len(heads) - read, gone, work.alike(tasks))
+
+
+def _store(documented: SelfModel, settings: Settings) -> Store:
+    """Of the moments of recordings that are so understood."""
+    told = "" if settings.told == AS_RECORDED else repr(settings.told)
+    return Store(settings.folder, model_file.dumps(documented) + told)
 
 
 class _Work:
@@ -278,13 +286,13 @@ def forget(given: Sequence[str], documented: SelfModel, settings: Settings) -> N
     Raises:
         SettingsError: one of them is neither.
     """
-    store = Store(settings.folder, model_file.dumps(documented))
+    store = _store(documented, settings)
     store.forget(_contents_of(store, given, documented, settings))
 
 
 def recall(given: Sequence[str], documented: SelfModel, settings: Settings) -> None:
     """Take back what `forget` did; the recordings are read again when they are given."""
-    store = Store(settings.folder, model_file.dumps(documented))
+    store = _store(documented, settings)
     store.recall(_contents_of(store, given, documented, settings))
 
 

@@ -32,6 +32,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.replay import filtered_tables, fitted_to
 from adapter.signals.matching import matching
+from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log
 from drivers.interface import DriverError
 
@@ -46,12 +47,13 @@ class Task(NamedTuple):
     Attributes:
         path: of the file or folder, or an address that fsspec opens.
         model: the documented arm as the text of a model file.
-        topic: of the joint states, None for the only one.
+        topic: of the joint states, None for the only one; told: what is said of the recording.
     """
 
     path: str
     model: str
     topic: str | None = None
+    told: Told = AS_RECORDED
 
 
 class Broken(NamedTuple):
@@ -141,7 +143,8 @@ def moments_of(task: Task) -> LogMoments | Broken:
         with at_hand(task.path) as path:
             content = _content(path)
             log = read_log(path, topic=task.topic)
-        return taken(log, _model(task.model), content, task.path)
+        model = _model(task.model)
+        return taken(task.told.log(log, model), model, content, task.path)
     except Exception as error:  # of thousands of files one has what no reader has thought of
         return _broken(task.path, error)
 
