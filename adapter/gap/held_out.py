@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
@@ -28,6 +29,7 @@ from adapter.signals.validation import smooth
 from adapter.simulate import DrivenMotion, Simulate
 
 SEGMENT_S = 0.5
+SMEARED_MS = 101  # about an instant, in which the recipe's filter mixes torques
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
 THINNED = 10  # rollout rows kept for a plot: one in so many
@@ -90,7 +92,7 @@ def torque_errors(
         rows = fold == f
         if rows.any():
             new[rows] = (tau - ModelTorque(model, own_log=True)(q, dq, ddq, t, sharp))[rows]
-    unheard = ~recording.heard_at(t)
+    unheard = maximum_filter1d(~recording.heard_at(t), SMEARED_MS, axis=0)
     old[unheard] = new[unheard] = np.nan
     edge = round(RECIPE_EDGE_S / 1e-3)
     return ErrorsOverTime(t[edge:-edge], old[edge:-edge], new[edge:-edge])

@@ -47,7 +47,7 @@ CUT_S, CUT_PERIODS = 0.15, 6.0  # without samples: what is longer, and of more p
 STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
 # s, rad/s: a torque that stays so long while its joint moves is none; and so many usual stays
 STUCK_S, STUCK_DQ, STUCK_TIMES = 0.3, 0.05, 20.0
-HEARD = 0.999  # of a sample in the band: that all it is made of was measured
+HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
@@ -302,8 +302,9 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
 
 
 def heard_in(known: Array) -> Array:
-    """(k, n) in the band where a torque was measured; `known` (m, n) at 250 Hz."""
-    return (low(known) > HEARD).astype(float)
+    """(k, n) in the band where a torque was measured all the while; `known` (m, n) at 250 Hz."""
+    whole = minimum_filter1d(known, TAPS, axis=0)[TAPS // 2 : -(TAPS // 2) : DECIMATION]
+    return np.asarray((whole > HEARD).astype(float))
 
 
 def together(parts: Sequence[Signals]) -> Signals:
