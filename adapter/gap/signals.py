@@ -45,8 +45,9 @@ MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording
 CUT_S, CUT_PERIODS = 0.15, 6.0  # without samples: what is longer, and of more periods, is a pause
 STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
-# s, rad/s: a torque that stays so long while its joint moves is none; and so many usual stays
-STUCK_S, STUCK_DQ, STUCK_TIMES = 0.3, 0.05, 20.0
+# s, rad/s: a torque that stays so long while its joint moves is none, sooner at the end of its
+# range; and longer than so many usual stays
+STUCK_S, ENDS_S, STUCK_DQ, STUCK_TIMES = 0.3, 0.05, 0.05, 20.0
 HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
@@ -93,13 +94,13 @@ def stuck(t: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
     for j in np.flatnonzero(~out.all(axis=0)):
         x, edges = tau[:, j], np.flatnonzero(np.diff(tau[:, j])) + 1
         first, last = np.r_[0, edges], np.r_[edges, len(t)] - 1
-        long_s = max(STUCK_S, STUCK_TIMES * float(np.median(t[last] - t[first])))
-        for k in np.flatnonzero(t[last] - t[first] > long_s):
+        stays_s, ends = t[last] - t[first], np.isin(x[first], (x.min(), x.max()))
+        long_s = np.where(ends, ENDS_S, STUCK_S)
+        for k in np.flatnonzero(stays_s > np.maximum(long_s, STUCK_TIMES * np.median(stays_s))):
             rows = slice(first[k], last[k] + 1)
             if np.median(np.abs(dq[rows, j])) > STUCK_DQ:
                 out[rows, j] = True
-                if x[first[k]] in (x.min(), x.max()):
-                    out[:, j] |= x == x[first[k]]
+                out[:, j] |= ends[k] & (x == x[first[k]])
     return out
 
 
