@@ -34,6 +34,7 @@ from adapter.physics.rigid_arm import RigidArm
 
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count
+HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 25.0  # twice the log-likelihood that a reading must gain: odds of 1 to 270 000
 MOST = 3  # readings in one recording
@@ -120,6 +121,7 @@ class Telling:
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
                 normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
                 x = np.linalg.solve(normal, weight @ products)
+                x[-len(usual) :] = np.clip(x[-len(usual) :], -HELD, HELD)
                 left = np.mean((apart - columns @ x) ** 2, axis=0)
                 total = self.samples + SENSOR_WEIGHT
                 sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
