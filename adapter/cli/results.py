@@ -62,14 +62,16 @@ def conclude(
         source=source,
         robot=robot.name,
     )
+    page, other = folder / "report.html", folder / "model.urdf"
+    for stale in (page, other):  # of an earlier model, which they alone describe
+        stale.unlink(missing_ok=True)
     try:
-        urdf = robot_urdf(data.model)
-        (folder / "model.urdf").write_bytes(urdf.text.encode())
+        other.write_bytes(robot_urdf(data.model).text.encode())
     except ModelError as error:
         warn([f"no URDF: {error}"])
     save_run(folder, data)
     if not args.no_report:
-        figures["report"] = str(write_report(folder / "report.html", data))
+        figures["report"] = str(write_report(page, data))
     write_json(args.json, figures)
     print_figures(data, figures.get("report"), accounts)
 

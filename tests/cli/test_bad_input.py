@@ -170,6 +170,25 @@ def test_a_folder_cannot_be_written_to(tmp_path, capsys) -> None:
     assert "folder.urdf: Is a directory" in said and "Errno" not in said
 
 
+@pytest.mark.parametrize("name", ["recording.mcap", "recording.part2.mcap", "own.mcap"])
+def test_the_recording_of_another_run_is_kept(tmp_path, capsys, name: str) -> None:
+    """It cannot be made again; the choices are said, and the same command may not lose it."""
+    kept = record(tmp_path / name, motion(20)).read_bytes()
+    where = ["--record", tmp_path / name] if name == "own.mcap" else []
+    said = refused(capsys, "run", "--duration", 1, "--out", tmp_path, *where)
+    assert name in said and all(x in said for x in ("--out", "--record", "--overwrite"))
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_bytes() == kept
+
+
+def test_no_page_stays_beside_a_model_that_it_does_not_describe(tmp_path, capsys) -> None:
+    log, out = record(tmp_path / "log.mcap", motion()), tmp_path / "out"
+    assert main(["replay", str(log), "--quiet", "--out", str(out)]) == 0
+    assert (out / "report.html").exists()
+    replayed(tmp_path, capsys, log)  # without a page, into the same folder
+    assert (out / "model.json").exists() and not (out / "report.html").exists()
+
+
 def test_models_of_different_joints_are_not_compared(tmp_path, capsys) -> None:
     said = refused(capsys, "diff", "panda", with_gripper(tmp_path))
     assert "different trees" in said and "--lock JOINT=VALUE takes one away" in said
