@@ -88,7 +88,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
             f"The learned model predicts torque as the documentation does: to {after}, the "
             f"documentation to {before} ({fall.seen})."
         ]
-    j = int(np.argmax(fall.before))
+    more = np.square(fall.after) - np.square(fall.before)
+    j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
     worst = f"joint {j + 1} {_fall_words(fall, j)}"
     verb = "fell" if fall.better else "rose"
     return [
