@@ -19,7 +19,7 @@ from adapter.cli.common import configure, recording_metadata, robot_of, with_mot
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.publishing import publisher_job, together
-from adapter.cli.results import Learned, conclude
+from adapter.cli.results import Learned, code_of, conclude
 from adapter.cli.run_options import simulated
 from adapter.cli.watching import known_run, view_job
 from adapter.control.controller import ControlSettings, ExcitationController
@@ -208,9 +208,8 @@ def _ended(result: LiveResult) -> ExitCode:
     """How a run with results ended."""
     if result.fault:
         return ExitCode.ARM_FAILED
-    if not result.collected.learned:
-        return ExitCode.NOTHING_LEARNED
-    return ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
+    usual = ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
+    return code_of(result.collected, usual)
 
 
 def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:

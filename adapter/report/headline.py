@@ -145,6 +145,8 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
     fault = figures.get("fault")
     new = len(not_learned(figures))
     said = [f"The run ended early: {fault}."] if fault else []
+    if figures["theta"].get("started_s") is not None and not figures["theta"].get("settled", True):
+        said.append("What the links weigh (θ) had not converged: do not use this model yet.")
     if new:
         said.append(
             f"Something new acts that the learned model does not hold: {new} "
