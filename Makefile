@@ -22,7 +22,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: run test quick experiment setup lint shared quick-tests docs trials soak bench licences clean
 
 run: $(WARM)
-	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda
+	$(BIN)/adapter run --driver pybullet:panda --duration 30 --seed 5 --out runs/panda --overwrite
 
 experiment: $(WARM)
 	$(BIN)/adapter experiment atlas panda --out runs/experiment --json runs/experiment.json

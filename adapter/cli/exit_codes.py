@@ -25,6 +25,7 @@ class ExitCode(IntEnum):
     NOT_READY = 6, "the robot is not ready; the error says what to do"
     INCOMPLETE = 7, "samples are missing in the recording, all else is done"
     NOTHING_LEARNED = 8, "no sample taught anything"
+    NOT_CONVERGED = 9, "there are results, but θ (what the links weigh) had not converged"
     INTERRUPTED = 130, "interrupted before there were results"
 
 

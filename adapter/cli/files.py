@@ -12,7 +12,7 @@ from adapter.effects.active import check_effects
 from adapter.effects.base import with_squares
 from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
-from adapter.model.self_model import SelfModel
+from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_table, table_log
 from adapter.signals.recording import describe, summary
@@ -115,6 +115,7 @@ def _model_lines(model: SelfModel) -> list[str]:
         f"λ          {model.lambda_source}",
         *(f"           from the documentation: {text}" for text in told.get("lambda_filled", ())),
         f"θ          {told.get('theta_source', 'documented')}",
+        *(f"           {text}" for text in filter(None, [theta_doubt(model)])),
         *(f"           from the documentation: {text}" for text in told.get("theta_filled", ())),
     ]
     masses, hint = [f"{m:.3g}" for m in model.theta[:, 0]], ""

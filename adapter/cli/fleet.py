@@ -73,8 +73,10 @@ def run(args: argparse.Namespace) -> int:
     for line in summary(found):
         show(line)
     figures["table"] = str(_table(found, folder))
+    page = folder / "fleet.html"
+    page.unlink(missing_ok=True)  # of earlier models
     if not args.no_report:
-        figures["report"] = str(write_fleet_page(found, folder / "fleet.html"))
+        figures["report"] = str(write_fleet_page(found, page))
         show(figures["report"])
     write_json(args.json, figures)
     return ExitCode.DONE if found.arms else ExitCode.NOTHING_LEARNED

@@ -132,6 +132,8 @@ def _without_empty_rollouts(result: GapResult) -> GapResult:
 def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None:
     """Write URDF, page and figures beside the model; print the summary."""
     more: dict[str, Any] = {}
+    for stale in ("report.html", "model.urdf"):  # of an earlier model
+        (folder / stale).unlink(missing_ok=True)
     if result.model_out is not None:
         more["urdf_out"] = _write_urdf(load_model(result.model_out), folder / "model.urdf")
     if not args.no_report:

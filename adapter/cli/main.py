@@ -74,7 +74,7 @@ COMMANDS = {  # in the order of --help
         replay_options.declare,
         "learn from a recording",
         "adapter.cli.replay:run",
-        (ExitCode.NOTHING_LEARNED,),
+        (ExitCode.NOTHING_LEARNED, ExitCode.NOT_CONVERGED),
         "learning from {logs}",
     ),
     "gap": Command(

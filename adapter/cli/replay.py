@@ -10,8 +10,7 @@ from typing import Any
 from rich.progress import Progress
 
 from adapter.cli.common import configure, robot_of_log, told_of
-from adapter.cli.exit_codes import ExitCode
-from adapter.cli.results import Learned, conclude
+from adapter.cli.results import Learned, code_of, conclude
 from adapter.errors import SettingsError
 from adapter.gap.screen import check_torque
 from adapter.gap.torque_gains import TorqueGains, as_told
@@ -85,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     learned = Learned(result.outcome, robot, reference, front_end)
     conclude(args, folder, learned, numbers, source)
     show(f"{numbers['times_real_time']:.1f} times faster than real time")
-    return ExitCode.DONE if result.outcome.learned else ExitCode.NOTHING_LEARNED
+    return code_of(result.outcome)
 
 
 def _figures(

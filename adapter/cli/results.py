@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 from rich.table import Column, Table
 from rich.text import Text
 
+from adapter.cli.exit_codes import ExitCode
 from adapter.effects.active import check_effects
 from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
-from adapter.model.self_model import SelfModel
+from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
 from adapter.report.headline import Worth, headline
 from adapter.report.next_steps import next_steps
@@ -48,7 +49,6 @@ def conclude(
 ) -> None:
     """Write model, figures and report; print the headline."""
     outcome, robot, reference, front_end, accounts = learned
-    warn([*front_end.messages, *outcome.lam_notes])
     figures["model"] = str(folder / "model.json")
     data = run_data(
         outcome,
@@ -62,16 +62,27 @@ def conclude(
         source=source,
         robot=robot.name,
     )
+    doubt = filter(None, [theta_doubt(data.model)])
+    warn([*front_end.messages, *outcome.lam_notes, *(f"model.json, θ: {why}" for why in doubt)])
+    page, other = folder / "report.html", folder / "model.urdf"
+    for stale in (page, other):  # of an earlier model, which they alone describe
+        stale.unlink(missing_ok=True)
     try:
-        urdf = robot_urdf(data.model)
-        (folder / "model.urdf").write_bytes(urdf.text.encode())
+        other.write_bytes(robot_urdf(data.model).text.encode())
     except ModelError as error:
         warn([f"no URDF: {error}"])
     save_run(folder, data)
     if not args.no_report:
-        figures["report"] = str(write_report(folder / "report.html", data))
+        figures["report"] = str(write_report(page, data))
     write_json(args.json, figures)
     print_figures(data, figures.get("report"), accounts)
+
+
+def code_of(outcome: Outcome, usual: ExitCode = ExitCode.DONE) -> ExitCode:
+    """How a run with results ends: `usual` where θ had converged, or something worse happened."""
+    if not outcome.learned:
+        return ExitCode.NOTHING_LEARNED
+    return usual if usual or outcome.theta_settled else ExitCode.NOT_CONVERGED
 
 
 def print_figures(data: RunData, report: str | None, accounts: Sequence[str]) -> None:
@@ -142,7 +153,8 @@ def disagreement_lines(reports: list[dict[str, Any]] | None, start_s: float = 0.
 def _reached(figures: dict[str, Any], which: str) -> str:
     at = figures[which]["converged_s"]
     if at is None:
-        return "not converged"
+        late = which == "theta" and figures[which]["settled"]
+        return "converged at the end" if late else "not converged"
     if not at and figures["slow_s"]:
         return "converged in the slow phase"
     return f"converged {at:.2f} s after {counted_from(figures)}"
@@ -184,8 +196,6 @@ def run_export(args: argparse.Namespace) -> int:
             show(f"from the documentation, as {what} shows it alone:")
         for words in facts[key]:
             show(f"  {words}")
-    if "theta_note" in model.provenance:
-        warn([f"θ: {model.provenance['theta_note']}"])
     return 0
 
 

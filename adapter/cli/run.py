@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from functools import partial
+from glob import escape
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +19,7 @@ from adapter.cli.common import configure, recording_metadata, robot_of, with_mot
 from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.publishing import publisher_job, together
-from adapter.cli.results import Learned, conclude
+from adapter.cli.results import Learned, code_of, conclude
 from adapter.cli.run_options import simulated
 from adapter.cli.watching import known_run, view_job
 from adapter.control.controller import ControlSettings, ExcitationController
@@ -33,6 +34,7 @@ from adapter.control.path_motion import PathMotion
 from adapter.control.resting import CarriedWeight
 from adapter.control.settings import DESIGNED, ExcitationSettings, gentle
 from adapter.effects.active import with_bodies
+from adapter.errors import UsageError
 from adapter.model.model_file import dumps
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -162,6 +164,8 @@ def _may_move(args: argparse.Namespace) -> bool:
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
+    if not (args.no_record or args.overwrite):
+        _check_free(args)
     plan = run_plan(args)
     config, robot = plan.config, plan.robot
     if plan.maybe_real and _may_move(args):
@@ -204,9 +208,8 @@ def _ended(result: LiveResult) -> ExitCode:
     """How a run with results ended."""
     if result.fault:
         return ExitCode.ARM_FAILED
-    if not result.collected.learned:
-        return ExitCode.NOTHING_LEARNED
-    return ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
+    usual = ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
+    return code_of(result.collected, usual)
 
 
 def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
@@ -306,6 +309,22 @@ def _recording_path(args: argparse.Namespace, folder: Path) -> Path:
     return args.record or folder / "recording.mcap"
 
 
+def _parts(path: Path) -> list[Path]:
+    """Files of a recording that are there: itself, and those of recorders that went on with it."""
+    name, kind = escape(path.stem), escape(path.suffix)
+    return [*path.parent.glob(name + kind), *path.parent.glob(f"{name}.part*{kind}")]
+
+
+def _check_free(args: argparse.Namespace) -> None:
+    """Refuse a run over the recording of another, which nothing brings back. Raises UsageError."""
+    there = [] if args.out is args.record is None else _parts(_recording_path(args, args.out))
+    if there:
+        raise UsageError(
+            f"{there[0]}: is there, and a recording cannot be made again; give another --out "
+            "FOLDER or --record FILE, --overwrite to replace it, or --no-record to keep none"
+        )
+
+
 def _recording(
     args: argparse.Namespace, plan: RunPlan, driver: Driver, folder: Path, truth: Path | None
 ) -> RecordingJob:
@@ -321,11 +340,13 @@ def _recording(
     attachments = {"documented.json": dumps(plan.robot).encode()}
     if truth is not None:
         attachments["truth.json"] = truth.read_bytes()
+    path = _recording_path(args, folder)
+    for earlier in _parts(path):  # --overwrite, or it would have been refused
+        earlier.unlink()
     return RecordingJob(
-        _recording_path(args, folder),
+        path,
         metadata,
         attachments,
-        overwrite=args.record is None,
         arm=ShownArm.of(plan.robot),
     )
 

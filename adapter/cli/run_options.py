@@ -99,6 +99,7 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "alone (default port 8765; needs panda-adapter[live])",
     )
     add("--record", type=Path, metavar="FILE", help="default: in the results")
+    add("--overwrite", action="store_true", help="replace an existing recording")
     add("--no-record", action="store_true", help="keep no recording")
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
     add_learning(parser)

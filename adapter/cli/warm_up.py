@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import main
 
 LOG = str(Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap")
@@ -31,8 +32,8 @@ def warm_up() -> int:
 
 
 def _give(lines: list[list[str]]) -> int:
-    """Give command lines one after the other; the worst exit code."""
-    return max(main(line) for line in lines)
+    """Give command lines one after the other; the worst exit code. Nothing has to converge."""
+    return max((code for code in map(main, lines) if code != ExitCode.NOT_CONVERGED), default=0)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ model's; what has no place in a format is said in words.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,11 @@ import numpy as np
 from adapter.effects.active import Active, active_effects
 from adapter.model.mjcf import mjcf_onto
 from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
-from adapter.model.self_model import MJCF, SelfModel
+from adapter.model.self_model import MJCF, SelfModel, theta_doubt
 from adapter.model.urdf import file_text
 from adapter.model.urdf_onto import urdf_onto
 from adapter.model.urdf_text import URDF_PLACES, Additions, unplaced, urdf_text
+from adapter.model.xml_edit import XmlText
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,10 @@ def robot_urdf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
     elif source is not None and source.text is not None and not alone:
         text, file = source.text, source.file
     else:
-        return RobotText(urdf_text(model, more), None, left_out, ())
+        return _doubted(model, RobotText(urdf_text(model, more), None, left_out, ()))
     written, notes = urdf_onto(model, more, text, file)
-    return RobotText(written, file, left_out, (*notes, *_lacking("a URDF", unplaced(model, more))))
+    lacking = _lacking("a URDF", unplaced(model, more))
+    return _doubted(model, RobotText(written, file, left_out, (*notes, *lacking)))
 
 
 def to_urdf(model: SelfModel) -> str:
@@ -85,9 +87,19 @@ def robot_mjcf(model: SelfModel, onto: str | Path | None = None, alone: bool = F
             notes = [f"{onto}, which the model came from, is not there; this is the arm alone"]
             onto = None
     if onto is None:
-        return RobotText(mjcf_text(model, more), None, left_out, tuple(notes))
+        return _doubted(model, RobotText(mjcf_text(model, more), None, left_out, tuple(notes)))
     written, notes = mjcf_onto(model, more, onto)
-    return RobotText(written, str(onto), left_out, (*notes, *_lacking("an MJCF", more.left_out)))
+    notes += _lacking("an MJCF", more.left_out)
+    return _doubted(model, RobotText(written, str(onto), left_out, tuple(notes)))
+
+
+def _doubted(model: SelfModel, written: RobotText) -> RobotText:
+    """The same with what is to be said of the model's θ, as a comment in the file and a note."""
+    if not theta_doubt(model):
+        return written
+    xml, doubt = XmlText(written.text, model.name), f"θ: {theta_doubt(model)}"
+    xml.remark(doubt)
+    return replace(written, text=xml.text(), notes=(*written.notes, doubt))
 
 
 def _lacking(kind: str, left_out: Sequence[str]) -> list[str]:

@@ -636,15 +636,40 @@ class Theta:
         """(P, P) covariance of (θ, effects); zero for the idle spare body."""
         H, _ = self.information()
         out = self._inverse_of(H)
-        if self.tree.floating:  # the base takes the opposite of what the links are off
-            links = self.rows.base_place[10:]
-            follows = np.zeros((10, self.P))
-            follows[:, links] = -np.linalg.solve(H[:10, :10], self._base_information()[:, 10:-1])
+        if self.tree.floating:
+            follows = self._base_follows(H)
             across = follows @ out
             out[:10, :10] += across @ follows.T
             out[:10, 10:] = across[:, 10:]
             out[10:, :10] = across[:, 10:].T
         return out
+
+    def _base_follows(self, H: Array) -> Array:
+        """(10, P): a floating base takes the opposite of what the links are off."""
+        follows = np.zeros((10, self.P))
+        links = self.rows.base_place[10:]
+        follows[:, links] = -np.linalg.solve(H[:10, :10], self._base_information()[:, 10:-1])
+        return follows
+
+    def told_by_data(self) -> Array:
+        """(10 bodies, 10 bodies) information on θ in use that is the data's, whatever the effects.
+
+        The bodies' prior is left out, that of the effects counts.
+        """
+        H, _ = self.information()
+        if self.tree.floating:
+            way = -self._base_follows(H)
+            way[:, :10] += np.eye(10)
+            base = H[:10, :10].copy()
+            H[:10, :10] = 0.0
+            H += way.T @ base @ way
+        used = (10 * self.in_use[:, None] + np.arange(10)).ravel()
+        believed = used[used < self.spare.start]
+        H[believed, believed] -= self._neutral_prior()[0][believed, believed]
+        rest = np.setdiff1d(self.known(), used)
+        across = H[np.ix_(rest, used)]
+        known = np.linalg.solve(H[np.ix_(rest, rest)], across)
+        return np.asarray(H[np.ix_(used, used)] - across.T @ known)
 
     @property
     def in_use(self) -> NDArray[np.intp]:

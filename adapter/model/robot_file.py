@@ -17,6 +17,7 @@ import numpy as np
 
 from adapter.errors import ModelError, ModelWarning
 from adapter.model.inertia import move_theta
+from adapter.model.link_checks import check_links, check_moving
 from adapter.model.locking import LOCKED
 from adapter.model.self_model import FixedFrame, Limits, SelfModel, Source, turned_theta
 from adapter.model.spatial import Array, exp_rotation, z_to_axis, zxz_from_matrix
@@ -222,16 +223,20 @@ class Merged:
         """The body of that number, -1 for the base."""
         return self.base if number == BASE else self.order[number]
 
-    def _check_masses(self, floating: bool) -> None:
-        """Refuse a moving body without mass: no motion of it could be explained."""
-        for body in [self.body(BASE), *self.order] if floating else self.order:
+    def _check_bodies(self, floating: bool) -> None:
+        """Judge the links; refuse a moving one without mass: no motion of it could be explained."""
+        file, moving = self.robot.file, [self.base, *self.order] if floating else self.order
+        for body in moving:
             if body.theta[0] <= 0.0:
                 rest = f" (with {', '.join(body.merged)})" if body.merged else ""
                 joint = f"leave joint '{body.joint.name}' out" if body.joint else "fix the base"
                 raise ModelError(
-                    f"{self.robot.file}: moving link '{body.name}'{rest} has no mass; give it an "
-                    f"<inertial> or {joint}"
+                    f"{file}: moving link '{body.name}'{rest} has no mass; give it an <inertial> "
+                    f"or {joint}"
                 )
+        told = [(b, b.joint.name if b.joint else "") for b in moving]
+        check_moving(file, [(b.name, j, b.parent + floating, b.theta) for b, j in told])
+        check_links(file, self.robot.links)
 
     def model(self, floating: bool, gravity: Array) -> SelfModel:
         """The self model of what was walked.
@@ -241,9 +246,9 @@ class Merged:
             gravity: (3,) in base axes, m/s².
 
         Raises:
-            ModelError: a moving body without mass.
+            ModelError: a moving body without mass, or with a negative moment of inertia.
         """
-        self._check_masses(floating)
+        self._check_bodies(floating)
         base, order = self.body(BASE), self.order
         joints = [body.joint for body in order if body.joint is not None]
         tree = Tree(

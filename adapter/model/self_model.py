@@ -315,6 +315,11 @@ class SelfModel:
         return matrix_from_zxz(self.lam[:, :3])
 
 
+def theta_doubt(model: SelfModel) -> str:
+    """What a learned model says against its θ, as that it had not converged; else nothing."""
+    return str(model.provenance.get("theta_note", ""))
+
+
 def base_inertia(model: SelfModel) -> Array:
     """Ten parameters (10,) of the base link, in its frame, whether it floats or not."""
     return model.theta[0] if model.tree.floating else model.base_theta

@@ -139,6 +139,11 @@ class XmlText:
                 new += f"{self._newline}{outer}"
         self._edits.append((at, end, new.encode()))
 
+    def remark(self, text: str) -> None:
+        """Put a comment first into the top element; XML forbids two hyphens in a row in one."""
+        comment = f"{self._newline}  <!-- {text.replace('--', '- -')} -->"
+        self._edits.append((self.root.inside, self.root.inside, comment.encode()))
+
     def _indent(self, element: Element) -> str | None:
         """What stands before an element in its line; None where that is more than space."""
         line = self._bytes[: element.start].rpartition(b"\n")[2]

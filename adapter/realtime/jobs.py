@@ -90,7 +90,6 @@ class RecordingJob:
         path: of the MCAP file.
         metadata: configuration, version, ...: written at the start.
         attachments: files to put inside, by name.
-        overwrite: whether an existing file may be replaced.
         arm: told beside the samples, as documented and as learned; None tells no frames.
         estimate_s, frames_s, timing_s: how often an estimate, the links' places and what the
             loop's timing was meanwhile are told.
@@ -99,7 +98,6 @@ class RecordingJob:
     path: Path
     metadata: Mapping[str, Any] = field(default_factory=dict)
     attachments: Mapping[str, bytes] = field(default_factory=dict)
-    overwrite: bool = False
     arm: ShownArm | None = None
     estimate_s: float = 0.1
     frames_s: float = 1.0 / 30.0
@@ -255,9 +253,7 @@ class RecorderTask:
         job = self.job
         ring.resume(ring.released)
         try:
-            writer = McapWriter(
-                job.path, self.joint_names, self.link_names, job.metadata, overwrite=job.overwrite
-            )
+            writer = McapWriter(job.path, self.joint_names, self.link_names, job.metadata)
             with writer:
                 for name, data in job.attachments.items():
                     writer.attach(name, data, "application/octet-stream")

@@ -88,7 +88,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
             f"The learned model predicts torque as the documentation does: to {after}, the "
             f"documentation to {before} ({fall.seen})."
         ]
-    j = int(np.argmax(fall.before))
+    more = np.square(fall.after) - np.square(fall.before)
+    j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
     worst = f"joint {j + 1} {_fall_words(fall, j)}"
     verb = "fell" if fall.better else "rose"
     return [
@@ -144,6 +145,8 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
     fault = figures.get("fault")
     new = len(not_learned(figures))
     said = [f"The run ended early: {fault}."] if fault else []
+    if figures["theta"].get("started_s") is not None and not figures["theta"].get("settled", True):
+        said.append("What the links weigh (θ) had not converged: do not use this model yet.")
     if new:
         said.append(
             f"Something new acts that the learned model does not hold: {new} "

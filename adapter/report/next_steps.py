@@ -23,7 +23,7 @@ SIMULATED = "pybullet"
 ITS_OWN = (
     *("--out", "--json", "--duration", "--excitation", "--feedforward", "--passive", "--yes"),
     *("--allow-motion", "--quiet", "--no-report", "--checkpoint", "--resume", "--view"),
-    *("--foxglove", "--fault"),
+    *("--foxglove", "--fault", "--record", "--overwrite"),
 )
 
 

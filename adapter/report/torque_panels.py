@@ -43,7 +43,6 @@ BODY_PARTS = (
     (5, "XZ"),
     (6, "YZ"),
 )
-ROUNDING = 1e-6  # of θ: the spare body moves by less while it is not in use
 MOST_ROWS = 160  # along a line of a small panel
 
 
@@ -59,14 +58,12 @@ def theta_started(data: RunData) -> bool:
 
 
 def bodies_over_time(data: RunData, rows: Array) -> Array:
-    """θ (k, n, 10) in use; the spare body stands for the last link once it left its start."""
+    """θ (k, n, 10) in use; the spare body stands for the last link from the first change on."""
     n = data.n
     bodies = rows[:, 1 : 1 + 10 * (n + 1)].reshape(len(rows), n + 1, 10)
-    spare = data.theta_trace[:, 1 + 10 * n : 1 + 10 * (n + 1)]
-    left = np.flatnonzero(np.abs(spare - spare[0]).max(axis=1) > ROUNDING)
     theta = bodies[:, :n].copy()
-    if len(left):
-        after = rows[:, 0] >= data.theta_trace[left[0], 0]
+    for first in change_times(data)[:1]:
+        after = data.times(rows) >= first
         theta[after, -1] = bodies[after, n]
     return theta
 

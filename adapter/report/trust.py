@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.gap.phrases import numbered
-from adapter.model.self_model import LAMBDA_MEASURED
+from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
 from adapter.report.headline import Worth, against
 from adapter.report.torque_panels import SHARE_ALONE, theta_started
 from adapter.report.words import (
@@ -112,6 +112,9 @@ def _parameters(data: RunData) -> Check | None:
     )
     at, goal = theta.get("converged_s"), f"{TORQUE_GOAL:g} × the error of batch least squares"
     if at is None:
+        if not theta.get("settled", True):
+            doubt = theta_doubt(data.model) or "it had not converged"
+            return Check(BAD, "Inertias and friction", f"{said}; θ: {doubt}")
         said += f"; the prequential error did not stay within {goal}"
         return Check(LOOK, "Inertias and friction", said)
     after = quantity(at, "s", 2)

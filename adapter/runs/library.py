@@ -164,7 +164,8 @@ class LearnResult:
     def __repr__(self) -> str:
         worst = np.max(self.held_out_rmse_nm)
         lam = "converged" if self.lam_converged else "not converged"
-        theta = "learned" if self.theta_learned else "not learned"
+        settled = self.model.provenance.get("theta_converged", True)
+        theta = "learned" if settled else "not converged" if self.theta_learned else "not learned"
         return f"LearnResult(λ {lam}, θ {theta}, held-out torque error at most {worst:.2g} N m)"
 
     def _repr_html_(self) -> str:

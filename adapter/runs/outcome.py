@@ -11,7 +11,7 @@ import numpy as np
 from adapter.effects.active import active_effects, with_bodies
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
-from adapter.learning.batch.theta_filling import filled_theta, filled_words
+from adapter.learning.batch.theta_filling import filled_theta, filled_words, told_basis
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
@@ -27,6 +27,7 @@ from adapter.physics.identifiability import (
 )
 from adapter.signals.records import LinkMotionKind
 
+TORQUE_GOAL = 1.1  # times the final batch least squares
 SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
 
 
@@ -46,6 +47,9 @@ class Outcome:
         shapes: (e, n) of the effects that have several (`LearnedEffect`), NaN for the others.
         variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
+        theta_excess: torque error of θ over that of batch least squares on the same data, rms over
+            the joints; theta_settled: it is inside the goal, or the learner says so.
+        theta_information: (10 bodies, 10 bodies) that data have on θ, see `Theta.told_by_data`.
         covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
         payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
@@ -78,6 +82,9 @@ class Outcome:
     shapes: Array
     variance: Array
     theta_started_ns: int | None
+    theta_excess: float
+    theta_settled: bool
+    theta_information: Array
     covariance: Array
     least_squares: Array
     spare_in_use: bool
@@ -107,6 +114,8 @@ def collect(learner: OnlineLearner) -> Outcome:
     schema, theta = learner.schema, learner.theta
     traced = learner.theta_trace.rows[:, 1 : 1 + 10 * learner.tree.bodies].reshape(-1, 10)
     eigenvalues = min_eigenvalue(np.concatenate([traced, theta.theta]))
+    batch, started = theta.least_squares(), learner.theta_started_ns is not None
+    excess = float(np.sqrt(np.mean(theta.variance() / theta.variance(batch))))
     return Outcome(
         learned=learner.learned,
         updates=schema.updates,
@@ -126,8 +135,11 @@ def collect(learner: OnlineLearner) -> Outcome:
         shapes=theta.shapes.copy(),
         variance=theta.variance(),
         theta_started_ns=learner.theta_started_ns,
+        theta_excess=excess,
+        theta_settled=started and (learner.theta_converged or excess <= TORQUE_GOAL),
+        theta_information=theta.told_by_data(),
         covariance=theta.covariance(),
-        least_squares=theta.least_squares(),
+        least_squares=batch,
         spare_in_use=theta.spare_in_use,
         payload=theta.payload,
         changes_ns=tuple(change.stamp_ns for change in learner.changes),
@@ -190,36 +202,47 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda
 
 
 def completed_theta(
-    outcome: Outcome, documented: SelfModel, lam: Array, basis: Array
-) -> tuple[Array, dict[str, Any]]:
-    """The learned θ (bodies, 10) with what torques do not show taken from the documentation.
+    outcome: Outcome, documented: SelfModel, lam: Array
+) -> tuple[Array, Array, dict[str, Any]]:
+    """The learned θ (bodies, 10) with what torques did not show taken from the documentation.
 
-    Torques stay what they were, unless no possible bodies have them.
+    Torques over the motion that was learned from stay what they were but for noise, unless no
+    possible bodies have them.
 
     Args:
-        lam: (n, 6) λ as it leaves the house; basis: of the combinations that torques show.
+        lam: (n, 6) λ as it leaves the house.
 
     Returns:
-        θ, and what is to be said of it, for the model's provenance.
+        θ, (10 bodies, rank) the basis of what is learned of it, and what is to be said of it, for
+        the model's provenance.
     """
+    size = documented.theta.size
     if outcome.theta_started_ns is None:
-        return documented.theta, {"theta_source": "documentation: λ had not converged"}
-    wrench, count = outcome.settings.base_wrench, 4 * len(basis)
+        said = {"theta_source": "documentation: λ had not converged", "theta_converged": False}
+        return documented.theta, np.zeros((size, 0)), said
+    basis = told_basis(outcome.theta_information, documented.theta)
+    wrench, count = outcome.settings.base_wrench, 4 * size
     shown = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
-    table = shown.matrix.reshape(-1, len(basis))
-    said: dict[str, Any] = {"theta_source": "learned"}
+    table, notes = shown.matrix.reshape(-1, size), []
+    said = {"theta_source": "learned", "theta_converged": outcome.theta_settled}
+    if not outcome.theta_settled:
+        notes = [
+            f"it had not converged: its torque error is {outcome.theta_excess:.3g} times that of "
+            "batch least squares on the same data; it takes more motion to learn from"
+        ]
+    theta = outcome.theta
     try:
-        found = filled_theta(outcome.theta, documented.theta, basis, table)
+        found = filled_theta(theta, documented.theta, basis, table)
     except ModelError as error:  # a run's results are not lost over it
-        return outcome.theta, {**said, "theta_note": f"nothing of it is filled: {error}"}
-    said["theta_filled"] = filled_words(basis, documented.tree.body_names)
-    if not found.possible:
-        moved = table @ (found.theta - outcome.theta).ravel()
-        said["theta_note"] = (
-            "no possible bodies have what was learned; the nearest are off by "
-            f"{np.sqrt(np.mean(moved**2)):.2g} N m rms"
-        )
-    return found.theta, said
+        notes.append(f"nothing of it is filled: {error}")
+    else:
+        said["theta_filled"] = filled_words(basis, documented.tree.body_names)
+        if not found.possible:
+            off = float(np.sqrt(np.mean((table @ (found.theta - theta).ravel()) ** 2)))
+            why = "no possible bodies have what was learned; the nearest are off by"
+            notes.append(f"{why} {off:.2g} N m rms")
+        theta = found.theta
+    return theta, basis, said | ({"theta_note": "; ".join(notes)} if notes else {})
 
 
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
@@ -234,9 +257,9 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
     completed = completed_lambda(outcome, documented)
     base = shown_parameters(outcome, documented, completed.lam)
-    share = np.einsum("ab,ab->a", base.basis, base.basis).reshape(-1, 10)
     known = outcome.theta_started_ns is not None
-    theta, said = completed_theta(outcome, documented, completed.lam, base.basis)
+    theta, basis, said = completed_theta(outcome, documented, completed.lam)
+    share = np.einsum("ab,ab->a", basis, basis).reshape(-1, 10)
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -246,7 +269,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
         theta_std=_shown_std(outcome, base) if known else np.full((bodies, 10), np.nan),
-        theta_identifiable=(share > SHOWN_SHARE) & known,
+        theta_identifiable=share > SHOWN_SHARE,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={

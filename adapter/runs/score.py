@@ -21,6 +21,7 @@ from adapter.physics.freedom import Freedom, slid_to
 from adapter.physics.identifiability import frame_observability
 from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.outcome import (
+    TORQUE_GOAL,
     Outcome,
     changes,
     completed_lambda,
@@ -30,7 +31,6 @@ from adapter.runs.outcome import (
 from drivers.files.bounded import parse_json, read_text
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
-TORQUE_GOAL = 1.1  # times the final batch least squares
 TORQUE_WINDOW_S = 2.0
 
 
@@ -231,6 +231,8 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     base = shown_parameters(outcome, documented, lam)
     score: dict[str, Any] = {
         "converged_s": None,
+        "settled": outcome.theta_settled,
+        "excess": outcome.theta_excess,
         "base_parameters": base.rank,
         "torque_rmse_nm": [],
         "validation_torque_rmse_nm": None,

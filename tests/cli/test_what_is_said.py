@@ -10,11 +10,12 @@ import pytest
 
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.main import COMMANDS, build_parser, main
-from adapter.model.model_file import save_model
+from adapter.effects.robots import read_robot
+from adapter.model.model_file import load_model, save_model
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from drivers.interface import DriverError, NotReady
-from tests.helpers.pages import PAGES
+from tests.helpers.pages import PAGES, ROOT
 
 NAMES = ("[red]shoulder[/]", "[/]", "arm[1]", "[bold", ":smile:", "\\[x]", "[link=file:x]y")
 
@@ -68,6 +69,34 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
         process.stdout.close()
         assert process.stderr.read() == "reading m.json ...\n"
         assert process.wait(60) == 0
+
+
+def test_theta_that_has_not_converged_says_so_wherever_it_goes(tmp_path: Path, capsys) -> None:
+    """In the model, its URDF, the report, `info`, `export` and the exit code; and what little data
+    did not show is the documentation's, so that no link is of a mass that nobody saw."""
+    log, out = ROOT / "recordings" / "panda_nominal_6s.mcap", tmp_path / "out"
+    replay = ["replay", str(log), "--every", "1", "--quiet", "--out", str(out)]
+    assert main([*replay, "--validate-from", "1.2"]) == ExitCode.NOT_CONVERGED
+    why = "it had not converged: its torque error is"
+    assert why in capsys.readouterr().err
+    model, path = load_model(out / "model.json"), out / "model.json"
+    assert not model.provenance["theta_converged"] and why in model.provenance["theta_note"]
+    share = model.theta[:, 0] / documented("panda").theta[:, 0]
+    assert (share < 1.1).all(), share
+    page = (out / "report.html").read_text()
+    assert why in page and "do not use this model yet" in page
+    assert main(["info", str(path)]) == 0 and why in capsys.readouterr().out
+    files = [tmp_path / "arm.urdf", tmp_path / "arm.xml"]
+    for more in ([], ["--alone"]):
+        line = ["export", str(path), "--urdf", str(files[0]), "--mjcf", str(files[1]), *more]
+        assert main(line) == 0 and why in capsys.readouterr().err
+        for file in (out / "model.urdf", *files):
+            assert f"<!-- θ: {why}" in file.read_text()
+            assert read_robot(file).tree.n == 7
+    assert main(replay) == 0 and why not in capsys.readouterr().err
+    model = load_model(path)
+    assert model.provenance["theta_converged"] and "theta_note" not in model.provenance
+    assert "<!-- θ" not in (out / "model.urdf").read_text()
 
 
 def test_exit_codes_stand_in_the_pages_and_in_the_help() -> None:

@@ -48,7 +48,7 @@ def test_simulated_hardware(kind: str, tmp_path: Path) -> None:
     with Stalls() as stalls:
         try:
             options = "--duration 2 --out run --json run.json"
-            code, said = give(f"{run} {options}", tmp_path, codes=(0, 2, 3))
+            code, said = give(f"{run} {options}", tmp_path, codes=(0, 2, 3, 9))
         finally:
             arm.terminate()
             arm.communicate(timeout=30)
@@ -62,7 +62,7 @@ def test_simulated_hardware(kind: str, tmp_path: Path) -> None:
     assert figures["recorded"] + figures["unrecorded"] == figures["samples"]
     if kind == "fci":  # none that the robot does not know of
         assert intake["received"] <= seen["states_sent"]
-    if code == 0:
+    if code in (0, 9):  # 2 s are few to learn in
         assert figures["fault"] is None and figures["ended"] == "duration"
         assert figures["samples"] > 3000
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from adapter.learning.batch.theta_filling import KEPT, filled_theta, filled_words
+from adapter.learning.batch.theta_filling import KEPT, filled_theta, filled_words, told_basis
 from adapter.model.inertia import is_consistent, move_theta, theta_from_body
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, exp_rotation
@@ -34,6 +34,24 @@ def test_what_differs_from_the_documentation_unseen_is_taken_from_it(name: str) 
     found = filled_theta(model.theta + unseen(basis, 0), model.theta, basis, table)
     assert found.possible and found.kept == pytest.approx(1.0)
     np.testing.assert_allclose(found.theta, model.theta, atol=1e-9)
+
+
+@pytest.mark.parametrize("moving", [[6], [0, 3], [1, 2, 4, 5]])
+def test_what_this_motion_did_not_show_is_taken_from_the_documentation(moving: list[int]) -> None:
+    """Another motion would have shown it: torques of any posture are not those of a few joints."""
+    model, _, _ = robot("panda")
+    motion = random_motion(model.tree, 300, seed=2)
+    still = np.setdiff1d(np.arange(7), moving)
+    for signal, value in zip(motion, (0.4, 0.0, 0.0), strict=True):
+        signal[:, still] = value
+    table = RigidArm.of(model).regressor(*motion).reshape(-1, 70)
+    hidden = np.linalg.svd(table)[2][np.linalg.matrix_rank(table) :]
+    drift = (hidden.T @ np.random.default_rng(0).normal(size=len(hidden))).reshape(-1, 10)
+    basis = told_basis(table.T @ table / 0.05**2, model.theta)
+    assert basis.shape[1] < 43
+    found = filled_theta(model.theta + 20.0 * drift, model.theta, basis, table)
+    assert np.abs(20.0 * drift[:, 0]).max() > 5.0  # kg
+    np.testing.assert_allclose(found.theta, model.theta, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["panda", "tree"])

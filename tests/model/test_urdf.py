@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -203,6 +204,10 @@ BAD = {
         robot(AB, BC).replace('mass value="1"', 'mass value="-1"'),
         r"negative mass of -1",
     ),
+    "inertia below zero": (
+        robot(AB, BC).replace('izz="1"', 'izz="-1"'),
+        r"moving link 'c' has a principal moment of inertia of -1 kg m².*below zero",
+    ),
     "unknown link": (
         robot(AB, BC).replace("child link='c'", "child link='z'"),
         r"'z'.*have.*a, b, c",
@@ -235,6 +240,55 @@ def test_bad_files_are_refused_with_the_place_and_the_choices(fault: str, tmp_pa
         warnings.simplefilter("error")
         read_urdf(path, joints=joints)
     assert "bad.urdf" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "told"),
+    [
+        ({'mass value="3.228604"': 'mass value="3228.604"'}, "'panda_link3' of 3229 kg; .* grams"),
+        ({'izz="0.005433"': 'izz="0.0154"'}, r"no body .* 'panda_link6' \(0.00.*, 0.0155 kg m²\)"),
+        (
+            {
+                '"0.735522"': '"1e-5"',
+                '"0.012516"': '"1e-7"',
+                '"-0.000428"': '"0"',
+                '"-0.001196"': '"0"',
+                '"0.010027"': '"1e-7"',
+                '"-0.000741"': '"0"',
+                '"0.004815"': '"1e-7"',
+            },
+            r"no torque shows it: joint 'panda_joint7' \(link 'panda_link7' of 1e-05 kg\)",
+        ),
+    ],
+    ids=["grams", "impossible", "next to nothing"],
+)
+def test_numbers_that_no_link_has_are_told_at_reading(numbers: dict[str, str], told: str) -> None:
+    text = PANDA.read_text()
+    for number, other in numbers.items():
+        assert number in text
+        text = text.replace(number, other)
+    with pytest.warns(ModelWarning, match=f"arm.urdf: .*{told}") as caught:
+        model_from_urdf(text, "arm.urdf")
+    assert len(caught) == 1
+
+
+def test_links_in_grams_are_told_one_by_one() -> None:
+    """Also where inertias are in g m²; 17 kg that nobody meant."""
+    text = re.sub(r'(mass value|i[xyz][xyz])="([^"]*)"', r'\1="\g<2>e3"', PANDA.read_text())
+    text = re.sub(r'e-0(\d)e3"', lambda x: f'e{3 - int(x[1])}"', text)
+    with pytest.warns(ModelWarning, match=r"'panda_link4' of 3588 kg, .*; is its mass in grams"):
+        model_from_urdf(text)
+
+
+def test_no_number_of_a_real_robot_is_taken_amiss() -> None:
+    paths = [path for folder in ("models", "data") for path in shared(folder).rglob("*.urdf")]
+    assert len(paths) >= 5
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for path in paths:
+            read_urdf(path)
+    said = " ".join(str(x.message) for x in caught)
+    assert not any(words in said for words in ("denser", "no body has", "no torque shows it"))
 
 
 def test_a_joint_that_is_not_there_is_named_with_the_choices() -> None:

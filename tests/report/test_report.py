@@ -25,6 +25,7 @@ from adapter.report.headline import Worth, headline
 from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import rotation_path
 from adapter.report.style import thin
+from adapter.report.torque_panels import bodies_over_time
 from adapter.report.worth import SLOW, slow_share, torque_fall
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
@@ -225,6 +226,28 @@ def test_headline_says_what_changed_and_what_it_is_worth(data: RunData) -> None:
     for text, table in zip(found.groups(), (expected, error), strict=True):
         size = np.sqrt(np.mean(table[rows] ** 2, axis=0).sum())
         assert float(text) == pytest.approx(size, rel=0.05)
+
+
+def test_headline_names_the_joint_that_changed_most(data: RunData) -> None:
+    """Not the one whose error was the largest before."""
+    before, after = np.full(7, 0.4), np.full(7, 0.4)
+    before[2:4], after[2:4] = (1.5, 0.005), (1.4, 12.75)
+    for first, last, words in ((before, after, "rose"), (after, before, "fell")):
+        judged = {"documented_validation_torque_rmse_nm": first.tolist()}
+        judged["validation_torque_rmse_nm"] = last.tolist()
+        said = said_of(data, theta={**data.figures["theta"], **judged})
+        assert f" {words} from " in said and "; joint 4 " in said, said
+
+
+def test_a_body_that_waits_for_a_load_is_not_drawn(data: RunData) -> None:
+    """It stands for the last link after a change at the hand, and not before."""
+    own, spare = (data.theta_trace[:, 1 + 10 * k : 11 + 10 * k] for k in (6, 7))
+    assert (bodies_over_time(data, data.theta_trace)[:, -1] == own).all()
+    change = {"stamp_s": data.start_s + 2.0}
+    late = data.times(data.theta_trace) >= 2.0
+    told = with_figures(data, theta={**data.figures["theta"], "changes": [change]})
+    drawn = bodies_over_time(told, data.theta_trace)[:, -1]
+    assert (drawn[late] == spare[late]).all() and (drawn[~late] == own[~late]).all()
 
 
 def test_a_documented_low_pass_goes_by_the_stamps_of_the_rows(data: RunData) -> None:
