@@ -19,7 +19,6 @@ from adapter.cli.results import write_robot
 from adapter.effects.export import robot_urdf
 from adapter.errors import MeansError, ModelError, UsageError
 from adapter.gap.result import GapResult, Shortfall
-from adapter.gap.screen import RecordingRefused
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
@@ -36,6 +35,7 @@ from adapter.runs.terminal import (
     warn,
     write_json,
 )
+from adapter.screening.screen import RecordingRefused
 from adapter.simulate import Rollouts
 from drivers.files.mcap import Log, read_log
 

@@ -12,7 +12,6 @@ from rich.progress import Progress
 from adapter.cli.common import configure, robot_of_log, told_of
 from adapter.cli.results import Learned, code_of, conclude
 from adapter.errors import SettingsError
-from adapter.gap.screen import check_torque
 from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.self_model import SelfModel
 from adapter.runs.compiling import compile_first
@@ -32,6 +31,7 @@ from adapter.runs.replay import (
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
 from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
+from adapter.screening.screen import check_torque
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching, present

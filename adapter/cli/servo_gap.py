@@ -12,12 +12,12 @@ from rich.text import Text
 from adapter.cli.common import robot_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.errors import UsageError
-from adapter.gap.screen import RecordingRefused
 from adapter.gap.servo import explain
 from adapter.gap.servo_model import read_servos
 from adapter.gap.servo_words import as_json, lines
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import complain, console, output, results_folder, say, write_json
+from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Log, read_position_log
 
 WITH_TORQUE = (  # options

@@ -7,7 +7,7 @@ from typing import Any
 
 from adapter.cli.common import robot_of, told_of
 from adapter.control.teachable import teachable
-from adapter.gap.screen import RecordingRefused, check_torque
+from adapter.screening.screen import RecordingRefused, check_torque
 from adapter.signals.matching import matching, most_moved, present
 from drivers.files.mcap import Log, read_log
 

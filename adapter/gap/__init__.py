@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` finds the same
     from adapter.gap.monitor import Monitor
     from adapter.gap.result import Finding, GapResult, Leftover
-    from adapter.gap.screen import RecordingFault, RecordingRefused
     from adapter.gap.workflow import GapSettings, find_gap
+    from adapter.screening.screen import RecordingFault, RecordingRefused
 
 _FROM = {
     "Finding": "result",

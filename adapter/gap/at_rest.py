@@ -8,11 +8,11 @@ from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import real_arm
 from adapter.gap.result import Finding
 from adapter.gap.rivals import Standing
-from adapter.gap.screen import cleaned
 from adapter.gap.search import Found
 from adapter.gap.signals import LEAST_S, Recorded
-from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
+from adapter.screening.screen import cleaned
+from adapter.screening.timing import lateness
 from adapter.signals.matching import present
 from drivers.files.mcap import Log
 

@@ -19,7 +19,13 @@ from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import SHARES, real_arm
 from adapter.gap.sampled import Sampled, sampling_words
-from adapter.gap.screen import (
+from adapter.gap.signals import RATE_HZ, Recorded
+from adapter.gap.weighed import moments_of
+from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
+from adapter.model.self_model import FixedFrame, SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import (
     MOVES_DQ,
     Judged,
     cleaned,
@@ -28,13 +34,7 @@ from adapter.gap.screen import (
     silent,
     smoothed_rows,
 )
-from adapter.gap.signals import RATE_HZ, Recorded
-from adapter.gap.timing import lateness
-from adapter.gap.weighed import moments_of
-from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
-from adapter.model.self_model import FixedFrame, SelfModel
-from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.timing import lateness
 from adapter.signals.matching import matching, present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log

@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.base import ArmDynamics, Motion
-from adapter.gap.screen import RecordingFault, RecordingRefused, at_source
 from adapter.gap.signals import (
     DECIMATION,
     EDGE_S,
@@ -35,11 +34,12 @@ from adapter.gap.signals import (
     low,
     on_grid,
     smoothness_of,
-    stuck,
     together,
 )
-from adapter.gap.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.model.spatial import Array
+from adapter.screening.rows import stuck
+from adapter.screening.screen import RecordingFault, RecordingRefused, at_source
+from adapter.screening.timing import RecordingClock, check_timing, joined, lateness, uniform
 from adapter.signals.source_clock import source_stamps
 from drivers.files.mcap import Log
 from drivers.files.rows import RowsFile

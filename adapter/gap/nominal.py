@@ -10,9 +10,9 @@ from adapter.effects.active import active_effects
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
 from adapter.gap.hand import hand_of
 from adapter.gap.signals import Recorded, prepare
-from adapter.gap.timing import TIMING_SHARE
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.timing import TIMING_SHARE
 
 
 def nominal_fit(

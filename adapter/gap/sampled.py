@@ -18,10 +18,10 @@ from adapter.gap.long_recording import (
 )
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import real_arm
-from adapter.gap.screen import Screened, moving_joints, of_this_robot, refuse, standing
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import Screened, moving_joints, of_this_robot, refuse, standing
 from drivers.files.mcap import Log
 
 

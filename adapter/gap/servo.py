@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.gap.fit import theta_prior
-from adapter.gap.screen import RecordingFault, RecordingRefused, moving_joints
 from adapter.gap.servo_fit import (
     DELAY,
     PARAMETERS,
@@ -29,6 +28,7 @@ from adapter.gap.servo_signals import Track, loads
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import RecordingFault, RecordingRefused, moving_joints
 from drivers.files.mcap import Log
 
 ROUNDS = 2  # in which the load follows from the arm's simulated motion

@@ -29,6 +29,7 @@ from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.gap.evidence import ORDER
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.rows import pauses, stuck
 from adapter.signals.filters import noise_from_samples
 from drivers.files.mcap import Log
 
@@ -43,11 +44,7 @@ CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at
 MASSES = 20  # instants at which the mass matrix is asked for
 MANY = 100  # signals that are worth a look whether some are zero
 LEAST_S = 1.2  # of a recording
-CUT_S, CUT_PERIODS = 0.15, 6.0  # without samples: what is longer, and of more periods, is a pause
 STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
-# s, rad/s: a torque that stays so long while its joint moves is none, sooner at the end of its
-# range; and longer than so many usual stays
-STUCK_S, ENDS_S, STUCK_DQ, STUCK_TIMES = 0.3, 0.05, 0.05, 20.0
 HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
@@ -72,36 +69,6 @@ UNLIKE = 0.3  # of the measured torque's size: commands further off mean somethi
 FAR_S = 0.05  # a command older than that does not drive any more
 HOLE_S = 0.05  # between samples: what happened in there is not known
 ROLLOUT_EDGE_S = 0.3
-
-
-def pauses(t: Array) -> NDArray[np.int64]:
-    """Rows of t (m,), s, behind which a recording pauses."""
-    steps_s = np.diff(t)
-    usual_s = float(np.median(steps_s)) if len(steps_s) else 0.0
-    return np.flatnonzero(steps_s > max(CUT_S, CUT_PERIODS * usual_s))
-
-
-def stuck(t: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
-    """(m, n) where a torque is not measured: it never changes, or not for long in a motion.
-
-    A value at the end of its range that it stays at so long is where the sensor ends: no reading
-    of that value is a measured one.
-
-    Args:
-        t: (m,) s; dq, tau: (m, n) rad/s, N m.
-    """
-    out = np.broadcast_to(np.ptp(tau, axis=0) == 0.0, tau.shape).copy()
-    for j in np.flatnonzero(~out.all(axis=0)):
-        x, edges = tau[:, j], np.flatnonzero(np.diff(tau[:, j])) + 1
-        first, last = np.r_[0, edges], np.r_[edges, len(t)] - 1
-        stays_s, ends = t[last] - t[first], np.isin(x[first], (x.min(), x.max()))
-        long_s = np.where(ends, ENDS_S, STUCK_S)
-        for k in np.flatnonzero(stays_s > np.maximum(long_s, STUCK_TIMES * np.median(stays_s))):
-            rows = slice(first[k], last[k] + 1)
-            if np.median(np.abs(dq[rows, j])) > STUCK_DQ:
-                out[rows, j] = True
-                out[:, j] |= ends[k] & (x == x[first[k]])
-    return out
 
 
 def low(x: Array) -> Array:

@@ -26,15 +26,15 @@ from adapter.errors import SettingsError
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
-from adapter.gap.motor_currents import TorqueShares, torque_shares
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import as_driven, fitting_way, load_in
-from adapter.gap.screen import cleaned, compared, moving_joints, smoothed_rows
 from adapter.gap.signals import RATE_HZ, Recorded, prepare
-from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.motor_currents import TorqueShares, torque_shares
+from adapter.screening.screen import cleaned, compared, moving_joints, smoothed_rows
+from adapter.screening.timing import lateness
 from adapter.signals.matching import present
 from adapter.signals.told import Told
 from drivers.files.mcap import Log, read_log

@@ -31,15 +31,15 @@ from adapter.gap.long_recording import is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.sampled import Sampled, part_of, sampling, sampling_words
-from adapter.gap.screen import RecordingFault, RecordingRefused, Screened, refuse
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import Recorded
-from adapter.gap.timing import lateness
 from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import RecordingFault, RecordingRefused, Screened, refuse
+from adapter.screening.timing import lateness
 from adapter.signals.matching import matching, present
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log

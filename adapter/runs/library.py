@@ -19,7 +19,6 @@ from adapter.effects.robots import read_robot
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError, ModelWarning, SettingsError
 from adapter.gap.result import GapResult
-from adapter.gap.screen import check_torque
 from adapter.gap.workflow import GapSettings
 from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
@@ -32,6 +31,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect, learned_model
 from adapter.runs.pipeline import Pipeline, make_front_end
 from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, last_s, replay
+from adapter.screening.screen import check_torque
 from adapter.signals.matching import matching, present
 from adapter.signals.records import stamps_of
 from drivers.files.html_table import html_table, plus_minus

@@ -41,13 +41,13 @@ from adapter.gap.held_out import (
 from adapter.gap.result import Leftover
 from adapter.gap.rivals import DATES, Standing, price
 from adapter.gap.scan import BELIEF
-from adapter.gap.screen import refuse
 from adapter.gap.search import Budget, Found, search, weak, worst
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.words import as_json, console_summary, headline
 from adapter.model.inertia import theta_from_body
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import refuse
 from drivers.files.mcap import Log
 from tests.helpers import gap_results
 from tests.helpers.gap_tools import sines

@@ -8,10 +8,10 @@ import numpy as np
 import pybullet_data
 import pytest
 
-from adapter.gap.screen import RecordingRefused, Screened, moving_joints, refuse
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import RecordingRefused, Screened, moving_joints, refuse
 from drivers.files.mcap import Log, read_log
 from sim.effects import payload
 from sim.hidden import draw

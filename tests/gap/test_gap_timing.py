@@ -6,7 +6,7 @@ from time import process_time
 import numpy as np
 import pytest
 
-from adapter.gap.timing import check_timing, uniform
+from adapter.screening.timing import check_timing, uniform
 from tests.helpers.arm_data import Motion, trajectory
 
 SHARED = Path(__file__).parents[2].parent / "shared"

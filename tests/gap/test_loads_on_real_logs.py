@@ -12,11 +12,11 @@ from scipy.signal import butter, sosfiltfilt
 from adapter.effects.robots import read_robot
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import RealArm, real_arm
-from adapter.gap.screen import refuse
 from adapter.gap.signals import Recorded
-from adapter.gap.timing import lateness
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import refuse
+from adapter.screening.timing import lateness
 from drivers.files.mcap import Log
 from sim.hidden.record import log_of
 from sim.hidden.trial import nominal_urdf

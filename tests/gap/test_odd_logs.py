@@ -15,8 +15,8 @@ import adapter
 from adapter.cli import main
 from adapter.errors import ModelWarning
 from adapter.gap.load import HandLoad, find_load
-from adapter.gap.screen import RecordingRefused
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import Log, McapWriter
 from sim.effects import payload, per_joint
 from tests.helpers.arm_data import Motion, arm, panda_model, record

@@ -13,13 +13,13 @@ from adapter.gap.fit import place_of, refitted
 from adapter.gap.hand import Hand, hand_of
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import OTHER_UNIT, RealArm, real_arm, start
-from adapter.gap.screen import refuse
 from adapter.gap.signals import Recorded
-from adapter.gap.timing import lateness
 from adapter.gap.workflow import find_gap
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import refuse
+from adapter.screening.timing import lateness
 from sim.hidden.trial import nominal_urdf
 from sim.hidden.twins import Twin, draw_twin
 from tests.helpers.arm_data import panda_model

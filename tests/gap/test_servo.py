@@ -12,10 +12,10 @@ import pytest
 from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import ModelError
-from adapter.gap.screen import RecordingRefused
 from adapter.gap.servo import explain
 from adapter.gap.servo_kernels import Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
+from adapter.screening.screen import RecordingRefused
 from drivers.files.mcap import McapWriter, read_position_log
 from tests.helpers.position_arm import (
     Drawn,

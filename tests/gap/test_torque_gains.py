@@ -11,10 +11,10 @@ import pytest
 from adapter.cli import main
 from adapter.effects.robots import read_robot
 from adapter.errors import SettingsError
-from adapter.gap.screen import RecordingRefused, check_torque, refuse
 from adapter.gap.torque_gains import as_told, learn_gains
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.screen import RecordingRefused, check_torque, refuse
 from adapter.signals.importer import ImportSpec, table_log
 from adapter.signals.matching import matching
 from adapter.signals.told import Told

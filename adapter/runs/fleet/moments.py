@@ -21,7 +21,6 @@ import numpy as np
 
 from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.errors import MeansError
-from adapter.gap.screen import check_torque
 from adapter.learning.known_effects import learnable
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings
@@ -31,6 +30,7 @@ from adapter.model.spatial import Array
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.replay import filtered_tables, fitted_to
+from adapter.screening.screen import check_torque
 from adapter.signals.matching import matching
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log

@@ -19,7 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.by_joint import smooth_sign
-from adapter.gap.torque_units import (
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.torque_units import (
     FLOOR_NM,
     FLOOR_SHARE,
     FRICTION,
@@ -28,9 +31,6 @@ from adapter.gap.torque_units import (
     inertial_std,
     tau_gain,
 )
-from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
 
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count

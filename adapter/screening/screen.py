@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
-from adapter.gap.joint_readings import (
+from adapter.model.self_model import SelfModel
+from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.joint_readings import (
     ROWS,
     Rows,
     Telling,
@@ -19,14 +22,11 @@ from adapter.gap.joint_readings import (
     lateness_s,
     otherwise_told,
 )
-from adapter.gap.motor_currents import in_words as currents_in_words
-from adapter.gap.motor_currents import torque_shares
-from adapter.gap.signals import pauses, stuck
-from adapter.gap.timing import RecordingClock, check_timing, put_forward, uniform, unwrapped
-from adapter.gap.torque_units import TorqueComparison, convincing, in_words, readings, unit
-from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.motor_currents import in_words as currents_in_words
+from adapter.screening.motor_currents import torque_shares
+from adapter.screening.rows import pauses, stuck
+from adapter.screening.timing import RecordingClock, check_timing, put_forward, uniform, unwrapped
+from adapter.screening.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.signals.matching import matching, most_moved
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of

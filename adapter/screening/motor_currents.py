@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.gap.torque_units import EFFECTIVE, SEEN_NM, TorqueComparison
 from adapter.model.spatial import Array
+from adapter.screening.torque_units import EFFECTIVE, SEEN_NM, TorqueComparison
 
 IMPOSSIBLE = 0.25  # share of the model's torque, two standard deviations up; 40 % wrong: 0.6
 MIDDLE = 0.2  # of the joints' shares: gains of drives seen are 8 to 15

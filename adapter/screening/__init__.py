@@ -1,0 +1,1 @@
+"""Whether a recording can be learned from: the same verdicts and sentences at every door."""
