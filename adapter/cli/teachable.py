@@ -20,14 +20,17 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
     log = told_of(args).log(matching(most_moved(whole), robot), robot)
     if len(log) < len(whole):
         locked.append(f"predicted for {len(log)} of its {len(whole)} samples, where it moves most")
-    unit = "N m"
+    unit, teaches = "N m", "yes"
     try:
         log, doubt = check_torque(log, robot)
     except RecordingRefused as refusal:
-        unit, doubt = str(refusal), [str(refusal)]
+        unit, doubt, teaches = str(refusal), [str(refusal)], "no"
     told = teachable(log, robot)
     expected = told.expected
+    if teaches == "yes" and told.rank < told.full_rank:
+        teaches = "in part" if told.rank else "no"
     figures = {
+        "teaches": teaches,
         "rank": told.rank,
         "full_rank": told.full_rank,
         "torque_std_nm": told.torque_std.tolist(),
@@ -42,6 +45,7 @@ def predict(args: argparse.Namespace, log: Log | None = None) -> tuple[dict[str,
     }
     noise = "  ".join(f"{std:.2g}" for std in told.torque_std)
     lines = [
+        f"can be learned from: {teaches}",
         f"{robot.name}: tells {told.rank} of the {told.full_rank} combinations of parameters that "
         "torques depend on",
         f"torque that no parameters explain, N m: {noise}",

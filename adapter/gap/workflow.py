@@ -179,7 +179,7 @@ def _task(
         progress(f"reading {name}")
         read.append(log if isinstance(log, Log) else read_log(Path(log)))
         model, said = present(model, read[-1].joint_names, name)
-        locked += said
+        locked += [*read[-1].warnings, *said]
     if settings.told.learn:
         progress("learning the gains of the drives")
         taught = [part_of(log, model, settings.validate_from_s) for log in read[: len(kept)]]

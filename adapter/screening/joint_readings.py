@@ -46,9 +46,9 @@ LEAST_FACTOR = 1.5  # of one joint's torque; gains and friction explain less
 NEAR = 2  # joints up to which an axis may be told against another (parallel links)
 # Of the variance of torques: middle joint and best one. Real arms: 0.9 and 0.97 at least.
 EXPLAINED, BEST_EXPLAINED = 0.5, 0.85
-# Of torques that come late: steps in which it is sought and how many, ms; and from where on it is
-# no sensor's filter or bus, which `gap` names and weighs.
-LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 212, 0.04
+# Of torques that come late: steps in which it is sought and how many, ms; less than `LATE_S` is
+# within the timing of samples.
+LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 219, 0.004
 
 
 class Rows(NamedTuple):

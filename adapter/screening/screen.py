@@ -25,7 +25,14 @@ from adapter.screening.joint_readings import (
 from adapter.screening.motor_currents import in_words as currents_in_words
 from adapter.screening.motor_currents import torque_shares
 from adapter.screening.rows import pauses, stuck
-from adapter.screening.timing import RecordingClock, check_timing, put_forward, uniform, unwrapped
+from adapter.screening.timing import (
+    RecordingClock,
+    check_timing,
+    put_forward,
+    uniform,
+    unsaid,
+    unwrapped,
+)
 from adapter.screening.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.signals.matching import matching, most_moved
 from adapter.signals.source_clock import source_stamps
@@ -47,6 +54,7 @@ NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than th
 EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
 FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
 PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
+NAMED_LATE_S = 0.04  # of torques: what is less a sensor's filter makes, which `gap` names
 DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
@@ -90,7 +98,7 @@ class Judged:
     """The torques of a recording that passes.
 
     Attributes:
-        late_s: how much later than the motion they come; more than a sensor's filter or none.
+        late_s: how much later than the motion they come.
         model: of them, after corrections of a plausible size, by instants; None where unknown.
         doubts: what speaks against a recording that is trusted.
     """
@@ -126,7 +134,7 @@ class Judged:
 
         def told(piece: Log) -> Log:
             t = 1e-9 * (piece.stamp_ns - piece.stamp_ns[0])
-            missing = stuck(t, piece.dq, piece.tau)
+            missing = stuck(t, piece.dq, piece.tau) | unsaid(piece.tau)[:, None]
             if not missing.any():
                 return piece
             around = max(round(DDQ_S / max(float(np.median(np.diff(t))), 1e-9)), 1)
@@ -136,8 +144,7 @@ class Judged:
             model = torque_of(Rows(piece.q, piece.dq, ddq, piece.tau))
             return replace(piece, tau=np.where(missing, model, piece.tau))
 
-        unheard = (stuck(1e-9 * x.stamp_ns.astype(float), x.dq, x.tau).any() for x in log.pieces())
-        return log.changed(told) if any(unheard) else log
+        return log.changed(told) if any(map(_lacks_torques, log.pieces())) else log
 
 
 @dataclass(frozen=True)
@@ -186,6 +193,8 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     dead = silent(log, names)
     torque = judged(log, model, arm, (q, dq, ddq, tau), recorded if renamed else ())
     said = standing(names, moving, q, dq)
+    if abs(torque.late_s) < NAMED_LATE_S:
+        torque = replace(torque, late_s=0.0)
     return Screened(log, timing, moving, outside, said, dead + torque.notes, torque)
 
 
@@ -382,6 +391,11 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
                 f"motion, from {t[rows][0]:.2f} s on: left out."
             )
     return said
+
+
+def _lacks_torques(log: Log) -> bool:
+    t = 1e-9 * log.stamp_ns.astype(np.float64)
+    return bool(stuck(t, log.dq, log.tau).any() or unsaid(log.tau).any())
 
 
 def judge_torque(

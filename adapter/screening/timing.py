@@ -294,21 +294,29 @@ def _finite(*signals: Array) -> NDArray[np.bool_]:
 def possible(q: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
     """(m,) whether an arm makes these readings (m, n), told before any filter smears them.
 
-    Torques are not all exactly zero now and then where the arm holds its weight throughout (a
-    second publisher, bursts of a driver that had nothing to say), and no reading stands alone far
-    from those around it.
+    See `unsaid`; and no reading stands alone far from those around it.
     """
     if len(tau) < FEWEST_COMPARED:
         return np.ones(len(tau), dtype=bool)
-    dead = (tau == 0.0).all(axis=1)
-    holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10) if not dead.all() else 0.0
-    good = ~dead if holds > HELD_NM else np.ones(len(tau), dtype=bool)
+    good = ~unsaid(tau)
     for x in (q, dq, tau) if good.any() else ():
         apart = np.abs(x - median_filter(x, size=(AROUND, 1), mode="nearest"))
         low, high = np.percentile(x[good], (1, 99), axis=0)
         usual = np.median(apart[good], axis=0)
         good &= (apart <= np.maximum(SPIKE_TIMES * usual, SPIKE_SHARE * (high - low))).all(axis=1)
     return good
+
+
+def unsaid(tau: Array) -> NDArray[np.bool_]:
+    """(m,) where torques (m, n) are all exactly zero while the arm holds its weight throughout.
+
+    A second publisher shows them, and bursts of a driver that had nothing to say.
+    """
+    dead = (tau == 0.0).all(axis=1)
+    if not dead.any() or dead.all():
+        return np.zeros(len(tau), dtype=bool)
+    holds = np.percentile(np.abs(tau[~dead]).max(axis=1), 10)
+    return np.asarray(dead & (holds > HELD_NM))
 
 
 def _same(x: Array) -> NDArray[np.bool_]:

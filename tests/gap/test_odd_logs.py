@@ -16,7 +16,7 @@ from adapter.cli import main
 from adapter.errors import ModelWarning
 from adapter.gap.load import HandLoad, find_load
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.screen import RecordingRefused
+from adapter.screening.screen import RecordingRefused, check_torque
 from drivers.files.mcap import Log, McapWriter
 from sim.effects import payload, per_joint
 from tests.helpers.arm_data import Motion, arm, panda_model, record
@@ -78,10 +78,15 @@ def unheard(joint: int, begin: int, end: int) -> Log:
     return replace(base(), tau=tau)
 
 
+def late(by_ms: int) -> Log:
+    return replace(base().take(slice(by_ms, None)), tau=base().tau[: len(base()) - by_ms])
+
+
 UNHEARD = {
     "panda_joint2 never changes": lambda: unheard(1, 0, len(base())),
     "panda_joint5 never changes": lambda: unheard(4, 0, len(base())),
     "panda_joint4 stays the same for 2 s": lambda: unheard(3, 3000, 5000),
+    "come 80 ms after the motion": lambda: late(80),
 }
 ODD = {
     "pause of 1 s": lambda: without(3.0, 4.0),
@@ -124,11 +129,19 @@ def friction_of(name: str) -> tuple[dict[int, tuple[float, float]], set[str], st
 def test_a_torque_that_is_not_measured_costs_its_own_joint_and_time_alone(said: str) -> None:
     sizes, named, notes = friction_of(said)
     usual, as_ever, _ = friction_of("")
-    dead = int(said[11]) if "never" in said else 0
+    dead = int(said[11]) if "never" in said else None
     assert named == as_ever
     assert set(sizes) == set(usual) - {dead}
     assert all(abs(sizes[j][0] - usual[j][0]) < 3.0 * sizes[j][1] for j in sizes)
     assert said in notes
+
+
+@pytest.mark.parametrize("name", [*UNHEARD, "bursts of zeros"])
+def test_who_learns_is_given_torques_of_the_arm_alone(name: str) -> None:
+    log, _ = check_torque(ODD[name](), panda_model())
+    _, ours, theirs = np.intersect1d(log.stamp_ns, base().stamp_ns, return_indices=True)
+    off = np.sqrt(np.mean((log.tau[ours] - base().tau[theirs]) ** 2, axis=0))
+    assert len(log) > 0.95 * len(base()) and off.max() < 0.5
 
 
 WRONG = {
