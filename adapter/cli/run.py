@@ -204,7 +204,7 @@ def _ended(result: LiveResult) -> ExitCode:
     """How a run with results ended."""
     if result.fault:
         return ExitCode.ARM_FAILED
-    if not result.collected.learned:
+    if not result.collected.learned or result.collected.verdict.refusal:
         return ExitCode.NOTHING_LEARNED
     return ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
 
@@ -278,7 +278,9 @@ def _go(
             later.append(agree(args, driver, controller, duration_s, folder, stopped))
 
     aloud = display is None and not args.quiet
-    learner = learner_job(robot, config.pipeline, args.checkpoint, args.resume, aloud)
+    learner = learner_job(
+        robot, config.pipeline, args.checkpoint, args.resume, aloud, args.trust_log
+    )
     deadman = maybe_real and controller is not None
     safety, watching = config.safety, None
     if safety.watch_contacts or safety.stop_at_contact:
@@ -361,6 +363,7 @@ def _conclude(
             *front_end.messages,
             *result.troubles,
             *outcome.lam_notes,
+            *outcome.verdict.notes,
             *contact_lines(result.contacts, robot.tree.joint_names, front_end.start_s),
         ],
         start_s=front_end.start_s,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +101,37 @@ class Watch(Protocol):
         """Take states (m, size), known effects taken off, that were just learned from."""
 
 
+class TorqueVerdict(NamedTuple):
+    """Whether torques are those of the arm that is learned; see `adapter.gap.screen`.
+
+    Attributes:
+        judged: there was motion enough to tell.
+        refusal: why they are not, a sentence; None where nothing says so.
+        notes: what was said of them so far, a sentence each.
+    """
+
+    judged: bool = True
+    refusal: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """Whether what is learned from them may be called converged."""
+        return self.judged and self.refusal is None
+
+
+NOT_ASKED = TorqueVerdict()  # whoever gives the states has judged them
+
+
+class Screen(Protocol):
+    """What judges the states that a learner is given one by one; it changes none of them."""
+
+    verdict: TorqueVerdict
+
+    def __call__(self, state: Array) -> None:
+        """Take a state as it came, before it is learned from."""
+
+
 class OnlineLearner:
     """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
 
@@ -172,6 +203,7 @@ class OnlineLearner:
         self.theta_converged = False
         self.changes: list[Change] = []
         self.watch: Watch | None = None
+        self.screen: Screen | None = None
         self._since_update, self._states_per_update = 0, float(s.update_every)
         self._held = np.zeros((s.held_samples, self.layout.before_links.stop))
         self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
@@ -214,7 +246,14 @@ class OnlineLearner:
         Raises:
             ModelError: a record of another size.
         """
+        if self.screen is not None:
+            self.screen(state)
         return self.step_table(state[None]) == 1
+
+    @property
+    def verdict(self) -> TorqueVerdict:
+        """On the torques learned from."""
+        return NOT_ASKED if self.screen is None else self.screen.verdict
 
     def step_table(self, table: Array) -> int:
         """Add a table (m, size) of filtered states, then make one update of λ and θ.

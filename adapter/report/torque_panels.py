@@ -25,6 +25,7 @@ from adapter.report.style import (
     thin_rows,
     time_axis,
 )
+from adapter.report.words import refusal
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
 
@@ -54,8 +55,8 @@ def change_times(data: RunData) -> list[float]:
 
 
 def theta_started(data: RunData) -> bool:
-    """Whether θ was learned at all."""
-    return len(data.theta_trace) > 0 and len(data.score_trace) > 0
+    """Whether θ was learned at all, and from this arm's torques."""
+    return refusal(data.figures) is None and len(data.theta_trace) > 0 and len(data.score_trace) > 0
 
 
 def bodies_over_time(data: RunData, rows: Array) -> Array:

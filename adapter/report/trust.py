@@ -20,6 +20,7 @@ from adapter.report.words import (
     not_learned,
     number,
     quantity,
+    refusal,
     small,
     spread,
 )
@@ -47,6 +48,8 @@ def checks(data: RunData, worth: Worth) -> list[Check]:
     """All that the run allows, in the order in which they matter."""
     figures = data.figures
     found = [_unseen(data, worth), _left(data), _parameters(data), _frames(data)]
+    if why := refusal(figures):
+        found = [Check(BAD, "Torques of this arm", why)]
     found += [_learner(data), _new(figures), _feedforward(figures), _timing(figures)]
     found.append(_samples(figures))
     return [check for check in found if check is not None]
