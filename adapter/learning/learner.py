@@ -6,7 +6,7 @@ whose base's motion comes with each state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -123,15 +123,6 @@ class TorqueVerdict(NamedTuple):
 NOT_ASKED = TorqueVerdict()  # whoever gives the states has judged them
 
 
-class Screen(Protocol):
-    """What judges the states that a learner is given one by one; it changes none of them."""
-
-    verdict: TorqueVerdict
-
-    def __call__(self, state: Array) -> None:
-        """Take a state as it came, before it is learned from."""
-
-
 class OnlineLearner:
     """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
 
@@ -151,6 +142,8 @@ class OnlineLearner:
         theta_started_ns: stamp at which θ began; None before.
         rebuilds: times that θ's moments were rebuilt for a better λ.
         changes: at the hand, in order.
+        screen: judges the states that `step` is given, see `adapter.runs.live_screen`; verdict:
+            what it said last.
 
     Raises:
         SettingsError: no gravity for a base that rests, or effects without the model's arm.
@@ -203,7 +196,8 @@ class OnlineLearner:
         self.theta_converged = False
         self.changes: list[Change] = []
         self.watch: Watch | None = None
-        self.screen: Screen | None = None
+        self.screen: Callable[[Array], TorqueVerdict] | None = None
+        self.verdict = NOT_ASKED
         self._since_update, self._states_per_update = 0, float(s.update_every)
         self._held = np.zeros((s.held_samples, self.layout.before_links.stop))
         self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
@@ -247,13 +241,8 @@ class OnlineLearner:
             ModelError: a record of another size.
         """
         if self.screen is not None:
-            self.screen(state)
+            self.verdict = self.screen(state)
         return self.step_table(state[None]) == 1
-
-    @property
-    def verdict(self) -> TorqueVerdict:
-        """On the torques learned from."""
-        return NOT_ASKED if self.screen is None else self.screen.verdict
 
     def step_table(self, table: Array) -> int:
         """Add a table (m, size) of filtered states, then make one update of λ and θ.

@@ -11,16 +11,8 @@ import numpy as np
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.report.torque_panels import theta_started
-from adapter.report.words import (
-    NARROW,
-    is_live,
-    missed_words,
-    not_learned,
-    plus_minus,
-    quantity,
-    refusal,
-)
+from adapter.report.torque_panels import refusal, theta_started
+from adapter.report.words import NARROW, is_live, missed_words, not_learned, plus_minus, quantity
 from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
 from adapter.runs.run_folder import RunData
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from adapter.report.style import (
     thin_rows,
     time_axis,
 )
-from adapter.report.words import refusal
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, TORQUE_WINDOW_S, trailing_rms
 
@@ -52,6 +52,11 @@ def change_times(data: RunData) -> list[float]:
     """Times of the changes at the hand, s after the first motion."""
     changes = data.figures["theta"].get("changes") or []
     return [change["stamp_s"] - data.start_s for change in changes]
+
+
+def refusal(figures: Mapping[str, Any]) -> str | None:
+    """Why the torques of a live run are not its arm's, a sentence; None where nobody says so."""
+    return (figures.get("torques") or {}).get("refusal")
 
 
 def theta_started(data: RunData) -> bool:

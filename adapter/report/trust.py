@@ -11,7 +11,7 @@ import numpy as np
 from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.headline import Worth, against
-from adapter.report.torque_panels import SHARE_ALONE, theta_started
+from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
     count,
@@ -20,7 +20,6 @@ from adapter.report.words import (
     not_learned,
     number,
     quantity,
-    refusal,
     small,
     spread,
 )

@@ -101,11 +101,6 @@ def missed_words(figures: Mapping[str, Any]) -> str:
     )
 
 
-def refusal(figures: Mapping[str, Any]) -> str | None:
-    """Why the torques of a live run are not its arm's, a sentence; None where nobody says so."""
-    return (figures.get("torques") or {}).get("refusal")
-
-
 LEARNED_WITHIN_S = 2.0  # a load that was noticed so soon after it began is the same one
 
 

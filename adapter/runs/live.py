@@ -85,7 +85,7 @@ def learner_job(
 def collect_judged(learner: OnlineLearner) -> Outcome:
     """What there is to tell at the end, the torques judged by all the motion there was."""
     if isinstance(learner.screen, LiveScreen):
-        learner.screen.judge()
+        learner.verdict = learner.screen.judge()
     return collect(learner)
 
 
