@@ -68,6 +68,10 @@ class LiveTable:
             if key not in self._told:
                 self._told.add(key)
                 lines.append(disagreement(sentence(found, 0.0)))
+        for note in now.view.news.get("notes", []):
+            if note not in self._told:
+                self._told.add(note)
+                lines.append(f"warning: {note}")
         for line in lines:
             self._console.print(line, soft_wrap=True)
 

@@ -24,7 +24,7 @@ class ExitCode(IntEnum):
     NO_MEANS = 5, "the machine lacks the means"
     NOT_READY = 6, "the robot is not ready; the error says what to do"
     INCOMPLETE = 7, "samples are missing in the recording, all else is done"
-    NOTHING_LEARNED = 8, "no sample taught anything"
+    NOTHING_LEARNED = 8, "no sample taught anything, or the torques are not those of the arm"
     NOT_CONVERGED = 9, "there are results, but θ (what the links weigh) had not converged"
     INTERRUPTED = 130, "interrupted before there were results"
 

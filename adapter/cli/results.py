@@ -80,7 +80,7 @@ def conclude(
 
 def code_of(outcome: Outcome, usual: ExitCode = ExitCode.DONE) -> ExitCode:
     """How a run with results ends: `usual` where θ had converged, or something worse happened."""
-    if not outcome.learned:
+    if not outcome.learned or outcome.verdict.refusal:
         return ExitCode.NOTHING_LEARNED
     return usual if usual or outcome.theta_settled else ExitCode.NOT_CONVERGED
 

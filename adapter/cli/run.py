@@ -281,7 +281,9 @@ def _go(
             later.append(agree(args, driver, controller, duration_s, folder, stopped))
 
     aloud = display is None and not args.quiet
-    learner = learner_job(robot, config.pipeline, args.checkpoint, args.resume, aloud)
+    learner = learner_job(
+        robot, config.pipeline, args.checkpoint, args.resume, aloud, args.trust_log
+    )
     deadman = maybe_real and controller is not None
     safety, watching = config.safety, None
     if safety.watch_contacts or safety.stop_at_contact:
@@ -382,6 +384,7 @@ def _conclude(
             *front_end.messages,
             *result.troubles,
             *outcome.lam_notes,
+            *outcome.verdict.notes,
             *contact_lines(result.contacts, robot.tree.joint_names, front_end.start_s),
         ],
         start_s=front_end.start_s,

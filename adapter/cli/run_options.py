@@ -101,6 +101,11 @@ def declare(parser: argparse.ArgumentParser) -> None:
     add("--record", type=Path, metavar="FILE", help="default: in the results")
     add("--overwrite", action="store_true", help="replace an existing recording")
     add("--no-record", action="store_true", help="keep no recording")
+    add(
+        "--trust-log",
+        action="store_true",
+        help="torques are as the model has them: what speaks against it is a warning",
+    )
     add("--checkpoint", type=Path, metavar="FILE", help="keep the learner's state")
     add_learning(parser)
     parser.set_defaults(check=_check)

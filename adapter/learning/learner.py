@@ -6,9 +6,9 @@ whose base's motion comes with each state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +101,28 @@ class Watch(Protocol):
         """Take states (m, size), known effects taken off, that were just learned from."""
 
 
+class TorqueVerdict(NamedTuple):
+    """Whether torques are those of the arm that is learned; see `adapter.gap.screen`.
+
+    Attributes:
+        judged: there was motion enough to tell.
+        refusal: why they are not, a sentence; None where nothing says so.
+        notes: what was said of them so far, a sentence each.
+    """
+
+    judged: bool = True
+    refusal: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def good(self) -> bool:
+        """Whether what is learned from them may be called converged."""
+        return self.judged and self.refusal is None
+
+
+NOT_ASKED = TorqueVerdict()  # whoever gives the states has judged them
+
+
 class OnlineLearner:
     """Takes filtered states, keeps λ, θ and the effects. Deterministic; no clock, no I/O.
 
@@ -120,6 +142,8 @@ class OnlineLearner:
         theta_started_ns: stamp at which θ began; None before.
         rebuilds: times that θ's moments were rebuilt for a better λ.
         changes: at the hand, in order.
+        screen: judges the states that `step` is given, see `adapter.runs.live_screen`; verdict:
+            what it said last.
 
     Raises:
         SettingsError: no gravity for a base that rests, or effects without the model's arm.
@@ -172,6 +196,8 @@ class OnlineLearner:
         self.theta_converged = False
         self.changes: list[Change] = []
         self.watch: Watch | None = None
+        self.screen: Callable[[Array], TorqueVerdict] | None = None
+        self.verdict = NOT_ASKED
         self._since_update, self._states_per_update = 0, float(s.update_every)
         self._held = np.zeros((s.held_samples, self.layout.before_links.stop))
         self._held_from, self._held_to = 0, 0  # running numbers of the oldest and next row
@@ -214,6 +240,8 @@ class OnlineLearner:
         Raises:
             ModelError: a record of another size.
         """
+        if self.screen is not None:
+            self.verdict = self.screen(state)
         return self.step_table(state[None]) == 1
 
     def step_table(self, table: Array) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
-from adapter.report.torque_panels import theta_started
+from adapter.report.torque_panels import refusal, theta_started
 from adapter.report.words import NARROW, is_live, missed_words, not_learned, plus_minus, quantity
 from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
 from adapter.runs.run_folder import RunData
@@ -39,6 +39,9 @@ class Worth:
 
 def headline(data: RunData, worth: Worth) -> list[str]:
     """At most a handful of short sentences, what is worth most first."""
+    if why := refusal(data.figures):
+        said = f"Nothing was learned, since the torques are not those of this arm: {why}"
+        return [said, *_trouble(data.figures), *_late(data.figures)]
     found = [
         *_tracking(worth),
         *_torque(data, worth),
@@ -147,6 +150,8 @@ def _trouble(figures: Mapping[str, Any]) -> list[str]:
     said = [f"The run ended early: {fault}."] if fault else []
     if figures["theta"].get("started_s") is not None and not figures["theta"].get("settled", True):
         said.append("What the links weigh (θ) had not converged: do not use this model yet.")
+    if not (figures.get("torques") or {}).get("judged", True):
+        said.append("Too little moved to tell whether the torques are this arm's.")
     if new:
         said.append(
             f"Something new acts that the learned model does not hold: {new} "

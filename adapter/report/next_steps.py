@@ -10,7 +10,7 @@ from typing import Any
 
 from adapter.model.self_model import MJCF
 from adapter.report.headline import Worth
-from adapter.report.torque_panels import theta_started
+from adapter.report.torque_panels import refusal, theta_started
 from adapter.report.words import is_live, not_learned
 from adapter.report.worth import SLOW, slow_share
 from adapter.runs.run_folder import RunData
@@ -38,6 +38,9 @@ class Step:
 def next_steps(data: RunData, worth: Worth) -> list[Step]:
     """At most `MOST` steps; never none."""
     files = _Files(data)
+    if refusal(data.figures):
+        why = "Mend it in the driver or the model; a log is taken with what the sentence names"
+        return [Step(why, files.command("replay", *files.logs or ["LOG"]))]
     started = theta_started(data)
     found: list[Step | None] = []
     if _left_to_find(data, worth):

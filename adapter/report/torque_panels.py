@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -52,9 +53,14 @@ def change_times(data: RunData) -> list[float]:
     return [change["stamp_s"] - data.start_s for change in changes]
 
 
+def refusal(figures: Mapping[str, Any]) -> str | None:
+    """Why the torques of a live run are not its arm's, a sentence; None where nobody says so."""
+    return (figures.get("torques") or {}).get("refusal")
+
+
 def theta_started(data: RunData) -> bool:
-    """Whether θ was learned at all."""
-    return len(data.theta_trace) > 0 and len(data.score_trace) > 0
+    """Whether θ was learned at all, and from this arm's torques."""
+    return refusal(data.figures) is None and len(data.theta_trace) > 0 and len(data.score_trace) > 0
 
 
 def bodies_over_time(data: RunData, rows: Array) -> Array:

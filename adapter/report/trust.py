@@ -11,7 +11,7 @@ import numpy as np
 from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
 from adapter.report.headline import Worth, against
-from adapter.report.torque_panels import SHARE_ALONE, theta_started
+from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
     count,
@@ -47,6 +47,8 @@ def checks(data: RunData, worth: Worth) -> list[Check]:
     """All that the run allows, in the order in which they matter."""
     figures = data.figures
     found = [_unseen(data, worth), _left(data), _parameters(data), _frames(data)]
+    if why := refusal(figures):
+        found = [Check(BAD, "Torques of this arm", why)]
     found += [_learner(data), _new(figures), _feedforward(figures), _timing(figures)]
     found.append(_samples(figures))
     return [check for check in found if check is not None]

@@ -18,7 +18,8 @@ from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfMod
 from adapter.realtime.jobs import LearnerJob
 from adapter.realtime.snapshot import NEWS_BYTES, Snapshot
 from adapter.runs.config import PipelineSettings
-from adapter.runs.outcome import SHOWN_SHARE, changes_at, collect, in_parents
+from adapter.runs.live_screen import LiveScreen
+from adapter.runs.outcome import SHOWN_SHARE, Outcome, changes_at, collect, in_parents
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.terminal import json_ready, json_text
 from adapter.signals.records import LinkMotionKind
@@ -29,11 +30,16 @@ STD_EVERY = 50  # publications; the covariance behind the standard deviations ta
 
 
 def single_thread_learner(
-    documented: SelfModel, settings: PipelineSettings, resume: Path | None, aloud: bool = False
+    documented: SelfModel,
+    settings: PipelineSettings,
+    resume: Path | None,
+    aloud: bool = False,
+    trusted: bool = False,
 ) -> OnlineLearner:
     """A learner in a process of its own: torch on one thread, so that runs repeat bit for bit.
 
-    A monitor looks over its shoulder; `aloud`, it tells at once what it finds.
+    A monitor looks over its shoulder, and the screen of recordings judges the torques; `aloud`,
+    they tell at once what they find. `trusted` torques are not refused.
     """
     import torch
 
@@ -42,6 +48,7 @@ def single_thread_learner(
     delay_s = make_front_end(documented, settings).delay_s
     tool = None if documented.tool is None else documented.tool.theta()
     learner.watch = Monitor(documented.tree.n, tool, delay_s, tell if aloud else keep_quiet)
+    learner.screen = LiveScreen(documented, tell_doubt if aloud else keep_quiet, trusted)
     if resume is not None:
         load_checkpoint(learner, resume)
     return learner
@@ -53,6 +60,7 @@ def learner_job(
     checkpoint: Path | None = None,
     resume: Path | None = None,
     aloud: bool = False,
+    trusted: bool = False,
 ) -> LearnerJob:
     """The learner process of a live run; everything in it can be pickled.
 
@@ -60,23 +68,46 @@ def learner_job(
         checkpoint: where the learner's state is kept; resume: one to go on from.
         aloud: whether new disagreements are told on standard error when they are found; where a
             display says them (`news_of`), nobody else should.
+        trusted: torques that are not those of the model are learned all the same.
     """
     return LearnerJob(
-        make=partial(single_thread_learner, documented, settings, resume, aloud),
-        collect=collect,
+        make=partial(single_thread_learner, documented, settings, resume, aloud, trusted),
+        collect=collect_judged,
         publish=Publisher(),
         news=news_of,
-        save=None if checkpoint is None else partial(save_checkpoint, path=checkpoint),
+        save=None if checkpoint is None else partial(save_unrefused, path=checkpoint),
         keep=keep_learner,
         restore=restore_learner,
         effect_names=settings.learner.effects,
     )
 
 
+def collect_judged(learner: OnlineLearner) -> Outcome:
+    """What there is to tell at the end, the torques judged by all the motion there was."""
+    if isinstance(learner.screen, LiveScreen):
+        learner.verdict = learner.screen.judge()
+    return collect(learner)
+
+
+def save_unrefused(learner: OnlineLearner, path: Path) -> None:
+    """Keep a checkpoint, unless it holds torques of another arm. Raises OSError."""
+    if learner.verdict.refusal is None:
+        save_checkpoint(learner, path)
+
+
 def tell(line: str) -> None:
     """A line to standard error; a table on a terminal would run into it, and says it itself."""
+    _write(disagreement(line))
+
+
+def tell_doubt(line: str) -> None:
+    """The same of what is said against torques."""
+    _write(f"warning: {line}")
+
+
+def _write(line: str) -> None:
     with suppress(OSError):  # the terminal may be gone; the learner goes on
-        sys.stderr.write(f"{disagreement(line)}\n")
+        sys.stderr.write(f"{line}\n")
         sys.stderr.flush()
 
 
@@ -92,13 +123,14 @@ def keep_quiet(line: str) -> None:
 def keep_learner(learner: OnlineLearner, folder: Path) -> None:
     """Leave a learner and its monitor to a successor in an empty folder. Raises OSError."""
     save_checkpoint(learner, folder / KEPT_LEARNER, sync=False)
-    (folder / KEPT_MONITOR).write_bytes(pickle.dumps(learner.watch))
+    (folder / KEPT_MONITOR).write_bytes(pickle.dumps((learner.watch, learner.screen)))
 
 
 def restore_learner(learner: OnlineLearner, folder: Path) -> None:
     """Put a fresh learner into the state that its predecessor left in this private folder."""
     load_checkpoint(learner, folder / KEPT_LEARNER)
-    learner.watch = pickle.loads((folder / KEPT_MONITOR).read_bytes())
+    judges = pickle.loads((folder / KEPT_MONITOR).read_bytes())
+    learner.watch, learner.screen = judges
 
 
 class Publisher:
@@ -113,6 +145,7 @@ class Publisher:
         if self._std is None or self._calls % STD_EVERY == 0:
             self._std = self._deviations(learner)
         self._calls += 1
+        good = learner.verdict.good
         measured = learner.schema.kind == LinkMotionKind.MEASURED
         return Snapshot(
             lam=learner.schema.lam,
@@ -123,8 +156,8 @@ class Publisher:
             effects_std=self._std[2],
             effect_shapes=learner.theta.shapes,
             torque_std=np.sqrt(learner.theta.variance()),
-            lam_converged=learner.schema.converged,
-            theta_converged=learner.theta_converged,
+            lam_converged=good and learner.schema.converged,
+            theta_converged=good and learner.theta_converged,
             stamp_ns=learner.stamp_ns,
             learned=learner.learned,
             lambda_source=LAMBDA_MEASURED if measured else LAMBDA_REPRODUCED,
@@ -159,7 +192,8 @@ def news_of(learner: OnlineLearner) -> dict[str, Any]:
         "theta_started": learner.theta_started_ns is not None,
         "load": None if load is None else {**load, "since_s": changes[-1]["stamp_s"]},
         "changes_s": [change["stamp_s"] for change in changes],
-        "notes": list(learner.schema.notes),
+        "notes": [*learner.schema.notes, *learner.verdict.notes],
+        "refusal": learner.verdict.refusal,
         "refused": learner.refused,
         "findings": findings,
     }

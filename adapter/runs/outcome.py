@@ -13,7 +13,7 @@ from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
 from adapter.learning.batch.theta_filling import filled_theta, filled_words, told_basis
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
-from adapter.learning.learner import OnlineLearner
+from adapter.learning.learner import NOT_ASKED, OnlineLearner, TorqueVerdict
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -62,6 +62,7 @@ class Outcome:
         smoothing_s: how long the filter takes a step of torque.
         min_eigenvalue: smallest eigenvalue of any link's pseudo-inertia at any traced step.
         disagreements: what `adapter.gap.monitor` reported; None where nothing watched.
+        verdict: on the torques; where it is not good, nothing has converged.
     """
 
     learned: int
@@ -100,6 +101,7 @@ class Outcome:
     settings: LearnerSettings
     smoothing_s: float
     disagreements: tuple[dict[str, Any], ...] | None = None
+    verdict: TorqueVerdict = NOT_ASKED
 
 
 def in_parents(R0: Array, table: Array) -> Array:
@@ -124,7 +126,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         lam_covariance=in_parents(schema.R0, schema.covariance()),
         lam_identifiable=in_parents(schema.R0, schema.certain),
         lam_rank=round(float(np.einsum("jaa->", schema.certain))),
-        lam_converged=schema.converged,
+        lam_converged=schema.converged and learner.verdict.good,
         lam_measured=schema.kind == LinkMotionKind.MEASURED,
         lam_restarts=schema.check.restarts,
         lam_notes=tuple(schema.notes),
@@ -153,6 +155,7 @@ def collect(learner: OnlineLearner) -> Outcome:
         settings=learner.settings,
         smoothing_s=theta.smoothing_s,
         disagreements=None if learner.watch is None else tuple(learner.watch.reports),
+        verdict=learner.verdict,
     )
 
 
@@ -250,8 +253,12 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     showed as the documentation has it, which is said.
 
     Effects of the documented model that were not learned stay in it as they are; those that
-    ended with the recording they were found in are left out.
+    ended with the recording they were found in are left out. Where the torques were not the arm's
+    it is the documentation, which says so.
     """
+    if outcome.verdict.refusal is not None:
+        said = {"refusal": outcome.verdict.refusal, "theta_source": "documentation"}
+        return replace(documented, provenance={**provenance, **said})
     documented, bodies = with_bodies(documented), documented.tree.bodies
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE

@@ -143,7 +143,7 @@ def schema_score(
     last_turn, last_shift = frame_errors(completed.lam, reference.lam, freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
-        "converged_s": _since(start_s, at),
+        "converged_s": _since(start_s, at) if outcome.verdict.good else None,
         "rotation_error_rad": last_turn.tolist(),
         "position_error_m": last_shift.tolist(),
         "identifiable_rank": outcome.lam_rank,
@@ -259,7 +259,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     ours = trailing_rms(rows.time_s[early], rows.error[early] / noise, TORQUE_WINDOW_S)
     theirs = trailing_rms(rows.time_s[early], batch[early] / noise, TORQUE_WINDOW_S)
     at = settled_at(rows.time_s[early], ours <= TORQUE_GOAL * theirs)
-    score["converged_s"] = _since(start_s, at)
+    score["converged_s"] = _since(start_s, at) if outcome.verdict.good else None
     return score
 
 
@@ -311,6 +311,7 @@ def figures(
         "slow_s": course.slow_s,
         "lambda": schema_score(outcome, documented, reference, start_s),
         "theta": theta_score(outcome, documented, start_s),
+        "torques": {"judged": outcome.verdict.judged, "refusal": outcome.verdict.refusal},
         "disagreements": None if outcome.disagreements is None else list(outcome.disagreements),
         **more,
     }

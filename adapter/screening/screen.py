@@ -111,7 +111,7 @@ class Judged:
     def notes(self) -> list[str]:
         """What to know of them, a sentence each."""
         side = "after" if self.late_s > 0.0 else "before"
-        late = f"The torques come {1e3 * abs(self.late_s):.0f} ms {side} the motion: put in time."
+        late = f"The torques come {1e3 * abs(self.late_s):.0f} ms {side} the motion."
         return [*self.doubts, *([late] if self.late_s else [])]
 
     def in_time(self, log: Log) -> Log:
@@ -388,7 +388,7 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
         if rows.any() and name not in dead:
             said.append(
                 f"The torque of {name} stays the same for {np.diff(t)[rows[1:]].sum():.2g} s in "
-                f"motion, from {t[rows][0]:.2f} s on: left out."
+                f"motion, from {t[rows][0]:.2f} s on."
             )
     return said
 

@@ -314,6 +314,8 @@ def headline(view: View, states: tuple[str, str], tree: Tree) -> str:
         return "Ended"
     if view.push is not None and view.push.contact_joint is not None:
         return f"Contact: something pushes {tree.joint_names[view.push.contact_joint]}"
+    if view.news.get("refusal"):
+        return "The torques are not those of this arm: nothing is called converged"
     late = f"; the learner is {view.waiting} samples behind" if view.waiting > BEHIND else ""
     return progress(*states) + late
 

@@ -20,6 +20,7 @@ from websockets.typing import Subprotocol
 
 from adapter.cli.display import LiveTable, table_of
 from adapter.realtime.timing import Histogram
+from adapter.runs.live_screen import FIRST_S
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
 from adapter.view.foxglove_view import FoxgloveView, free_port
@@ -32,7 +33,7 @@ from tests.helpers.live_tools import PANDA
 from tests.helpers.robot_models import PANDA as PANDA_URDF
 from tests.helpers.viewed import TICK_NS, Seen, again, seen_run
 
-SECONDS = 4.0
+SECONDS = 5.5
 PROTOCOLS = [Subprotocol("foxglove.sdk.v1")]
 CONTACT = {"contact_joint": 3, "learned": True}
 FOUND = {
@@ -74,6 +75,8 @@ def test_the_course_of_a_run(course: list[Now], seen: Seen) -> None:
     assert course[0].headline == "Learning where the joints sit (λ)"
     assert np.isnan(course[0].residual).all() and course[0].joint_states[0] == "not learned yet"
     assert course[-2].headline == "Learning what the links weigh (θ); λ has converged"
+    early = [now for now in course if now.t_s < FIRST_S]
+    assert not any("converged" in f"{now.headline} {now.lam_state}" for now in early)
     assert course[-1].headline == "Ended: the planned time is over"
     lasted_s = 1e-9 * (stamp_of(seen.states[-1]) - stamp_of(seen.states[0]))
     assert abs(course[-1].t_s - lasted_s) < 0.2 and course[0].t_s < 0.2
