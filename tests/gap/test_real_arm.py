@@ -97,7 +97,7 @@ def test_friction_of_large_joints_is_told_once() -> None:
     """Twenty times a Panda's: its size is no reason to split it into two effects."""
     twin = draw_twin(704)
     large = {key: 20.0 * getattr(twin.friction, key) for key in ("coulomb", "viscous")}
-    log = by_pinocchio(replace(twin, friction=replace(twin.friction, **large))).log()
+    log = by_pinocchio(replace(twin, friction=replace(twin.friction, **large)))
     found = find_gap([log], documented())
     dry = [f for f in found.findings if f.effect in DRY]
     assert dry and len({f.joints for f in dry}) == len(dry)
@@ -111,7 +111,7 @@ def test_an_arm_at_rest_says_what_it_holds() -> None:
         theta = twin.nominal.theta.copy()
         theta[-1] += kg * np.array([1.0, 0.0, 0.0, 0.17, 0.03, 0.0, 0.0, 0.03, 0.0, 0.002])
         still = np.repeat(twin.q[:1], 3000, axis=0)
-        log = by_pinocchio(replace(twin, arm=replace(twin.arm, theta=theta), q=still)).log()
+        log = by_pinocchio(replace(twin, arm=replace(twin.arm, theta=theta), q=still))
         found = find_gap([log], documented())
         assert found.problem is not None and "too little motion" in found.problem
         assert [f.effect for f in found.findings] == [HELD.name] * (kg > 0.0)
