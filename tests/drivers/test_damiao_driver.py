@@ -472,16 +472,23 @@ def test_a_wrong_vmax_ends_the_run(opened):
         ticks(5000, arm, bus)
 
 
-def test_silent_motors_are_named_at_connect():
-    for silent, said in (
-        ({2, 5}, r"motors 3 \(id 0x03\), 6 \(id 0x06\) do not"),
-        (set(range(7)), "no motor"),
-    ):
-        bus = MotorBus(Bank())
-        bus.bank.silent |= silent
-        with pytest.raises(DriverError, match=said):
-            arm_on(bus)
-        bus.shutdown()
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda b: b.silent.update({2, 5}), r"motors 3 \(id 0x03\), 6 \(id 0x06\) do not"),
+        (lambda b: b.silent.update(range(7)), "no motor"),
+        (lambda b: b.registers[3].update({21: 0.0}), r"motor 4.*registers 21 to 23"),
+        (lambda b: b.registers[3].update({22: math.nan}), r"motor 4.*registers 21 to 23"),
+        (lambda b: b.registers[3].update({23: 1e9}), r"motor 4.*registers 21 to 23"),
+    ],
+    ids=["two silent", "all silent", "PMAX", "VMAX", "TMAX"],
+)
+def test_silent_motors_and_wrong_registers_are_named_at_connect(spoil, said):
+    bus = MotorBus(Bank())
+    spoil(bus.bank)
+    with pytest.raises(DriverError, match=said):
+        arm_on(bus)
+    bus.shutdown()
 
 
 def test_a_lost_frame_at_connect_is_asked_for_again(opened):
@@ -492,15 +499,6 @@ def test_a_lost_frame_at_connect_is_asked_for_again(opened):
     assert bus.bank.status == [1] * N
 
 
-def test_wrong_registers_are_refused():
-    for register, value in ((21, 0.0), (22, math.nan), (23, 1e9)):
-        bus = MotorBus(Bank())
-        bus.bank.registers[3][register] = value
-        with pytest.raises(DriverError, match=r"motor 4.*registers 21 to 23"):
-            arm_on(bus)
-        bus.shutdown()
-
-
 def test_a_time_out_of_a_former_run_is_cleared(opened):
     bus = MotorBus(Bank())
     bus.bank.status = [0xD] * N
@@ -508,11 +506,10 @@ def test_a_time_out_of_a_former_run_is_cleared(opened):
     assert bus.bank.status == [1] * N
 
 
-def test_states_of_use(moving):
-    arm = moving[0]
+def test_it_is_connected_once_and_again_after_its_end(moving):
+    arm, _ = moving
     with pytest.raises(DriverError, match="connected already"):
         arm.connect()
-    arm.close()
     arm.close()
     with pytest.raises(DriverError, match="not connected"):
         arm.read()

@@ -39,7 +39,7 @@ def documented() -> SelfModel:
 def fitted(twin: Twin) -> tuple[RealArm, list[int]]:
     """All that the arm of a twin may have, and the joints that move."""
     model = documented()
-    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin).log()
+    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
     screened = refuse(log, model, RigidArm.of(model))
     own = Recorded.of(screened.log, lateness(screened.timing))
     fit = nominal_fit([own], model, PRIOR, screened.timing.period_s)
@@ -86,7 +86,7 @@ def test_inertias_are_as_uncertain_as_the_data_allow() -> None:
 
 def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
     twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 2.0)
-    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin).log()
+    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
     found = find_gap([log], documented())
     (load,) = (f for f in found.findings if f.effect == HELD.name)
     assert abs(load.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * load.std["m"])
@@ -148,5 +148,5 @@ def test_friction_held_at_the_first_sample_is_forgotten_as_a_joint_slides() -> N
 def test_names_that_were_exchanged_in_vain_are_given_up() -> None:
     """The search of this log went to and fro between two fits with the same names, without end."""
     twin = draw_twin(5097)
-    found = find_gap([by_mujoco(twin).log()], documented())
+    found = find_gap([by_mujoco(twin)], documented())
     assert not any(f.effect in ("payload", "external_wrench") for f in found.findings)
