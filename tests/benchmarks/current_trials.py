@@ -2,11 +2,9 @@
 
     python tests/benchmarks/current_trials.py BAG URDF --per-ampere K1,...,K6
 
-BAG tells torques in N m; divided by the drives' N m/A these are the currents that `find_gap` sees.
-Least squares is Pinocchio's regressor with the same columns (inertias with a prior, Coulomb and
-viscous friction, motor inertia, offset), weighted by joint, on efforts times the same gains; both
-are scored by the recipe of `adapter.signals.validation`, written again here. The maker of the bag
-states 13.5841, 14.2959, 11.3716, 11.2408, 11.7681, 11.7682 (unisa-acg/inverse-dynamics-solver).
+BAG tells torques in N m; divided by the drives' N m/A (13.5841, 14.2959, 11.3716, 11.2408, 11.7681,
+11.7682 by its maker, unisa-acg/inverse-dynamics-solver) these are the currents `find_gap` sees.
+Least squares is Pinocchio's regressor with the same columns and weights, on efforts times gains.
 """
 
 from __future__ import annotations

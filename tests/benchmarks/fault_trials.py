@@ -2,9 +2,8 @@
 
     PYTHONPATH=. python tests/benchmarks/fault_trials.py --driver sim --trials 100
 
-Each trial is a short motion; counted is what must never be: a command beyond torque or torque rate,
-a reference beyond position, speed, acceleration or jerk, contact torque on a joint that is still
-above 0.15 of its effort limit (at least 1 N m) 0.15 s after the stop, a stop by a blockage that
+Counted is what must never be: a command or a reference beyond a limit, contact torque on a joint
+that is above 0.15 of its effort (at least 1 N m) 0.15 s after the stop, a stop by a blockage that
 names no joint. Ends with 1 if any was. Each second arm's model is trusted (`--trust-model`).
 """
 

@@ -1,11 +1,9 @@
 """What a fleet costs: processes against each other, the same work elsewhere, and a plan from it.
 
-Recordings of `--seconds` hold the documented Panda's torques with friction and noise. The same
-normal equations are made by a plain loop over Pinocchio's regressor with numpy; `mujoco.sysid`
-(extra `mujoco[sysid]`) fits the same parameters by simulating the recording over and over. The plan
-takes what a recording costs here and lets a fleet of machines do hours of them, with stragglers and
-machines that fail, by a simulation: whoever is free takes the next, and all results go through one
-process that keeps them. `make bench`.
+The same normal equations are made by a plain loop over Pinocchio's regressor; `mujoco.sysid` (extra
+`mujoco[sysid]`) fits the same parameters by simulating the recording over and over. The plan takes
+what a recording costs here and simulates a fleet of machines that do hours of them, with stragglers
+and machines that fail, and one process that keeps all results. `make bench`.
 """
 
 from __future__ import annotations

@@ -3,12 +3,9 @@
     python tests/benchmarks/long_logs.py [--seconds 60 300 600] [--every 1 50] [--gap] [--hidden]
         [--holds] [--seed 7] [--json FILE]
 
-A log is the documented Panda on a periodic motion of three sines a joint, with viscous and dry
-friction and the sensors' noise (`--seed`), written once as MCAP below `--folder`. With `--hidden`
-the hand picks up 1 kg after two thirds of the time (`--holds`: puts it down), something pushes it
-for 3 s after one third, and the friction of joint 3 rises by 0.3 N m over the whole; what `gap`
-says of these is printed beside the truth. Each command runs in a process of its own on one thread,
-numba's kernels compiled before. Processor time is the fair figure where a machine is shared.
+A log is that of `tests.helpers.long_arm`, written once as MCAP below `--folder`; what `gap` says of
+the changes that `--hidden` puts in is printed beside the truth. Each command runs in a process of
+its own on one thread, kernels compiled before; on a shared machine processor time is the fair one.
 """
 
 from __future__ import annotations

@@ -2,11 +2,9 @@
 
     python tests/benchmarks/servo_trials.py [--seeds 12] [--first 0] [--seconds 20]
 
-Each seed is a simulated Panda with its own servos (5 to 10 Hz), delay (1 to 8 ms), friction and
-armature, once as its documentation says and once with bodies 2 % off, every second one without
-the command's speed fed forward, read at 100 to 500 Hz with 0.01 to 0.1 mrad of noise. It is
-fitted on sines and foretells a motion from point to point; then its true servos are given as
-documentation, and nothing is to be named.
+Each seed is a simulated Panda with its own servos, delay, friction and armature, as documented and
+with bodies 2 % off. It is fitted on sines and foretells a motion from point to point; then its true
+servos are given as documentation, and nothing is to be named.
 """
 
 from __future__ import annotations

@@ -11,7 +11,6 @@ import json
 import os
 import time
 import traceback
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
@@ -20,6 +19,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from gap_trials import SIMULATORS as MAKERS
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.held_out import rms, rollout_errors
@@ -31,16 +31,7 @@ from adapter.model.self_model import SelfModel
 from adapter.simulate import SIMULATORS, Rollouts
 from drivers.files.mcap import Log
 from sim.hidden import Trial, draw
-from sim.hidden.record import pybullet_recording
-from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_oracle import second
-from tests.helpers.gap_tools import pinocchio_recording
-
-MAKERS: dict[str, Callable[[Trial], Log]] = {
-    "pybullet": pybullet_recording,
-    "mujoco": mujoco_recording,
-    "pinocchio": pinocchio_recording,
-}
 
 
 def true_model(trial: Trial) -> SelfModel:

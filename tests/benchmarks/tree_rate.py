@@ -2,11 +2,9 @@
 
     python tests/benchmarks/tree_rate.py [--robot atlas panda] [--json FILE]
 
-ATLAS (30 joints) and the Panda on a floating base (7) fall freely in simulation, several ten-second
-motions one after the other. Link motion is what gyroscopes and accelerometers show, no velocity;
-noise is that of signals behind a filter. Prints the median and 99th percentile of
-each part of a sample's work on one core, when λ had settled and θ began, and θ's torque error on
-a motion never learned from, over that of batch least squares on the same samples.
+ATLAS (30 joints) and the Panda on a floating base fall freely, seen by gyroscopes and
+accelerometers. Prints p50 and p99 of each part of a sample's work on one core, when λ had settled,
+and θ's torque error on a motion never learned from, over that of batch least squares.
 """
 
 from __future__ import annotations

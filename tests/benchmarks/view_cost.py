@@ -1,18 +1,11 @@
 """What being watched costs the loop: `PYTHONPATH=. python tests/benchmarks/view_cost.py`.
 
-One live run of the simulated Panda. Its time is cut into pairs of stretches: without the view (its
-process is stopped, the browser shows an empty page), and with it (the page is open in headless
-Chromium and drawn). The loop's own counts are read at the edges from the shared memory that the
-view reads, so both of a pair come from the same process within seconds. Which of a pair comes
-first alternates. `--whole N` adds N pairs of whole runs, with `--view` and a browser and without.
+One live run of the simulated Panda, cut into pairs of stretches: without the view (its process
+stopped, the browser on an empty page) and with it (drawn in headless Chromium); which comes first
+alternates. The loop's own counts are read at the edges. `--whole N` adds N pairs of whole runs.
 
-The view runs only where nobody else wants the processor. On a machine that is busy otherwise it
-hardly runs at all, and so costs nothing; `--awake` gives it ordinary priority, which it never has,
-so that it runs in full: what is then told is more than it ever costs.
-
-Told: p50 and p99 of a tick's compute (`loop_us`, without the simulated arm's physics) and of its
-lateness, over all stretches of a kind and as ratios by pair; processor time of the view process
-and of the browser; what the machine did beside.
+The view runs only where nobody else wants the processor, so that on a busy machine it costs
+nothing; `--awake` gives it ordinary priority, which it never has: more than it ever costs.
 """
 
 from __future__ import annotations
@@ -63,18 +56,9 @@ def live_run(
     seconds: float, folder: Path, view: bool
 ) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """`adapter run`, and where it can be watched ("" where it cannot)."""
-    command = [
-        sys.executable,
-        "-u",
-        "-m",
-        "adapter",
-        "run",
-        "--duration",
-        str(seconds),
-        "--seed",
-        "5",
-    ]
-    command += ["--quiet", "--out", str(folder), "--json", str(folder / "figures.json")]
+    command = [sys.executable, "-u", "-m", "adapter", "run", "--duration", str(seconds)]
+    command += ["--seed", "5", "--quiet"]
+    command += ["--out", str(folder), "--json", str(folder / "figures.json")]
     command += ["--view", "0"] if view else []
     run = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     try:

@@ -1,13 +1,9 @@
 """What the hardware drivers cost and lose, against simulated arms: `make bench`.
 
-`fci`: states read at 1 kHz from `adapter sim fci` in a process of its own, a busy Python thread
-beside the loop; age of a sample when the loop has it, processor time of the loop's `read` and of
-the reader process, and every id that did not come. Ids count the states sent, so a gap is a loss;
-the kernel's own drops (SO_RXQ_OVFL) and the milliseconds in which the machine kept the processor
-from the simulated robot are counted apart.
-
-`virtual`, `udp`: seven joints both ways at 1 kHz; processor time of `read` and `command`, without
-that of the simulated motors.
+`fci`: states at 1 kHz from `adapter sim fci`, a busy Python thread beside the loop; a sample's age,
+processor time of `read` and of the reader process, and every id that did not come, the kernel's
+drops and the milliseconds in which the machine stood still counted apart.
+`virtual`, `udp`: seven joints both ways at 1 kHz; processor time of `read` and `command`.
 """
 
 from __future__ import annotations

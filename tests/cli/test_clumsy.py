@@ -102,6 +102,7 @@ def _parser(command: str):
         ("run --set lniks=true", "did you mean links?"),
         ("run --driver pybulet:panda", "did you mean pybullet?"),
         ("run --fault lsot=0.1", "did you mean lost?"),
+        ("replay LOG --robot pnada", "did you mean panda?"),
         ("replay LOG --joints panda_jiont1", "did you mean panda_joint1?"),
         ("replay LOG --topic /joint_sates", "did you mean /joint_states?"),
         ("sim can --motors opnarm", "have: "),
@@ -109,8 +110,8 @@ def _parser(command: str):
     ],
 )
 def test_what_is_misspelt_is_guessed(line: str, said: str, here: Path, capsys) -> None:
-    log = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
-    assert said in refused(capsys, *(str(log) if w == "LOG" else w for w in line.split()))
+    words = (str(RECORDING) if word == "LOG" else word for word in line.split())
+    assert said in refused(capsys, *words)
 
 
 def test_nothing_alike_is_not_guessed() -> None:

@@ -147,20 +147,15 @@ def test_another_robot(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_flipped_sign(data: Path, tmp_path: Path) -> None:
     log = read_log(data / "one.mcap")
-    figures = gap(
-        tmp_path, data / "arm.urdf", [changed(data, tmp_path / "flipped.mcap", tau=-log.tau)]
-    )
+    path = changed(data, tmp_path / "flipped.mcap", tau=-log.tau)
+    figures = gap(tmp_path, data / "arm.urdf", [path])
     assert figures["exit"] == 2 and figures["findings"] == [] and figures["unexplained"] == []
     assert "sign" in figures["problem"] and figures["refused"] == "sign"
 
 
 def test_validate_from(data: Path, tmp_path: Path) -> None:
-    figures = gap(
-        tmp_path,
-        data / "arm.urdf",
-        [data / "one.mcap"],
-        *("--validate-from", 8.0, "--no-simulation", "--no-report"),
-    )
+    options = "--validate-from", 8.0, "--no-simulation", "--no-report"
+    figures = gap(tmp_path, data / "arm.urdf", [data / "one.mcap"], *options)
     assert figures["exit"] == 0
     assert coulomb_on_joint_4(figures) == pytest.approx(2.0, rel=0.05)
     assert figures["before"]["rollout_rmse_rad"] is None and "report" not in figures
@@ -171,12 +166,8 @@ def test_validate_from(data: Path, tmp_path: Path) -> None:
 
 
 def test_one_of_two_recordings_is_held_out(data: Path, tmp_path: Path) -> None:
-    figures = gap(
-        tmp_path,
-        data / "arm.urdf",
-        [data / "two.mcap"],
-        *("--hold-out", data / "one.mcap", "--no-simulation", "--no-report"),
-    )
+    options = "--hold-out", data / "one.mcap", "--no-simulation", "--no-report"
+    figures = gap(tmp_path, data / "arm.urdf", [data / "two.mcap"], *options)
     assert figures["exit"] == 0 and figures["recordings"] == ["two.mcap", "one.mcap"]
     assert coulomb_on_joint_4(figures) == pytest.approx(2.0, rel=0.05)
     log = read_log(data / "one.mcap")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -15,14 +14,14 @@ from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError
-from adapter.model.urdf import read_urdf
+from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
-PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
 READY = build("nominal").truth.ready
 PERIOD_NS, TICKS = 1_000_000, 1300

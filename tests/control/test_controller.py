@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,12 +13,12 @@ from adapter.control.limits import MotionLimits
 from adapter.control.sample_clock import SampleClock
 from adapter.control.settings import ExcitationSettings, SafetySettings
 from adapter.errors import ControlError, SettingsError
-from adapter.model.urdf import read_urdf
+from adapter.model.robots import documented
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
-PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
 READY = build("nominal").truth.ready
 MS = 1_000_000

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,12 +13,11 @@ from adapter.control.information import EFFECTS, Information
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.robots import documented
-from adapter.model.urdf import read_urdf
 from adapter.physics.identifiability import BODY_SIZE
 from sim.scenarios import build
 from tests.helpers.played import played
 
-PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
 READY = build("nominal").truth.ready
 TOLD = Information(PANDA)

@@ -12,7 +12,7 @@ from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import stamp_of
 from drivers.faults.driver import with_faults
 from drivers.files.log import LogArm
-from drivers.files.mcap import McapWriter
+from drivers.files.mcap import write_log
 from tests.helpers.arm_data import Motion, arm, panda_model, record
 from tests.helpers.fault_runs import FaultRun, clean_run, heard, run_faulty
 from tests.helpers.live_tools import simulated_arm
@@ -108,9 +108,7 @@ def test_a_jump_of_an_encoder_ends_the_run_with_the_last_good_parameters() -> No
 def listened(path, text: str) -> tuple[LockstepResult, FrontEnd, list[int]]:
     """A recording of a moving arm behind faults; the stamps of what would be learned, in ms."""
     front_end, learned = FrontEnd(panda_model()), []
-    with McapWriter(path, panda_model().tree.joint_names) as writer:
-        for sample in record(arm(), Motion(3.0, seed=1)).samples():
-            writer.write(sample)
+    write_log(record(arm(), Motion(3.0, seed=1)).log(), path, {})
     driver = with_faults(LogArm(path), text)
     result = run_lockstep(driver, front_end, Stamps(learned))
     assert result.ended == "end_of_stream"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from importlib import resources
 
 import numpy as np
 import pytest
@@ -16,13 +15,13 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.errors import ControlError, SettingsError
-from adapter.model.urdf import read_urdf
+from adapter.model.robots import documented
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.played import played
 
-PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+PANDA = documented("panda")
 LIMITS = MotionLimits.of(PANDA)
 DT = 2e-3
 READY = build("nominal").truth.ready

@@ -27,10 +27,7 @@ def samples_with(external: np.ndarray, begin_s: float, seed: int = 3) -> list[Jo
     data = record(arm(), Motion(4.0, seed, low_hz=0.1))
     tau = data.tau.copy()
     tau[round(1e3 * begin_s) :] -= external
-    return [
-        JointSample(int(t), q, dq, own)
-        for t, q, dq, own in zip(data.stamp_ns, data.q, data.dq, tau, strict=True)
-    ]
+    return replace(data, tau=tau).samples()
 
 
 def learned_observer() -> ContactObserver:
@@ -121,6 +118,13 @@ def test_what_is_no_number_changes_nothing() -> None:
     assert observer.contacts == []
 
 
+def kind_from_2s_on(observer: ContactObserver) -> Kind:
+    """Of the first contact, which must have begun then."""
+    contact, model = observer.contacts[0], panda_model()
+    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
+    return kind_of(contact, observer.frames, model.gravity, model.limits.effort)
+
+
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_a_load_is_no_push_aside(seed: int) -> None:
     """A body of 1 kg that hangs on the hand from 2 s on, by Pinocchio."""
@@ -129,21 +133,18 @@ def test_a_load_is_no_push_aside(seed: int) -> None:
     q, dq, ddq = data.true[:3]
     held = pin_model(truth, payload(1.0, (0.0, 0.02, 0.12)))
     more = rnea(held, q, dq, ddq) - rnea(pin_model(truth), q, dq, ddq)
-    model, observer = panda_model(), learned_observer()
+    observer = learned_observer()
     for k, stamp_ns in enumerate(data.stamp_ns):
         tau = data.tau[k] + (more[k] if k >= 2000 else 0.0)
         observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
-    contact = observer.contacts[0]
-    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
-    kind = kind_of(contact, observer.frames, model.gravity, model.limits.effort)
-    assert kind == Kind.LOAD
+    assert kind_from_2s_on(observer) == Kind.LOAD
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7])
 def test_a_push_aside_is_no_load(seed: int) -> None:
     """10 N along y of the base at the hand from 2 s on, by Pinocchio's Jacobian."""
     truth, data = pin_model(panda()), record(arm(), Motion(4.0, seed, low_hz=0.3))
-    scratch, model, observer = truth.createData(), panda_model(), learned_observer()
+    scratch, observer = truth.createData(), learned_observer()
     for k, stamp_ns in enumerate(data.stamp_ns):
         tau = data.tau[k].copy()
         if k >= 2000:
@@ -151,10 +152,7 @@ def test_a_push_aside_is_no_load(seed: int) -> None:
             turn = scratch.oMi[7].rotation.T @ np.array([0.0, 10.0, 0.0])
             tau -= jacobian[:3].T @ turn
         observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
-    contact = observer.contacts[0]
-    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
-    kind = kind_of(contact, observer.frames, model.gravity, model.limits.effort)
-    assert kind == Kind.PUSH
+    assert kind_from_2s_on(observer) == Kind.PUSH
 
 
 def test_friction_that_is_documented_and_learned_counts_once() -> None:

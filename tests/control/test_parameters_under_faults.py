@@ -1,15 +1,8 @@
 """The parameters after a run with faults are those of the run without, within their deviations.
 
-Compared are two runs of the simulated Panda, same motion, same sensor noise:
-
-* every θ: |with - without| at most two roots of the sum of both variances. Much of θ is not seen
-  by any torque, and its deviations are wide; therefore also
-* the torques that both predict on motion that neither has seen: rms of their difference over its
-  deviation at most 0.6 (two runs that differ in nothing but sensor noise: 0.5);
-* their errors against the true torque there: at most 1.6 times that of the run without faults;
-* λ, where it can be seen: as near as a bolt's play.
-
-The whole grid of faults and shares: `python -m tests.helpers.fault_runs`.
+Same motion, same sensor noise. Much of θ is not seen by any torque, and its deviations are wide:
+therefore the torques that both predict on unseen motion are compared too, and their errors against
+the true ones. The whole grid of faults and shares: `python -m tests.helpers.fault_runs`.
 """
 
 import pytest

@@ -17,8 +17,7 @@ from adapter.discovery.tree_search import TreeSearch, cycle
 from adapter.errors import ModelError, SettingsError
 from adapter.model.model_file import load_model
 from adapter.model.spatial import log_rotation, matrix_from_zxz
-from drivers.files.mcap import McapWriter
-from drivers.interface import LinkMotion
+from drivers.files.mcap import write_log
 from tests.helpers.discovery_data import Case, Motion, record, robot
 
 TRUSTED = 0.9
@@ -214,10 +213,7 @@ def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     case = _case("panda", Motion(seconds=2.0, rate_hz=RATE_HZ), 8)
     log = case.log
     assert log.twists is not None and log.accels is not None
-    with McapWriter(tmp_path / "log.mcap", log.joint_names, log.link_names) as writer:
-        for k, stamp in enumerate(log.stamp_ns.tolist()):
-            writer.write_joint_state(stamp, log.q[k], log.dq[k], log.tau[k])
-            writer.write_links(stamp, LinkMotion(log.twists[k], log.accels[k]))
+    write_log(log, tmp_path / "log.mcap", {})
     names = {key: str(tmp_path / key) for key in ("model.json", "figures.json")}
     arguments = ["--model", names["model.json"], "--json", names["figures.json"]]
     assert main(["discover", str(tmp_path / "log.mcap"), *arguments]) == 0

@@ -115,19 +115,18 @@ def test_a_cut_mcap_of_ros1_gives_what_it_has(tmp_path):
     assert np.array_equal(log.tau, motion.tau[: len(log)])
 
 
-@pytest.mark.parametrize("definition", ["no!at64[] effort", "other_msgs/Unknown x", "\x00"])
+RULE = "=" * 80
+# Any number of messages of no bytes would fit into one, and be walked over.
+NO_BYTES = [
+    f"{array} many\n{RULE}\nMSG: franka_msgs/Nothing\nfloat64[0] none\n"
+    for array in ("Nothing[100000000]", "Nothing[]", "Nothing[2]")
+]
+
+
+@pytest.mark.parametrize(
+    "definition", ["no!at64[] effort", "other_msgs/Unknown x", "\x00", *NO_BYTES]
+)
 def test_ros1_messages_whose_definition_is_none_are_refused(tmp_path, definition):
-    topics = {"/arm": ("franka_msgs/msg/FrankaState", Motion.of(7))}
-    path = write_ros1_mcap(tmp_path / "a.mcap", topics, SEVEN, definition)
-    with pytest.raises(DriverError, match=r"a\.mcap: .*/arm"):
-        read_log(path)
-
-
-@pytest.mark.parametrize("array", ["Nothing[100000000]", "Nothing[]", "Nothing[2]"])
-def test_ros1_messages_of_no_bytes_are_refused(tmp_path, array):
-    """Any number of them would fit into one message, and be walked over."""
-    rule = "=" * 80
-    definition = f"{array} many\n{rule}\nMSG: franka_msgs/Nothing\nfloat64[0] none\n"
     topics = {"/arm": ("franka_msgs/msg/FrankaState", Motion.of(7))}
     path = write_ros1_mcap(tmp_path / "a.mcap", topics, SEVEN, definition)
     with pytest.raises(DriverError, match=r"a\.mcap: .*/arm"):
@@ -141,27 +140,26 @@ def test_others_of_ros1_reach_the_reader_too(tmp_path):
     assert read_log(path, tuple(reversed(JOINTS))).joint_names == tuple(reversed(JOINTS))
 
 
+def whole_of(folder, kind, message=JOINT_STATE):
+    """The bytes of a bag in one file."""
+    topics = {"/joint_states": (message, Motion.of())}
+    if kind == "bag":
+        return write_ros1(folder / "whole.bag", topics).read_bytes()
+    return next(write_ros2(folder / "bag", topics).glob("*.db3")).read_bytes()
+
+
 @pytest.mark.parametrize("keep", [20, 100, 2000, 9000])
 @pytest.mark.parametrize("kind", ["bag", "db3"])
 def test_cut_bags_are_named(tmp_path, kind, keep):
-    topics = {"/joint_states": (JOINT_STATE, Motion.of())}
-    if kind == "bag":
-        whole = write_ros1(tmp_path / "whole.bag", topics)
-    else:
-        whole = next(write_ros2(tmp_path / "bag", topics).glob("*.db3"))
     path = tmp_path / f"cut.{kind}"
-    path.write_bytes(whole.read_bytes()[:keep])
+    path.write_bytes(whole_of(tmp_path, kind)[:keep])
     with pytest.raises(DriverError, match=rf"cut\.{kind}: "):
         read_log(path)
 
 
 @pytest.mark.parametrize("kind", ["bag", "db3"])
 def test_any_damage_ends_in_samples_or_a_sentence(tmp_path, kind):
-    topics = {"/joint_states": (KINDS[1] if kind == "db3" else JOINT_STATE, Motion.of())}
-    if kind == "bag":
-        whole = write_ros1(tmp_path / "whole.bag", topics).read_bytes()
-    else:
-        whole = next(write_ros2(tmp_path / "bag", topics).glob("*.db3")).read_bytes()
+    whole = whole_of(tmp_path, kind, KINDS[1] if kind == "db3" else JOINT_STATE)
     rng, path, read = np.random.default_rng(7), tmp_path / f"x.{kind}", 0
     for _ in range(40):
         data = bytearray(whole)

@@ -36,8 +36,12 @@ def ros1(path, compression, messages):
     writer = Ros1Writer(path)
     writer.chunk_threshold = 1
     writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    return filled(writer, path, ROS1, messages)
+
+
+def filled(writer, path, store, messages):
     with writer:
-        connection = writer.add_connection("/joint_states", JOINT_STATE, typestore=ROS1)
+        connection = writer.add_connection("/joint_states", JOINT_STATE, typestore=store)
         for i, message in enumerate(messages):
             writer.write(connection, 10**18 + i, message)
     return path
@@ -46,11 +50,7 @@ def ros1(path, compression, messages):
 def ros2(path, mode, messages, storage=StoragePlugin.SQLITE3):
     writer = Ros2Writer(path, version=9, storage_plugin=storage)
     writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connection = writer.add_connection("/joint_states", JOINT_STATE, typestore=ROS2)
-        for i, message in enumerate(messages):
-            writer.write(connection, 10**18 + i, message)
-    return path
+    return filled(writer, path, ROS2, messages)
 
 
 def base_of(path):

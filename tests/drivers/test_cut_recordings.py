@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -78,19 +79,21 @@ def test_kill_9_costs_at_most_a_second(tmp_path):
     assert not read_log(report.out).truncated
 
 
-def complete_chunks(path: Path) -> list[int]:
+def complete_chunks(content: bytes) -> list[int]:
     """Where the chunks of a file end."""
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
+    summary = make_reader(BytesIO(content)).get_summary()
     assert summary is not None
     return [c.chunk_start_offset + c.chunk_length for c in summary.chunk_indexes]
 
 
+@pytest.fixture(scope="module")
+def ends(whole) -> list[int]:
+    return complete_chunks(whole)
+
+
 @settings(max_examples=60, deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True))
-def test_a_cut_at_any_byte(whole, place, share):
-    place.write_bytes(whole)
-    ends = complete_chunks(place)
+def test_a_cut_at_any_byte(whole, ends, place, share):
     cut = int(share * len(whole))
     place.write_bytes(whole[:cut])
     held = sum(end <= cut for end in ends) * EVERY
@@ -121,7 +124,7 @@ def test_cut_files_of_others(tmp_path, compression, chunking, share):
 
 def test_the_readable_part_of_a_cut_chunk_is_read(tmp_path):
     path = record(tmp_path / "a.mcap", ITEMS, every=COUNT + 1)
-    (end,) = complete_chunks(path)
+    (end,) = complete_chunks(path.read_bytes())
     path.write_bytes(path.read_bytes()[: end - 20_000])
     log = read_log(path)
     assert len(log) > 0
@@ -165,21 +168,24 @@ def test_a_cut_index_loses_nothing(tmp_path, whole):
     assert "cut in its index; no message is lost" in log.warnings[0]
 
 
-def test_zeros_behind_the_cut(tmp_path, whole):
+def test_zeros_behind_the_cut(tmp_path, whole, ends):
     path = tmp_path / "a.mcap"
-    ends = complete_chunks(record(tmp_path / "b.mcap", ITEMS, EVERY, metadata={"version": "1"}))
     path.write_bytes(whole[: ends[1]] + bytes(100_000))
     log = read_log(path)
     assert len(log) == 2 * EVERY
     assert log.truncated
 
 
-def test_a_damaged_chunk_costs_only_itself(tmp_path, whole):
-    path = tmp_path / "a.mcap"
-    path.write_bytes(whole)
+def damaged(path: Path, whole: bytes, at: int, bits: int) -> Path:
+    """The recording with some bits of one byte flipped."""
     data = bytearray(whole)
-    data[complete_chunks(path)[1] - 500] ^= 0xFF
+    data[at] ^= bits
     path.write_bytes(data)
+    return path
+
+
+def test_a_damaged_chunk_costs_only_itself(tmp_path, whole, ends):
+    path = damaged(tmp_path / "a.mcap", whole, ends[1] - 500, 0xFF)
     log = read_log(path)
     assert len(log) == COUNT - EVERY
     assert "is damaged and was passed over" in log.warnings[0]
@@ -189,25 +195,15 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path, whole):
     assert recover(path).messages["/joint_states"] == COUNT - EVERY
 
 
-def test_a_damaged_first_chunk_costs_only_itself(tmp_path, whole):
+def test_a_damaged_first_chunk_costs_only_itself(tmp_path, whole, ends):
     """It alone defines the channels; the index repeats them."""
-    path = tmp_path / "a.mcap"
-    path.write_bytes(whole)
-    data = bytearray(whole)
-    data[complete_chunks(path)[0] - 500] ^= 0xFF
-    path.write_bytes(data)
+    path = damaged(tmp_path / "a.mcap", whole, ends[0] - 500, 0xFF)
     assert np.array_equal(read_log(path).tau, TORQUES[EVERY:])
 
 
 def test_a_damaged_length_costs_only_its_chunk(tmp_path, whole):
-    path = tmp_path / "a.mcap"
-    path.write_bytes(whole)
-    with path.open("rb") as file:
-        start = make_reader(file).get_summary().chunk_indexes[1].chunk_start_offset
-    data = bytearray(whole)
-    data[start + 4] ^= 0x01
-    path.write_bytes(data)
-    log = read_log(path)
+    start = make_reader(BytesIO(whole)).get_summary().chunk_indexes[1].chunk_start_offset
+    log = read_log(damaged(tmp_path / "a.mcap", whole, start + 4, 0x01))
     assert len(log) == COUNT - EVERY
     assert "damaged and were passed over" in log.warnings[0]
     assert not log.truncated

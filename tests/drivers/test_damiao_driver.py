@@ -4,6 +4,7 @@ import itertools
 import math
 import re
 import time
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.speed_check import SpeedCheck
 from drivers.damiao.timing import NOTHING, ArrivalClock, at_instant
 from drivers.interface import Driver, DriverError
-from tests.helpers.damiao_tools import LIMITS, Bank, MotorBus, reply_bytes, tick
+from tests.helpers.damiao_tools import LIMITS, Bank, MotorBus, reply_bytes, tick, ticks
 
 N = 7
 PHASE = np.arange(N)
+LOAD = np.full(N, 2.0)  # what carries the motors' load, N m
 STEPS = np.array(
     [[2 * most / top for most, top in zip(row, (65535, 4095, 4095), strict=True)] for row in LIMITS]
 )
@@ -32,55 +34,50 @@ def arm_on(bus, address="can://bench?interface=virtual", **options):
 
 
 @pytest.fixture
-def moving(monkeypatch):
-    """A listening driver and motors that move as `motion` says, in made-up time throughout."""
-    bus = MotorBus(Bank(motion=motion))
-    let_time_pass(bus, monkeypatch)
-    arm = arm_on(bus)
-    yield arm, bus
-    arm.close()
-    bus.shutdown()
+def opened(monkeypatch):
+    """Makes a driver on a bus whose made-up time passes for whoever sleeps; closes both."""
+    with ExitStack() as stack:
 
+        def made(bus, **options):
+            def sleep(seconds):
+                bus.clock.ns += int(1e9 * seconds)
 
-def let_time_pass(bus, monkeypatch):
-    """Whoever sleeps lets the bus's made-up time pass."""
+            monkeypatch.setattr(time, "sleep", sleep)
+            monkeypatch.setattr(time, "monotonic", lambda: 1e-9 * bus.clock.ns)
+            stack.callback(bus.shutdown)
+            arm = arm_on(bus, **options)
+            stack.callback(arm.close)
+            return arm, bus
 
-    def sleep(seconds):
-        bus.clock.ns += int(1e9 * seconds)
-
-    monkeypatch.setattr(time, "sleep", sleep)
-    monkeypatch.setattr(time, "monotonic", lambda: 1e-9 * bus.clock.ns)
+        yield made
 
 
 @pytest.fixture
-def driven(monkeypatch):
-    """A driver that may move its motors; whoever sleeps lets made-up time pass."""
-    bus = MotorBus(Bank())
-    let_time_pass(bus, monkeypatch)
-    arm = arm_on(bus, allow_motion=True)
-    yield arm, bus
-    arm.close()
-    bus.shutdown()
+def moving(opened):
+    """A listening driver and motors that move as `motion` says."""
+    return opened(MotorBus(Bank(motion=motion)))
+
+
+@pytest.fixture
+def driven(opened):
+    """A driver that may move its motors."""
+    return opened(MotorBus(Bank()), allow_motion=True)
 
 
 def test_it_is_a_driver(moving):
     arm: Driver = moving[0]
     assert arm.joint_names == tuple(f"joint{j}" for j in range(1, 8))
-    assert (arm.paced, arm.can_move, arm.adds_gravity, arm.period_ns) == (
-        False,
-        False,
-        False,
-        10**6,
-    )
+    assert not (arm.paced or arm.can_move or arm.adds_gravity)
+    assert arm.period_ns == 10**6
 
 
 def test_a_listener_changes_nothing(moving):
     arm, bus = moving
-    for _ in range(50):
-        tick(arm, bus)
+    ticks(50, arm, bus)
     assert {can_id for can_id, _ in bus.sent} == {0x7FF}
     assert {data[2] for _, data in bus.sent} == {0x33, 0xCC}
     assert bus.bank.status == [0] * N
+    assert arm.intake.commands is None
     with pytest.raises(DriverError, match="allow motion"):
         arm.command(np.zeros(N))
 
@@ -88,8 +85,7 @@ def test_a_listener_changes_nothing(moving):
 def test_samples_are_of_one_instant(moving):
     """Replies come 0.6 ms apart; the sample is what all joints did at its stamp."""
     arm, bus = moving
-    for _ in range(5):
-        tick(arm, bus)
+    ticks(5, arm, bus)
     errors, stamps = [], []
     for _ in range(1000):
         sample = tick(arm, bus)
@@ -101,9 +97,8 @@ def test_samples_are_of_one_instant(moving):
     assert (np.diff(stamps) > 0).all()
     assert (np.abs(errors).max(axis=0).T <= 1.01 * STEPS).all()  # truncation, nothing else
     assert (np.abs(errors.mean(axis=0).T) <= 0.53 * STEPS).all()
-    assert (
-        arm.intake.received == arm.intake.used == N * 1006
-    )  # the last tick is on its way, two rounds came before
+    # The last tick is on its way, two rounds came before.
+    assert arm.intake.received == arm.intake.used == N * 1006
     assert not arm.intake.refused
     assert not arm.intake.notes
 
@@ -151,8 +146,7 @@ def test_alignment_at_its_edges():
 
 def test_a_missing_reply_is_predicted_and_counted_as_lost(moving):
     arm, bus = moving
-    for _ in range(20):
-        tick(arm, bus)
+    ticks(20, arm, bus)
     dropped = iter(range(10**6))
     bus.keep = lambda can_id, data: can_id != 0x13 or next(dropped) % 10 != 0
     nans = 0
@@ -173,8 +167,7 @@ def test_a_missing_reply_is_predicted_and_counted_as_lost(moving):
 
 def test_a_longer_hole_is_nan_and_then_an_error_that_names_the_motor(moving):
     arm, bus = moving
-    for _ in range(20):
-        tick(arm, bus)
+    ticks(20, arm, bus)
     bus.bank.silent.add(2)
     seen = []
     with pytest.raises(DriverError, match=r"motor 3 \(id 0x03\) silent for 0.1 s"):
@@ -190,48 +183,38 @@ def test_a_longer_hole_is_nan_and_then_an_error_that_names_the_motor(moving):
 def test_commands_are_accounted_for_by_their_replies(driven):
     """Each seventh reply that is missing is a seventh of a command; windows are of 100."""
     arm, bus = driven
-    load = np.full(N, 2.0)
-    for _ in range(200):
-        tick(arm, bus, load)
+    ticks(200, arm, bus, LOAD)
     count = arm.intake.commands
     assert (count.sent, count.cut, count.holes) == (200, 0, 0)
     assert (count.success_min, count.success_mean) == (1.0, 1.0)
     every_other = itertools.count()
     bus.keep = lambda can_id, data: can_id != 0x13 or next(every_other) % 2 == 0
-    for _ in range(100):
-        tick(arm, bus, load)
+    ticks(100, arm, bus, LOAD)
     bus.keep = lambda can_id, data: True
-    for _ in range(100):
-        tick(arm, bus, load)
+    ticks(100, arm, bus, LOAD)
     assert count.success_min == pytest.approx(1 - 50 / (100 * N))
     assert count.success_mean == pytest.approx(1 - 50 / (399 * N))  # the last one's is to come
     assert count.holes == 0  # the motors had them all
-    tick(arm, bus, load, period_ns=6_000_000)
+    tick(arm, bus, LOAD, period_ns=6_000_000)
     tick(arm, bus, np.full(N, 1e3))
     assert (count.sent, count.cut, count.holes) == (402, 1, 1)
     assert count.longest_hole_ms == pytest.approx(6.0, abs=0.2)
     bus.refusing = 1  # the bus takes six of seven: no command, and a hole of two periods
-    tick(arm, bus, load)
-    tick(arm, bus, load)
+    tick(arm, bus, LOAD)
+    tick(arm, bus, LOAD)
     assert (count.sent, count.holes) == (403, 2)
     told = arm.intake.as_dict()["commands"]
     assert told["success_min"] == count.success_min and told["sent"] == 403
     assert "at worst 93 %" in count.line()
 
 
-def test_a_listener_has_no_commands_to_count(moving):
-    assert moving[0].intake.commands is None
-
-
 def test_late_replies_cost_one_sample_and_are_not_lost(moving):
     arm, bus = moving
-    for _ in range(20):
-        tick(arm, bus)
+    ticks(20, arm, bus)
     bus.spread_ns = 200_000  # motors 5 to 7 answer after the tick
     holes = sum(np.isnan(tick(arm, bus).tau).any() for _ in range(50))
     bus.spread_ns = 100_000
-    for _ in range(300):
-        sample = tick(arm, bus)
+    sample = ticks(300, arm, bus)
     assert holes == 1  # from then on the last tick's late reply comes after the stamp
     assert np.isfinite(sample.tau).all()
     arm.close()
@@ -266,14 +249,8 @@ def test_what_is_no_reply_is_refused_by_reason(moving):
     }
     assert intake.received == intake.used + sum(intake.refused.values())
     notes = " ".join(intake.notes)
-    for part in (
-        "no motor's",
-        "5 bytes",
-        "same reply id",
-        "another program",
-        "made the controller",
-    ):
-        assert part in notes
+    told = "no motor's", "5 bytes", "same reply id", "another program", "made the controller"
+    assert all(part in notes for part in told)
     assert len(intake.notes) == len(set(intake.notes)) <= 8
 
 
@@ -299,12 +276,10 @@ def test_bus_off_says_how_to_restart(moving):
 )
 def test_a_fault_ends_the_run_with_advice(driven, status, said):
     arm, bus = driven
-    for _ in range(3):
-        tick(arm, bus, np.full(N, 2.0))
+    ticks(3, arm, bus, LOAD)
     bus.bank.status[4] = status
     with pytest.raises(DriverError, match=rf"motor 5 \(id 0x05\) reports {said} \(status "):
-        for _ in range(6):
-            tick(arm, bus, np.full(N, 2.0))
+        ticks(6, arm, bus, LOAD)
     with pytest.raises(DriverError, match=said):
         arm_on(bus)
 
@@ -314,7 +289,7 @@ def test_a_single_alarm_is_refused_and_not_believed(driven):
     for k in range(60):
         bus.bank.status[4] = 0xE if k % 10 == 0 else 1
         bus.bank.temperatures[2] = (200, 30) if k % 10 == 5 else (40, 40)
-        tick(arm, bus, np.full(N, 2.0))
+        tick(arm, bus, LOAD)
     intake = arm.intake
     assert 3 <= intake.refused["unconfirmed_alarm"] <= 7
     assert intake.received == intake.used + sum(intake.refused.values())
@@ -322,27 +297,23 @@ def test_a_single_alarm_is_refused_and_not_believed(driven):
 
 def test_a_motor_that_lost_its_power_is_said(driven):
     arm, bus = driven
-    tick(arm, bus, np.full(N, 2.0))
+    tick(arm, bus, LOAD)
     bus.bank.status[1] = 0
     with pytest.raises(DriverError, match=r"motor 2 .* is disabled"):
-        for _ in range(6):
-            tick(arm, bus, np.full(N, 2.0))
+        ticks(6, arm, bus, LOAD)
 
 
 def test_temperatures_warn_and_then_stop(driven):
     arm, bus = driven
     bus.bank.temperatures[0] = (250, 251)  # below zero
-    for _ in range(3):
-        tick(arm, bus, np.full(N, 2.0))
+    ticks(3, arm, bus, LOAD)
     assert not any("deg C" in note for note in arm.intake.notes)
     bus.bank.temperatures[3] = (50, 85)
-    for _ in range(5):
-        tick(arm, bus, np.full(N, 2.0))
+    ticks(5, arm, bus, LOAD)
     assert sum("motor 4" in note and "85 deg C" in note for note in arm.intake.notes) == 1
     bus.bank.temperatures[3] = (50, 101)
     with pytest.raises(DriverError, match=r"motor 4.*101 deg C"):
-        for _ in range(6):
-            tick(arm, bus, np.full(N, 2.0))
+        ticks(6, arm, bus, LOAD)
 
 
 def test_connecting_enables_and_holds_and_saves_nothing(driven):
@@ -356,8 +327,7 @@ def test_connecting_enables_and_holds_and_saves_nothing(driven):
     np.testing.assert_allclose(sample.tau, 2.0, atol=0.1)  # what carries the load is known
     np.testing.assert_allclose(bus.bank.q, np.linspace(-0.6, 0.6, N), atol=0.02)  # it came back
     q0 = bus.bank.q.copy()
-    for _ in range(1500):
-        sample = tick(arm, bus)
+    sample = ticks(1500, arm, bus)
     np.testing.assert_allclose(sample.tau, 2.0, atol=0.1)
     np.testing.assert_allclose(bus.bank.q, q0, atol=0.01)
 
@@ -376,7 +346,7 @@ def test_commands_are_torques_clamped_to_tmax(driven):
 @pytest.mark.parametrize("wrong", [np.full(N, np.nan), [0, 0, 0, np.inf, 0, 0, 0], [0.0] * 6, 1.0])
 def test_a_wrong_command_sends_nothing(driven, wrong):
     arm, bus = driven
-    tick(arm, bus, np.full(N, 2.0))
+    tick(arm, bus, LOAD)
     sent = len(bus.sent)
     with pytest.raises(DriverError):
         arm.command(wrong)
@@ -385,16 +355,13 @@ def test_a_wrong_command_sends_nothing(driven, wrong):
 
 def test_a_full_queue_is_borne_for_some_ticks(driven):
     arm, bus = driven
-    for _ in range(5):
-        tick(arm, bus, np.full(N, 2.0))
+    ticks(5, arm, bus, LOAD)
     bus.refusing = 3 * N
-    for _ in range(10):
-        tick(arm, bus, np.full(N, 2.0))
+    ticks(10, arm, bus, LOAD)
     assert sum("Transmit buffer full" in note for note in arm.intake.notes) == 1
     bus.refusing = 10**6
     with pytest.raises(DriverError, match=r"nothing could be sent for 20 ticks.*txqueuelen"):
-        for _ in range(40):
-            tick(arm, bus, np.full(N, 2.0))
+        ticks(40, arm, bus, LOAD)
     bus.refusing = 0
 
 
@@ -422,8 +389,7 @@ def test_a_driven_arm_is_braked_and_held(driven):
 
 def test_a_jump_of_the_wall_clock_disturbs_nothing(moving):
     arm, bus = moving
-    for _ in range(10):
-        tick(arm, bus)
+    ticks(10, arm, bus)
     for jump_ns in (3_600_000_000_000, -7_200_000_000_000, 3_000_000, -2_000_000):
         bus.clock.wall_offset_ns += jump_ns  # between the replies' stamps and the batch
         for _ in range(20):
@@ -496,69 +462,54 @@ def speed_of(seed, factor, fast=False, duration_s=5.0):
     return None
 
 
-def test_a_wrong_vmax_ends_the_run(monkeypatch):
+def test_a_wrong_vmax_ends_the_run(opened):
     """The motor's register says 8, it scales with 10, as a DM4340 by another source's table."""
     limits = list(LIMITS)
     limits[2] = (12.5, 8.0, 28.0)
-    bus = MotorBus(Bank(motion=motion, limits=limits, encode=LIMITS))
-    let_time_pass(bus, monkeypatch)
-    arm = arm_on(bus)
+    arm, bus = opened(MotorBus(Bank(motion=motion, limits=limits, encode=LIMITS)))
     assert any("as no known type does" in note for note in arm.intake.notes)
     with pytest.raises(DriverError, match=r"joint3: its speed is 0.80 times.*about (10|9.99)\)"):
-        for _ in range(5000):
-            tick(arm, bus)
-    arm.close()
+        ticks(5000, arm, bus)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda b: b.silent.update({2, 5}), r"motors 3 \(id 0x03\), 6 \(id 0x06\) do not"),
+        (lambda b: b.silent.update(range(7)), "no motor"),
+        (lambda b: b.registers[3].update({21: 0.0}), r"motor 4.*registers 21 to 23"),
+        (lambda b: b.registers[3].update({22: math.nan}), r"motor 4.*registers 21 to 23"),
+        (lambda b: b.registers[3].update({23: 1e9}), r"motor 4.*registers 21 to 23"),
+    ],
+    ids=["two silent", "all silent", "PMAX", "VMAX", "TMAX"],
+)
+def test_silent_motors_and_wrong_registers_are_named_at_connect(spoil, said):
+    bus = MotorBus(Bank())
+    spoil(bus.bank)
+    with pytest.raises(DriverError, match=said):
+        arm_on(bus)
     bus.shutdown()
 
 
-def test_silent_motors_are_named_at_connect():
-    for silent, said in (
-        ({2, 5}, r"motors 3 \(id 0x03\), 6 \(id 0x06\) do not"),
-        (set(range(7)), "no motor"),
-    ):
-        bus = MotorBus(Bank())
-        bus.bank.silent |= silent
-        with pytest.raises(DriverError, match=said):
-            arm_on(bus)
-        bus.shutdown()
-
-
-def test_a_lost_frame_at_connect_is_asked_for_again(monkeypatch):
-    bus = MotorBus(Bank())
-    let_time_pass(bus, monkeypatch)
-    count = itertools.count()
+def test_a_lost_frame_at_connect_is_asked_for_again(opened):
+    bus, count = MotorBus(Bank()), itertools.count()
     bus.keep = lambda can_id, data: next(count) % 5 != 0
-    arm = arm_on(bus, allow_motion=True)
+    arm, _ = opened(bus, allow_motion=True)
     assert [(x.q_max, x.dq_max, x.tau_max) for x in arm.limits] == LIMITS
     assert bus.bank.status == [1] * N
-    arm.close()
-    bus.shutdown()
 
 
-def test_wrong_registers_are_refused():
-    for register, value in ((21, 0.0), (22, math.nan), (23, 1e9)):
-        bus = MotorBus(Bank())
-        bus.bank.registers[3][register] = value
-        with pytest.raises(DriverError, match=r"motor 4.*registers 21 to 23"):
-            arm_on(bus)
-        bus.shutdown()
-
-
-def test_a_time_out_of_a_former_run_is_cleared(monkeypatch):
+def test_a_time_out_of_a_former_run_is_cleared(opened):
     bus = MotorBus(Bank())
-    let_time_pass(bus, monkeypatch)
     bus.bank.status = [0xD] * N
-    arm = arm_on(bus, allow_motion=True)
+    opened(bus, allow_motion=True)
     assert bus.bank.status == [1] * N
-    arm.close()
-    bus.shutdown()
 
 
-def test_states_of_use(moving):
-    arm = moving[0]
+def test_it_is_connected_once_and_again_after_its_end(moving):
+    arm, _ = moving
     with pytest.raises(DriverError, match="connected already"):
         arm.connect()
-    arm.close()
     arm.close()
     with pytest.raises(DriverError, match="not connected"):
         arm.read()

@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 import tempfile
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from adapter.control.feedforward import ModelFeedforward
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.model.robots import documented
-from adapter.realtime.session import run_lockstep
+from adapter.realtime.session import LockstepResult, run_lockstep
 from adapter.signals.front_end import FrontEnd
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
@@ -26,43 +27,54 @@ from drivers.damiao.settings import BusSettings
 from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
-from sim.scenarios import build
+from sim.scenarios import Scenario, build
 
 PANDA = documented("panda")
 LIMITS = [Scales(12.5, 25.0, 100.0)] * 2
 
 
-def test_a_held_can_arm_is_stopped_and_the_push_goes(monkeypatch) -> None:
-    scenario = build("nominal", trouble={"held": [2], "t_s": 2.5})
-    line = Line()
-    boards = Boards(line.boards, scenario, now_ns=line.now_ns)
-    line.attach(boards)
-    monkeypatch.setattr(
-        holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
-    )
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    names = scenario.truth.joint_names
-    arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
-    driver = Lockstep(arm, line)
+@pytest.fixture
+def on_a_line(monkeypatch):
+    """Makes an arm on a line in lockstep, with its boards; sleeping lets the line's time pass."""
+    with ExitStack() as stack:
+
+        def made(scenario: Scenario) -> tuple[DamiaoArm, Lockstep, Boards]:
+            line = Line()
+            boards = Boards(line.boards, scenario, now_ns=line.now_ns)
+            stack.callback(boards.close)
+            line.attach(boards)
+            monkeypatch.setattr(
+                holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
+            )
+            clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+            names = scenario.truth.joint_names
+            arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
+            driver = Lockstep(arm, line)
+            stack.callback(driver.close)
+            return arm, driver, boards
+
+        yield made
+
+
+def excited(driver: Lockstep, seed: int, seconds: float, each) -> LockstepResult:
+    """What becomes of so much excitation."""
     controller = ExcitationController(
-        MotionLimits.of(PANDA), ExcitationSettings(seed=1), expected=ModelFeedforward.of(PANDA)
+        MotionLimits.of(PANDA), ExcitationSettings(seed=seed), expected=ModelFeedforward.of(PANDA)
     )
+    return run_lockstep(driver, FrontEnd(PANDA), None, controller, seconds, each=each)
+
+
+def test_a_held_can_arm_is_stopped_and_the_push_goes(on_a_line) -> None:
+    _, driver, boards = on_a_line(build("nominal", trouble={"held": [2], "t_s": 2.5}))
     obstacles, pushes = boards.world._engine.obstacles, []
-    result = run_lockstep(
-        driver,
-        FrontEnd(PANDA),
-        None,
-        controller,
-        4.0,
-        each=lambda sample, tau: pushes.append(np.abs(obstacles.torque).max()),
+    result = excited(
+        driver, 1, 4.0, lambda sample, tau: pushes.append(np.abs(obstacles.torque).max())
     )
     assert result.fault is not None and result.fault.startswith("joint 2 (panda_joint2) is ")
     assert max(pushes) > 20.0
     left = np.abs(obstacles.torque).max()
     assert left < 0.3 * max(pushes), (left, max(pushes))
     assert np.abs(boards.world.state()[2]).max() < 0.2
-    driver.close()
-    boards.close()
 
 
 def test_held_angles_come_after_an_arm_that_is_kept_away_but_slowly() -> None:
@@ -100,22 +112,9 @@ def test_the_guardian_finds_an_arm_that_is_pushed_although_it_stands(
     assert found[0] is None
 
 
-def test_a_free_arm_never_looks_pushed(monkeypatch) -> None:
+def test_a_free_arm_never_looks_pushed(on_a_line) -> None:
     """Turning points of 2 s of motion: standing joints, none pushed for a fifth of the time."""
-    scenario = build("nominal")
-    line = Line()
-    boards = Boards(line.boards, scenario, now_ns=line.now_ns)
-    line.attach(boards)
-    monkeypatch.setattr(
-        holding.time, "sleep", lambda s: line.advance_to(line.now_ns() + int(1e9 * s))
-    )
-    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
-    names = scenario.truth.joint_names
-    arm = DamiaoArm("can://line?interface=virtual", names, True, bus=line.host, **clocks)
-    driver = Lockstep(arm, line)
-    controller = ExcitationController(
-        MotionLimits.of(PANDA), ExcitationSettings(seed=3), expected=ModelFeedforward.of(PANDA)
-    )
+    arm, driver, _ = on_a_line(build("nominal"))
     watch, longest_s, still = None, 0.0, 0
 
     def look(sample, tau):
@@ -126,9 +125,7 @@ def test_a_free_arm_never_looks_pushed(monkeypatch) -> None:
         longest_s = max(longest_s, *watch._pushed_s)
         still += int((np.abs(sample.dq) < holding.STANDING).sum())
 
-    result = run_lockstep(driver, FrontEnd(PANDA), None, controller, 2.0, each=look)
-    driver.close()
-    boards.close()
+    result = excited(driver, 3, 2.0, look)
     assert result.fault is None and still > 300
     assert longest_s < 0.2 * holding.PUSH_S
 

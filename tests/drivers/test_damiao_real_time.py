@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import can
@@ -90,7 +91,7 @@ def served():
         yield f"can://{GROUP}:{port}?interface=udp_multicast&rate=200", bank
 
 
-LOOP = """
+BEGIN = """
 import sys, time
 import numpy as np
 from drivers.damiao.arm import DamiaoArm
@@ -98,7 +99,8 @@ from tests.helpers.patience import connect
 arm = DamiaoArm(sys.argv[1], allow_motion=True)
 connect(arm)
 print(arm.guardian_pid, flush=True)
-tau = 2.0
+"""
+LOOP = f"""{BEGIN}
 while True:
     sample = arm.read()
     arm.command(np.where(sample.dq < 0.4, 2.4, 1.95))
@@ -132,21 +134,30 @@ def gone(pid):
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-DISOBEYS = """
-import sys, time
-import numpy as np
-from drivers.damiao.arm import DamiaoArm
-from tests.helpers.patience import connect
-arm = DamiaoArm(sys.argv[1], allow_motion=True)
-connect(arm)
+DISOBEYS = f"""{BEGIN}
 arm._need_leave = lambda: None
-print(arm.guardian_pid, flush=True)
 while True:
     sample = arm.read()
     arm.carry(np.full(7, 2.0))
     arm.command(np.where(np.arange(7) == 1, 50.0, 2.0 - 0.5 * sample.dq))
     time.sleep(0.005)
 """
+
+
+@contextmanager
+def driving(*words):
+    """A loop in a process of its own, and the number of its guardian's; both end here."""
+    command = [sys.executable, "-c", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as loop:
+        guardian = int(loop.stdout.readline())
+        try:
+            yield loop, guardian
+        finally:
+            loop.kill()
+            loop.wait()
+            with suppress(ProcessLookupError):
+                os.kill(guardian, signal.SIGTERM)
+            ended(guardian)
 
 
 @needs_multicast
@@ -162,23 +173,13 @@ def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(serve
             pushed_s.append(time.monotonic())
 
     bank._take = note
-    loop = subprocess.Popen(
-        [sys.executable, "-c", DISOBEYS, address], stdout=subprocess.PIPE, text=True
-    )
-    guardian = int(loop.stdout.readline())
-    try:
+    with driving(DISOBEYS, address) as (loop, _):
         wait_for(lambda: pushed_s, "the loop pushes")
         wait_for(lambda: abs(bank.command[1][4]) < 5.0, "the guardian brakes the arm")
         assert loop.wait(10.0) == -signal.SIGKILL
         time.sleep(0.6)
         assert abs(bank.command[1][4]) < 5.0 and bank.status == [1] * N and not bank.limp
         assert np.abs(bank.dq).max() < 0.02
-    finally:
-        loop.kill()
-        loop.wait()
-        loop.stdout.close()
-        os.kill(guardian, signal.SIGTERM)
-        ended(guardian)
     said = capfd.readouterr().err
     assert "joint 2 (joint2) is pushed with +48.0 N m (limit 40.5 N m)" in said
     assert "goes on driving; it is ended" in said and "braked and held" in said
@@ -190,11 +191,7 @@ def test_the_guardian_ends_a_loop_that_pushes_a_held_arm_and_does_not_stop(serve
 @pytest.mark.parametrize("how", ["kill", "hang"])
 def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
     address, bank = served
-    loop = subprocess.Popen(
-        [sys.executable, "-c", LOOP, address, how], stdout=subprocess.PIPE, text=True
-    )
-    guardian = int(loop.stdout.readline())
-    try:
+    with driving(LOOP, address, how) as (loop, guardian):
         wait_for(lambda: bank.dq.min() > 0.3, "the loop drives the arm")
         q0 = bank.q.copy()
         if how == "kill":
@@ -210,11 +207,6 @@ def test_the_guardian_brakes_and_holds_when_the_loop_dies(served, how, capfd):
         assert bank.status == [1] * N
         os.kill(guardian, signal.SIGTERM)  # the operator has put something under the arm
         wait_for(lambda: bank.status == [0] * N, "the motors are switched off")
-    finally:
-        loop.kill()
-        loop.wait()
-        loop.stdout.close()
-        ended(guardian)
     assert "braked and held" in capfd.readouterr().err
 
 

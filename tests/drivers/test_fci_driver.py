@@ -70,18 +70,44 @@ def ids_until(arm, last):
     return got
 
 
+def patiently(condition, between=lambda: time.sleep(0.005)):
+    """Do something until a condition is true; it must come true in time."""
+    deadline = time.monotonic() + LIMIT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        between()
+
+
+def answer(arm, tau=TAU):
+    """Read and command."""
+    arm.read()
+    arm.command(tau)
+
+
 def drive(arm, until, tau=TAU):
     """Read and command until something is true."""
-    deadline = time.monotonic() + LIMIT_S
-    while not until():
-        assert time.monotonic() < deadline
-        arm.read()
-        arm.command(tau)
+    patiently(until, lambda: answer(arm, tau))
 
 
 def moving(arm, peer, tau=TAU):
     """A motion that has taken some commands."""
     drive(arm, lambda: len(peer.commands) >= 20 and peer.commands[-1][1] == tuple(tau), tau)
+
+
+@pytest.fixture
+def in_motion(peer, connected):
+    """(arm, peer) of a motion that has begun."""
+    arm = connected(peer, allow_motion=True)
+    moving(arm, peer)
+    return arm, peer
+
+
+@pytest.fixture
+def in_motion5(peer5, connected):
+    """The same of protocol 5 alone."""
+    arm = connected(peer5, allow_motion=True)
+    moving(arm, peer5)
+    return arm, peer5
 
 
 def exact(intake):
@@ -192,19 +218,18 @@ def test_a_handshake_that_is_none(peer5, answer, why):
         FciArm(peer5.address).connect()
 
 
-def test_another_kind_of_server(peer5):
-    peer5.connect_reply = lambda version, command_id: b"HTTP/1.1 400 Bad Request\r\n"
-    with pytest.raises(DriverError, match="is this an FCI port"):
-        FciArm(peer5.address).connect()
-
-
-def test_no_answer_and_a_hang_up(peer5, monkeypatch):
+@pytest.mark.parametrize(
+    ("answered", "why"),
+    [
+        (lambda peer: b"HTTP/1.1 400 Bad Request\r\n", "is this an FCI port"),
+        (lambda peer: None, "does not answer Connect"),
+        (lambda peer: peer.hang_up(), "hung up during the handshake"),
+    ],
+)
+def test_another_kind_of_server_none_and_a_hang_up(peer5, monkeypatch, answered, why):
     monkeypatch.setattr("drivers.fci.connect.REPLY_LIMIT_S", 0.2)
-    peer5.connect_reply = lambda version, command_id: None
-    with pytest.raises(DriverError, match="does not answer Connect"):
-        FciArm(peer5.address).connect()
-    peer5.connect_reply = lambda version, command_id: peer5.hang_up()
-    with pytest.raises(DriverError, match="hung up during the handshake"):
+    peer5.connect_reply = lambda version, command_id: answered(peer5)
+    with pytest.raises(DriverError, match=why):
         FciArm(peer5.address).connect()
 
 
@@ -295,10 +320,7 @@ def test_a_loop_that_was_away_gets_fresh_states_and_an_exact_account(peer5, conn
     first = quiet(arm, peer5)
     before = arm.intake.received
     peer5.streaming.set()
-    deadline = time.monotonic() + LIMIT_S
-    while peer5.message_id < first + 1500:  # more than are kept
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    patiently(lambda: peer5.message_id >= first + 1500)  # more than are kept
     sample = arm.read()
     assert time.monotonic_ns() - arm.arrived_ns < 600_000_000
     assert sample.stamp_ns > (first + 400) * 1_000_000
@@ -330,10 +352,7 @@ def test_a_killed_reader_is_replaced(peer5, connected):
     for _ in range(3):
         pid = arm.reader_pid
         os.kill(pid, signal.SIGKILL)
-        deadline = time.monotonic() + LIMIT_S
-        while arm.reader_pid == pid:
-            assert time.monotonic() < deadline
-            arm.read()
+        patiently(lambda old=pid: arm.reader_pid != old, arm.read)
         for _ in range(50):
             arm.read()
     last = quiet(arm, peer5)
@@ -346,10 +365,9 @@ def test_a_killed_reader_is_replaced(peer5, connected):
 
 
 @pytest.mark.parametrize("ready", [True, False])
-def test_a_spare_reader_takes_over_in_motion(peer, connected, ready):
+def test_a_spare_reader_takes_over_in_motion(in_motion, ready):
     """The motion goes on where the spare had started; where it dies as well, a new one is made."""
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+    arm, peer = in_motion
     pid, spare = arm.reader_pid, arm.spare_pid
     if not ready:
         os.kill(spare, signal.SIGKILL)
@@ -370,10 +388,7 @@ def test_a_reader_that_stands_still_is_replaced(peer5, connected):
     os.kill(pid, signal.SIGSTOP)
     for _ in range(100):
         arm.read()
-    deadline = time.monotonic() + LIMIT_S
-    while arm.reader_pid == pid:
-        assert time.monotonic() < deadline
-        arm.read()
+    patiently(lambda: arm.reader_pid != pid, arm.read)
     assert exact(arm.intake)
 
 
@@ -416,10 +431,7 @@ def test_the_reader_goes_when_its_driver_is_killed(peer5):
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
     driver.stdout.close()
-    deadline = time.monotonic() + LIMIT_S
-    while any(map(_alive, pids)):
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+    patiently(lambda: not any(map(_alive, pids)))
 
 
 def _alive(pid):
@@ -517,10 +529,9 @@ def test_a_motion_is_started_fed_and_finished(peer, connected):
     assert peer.modes[2] == 2
 
 
-def test_commands_are_accounted_for(peer, connected):
+def test_commands_are_accounted_for(in_motion):
     """A hole is a gap in the robot's ticks that we answered; shares are what the robot says."""
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+    arm, peer = in_motion
     last = quiet(arm, peer)
     arm.command(TAU)
     count = arm.intake.commands
@@ -528,8 +539,7 @@ def test_commands_are_accounted_for(peer, connected):
     for step, rate in (*[(1, 1.0)] * 100, (1, 0.9), (7, 0.5), (1, 0.9), (1, np.nan), (1, 1.0)):
         last += step
         peer.send(peer.state(last, rate=rate))
-        arm.read()
-        arm.command(TAU)
+        answer(arm)
     assert count.sent - sent == 105
     assert count.holes - holes == 1
     assert count.longest_hole_ms >= 7
@@ -544,23 +554,16 @@ def test_commands_wait_until_the_modes_show_the_motion(peer5, connected):
     arm = connected(peer5, allow_motion=True)
     quiet(arm, peer5)
     arm.command(TAU)
-    deadline = time.monotonic() + LIMIT_S
-    while peer5.modes[2] != 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    patiently(lambda: peer5.modes[2] == 2)
     base = peer5.message_id
     for k in range(1, 6):  # the robot has answered, its states still show no motion
         peer5.send(peer5.state(base + k, modes=(0, 3, 1)))
-        arm.read()
-        arm.command(TAU)
+        answer(arm)
     time.sleep(0.1)
     assert peer5.commands == []
     peer5.send(peer5.state(base + 6))
-    arm.read()
-    arm.command(TAU)
-    while not peer5.commands:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    answer(arm)
+    patiently(lambda: peer5.commands)
     assert [message_id for message_id, _, _ in peer5.commands] == [base + 6]
 
 
@@ -595,10 +598,9 @@ def test_a_command_answers_the_newest_state_with_what_was_accepted_there(
     peer5.send(peer5.state(base + 1, tau_d=(older,) * 7))
     if first:
         peer5.send(peer5.state(base + 2, tau_d=(newer,) * 7))
-        assert patiently(lambda: waits(arm, base + 2))
-    arm.read()
-    arm.command(np.full(7, sign * 9.0))
-    assert patiently(lambda: len(peer5.commands) > sent)
+        patiently(lambda: waits(arm, base + 2))
+    answer(arm, np.full(7, sign * 9.0))
+    patiently(lambda: len(peer5.commands) > sent)
     message_id, tau, _ = peer5.commands[sent]
     # A step counts from the command sent last, 3 N m, and from what was accepted.
     accepted = newer if first else older
@@ -612,30 +614,19 @@ def waits(arm, message_id):
     return start is not None and id_at(arm._connection.reader.data, start) == message_id
 
 
-def patiently(condition):
-    """Whether it comes true."""
-    deadline = time.monotonic() + LIMIT_S
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.005)
-    return True
-
-
-def test_stopping_brakes_a_moving_arm(peer5, connected):
-    arm = connected(peer5, allow_motion=True)
-    moving(arm, peer5)
-    before = len(peer5.commands)
-    peer5.dq = (0.5, -0.5, 0.5, -0.5, 1.0, -1.0, 1.0)
+def test_stopping_brakes_a_moving_arm(in_motion5):
+    arm, peer = in_motion5
+    before = len(peer.commands)
+    peer.dq = (0.5, -0.5, 0.5, -0.5, 1.0, -1.0, 1.0)
     begin = time.monotonic()
     arm.stop()
     assert time.monotonic() - begin < LIMIT_S
-    torques = np.array([tau for _, tau, _ in peer5.commands[before:]])
+    torques = np.array([tau for _, tau, _ in peer.commands[before:]])
     braking = torques[np.argmax(np.abs(torques).sum(axis=1))]
-    assert (np.sign(braking) == -np.sign(peer5.dq)).all()
+    assert (np.sign(braking) == -np.sign(peer.dq)).all()
     assert np.abs(np.diff(torques, axis=0)).max() <= 1.0
     assert np.abs(torques[-1]).max() < 1.0
-    assert peer5.commands[-1][2]
+    assert peer.commands[-1][2]
 
 
 @pytest.mark.parametrize(
@@ -671,9 +662,8 @@ def test_a_motion_that_never_starts(peer5, connected, monkeypatch):
         drive(arm, lambda: False)
 
 
-def test_a_reflex_names_its_reason(peer, connected):
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+def test_a_reflex_names_its_reason(in_motion):
+    arm, peer = in_motion
     peer.end_motion(4, fci_peer.REFLEX[peer.protocol], reflex=(25, 32))
     with pytest.raises(DriverError, match="reflex stopped") as error:
         drive(arm, lambda: False)
@@ -686,15 +676,13 @@ def test_a_reflex_names_its_reason(peer, connected):
         arm.command(TAU)
 
 
-def test_one_state_with_a_damaged_mode_ends_no_motion(peer, connected):
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+def test_one_state_with_a_damaged_mode_ends_no_motion(in_motion):
+    arm, peer = in_motion
     last = quiet(arm, peer)
     for modes in ((0, 3, 4), peer.modes, (0, 2, 2), peer.modes):  # every other one is damaged
         last += 1
         peer.send(peer.state(last, modes=modes))
-        arm.read()
-        arm.command(TAU)
+        answer(arm)
     for _ in range(2):
         last += 1
         peer.send(peer.state(last, modes=(0, 3, 4)))
@@ -711,9 +699,8 @@ def test_one_state_with_a_damaged_mode_ends_no_motion(peer, connected):
         (1, {5: 9, 10: 11}, "it aborted: look at Desk"),
     ],
 )
-def test_other_ends_of_a_motion(peer, connected, mode, statuses, why):
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+def test_other_ends_of_a_motion(in_motion, mode, statuses, why):
+    arm, peer = in_motion
     peer.end_motion(mode, statuses[peer.protocol])
     with pytest.raises(DriverError, match=why):
         drive(arm, lambda: False)
@@ -731,18 +718,16 @@ def test_a_reflex_and_a_user_stop_are_notes_while_only_reading(peer5, connected)
     assert "user stop pressed" in notes
 
 
-def test_a_robot_without_the_finish_flag_is_stopped_over_tcp(peer, connected):
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+def test_a_robot_without_the_finish_flag_is_stopped_over_tcp(in_motion):
+    arm, peer = in_motion
     peer.obeys_finish = False
     arm.stop()
     assert peer.requests[-1][0] == fci_peer.STOP_MOVE
     assert peer.modes == (0, 3, 1)
 
 
-def test_a_stop_that_nobody_confirms_ends_and_says_so(peer, connected):
-    arm = connected(peer, allow_motion=True)
-    moving(arm, peer)
+def test_a_stop_that_nobody_confirms_ends_and_says_so(in_motion):
+    arm, peer = in_motion
     peer.obeys_finish, peer.stop_status = False, None
     begin = time.monotonic()
     with pytest.raises(DriverError, match="press its user stop"):
@@ -751,29 +736,26 @@ def test_a_stop_that_nobody_confirms_ends_and_says_so(peer, connected):
     arm.stop()
 
 
-def test_a_stop_without_states_goes_over_tcp(peer5, connected):
-    arm = connected(peer5, allow_motion=True)
-    moving(arm, peer5)
-    peer5.pause()
+def test_a_stop_without_states_goes_over_tcp(in_motion5):
+    arm, peer = in_motion5
+    peer.pause()
     arm.stop()
-    assert peer5.requests[-1][0] == fci_peer.STOP_MOVE
+    assert peer.requests[-1][0] == fci_peer.STOP_MOVE
 
 
-def test_the_connection_cut_in_a_motion(peer5, connected):
-    arm = connected(peer5, allow_motion=True)
-    moving(arm, peer5)
-    peer5.hang_up()
+def test_the_connection_cut_in_a_motion(in_motion5):
+    arm, peer = in_motion5
+    peer.hang_up()
     with pytest.raises(DriverError, match="cut the connection"):
         drive(arm, lambda: False)
     arm.stop()
 
 
-def test_closing_stops_the_arm(peer5, connected):
-    arm = connected(peer5, allow_motion=True)
-    moving(arm, peer5)
+def test_closing_stops_the_arm(in_motion5):
+    arm, peer = in_motion5
     arm.close()
-    assert peer5.commands[-1][2]
-    assert peer5.modes == (0, 3, 1)
+    assert peer.commands[-1][2]
+    assert peer.modes == (0, 3, 1)
 
 
 # Thresholds and load

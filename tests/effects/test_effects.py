@@ -27,7 +27,7 @@ from adapter.physics.rigid_arm import RigidArm
 from sim.truth import panda
 from tests.helpers.arm_data import pin_model as truth_model
 from tests.helpers.arm_data import rnea
-from tests.helpers.robot_models import pin_model, pinocchio_case, random_urdf, relative, urdf_text
+from tests.helpers.robot_models import relative
 
 N, J = 7, 3  # joints; the one that most effects sit on, from 0
 PERIOD_S = 1e-3
@@ -95,43 +95,6 @@ def test_the_rigid_arm_is_pinocchios() -> None:
     assert relative(ARM.torque(Q, DQ, DDQ), RIGID) < 1e-9
     assert relative(ARM.regressor(Q, DQ, DDQ) @ ARM.theta.ravel(), RIGID) < 1e-9
     assert relative(sensed(), RIGID) < 1e-9
-
-
-@pytest.mark.parametrize("robot", ["panda", "lwr4", "tree5", "tree17", "two_arms"])
-def test_rigid_arms_of_any_shape(robot: str) -> None:
-    text = random_urdf(8, seed=3) if robot == "two_arms" else urdf_text(robot)
-    case = pinocchio_case(text, floating=False, samples=6, seed=2)
-    arm = RigidArm.of(case.model)
-    q, dq, ddq = (x.numpy() for x in (case.q, case.dq, case.ddq))
-    assert relative(arm.torque(q, dq, ddq), case.tau) < 1e-9
-    assert relative(arm.regressor(q, dq, ddq) @ arm.theta.ravel(), case.tau) < 1e-9
-    assert arm.torque(q[:0], dq[:0], ddq[:0]).shape == (0, arm.n)
-
-
-def test_wrench_torque_is_pinocchios_jacobian() -> None:
-    wrench = np.array([11.0, -7.0, 5.0, 0.6, -0.9, 1.3])
-    rows = slice(0, None, 50)
-    theirs = np.einsum("mij,i->mj", jacobians(Q[rows]), wrench)
-    assert relative(ARM.wrench_torque(Q[rows], wrench), theirs) < 1e-9
-
-
-def test_wrench_torque_on_a_tree_leaves_other_branches_alone() -> None:
-    text = urdf_text("tree17")
-    model = pinocchio_case(text, floating=False, samples=1).model
-    oracle = pin_model(text)
-    arm, rng = RigidArm.of(model), np.random.default_rng(0)
-    q = rng.uniform(-2, 2, (1, arm.n))
-    wrench = rng.normal(size=6)
-    data, there = oracle.createData(), pin.neutral(oracle)
-    order = [oracle.joints[oracle.getJointId(name)] for name in model.tree.joint_names]
-    for joint, angle in zip(order, q[0], strict=True):
-        at = slice(joint.idx_q, joint.idx_q + joint.nq)
-        there[at] = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
-    pin.computeJointJacobians(oracle, data, there)
-    last = oracle.getJointId(model.tree.joint_names[-1])
-    J6 = pin.getJointJacobian(oracle, data, last, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-    theirs = (J6.T @ wrench)[[joint.idx_v for joint in order]]
-    assert relative(arm.wrench_torque(q, wrench)[0], theirs) < 1e-9
 
 
 AT_JOINT = {

@@ -47,12 +47,18 @@ def carrying(*effects: dict[str, object], robot: str = "panda") -> SelfModel:
     return replace(read_quietly(urdf_text(robot), False), effects=effects)
 
 
+def apart(one: SelfModel, other: SelfModel) -> float:
+    """By how much their torques differ, relatively."""
+    moved = signals(one.tree.n)
+    return relative(ModelTorque(one)(*moved), ModelTorque(other)(*moved))
+
+
 @pytest.mark.parametrize("robot", ["panda", "lwr4"])
 def test_read_back_the_arm_takes_the_torque_of_the_model(robot: str) -> None:
     model = carrying(*BODIES, robot=robot)
     back = read_quietly(to_urdf(model), False)
+    assert apart(back, model) < 1e-9
     moved = signals(model.tree.n)
-    assert relative(ModelTorque(back)(*moved), ModelTorque(model)(*moved)) < 1e-9
     assert relative(ModelTorque(model)(*moved), RigidArm.of(model).torque(*moved)) > 1e-3
     assert {frame.name for frame in model.frames} < {frame.name for frame in back.frames}
 
@@ -85,11 +91,9 @@ def test_a_base_that_was_tilted_twice_stands_as_it_stands_in_the_model() -> None
         {"effect": "base_tilt", "joints": [], "parameters": {"rx": x, "ry": y}}
         for x, y in ((0.3, 0.0), (0.0, 0.4))
     ]
-    model, moved = carrying(*tilts), signals(7)
-    back = read_quietly(to_urdf(model), False)
-    assert relative(ModelTorque(back)(*moved), ModelTorque(model)(*moved)) < 1e-9
-    other = carrying(*tilts[::-1])
-    assert relative(ModelTorque(other)(*moved), ModelTorque(model)(*moved)) > 1e-3
+    model = carrying(*tilts)
+    assert apart(read_quietly(to_urdf(model), False), model) < 1e-9
+    assert apart(carrying(*tilts[::-1]), model) > 1e-3
 
 
 def test_friction_is_in_dynamics_and_nowhere_else_mentioned() -> None:
@@ -178,9 +182,7 @@ def test_a_load_without_inertia_is_part_of_the_link() -> None:
     text = to_urdf(model)
     (said,) = comments(text)
     assert "payload, m = 1.3 kg" in said and "the last link has it" in said
-    moved = signals(7)
-    back = read_quietly(text, False)
-    assert relative(ModelTorque(back)(*moved), ModelTorque(model)(*moved)) < 1e-9
+    assert apart(read_quietly(text, False), model) < 1e-9
 
 
 def test_gravity_that_is_not_upright_is_said() -> None:
@@ -194,8 +196,7 @@ def test_bodies_folded_into_the_model_take_the_same_torque() -> None:
     assert [e["effect"] for e in folded.effects] == ["encoder_offset"] + [
         e["effect"] for e in LOSSES
     ]
-    moved = signals(7)
-    assert relative(ModelTorque(folded)(*moved), ModelTorque(model)(*moved)) < 1e-12
+    assert apart(folded, model) < 1e-12
     assert with_bodies(folded) is folded
     floating = with_bodies(model.with_base(floating=True))
     np.testing.assert_array_equal(floating.theta[1:], folded.theta)

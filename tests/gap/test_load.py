@@ -19,7 +19,7 @@ from adapter.gap.load_words import as_json, robot_lines, sentence
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import rot_x
-from drivers.files.mcap import Log, McapWriter
+from drivers.files.mcap import Log, write_log
 from sim.effects import Effect, payload, per_joint
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, arm, panda_model, record
@@ -147,13 +147,9 @@ def test_every_robot_gets_its_numbers_in_its_order() -> None:
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, empty, load = logs(2, 0.02, Motion(3.0, 2))
-    paths = []
-    for name, one in (("log", log), ("empty", empty)):
-        paths.append(str(tmp_path / f"{name}.mcap"))
-        with McapWriter(Path(paths[-1]), one.joint_names) as writer:
-            for row in zip(one.stamp_ns.tolist(), one.q, one.dq, one.tau, strict=True):
-                writer.write_joint_state(*row)
-    command = ["load", paths[0], "--empty", paths[1]]
+    write_log(log, tmp_path / "log.mcap", {})
+    write_log(empty, tmp_path / "empty.mcap", {})
+    command = ["load", str(tmp_path / "log.mcap"), "--empty", str(tmp_path / "empty.mcap")]
     assert main([*command, "--json", "-"]) == 0
     said = capsys.readouterr()
     figures = json.loads(said.out)

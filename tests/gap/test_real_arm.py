@@ -39,7 +39,7 @@ def documented() -> SelfModel:
 def fitted(twin: Twin) -> tuple[RealArm, list[int]]:
     """All that the arm of a twin may have, and the joints that move."""
     model = documented()
-    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin).log()
+    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
     screened = refuse(log, model, RigidArm.of(model))
     own = Recorded.of(screened.log, lateness(screened.timing))
     fit = nominal_fit([own], model, PRIOR, screened.timing.period_s)
@@ -86,7 +86,7 @@ def test_inertias_are_as_uncertain_as_the_data_allow() -> None:
 
 def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
     twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 2.0)
-    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin).log()
+    log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
     found = find_gap([log], documented())
     (load,) = (f for f in found.findings if f.effect == HELD.name)
     assert abs(load.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * load.std["m"])
@@ -97,7 +97,7 @@ def test_friction_of_large_joints_is_told_once() -> None:
     """Twenty times a Panda's: its size is no reason to split it into two effects."""
     twin = draw_twin(704)
     large = {key: 20.0 * getattr(twin.friction, key) for key in ("coulomb", "viscous")}
-    log = by_pinocchio(replace(twin, friction=replace(twin.friction, **large))).log()
+    log = by_pinocchio(replace(twin, friction=replace(twin.friction, **large)))
     found = find_gap([log], documented())
     dry = [f for f in found.findings if f.effect in DRY]
     assert dry and len({f.joints for f in dry}) == len(dry)
@@ -111,7 +111,7 @@ def test_an_arm_at_rest_says_what_it_holds() -> None:
         theta = twin.nominal.theta.copy()
         theta[-1] += kg * np.array([1.0, 0.0, 0.0, 0.17, 0.03, 0.0, 0.0, 0.03, 0.0, 0.002])
         still = np.repeat(twin.q[:1], 3000, axis=0)
-        log = by_pinocchio(replace(twin, arm=replace(twin.arm, theta=theta), q=still)).log()
+        log = by_pinocchio(replace(twin, arm=replace(twin.arm, theta=theta), q=still))
         found = find_gap([log], documented())
         assert found.problem is not None and "too little motion" in found.problem
         assert [f.effect for f in found.findings] == [HELD.name] * (kg > 0.0)
@@ -148,5 +148,5 @@ def test_friction_held_at_the_first_sample_is_forgotten_as_a_joint_slides() -> N
 def test_names_that_were_exchanged_in_vain_are_given_up() -> None:
     """The search of this log went to and fro between two fits with the same names, without end."""
     twin = draw_twin(5097)
-    found = find_gap([by_mujoco(twin).log()], documented())
+    found = find_gap([by_mujoco(twin)], documented())
     assert not any(f.effect in ("payload", "external_wrench") for f in found.findings)

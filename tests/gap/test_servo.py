@@ -16,7 +16,7 @@ from adapter.gap.servo import explain
 from adapter.gap.servo_kernels import Load, follow_alone
 from adapter.gap.servo_model import ServoModel, read_servos
 from adapter.screening.screen import RecordingRefused
-from drivers.files.mcap import McapWriter, read_position_log
+from drivers.files.mcap import Log, read_position_log, write_log
 from tests.helpers.position_arm import (
     Drawn,
     PositionArm,
@@ -156,9 +156,9 @@ def test_what_does_not_belong_to_such_a_recording_is_refused(recorded, tmp_path,
     assert main([*words, "--tau-gain", "2"]) == 2
     assert "--tau-gain: for recordings with torques" in capsys.readouterr().err
     torque = tmp_path / "torque.mcap"
-    with McapWriter(torque, PANDA.tree.joint_names) as writer:
-        for k in range(20):
-            writer.write_joint_state(10**6 * k, *np.full((3, 7), 0.1 + 0.01 * k))
+    signals = np.tile(0.1 + 0.01 * np.arange(20)[:, None], 7)
+    log = Log(torque, PANDA.tree.joint_names, 10**6 * np.arange(20), *[signals] * 3)
+    write_log(log, torque, {})
     assert read_position_log(torque) is None
     assert main([*words, "--hold-out", str(torque)]) == 2
     assert "give recordings of one kind" in capsys.readouterr().err

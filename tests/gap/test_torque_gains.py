@@ -18,8 +18,7 @@ from adapter.screening.screen import RecordingRefused, check_torque, refuse
 from adapter.signals.importer import ImportSpec, table_log
 from adapter.signals.matching import matching
 from adapter.signals.told import Told
-from drivers.files.mcap import Log, McapWriter, read_log
-from drivers.interface import JointSample
+from drivers.files.mcap import Log, read_log, write_log
 from tests.benchmarks.lambda_trials import robots_folder
 from tests.helpers.driven_arm import JOINTS, LOAD_KG, currents, driven_arm, six_joints
 
@@ -170,9 +169,7 @@ def test_options_that_mean_nothing(command: str, options: list[str], said: str, 
 def test_commands_refuse_currents(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     log = currents(driven_arm(0), 0, 6.0)
     path = tmp_path / "amperes.mcap"
-    with McapWriter(path, log.joint_names) as file:
-        for row in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
-            file.write(JointSample(*row))
+    write_log(log, path, {})
     assert main(["info", str(path), "--robot", "panda"]) == 0
     assert "looks like motor current" in " ".join(capfd.readouterr().out.split())
     for arguments in (["gap", str(path), "--model", "panda"], ["replay", str(path)]):

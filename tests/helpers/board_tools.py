@@ -150,6 +150,16 @@ def rig(*args, **more):
         opened.close()
 
 
+@contextmanager
+def two_buses(channel: str):
+    """Both ends of a virtual bus."""
+    with (
+        can.Bus(interface="virtual", channel=channel) as near,
+        can.Bus(interface="virtual", channel=channel) as far,
+    ):
+        yield near, far
+
+
 def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("", 0))

@@ -64,6 +64,12 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     return links.ids
 
 
+def text_of(page: str) -> str:
+    """What a reader sees, with plain spaces."""
+    text = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.S)
+    return re.sub(r"\s+", " ", html.unescape(text).replace("\u2060", ""))
+
+
 def need_chromium() -> None:
     """Skip the test where there is no Chromium, which CI must have."""
     if not CHROMIUM.exists():
@@ -122,6 +128,14 @@ def screenshot(
         f"--screenshot={picture}",
     )
     return picture.read_bytes(), [x for x in done.stderr.splitlines() if "CONSOLE" in x]
+
+
+def shown_without_complaint(page: str, folder: Path, least: int, *how: Any) -> None:
+    """Assert that Chromium shows a page, in more than so many bytes of PNG, and says nothing."""
+    picture, complaints = screenshot(page, folder, *how)
+    assert complaints == []
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) > least  # more than an empty page
 
 
 def _chromium(page: str, folder: Path, *options: str) -> subprocess.CompletedProcess[str]:

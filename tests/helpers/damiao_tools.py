@@ -184,6 +184,13 @@ def tick(arm, bus, tau=None, period_ns=1_000_000):
     return sample
 
 
+def ticks(count, arm, bus, tau=None):
+    """So many of them; the last sample."""
+    for _ in range(count):
+        sample = tick(arm, bus, tau)
+    return sample
+
+
 class Served:
     """Motors in a thread behind a python-can bus, in real time. Use as a context manager."""
 

@@ -22,7 +22,7 @@ from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.signals.front_end import FrontEnd
 from drivers.faults.driver import FaultyDriver, with_faults
 from drivers.files.log import LogArm
-from drivers.files.mcap import McapWriter
+from drivers.files.mcap import write_log
 from drivers.interface import Driver
 from tests.helpers.arm_data import Motion, arm, model_torque, panda_model, record, rms
 from tests.helpers.live_tools import simulated_arm
@@ -110,9 +110,7 @@ def clean_run(seconds: float) -> FaultRun:
 def _recording(seconds: float) -> LogArm:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "motion.mcap"
-        with McapWriter(path, panda_model().tree.joint_names) as writer:
-            for sample in record(arm(), Motion(seconds, SEED)).samples():
-                writer.write(sample)
+        write_log(record(arm(), Motion(seconds, SEED)).log(), path, {})
         return LogArm(path)
 
 

@@ -14,6 +14,8 @@ import pinocchio as pin
 
 from sim.effects import Effect
 from sim.truth import Truth
+from tests.helpers.arm_data import pin_model
+from tests.helpers.arm_data import rnea as rnea_of_model
 
 Array = np.ndarray
 PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
@@ -22,23 +24,9 @@ PAD = 2000  # samples before and after a recording, for its spectrum
 PUSH_SPEED = 0.01  # rad/s, below it the motor doesn't push in full
 
 
-def pin_model(truth: Truth) -> pin.Model:
-    """A Pinocchio model built joint by joint from the truth's numbers alone."""
-    model = pin.Model()
-    model.gravity.linear = truth.gravity
-    parent = 0
-    for j, name in enumerate(truth.joint_names):
-        parent = model.addJoint(parent, pin.JointModelRZ(), pin.SE3(truth.R[j], truth.p[j]), name)
-        body = pin.Inertia.FromDynamicParameters(truth.theta[j][PIN_ORDER])
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
-    return model
-
-
-def rnea(truth: Truth, q: Array, dq: Array, ddq: Array) -> Array:
+def rnea(truth: Truth, *motion: Array) -> Array:
     """Rigid-body torques (m, n)."""
-    model = pin_model(truth)
-    data = model.createData()
-    return np.array([pin.rnea(model, data, *row) for row in zip(q, dq, ddq, strict=True)])
+    return rnea_of_model(pin_model(truth), *motion)
 
 
 def regressor(truth: Truth, q: Array, dq: Array, ddq: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
-from adapter.model.urdf import read_urdf
+from adapter.model.robots import documented
 from adapter.realtime.jobs import RecordingJob
 from adapter.realtime.loop import LiveOptions
 from adapter.realtime.shared import SharedBlock
@@ -36,7 +35,7 @@ from tests.helpers.live_learners import (  # noqa: F401  # these are the tests' 
     save_count,
 )
 
-PANDA = read_urdf(resources.files("adapter") / "model" / "robots" / "panda.urdf")
+PANDA = documented("panda")
 
 
 def simulated_arm(seed: int = 5, scenario: str = "nominal") -> PyBulletArm:

@@ -61,7 +61,7 @@ def random_urdf(links: int, seed: int) -> str:
     return '<robot name="random">\n' + "\n".join(parts) + "\n</robot>"
 
 
-def _text(values: np.ndarray) -> str:
+def text_of(values: np.ndarray) -> str:
     return " ".join(repr(float(v)) for v in values)
 
 
@@ -73,7 +73,7 @@ def _link(name: str, rng: np.random.Generator) -> str:
     keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2]}
     keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
     six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
-    xyz, rpy = _text(rng.normal(size=3) * 0.1), _text(rng.uniform(-3, 3, 3))
+    xyz, rpy = text_of(rng.normal(size=3) * 0.1), text_of(rng.uniform(-3, 3, 3))
     return (
         f'<link name="{name}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/>'
         f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
@@ -82,11 +82,11 @@ def _link(name: str, rng: np.random.Generator) -> str:
 
 def _joint(name: str, parent: str, fixed: bool, rng: np.random.Generator) -> str:
     special = bool(rng.random() < 0.5)
-    axis = str(rng.choice(_SPECIAL_AXES)) if special else _text(rng.normal(size=3))
+    axis = str(rng.choice(_SPECIAL_AXES)) if special else text_of(rng.normal(size=3))
     kind = "fixed" if fixed else str(rng.choice(["revolute", "continuous"]))
     limit = '<limit lower="-2" upper="2" velocity="3" effort="50"/>' if kind == "revolute" else ""
-    xyz = _text(rng.normal(size=3) * 0.3)
-    rpy = _text(rpy_from_matrix(exp_rotation(rng.normal(size=3))))
+    xyz = text_of(rng.normal(size=3) * 0.3)
+    rpy = text_of(rpy_from_matrix(exp_rotation(rng.normal(size=3))))
     return (
         f'<joint name="j_{name}" type="{kind}"><parent link="{parent}"/><child link="{name}"/>'
         f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>{limit}</joint>'
@@ -127,7 +127,7 @@ def pinocchio_case(text: str, floating: bool, samples: int = 5, seed: int = 1) -
         gravity = oracle.gravity.linear
         bodies = [_body(oracle, data, model, name, gravity) for name in model.tree.joint_names]
         if floating:
-            root = _motion(oracle, data, 1, np.eye(3), gravity)
+            root = frame_motion(oracle, data, 1, np.eye(3), gravity)
             bases.append(root)
             bodies.insert(0, root)
         signals.append((q, dq, ddq))
@@ -168,10 +168,10 @@ def _configuration(oracle, model, q, dq, ddq, rng):  # type: ignore[no-untyped-d
 
 def _body(oracle, data, model, joint, gravity):  # type: ignore[no-untyped-def]
     turn = z_to_axis(model.axis[model.tree.joint_names.index(joint)])
-    return _motion(oracle, data, oracle.getJointId(joint), turn, gravity)
+    return frame_motion(oracle, data, oracle.getJointId(joint), turn, gravity)
 
 
-def _motion(oracle, data, number, turn, gravity):  # type: ignore[no-untyped-def]
+def frame_motion(oracle, data, number, turn, gravity):  # type: ignore[no-untyped-def]
     """[v w a dw] (4, 3) of a joint's frame, turned; `a` as an accelerometer reads it."""
     twist = data.v[number]
     accel = pin.getClassicalAcceleration(oracle, data, number, pin.LOCAL)

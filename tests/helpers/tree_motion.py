@@ -9,6 +9,7 @@ from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import z_to_axis
 from adapter.model.urdf import model_from_urdf
+from tests.helpers.robot_models import frame_motion, text_of
 
 FREQUENCIES_HZ = (0.15, 0.9)
 WIDEST_RAD = 0.9  # swing of a joint without narrow limits
@@ -68,21 +69,14 @@ def in_motion(text: str, floating: bool, seconds: float, seed: int, rate_hz: flo
         torque = pin.rnea(oracle, data, full_q, full_v, full_a)
         pin.forwardKinematics(oracle, data, full_q, full_v, full_a)
         tau[k] = np.concatenate([torque[: tau.shape[1] - n], torque[places]])
-        base[k] = _row(oracle, data, 1, np.eye(3), gravity) if floating else 0.0
+        if floating:
+            base[k] = frame_motion(oracle, data, 1, np.eye(3), gravity).ravel()
         for j, number in enumerate(numbers):
-            links[k, j] = _row(oracle, data, number, turns[j], gravity)
+            links[k, j] = frame_motion(oracle, data, number, turns[j], gravity).ravel()
     if not floating:
         base[:, 6:9] = -gravity
     samples = TreeData(model.tree, q, dq, ddq, tau, _motion(base), _motion(links))
     return model, samples
-
-
-def _row(oracle, data, number, turn, gravity):  # type: ignore[no-untyped-def]
-    """[v w a dw] (12,) of a joint's frame, turned to its axis; `a` with gravity."""
-    twist = data.v[number]
-    accel = pin.getClassicalAcceleration(oracle, data, number, pin.LOCAL)
-    lifted = accel.linear - data.oMi[number].rotation.T @ gravity
-    return (np.stack([twist.linear, twist.angular, lifted, accel.angular]) @ turn).ravel()
 
 
 def _motion(rows: np.ndarray) -> BodyMotion:
@@ -120,15 +114,11 @@ def random_tree_text(links: int, seed: int) -> str:
         parts.append(_link_text(f"l{k}", rng))
         parts.append(
             f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
-            f'<origin xyz="{_text(xyz)}" rpy="{_text(rpy)}"/><axis xyz="{_text(axis)}"/>'
+            f'<origin xyz="{text_of(xyz)}" rpy="{text_of(rpy)}"/><axis xyz="{text_of(axis)}"/>'
             '<limit lower="-2" upper="2" velocity="5" effort="50"/></joint>'
         )
         names.append(f"l{k}")
     return '<robot name="random">' + "".join(parts) + "</robot>"
-
-
-def _text(values: np.ndarray) -> str:
-    return " ".join(repr(float(v)) for v in values)
 
 
 def _link_text(name: str, rng: np.random.Generator) -> str:
@@ -139,6 +129,6 @@ def _link_text(name: str, rng: np.random.Generator) -> str:
     keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
     six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
     return (
-        f'<link name="{name}"><inertial><origin xyz="{_text(0.1 * rng.normal(size=3))}"/>'
+        f'<link name="{name}"><inertial><origin xyz="{text_of(0.1 * rng.normal(size=3))}"/>'
         f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
     )

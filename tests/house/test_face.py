@@ -50,12 +50,15 @@ def loaded(*words: str) -> tuple[int, set[str], str]:
     return int(last[1]), HEAVY & set(last[3:]), done.stdout + done.stderr
 
 
+def printed(code: str) -> str:
+    """By a fresh interpreter."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
 def test_importing_the_package_loads_next_to_nothing() -> None:
     code = "import sys; a = set(sys.modules); import adapter; print(len(set(sys.modules) - a))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert int(done.stdout) < 30
+    assert int(printed(code)) < 30
     assert loaded() == (0, set(), loaded()[2])
 
 
@@ -103,6 +106,7 @@ def test_importing_the_package_loads_next_to_nothing() -> None:
 def test_help_and_wrong_use_load_nothing_heavy(words: list[str], code: int, said: str) -> None:
     found, heavy, text = loaded(*words)
     assert (found, heavy) == (code, set()) and said in text
+    assert text.count("error: ") == (code == 2) and "Traceback" not in text
 
 
 @pytest.mark.parametrize(
@@ -128,10 +132,7 @@ def test_what_takes_seconds_to_load_is_loaded_where_it_is_used() -> None:
         "adapter.report.style.Drawing('half').panel('a')\n"
         "print(before, 'matplotlib' in sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["False", "True"]
+    assert printed(code).split() == ["False", "True"]
 
 
 def test_a_model_whose_effects_do_not_exist_is_refused(tmp_path: Path) -> None:

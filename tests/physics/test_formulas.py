@@ -205,13 +205,14 @@ def fixed_case(name: str) -> tuple[Case, SelfModel, list[np.ndarray]]:
     return case, case.model, [x.numpy() for x in (case.q, case.dq, case.ddq)]
 
 
-@pytest.mark.parametrize("robot", ["panda", "lwr4", "tree17", "two_arms"])
+@pytest.mark.parametrize("robot", ["panda", "lwr4", "tree5", "tree17", "two_arms"])
 def test_a_rigid_arm_is_pinocchios(robot: str) -> None:
     """Torque and regressor over tables; a changed arm is another one's."""
     case, model, signals = fixed_case(robot)
     arm = RigidArm.of(model)
     assert relative(arm.torque(*signals), case.tau) < 1e-9
     assert relative(arm.regressor(*signals) @ arm.theta.ravel(), case.tau) < 1e-9
+    assert arm.torque(*(x[:0] for x in signals)).shape == (0, arm.n)
     turned = arm.changed(theta=2.0 * arm.theta, gravity=np.zeros(3))
     weightless = 2.0 * (case.tau - arm.torque(signals[0], *np.zeros((2, *case.tau.shape))))
     assert relative(turned.torque(*signals), weightless) < 1e-9

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
 import shlex
@@ -34,7 +33,12 @@ from adapter.runs.run_folder import RunData, RunFolderError, load_run, run_data,
 from adapter.runs.score import Course, figures, reference_from
 from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
-from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, laid_out, screenshot
+from tests.helpers.browser import (
+    ids_of_a_page_that_fetches_nothing,
+    laid_out,
+    shown_without_complaint,
+    text_of,
+)
 
 PERCENTILES = {"p50": 90.0, "p99": 140.0, "p99.9": 200.0, "max": 900.0}
 SECTIONS = (  # worth, trust, what to do; then details in the order in which they are of use
@@ -94,12 +98,6 @@ def test_page_fetches_nothing(page: str) -> None:
     ids = ids_of_a_page_that_fetches_nothing(page)
     for target in re.findall(r'(?:href="|url\()#([\w-]+)', page):
         assert target in ids
-
-
-def text_of(page: str) -> str:
-    """What a reader sees, with plain spaces."""
-    text = re.sub(r"<(style|script).*?</\1>|<[^>]+>", " ", page, flags=re.S)
-    return re.sub(r"\s+", " ", html.unescape(text))
 
 
 def test_nothing_missing_is_shown_as_null(page: str) -> None:
@@ -390,7 +388,4 @@ def test_nothing_is_lost_on_a_phone(page: str, tmp_path: Path) -> None:
 
 
 def test_a_browser_shows_it_without_complaint(page: str, tmp_path: Path) -> None:
-    picture, complaints = screenshot(page, tmp_path)
-    assert complaints == []
-    assert picture.startswith(b"\x89PNG")
-    assert len(picture) > 50_000  # more than an empty page
+    shown_without_complaint(page, tmp_path, 50_000)

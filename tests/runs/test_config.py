@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adapter.effects.catalogue import REAL_ARM_EFFECTS, effects_by_name
 from adapter.errors import ModelError, SettingsError
 from adapter.model.robots import documented
 from adapter.runs.config import (
@@ -161,23 +160,13 @@ def test_a_key_that_does_not_exist_is_named_with_the_choices(tmp_path, where, ki
         ("[tool]\nmass = 1.0\ncom = [1.0]", "com of 3"),
         ("[tool]\ncom = [0.0, 0.0, 0.0]", "mass"),
         ("gravity = ", "not TOML"),
+        # These would fail later, without a word.
+        ("[pipeline.learner.theta]\nbetas = [0.9]", "betas"),
+        ("[pipeline.learner.theta]\nbetas = [0.9, 1.5]", "betas"),
+        ("[excitation]\nrests = [[1.0]]", "rests"),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    assert said in refusal(tmp_path, text)
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[pipeline.learner.theta]\nbetas = [0.9]", "betas"),
-        ("[excitation]\nrests = [[1.0]]", "rests"),
-        ("[pipeline.learner.theta]\nbetas = [0.9, 1.5]", "betas"),
-    ],
-)
-def test_values_that_would_fail_without_a_word_are_refused_at_once(
-    tmp_path, text: str, said: str
-) -> None:
     assert said in refusal(tmp_path, text)
 
 
@@ -202,10 +191,6 @@ def test_gravity_and_tool_reach_the_model() -> None:
     assert model.tool is not None
     assert np.allclose(model.tool.theta()[:4], [2.0, 0.0, 0.0, 0.2])
     assert Config().apply(panda).gravity.tolist() == panda.gravity.tolist()
-
-
-def test_the_effects_of_real_arms_exist() -> None:
-    assert len(effects_by_name(REAL_ARM_EFFECTS)) == len(REAL_ARM_EFFECTS)
 
 
 VALUES = st.recursive(

@@ -34,18 +34,15 @@ from adapter.runs.fleet.fleet import (
 from adapter.runs.fleet.information import Information
 from adapter.runs.fleet.moments import Broken, LogMoments, Task, learner_of, moments_of
 from adapter.runs.pipeline import make_front_end
-from drivers.files.mcap import McapWriter, read_log
+from drivers.files.mcap import read_log, write_log
 from sim.effects import per_joint
 from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, panda_model, pin_model, record, rubbing
 
 DAY_NS = 86_400 * 10**9
-LOADED, WORN, OTHER = (
-    2,
-    3,
-    6,
-)  # the log with a load; joint (from 1) whose friction grows; another arm
+# The log with a load; joint (from 1) whose friction grows; another arm.
+LOADED, WORN, OTHER = 2, 3, 6
 LOGS, MASS, WEAR = 6, 1.2, 0.05  # N m s/rad a day
 
 
@@ -62,11 +59,8 @@ def truth_on(day: int) -> Truth:
 
 def write(path: Path, truth: Truth, day: int, arm: str | None = None, seconds: float = 8.0) -> Path:
     data = record(truth, Motion(seconds, 50 + day))
-    metadata = {} if arm is None else {"serial": arm}
-    with McapWriter(path, panda_model().tree.joint_names, metadata=metadata) as writer:
-        for row in range(len(data.q)):
-            stamp = day * DAY_NS + int(data.stamp_ns[row]) + 1
-            writer.write_joint_state(stamp, data.q[row], data.dq[row], data.tau[row])
+    log = replace(data.log(), stamp_ns=day * DAY_NS + data.stamp_ns + 1)
+    write_log(log, path, {} if arm is None else {"serial": arm})
     return path
 
 
@@ -351,11 +345,8 @@ def test_a_log_that_has_grown_counts_once(logs: Path, tmp_path: Path) -> None:
     assert same.moments.path == str(moved)
     moved.unlink()
     forget([str(moved)], panda_model(), settings)
-    assert all(
-        x.moments.content != same.moments.content
-        for arm in learn_fleet([], panda_model(), settings).arms
-        for x in arm.logs
-    )
+    left = [x for arm in learn_fleet([], panda_model(), settings).arms for x in arm.logs]
+    assert all(x.moments.content != same.moments.content for x in left)
     recall([str(moved)], panda_model(), settings)
     shutil.copy(whole, moved)
     assert learn_fleet([str(moved)], panda_model(), settings).read == 1

@@ -43,6 +43,15 @@ def run(samples: list[JointSample], **options) -> tuple[np.ndarray, FrontEnd]:
     return states, front_end
 
 
+def with_reading(signal: str, value: float, at: int = 2000) -> list[JointSample]:
+    """Samples of motion, in one of which joint 4 reads this."""
+    samples = moving().samples()
+    bad = getattr(samples[at], signal).copy()
+    bad[3] = value
+    samples[at] = replace(samples[at], **{signal: bad})
+    return samples
+
+
 def refused_beside(front_end: FrontEnd, *usual: str) -> Counter:
     """Counts without those that every start has."""
     return Counter({k: v for k, v in front_end.refused.items() if k not in (*usual, "at_rest")})
@@ -67,11 +76,7 @@ def test_clean_motion_passes() -> None:
 @pytest.mark.parametrize("signal", ["q", "dq", "tau"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_readings_that_are_no_numbers_are_refused(signal: str, value: float) -> None:
-    samples = moving().samples()
-    bad = getattr(samples[2000], signal).copy()
-    bad[3] = value
-    samples[2000] = replace(samples[2000], **{signal: bad})
-    states, front_end = run(samples)
+    states, front_end = run(with_reading(signal, value))
     assert refused_beside(front_end, "filter_settling") == {"non_finite": 1}
     said = [m for m in front_end.messages if "finite" in m]
     assert len(said) == 1 and said[0].startswith("at 2.000 s: ")
@@ -91,11 +96,7 @@ def test_readings_that_are_no_numbers_are_refused(signal: str, value: float) -> 
 def test_readings_out_of_range_are_refused_with_a_hint(
     signal: str, value: float, said: str
 ) -> None:
-    samples = moving().samples()
-    bad = getattr(samples[2000], signal).copy()
-    bad[3] = value
-    samples[2000] = replace(samples[2000], **{signal: bad})
-    _, front_end = run(samples)
+    _, front_end = run(with_reading(signal, value))
     assert refused_beside(front_end, "filter_settling") == {"out_of_range": 1}
     assert any(m.startswith("at 2.000 s: ") and said in m for m in front_end.messages)
 
@@ -110,10 +111,8 @@ def test_degrees_are_refused_throughout() -> None:
 
 
 def test_unknown_limits_allow_anything() -> None:
-    model = replace(panda_model(), limits=Limits.unknown(N))
-    front_end = FrontEnd(model)
     data = moving()
-    states = feed(front_end, replace(data, q=100 * data.q, tau=1e3 * data.tau).samples())
+    states, front_end = run_unknown(replace(data, q=100 * data.q, tau=1e3 * data.tau).samples())
     assert len(states) > 2600 and front_end.refused["out_of_range"] == 0
 
 
@@ -257,11 +256,7 @@ def test_a_spike_of_a_link_sensor_is_not_learned_from(value: float) -> None:
 @pytest.mark.parametrize("signal", ["q", "dq", "tau"])
 def test_absurd_readings_are_refused_even_where_limits_are_unknown(signal: str) -> None:
     """1e305 is a finite number, but the filter's products of it are not, ever after."""
-    samples = moving().samples()
-    bad = getattr(samples[1000], signal).copy()
-    bad[3] = 1e305
-    samples[1000] = replace(samples[1000], **{signal: bad})
-    states, front_end = run_unknown(samples)
+    states, front_end = run_unknown(with_reading(signal, 1e305, at=1000))
     assert np.isfinite(states[:, SIGNALS]).all()
     assert front_end.refused["out_of_range"] == 1
 
@@ -269,8 +264,7 @@ def test_absurd_readings_are_refused_even_where_limits_are_unknown(signal: str) 
 def run_unknown(samples: list[JointSample]) -> tuple[np.ndarray, FrontEnd]:
     """With an arm whose limits nobody documented."""
     front_end = FrontEnd(replace(panda_model(), limits=Limits.unknown(N)))
-    states = feed(front_end, samples)
-    return states, front_end
+    return feed(front_end, samples), front_end
 
 
 @pytest.mark.parametrize("name", list(FrontEndSettings.__dataclass_fields__))

@@ -22,6 +22,7 @@ from tests.helpers.board_tools import (
     parse,
     refresh,
     rig,
+    two_buses,
 )
 
 READY = build("nominal").truth.ready
@@ -110,10 +111,7 @@ def test_repeated_replies_are_the_same_frame_twice() -> None:
 
 def test_reordered_replies_come_after_the_next_one() -> None:
     """On a bus that keeps its order; on a line the lowest id goes first, whatever came first."""
-    with (
-        can.Bus(interface="virtual", channel="reorder") as near,
-        can.Bus(interface="virtual", channel="reorder") as far,
-    ):
+    with two_buses("reorder") as (near, far):
         clock = [0]
         boards = Boards(far, build("nominal"), faults=[f"reorder={SHARE}"], now_ns=lambda: clock[0])
         order = []
@@ -278,10 +276,7 @@ def test_bytes_that_are_no_frame_are_counted_and_passed_over() -> None:
         def send(self, message):
             self.bus.send(message)
 
-    with (
-        can.Bus(interface="virtual", channel="noisy") as near,
-        can.Bus(interface="virtual", channel="noisy") as far,
-    ):
+    with two_buses("noisy") as (near, far):
         boards = Boards(Noisy(far), build("nominal"))
         near.send(frame(0x7FF, refresh(1)))
         assert boards.service() == 1

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 
 import can
@@ -45,6 +46,7 @@ from tests.helpers.board_tools import (
     read_register,
     refresh,
     rig,
+    two_buses,
     write_register,
 )
 from tests.helpers.hardware_rigs import SERVE_CAN
@@ -355,10 +357,7 @@ def test_effects_in_sensors_are_refused_those_on_the_arm_are_not() -> None:
 
 
 def test_in_one_process_on_the_virtual_bus() -> None:
-    with (
-        can.Bus(interface="virtual", channel="in process") as near,
-        can.Bus(interface="virtual", channel="in process") as far,
-    ):
+    with two_buses("in process") as (near, far):
         boards = Boards(far, build("nominal"))
         host = ServedBus(near, boards)
         host.send(frame(0x7FF, refresh(6)))
@@ -405,21 +404,26 @@ def receive(bus: can.BusABC, identifier: int, patience_s: float = 20.0) -> can.M
     return None
 
 
+@contextmanager
+def serving(boards: Boards):
+    """Boards served in a thread, which ends when it is told to."""
+    stop = threading.Event()
+    thread = threading.Thread(target=boards.serve, args=(stop,))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(20.0)
+    assert not thread.is_alive()
+
+
 def test_served_in_a_thread_until_told_to_stop() -> None:
-    with (
-        can.Bus(interface="virtual", channel="thread") as near,
-        can.Bus(interface="virtual", channel="thread") as far,
-    ):
-        boards, stop = Boards(far, build("nominal"), LIMP), threading.Event()
-        thread = threading.Thread(target=boards.serve, args=(stop,))
-        thread.start()
-        try:
+    with two_buses("thread") as (near, far):
+        boards = Boards(far, build("nominal"), LIMP)
+        with serving(boards):
             near.send(frame(0x7FF, refresh(2)))
             assert receive(near, 0x12) is not None
-        finally:
-            stop.set()
-            thread.join(20.0)
-        assert not thread.is_alive()
         boards.close()
 
 
@@ -443,15 +447,9 @@ def test_boards_on_multicast_do_not_hear_themselves_and_pass_over_noise(channel)
                 noise.sendto(junk, (channel, port))
         for motor in (*IDS, *IDS):
             host.send(frame(0x7FF, refresh(motor)))
-        stop = threading.Event()
-        thread = threading.Thread(target=boards.serve, args=(stop,))
-        thread.start()
-        try:
+        with serving(boards):
             for motor in (*IDS, *IDS):
                 assert receive(host, 0x10 + motor) is not None
-        finally:
-            stop.set()
-            thread.join(20.0)
         boards.close()
     assert boards.frames == {"unreadable": 4, "refresh": 14}
 

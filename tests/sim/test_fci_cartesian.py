@@ -12,7 +12,7 @@ import pytest
 from sim.effects import Effect
 from sim.fci import gripper
 from sim.fci.cartesian import difference, moved, rotation_vector
-from sim.fci.codec import ERRORS, Generator, Request, RobotCommand
+from sim.fci.codec import ERRORS, Request, RobotCommand
 from sim.fci.gripper import Fingers, GripperServer
 from sim.fci.robot import Robot
 from sim.scenarios import build
@@ -200,10 +200,6 @@ def test_a_threshold_below_a_push_ends_the_motion():
             robot.tick(answer(start))
         assert robot.violations == ended
         robot.arm.close()
-
-
-def test_generators_have_their_numbers():
-    assert [Generator.CARTESIAN_POSITION, Generator.CARTESIAN_VELOCITY] == [2, 3]
 
 
 # Gripper

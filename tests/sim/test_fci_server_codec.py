@@ -24,7 +24,7 @@ from sim.fci.codec import (
 from sim.fci.urdf import robot_urdf
 from sim.scenarios import build
 
-# SignatureTable -> byte offset in version 5 (f64) and in version 10 (f32).
+# Field -> byte offset in version 5 (f64) and in version 10 (f32).
 OFFSETS = {
     "O_T_EE": (8, 8), "O_T_EE_d": (136, 72), "F_T_EE": (264, 136), "EE_T_K": (392, 200),
     "F_T_NE": (520, 264), "NE_T_EE": (648, 328), "m_ee": (776, 392), "I_ee": (784, 396),

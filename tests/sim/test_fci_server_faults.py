@@ -395,6 +395,14 @@ class RawClient:
         self.udp.close()
 
 
+@contextlib.contextmanager
+def connected(server):
+    """A client whose version was accepted."""
+    with contextlib.closing(RawClient(server)) as client:
+        assert client.reply(15)[12] == 0
+        yield client
+
+
 def test_ids_are_contiguous_and_the_world_stands_between_clients():
     with serving() as server:
         ids = []
@@ -416,14 +424,12 @@ def test_ids_are_contiguous_and_the_world_stands_between_clients():
 
 def test_a_second_client_is_turned_away():
     with serving() as server:
-        first = RawClient(server)
-        first.reply(15)
-        second = RawClient(server)
-        with contextlib.suppress(ConnectionResetError):
-            assert second.reply(15) == b""
-        second.close()
-        assert first.ids(5)
-        first.close()
+        with connected(server) as first:
+            second = RawClient(server)
+            with contextlib.suppress(ConnectionResetError):
+                assert second.reply(15) == b""
+            second.close()
+            assert first.ids(5)
         assert server.summary()["refused_clients"] == 1
 
 
@@ -438,34 +444,24 @@ def test_nonsense_closes_the_connection_and_nothing_else(nonsense):
         with contextlib.suppress(ConnectionResetError):
             assert bad.recv(100) == b""
         bad.close()
-        good = RawClient(server)
-        assert good.reply(15)[12] == 0 and good.ids(5)
-        good.udp.sendto(b"x" * 17, good.udp.getsockname())
-        good.close()
+        with connected(server) as good:
+            assert good.ids(5)
+            good.udp.sendto(b"x" * 17, good.udp.getsockname())
 
 
 def test_cut_and_silence_and_a_jump_of_the_clock():
     with serving("cut@0.1") as server:
-        client = RawClient(server)
-        client.reply(15)
-        assert client.tcp.recv(1) == b""
-        client.close()
-        again = RawClient(server)
-        assert again.reply(15)[12] == 0 and len(again.ids(10)) == 10
-        again.close()
-    with serving("silence@0.05") as server:
-        client = RawClient(server)
-        client.reply(15)
+        with connected(server) as client:
+            assert client.tcp.recv(1) == b""
+        with connected(server) as again:
+            assert len(again.ids(10)) == 10
+    with serving("silence@0.05") as server, connected(server) as client:
         client.udp.settimeout(1.0)
         with pytest.raises(TimeoutError):
             client.ids(10_000)
-        client.close()
-    with serving("clock=5000@0.05") as server:
-        client = RawClient(server)
-        client.reply(15)
+    with serving("clock=5000@0.05") as server, connected(server) as client:
         steps = np.diff(client.ids(200))
         assert np.sum(steps > 4000) == 1 and np.sum(steps < 1) == 0
-        client.close()
 
 
 def shell(*words):

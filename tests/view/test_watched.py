@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 import threading
 import time
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from mcap_ros2._dynamic import generate_dynamic  # not what encoded it
 from rich.console import Console
@@ -87,8 +89,6 @@ def test_the_course_of_a_run(course: list[Now], seen: Seen) -> None:
 
 
 def test_the_skeleton_stands_where_pinocchio_puts_it(course: list[Now], seen: Seen) -> None:
-    import pinocchio as pin
-
     messages = Messages(Onlooker(seen.known))
     arms = messages.take(course[-1])["frame"]["arms"]
     model = pin.buildModelFromUrdf(str(PANDA_URDF))
@@ -189,8 +189,6 @@ def test_lines_come_out_above_the_table(seen: Seen, tmp_path: Path) -> None:
 
 
 def _pieces(text: str) -> Iterator[str]:
-    import re
-
     yield from (x for x in re.split(r"(\x1b\[[0-9;?]*[A-Za-z]|\n)", text.replace("\r", "")) if x)
 
 
@@ -324,8 +322,6 @@ def _feed(shown: FoxgloveView, now: Now) -> None:
 
 def _check_transforms(transforms: list, now: Now) -> None:
     """Of both arms, chained up from the base: the hand stands where pinocchio puts it."""
-    import pinocchio as pin
-
     model = pin.buildModelFromUrdf(str(PANDA_URDF))
     data = model.createData()
     pin.forwardKinematics(model, data, now.q)
