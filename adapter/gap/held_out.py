@@ -16,6 +16,7 @@ from adapter.gap.evidence import Carried, Moments
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
+from adapter.gap.long_recording import LongRecording
 from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
@@ -251,8 +252,8 @@ def measure(
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
     searched, found = found.fit, _paying(task, refined(found))
-    whole = task.fitted[0].whole
-    if whole is not None and len(task.fitted) == 1:
+    whole = task.fitted[0]
+    if isinstance(whole, LongRecording) and len(task.fitted) == 1:
         progress("weighing it on the whole recording")
         found = weighed(found, whole)
     fit = possible(found.fit, found.carried)

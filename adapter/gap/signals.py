@@ -9,10 +9,10 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
-from adapter.effects.base import ArmDynamics, Motion
+from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.gap.evidence import ORDER
@@ -320,24 +320,6 @@ def on_grid(grid: Array, t: Array, tau: Array) -> Array:
     return oaconvolve(raw, _ANTI_ALIAS[:, None], mode="valid", axes=0)[::factor][: len(grid)]
 
 
-class WholeMotion(Protocol):
-    """A long recording of which some stretches are in memory, see `long_recording`."""
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """From when to when it is used, s."""
-
-    @property
-    def seconds(self) -> float:
-        """How much of it there is."""
-
-    def signals(self, spans: Sequence[tuple[float, float]], arm: ArmDynamics) -> Signals:
-        """Some stretches of it."""
-
-    def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
-        """All of it, piece by piece."""
-
-
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """One recording.
@@ -348,8 +330,6 @@ class Recorded:
         command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
         dq_late_s: how much later dq is than q.
         begins: rows at which its stretches begin; between these time is left out.
-        whole: of which it holds some stretches; None where it is all there is.
-        spans: (begin, end) s of the stretches.
         loads_s: about when what the hand holds changed, where that is known already.
     """
 
@@ -362,8 +342,6 @@ class Recorded:
     commands: Array | None = None
     dq_late_s: float = 0.0
     begins: tuple[int, ...] = (0,)
-    whole: WholeMotion | None = None
-    spans: tuple[tuple[float, float], ...] = ()
     loads_s: tuple[float, ...] = ()
 
     @classmethod
@@ -416,13 +394,11 @@ class Recorded:
     @property
     def end_s(self) -> float:
         """When the recording ends."""
-        return float(self.t[-1]) if self.whole is None else self.whole.span[1]
+        return float(self.t[-1])
 
     @property
     def seconds(self) -> float:
         """How much of it there is in memory."""
-        if self.whole is not None:
-            return sum(b - a for a, b in self.spans)
         return sum(float(x.t[-1] - x.t[0]) for x in self.stretches())
 
     def stretches(self) -> list[Recorded]:
@@ -437,8 +413,6 @@ class Recorded:
         return next((x for x in others if x is not self and self._repeats(x)), None)
 
     def _repeats(self, other: Recorded) -> bool:
-        if self.whole is not None or other.whole is not None:
-            return False
         if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
             return False
         span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])
