@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -136,14 +137,17 @@ def rollout_errors(
     if len(recording.begins) > 1:
         parts = [rollout_errors(x, before, after, simulate, block) for x in recording.stretches()]
         first, second, third, fourth = (np.concatenate([x[k] for x in parts]) for k in range(4))
-        return RolloutErrors(first, second, third, fourth, _in_turn([x.curves for x in parts]))
+        columns = ([getattr(x.curves, f.name) for x in parts] for f in fields(RolloutCurves))
+        curves = RolloutCurves(*map(np.concatenate, columns))
+        return RolloutErrors(first, second, third, fourth, curves)
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
     heard = np.logical_or(recording.heard_at(t).all(axis=1), drive == COMMANDS)
+    length = round(SEGMENT_S / ROLLOUT_STEP_S)
     segments = [
-        (a, b)
-        for a, b in _segments(len(t))
+        (a, b)  # the row at b is the next start
+        for a, b in pairwise(range(0, len(t), length))
         if heard[a:b].all() and recording.is_whole(t[a], t[b - 1])
     ]
     motion = DrivenMotion(t, q, dq, u)
@@ -161,18 +165,6 @@ def rollout_errors(
         _off(new_dq, dq)[told],
         curves,
     )
-
-
-def _in_turn(parts: Sequence[RolloutCurves]) -> RolloutCurves:
-    """Curves of stretches behind one another."""
-    columns = ([getattr(x, f.name) for x in parts] for f in fields(RolloutCurves))
-    return RolloutCurves(*map(np.concatenate, columns))
-
-
-def _segments(rows: int) -> list[tuple[int, int]]:
-    """[start, stop) of 0.5 s each; the row at stop is the next start."""
-    length = round(SEGMENT_S / ROLLOUT_STEP_S)
-    return [(k, k + length) for k in range(0, rows - length, length)]
 
 
 def _along(

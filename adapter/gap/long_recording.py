@@ -30,9 +30,7 @@ from adapter.gap.signals import (
     Signals,
     Smoothness,
     Splines,
-    bands_of,
-    heard_in,
-    low,
+    in_band,
     on_grid,
     smoothness_of,
     together,
@@ -168,7 +166,7 @@ class Survey:
         inside = (self.begins >= span[0]) & (self.begins + STRETCH_S <= span[1])
         usable = np.flatnonzero(inside & np.isfinite(self.moments[:, 0, 0]))
         if not len(usable):
-            return []
+            return [span]
         scale = np.sqrt(np.diagonal(self.moments[usable].mean(axis=0)))
         M = self.moments[usable] / np.maximum(np.outer(scale, scale), 1e-12)
         known, chosen = 1e-3 * np.eye(len(scale)), []
@@ -289,7 +287,7 @@ class LongRecording(Recorded):
     def between(self, begin_s: float, end_s: float) -> LongRecording:
         """The same in a part of its time alone."""
         own = replace(self, span=(max(begin_s, self.span[0]), min(end_s, self.span[1])))
-        return own.taking(self.survey.spread(own.span) or [own.span])
+        return own.taking(self.survey.spread(own.span))
 
     def taking(self, spans: Sequence[Span]) -> LongRecording:
         """With these stretches; those that touch are one."""
@@ -345,12 +343,9 @@ class LongRecording(Recorded):
         first, last = DECIMATION * begin, DECIMATION * (end - 1 + 2 * TRIM) + TAPS
         parts = np.split(self.table.rows(run.first + first, run.first + last), 5, axis=1)
         q, dq, ddq, tau, known = map(np.ascontiguousarray, parts)
-        motion = Motion(run.begin_s + np.arange(first, last) / RATE_HZ, q, dq, ddq, arm)
+        t = run.begin_s + np.arange(first, last) / RATE_HZ
         noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
-        bands_hz = bands_of(motion, noise) if bands_hz is None else bands_hz
-        t = motion.t[TAPS // 2 : -(TAPS // 2) : DECIMATION][TRIM:-TRIM]
-        own, heard = (x[TRIM:-TRIM] for x in (low(tau), heard_in(known)))
-        return Signals(replace(motion, bands_hz=bands_hz), noise, own, t, heard, trim=TRIM)
+        return in_band(Motion(t, q, dq, ddq, arm, bands_hz=bands_hz), noise, tau, known, TRIM)
 
 
 _RAW = ("t", "q", "dq", "tau")
@@ -407,12 +402,12 @@ def sampling(recordings: Sequence[Recorded]) -> tuple[dict[str, Any], ...]:
 
 def sampling_words(recordings: Sequence[Recorded]) -> list[str]:
     """What was taken of long recordings, a sentence each."""
-    alone = len(recordings) == 1
-    return [
-        ("" if alone else f"{own.name}: ")
-        + f"searched and scored in {own.seconds:.0f} s of {own.whole_s:.0f} s, in "
-        f"{len(own.spans)} stretches from {own.spans[0][0]:.0f} s to {own.spans[-1][1]:.0f} s"
-        + (", weighed on all" if alone else "")
-        for own in recordings
-        if isinstance(own, LongRecording)
-    ]
+    alone, said = len(recordings) == 1, []
+    for x in sampling(recordings):
+        who, spans = "" if alone else f"{x['recording']}: ", x["stretches_s"]
+        said.append(
+            f"{who}searched and scored in {x['searched_s']:.0f} s of {x['seconds']:.0f} s, in "
+            f"{len(spans)} stretches from {spans[0][0]:.0f} s to {spans[-1][1]:.0f} s"
+            + (", weighed on all" if alone else "")
+        )
+    return said

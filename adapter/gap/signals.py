@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -122,8 +123,11 @@ class Signals:
 
         Where a joint jumped and its link did not, it is the link's torques that count.
         """
-        parts = [motion_rows(links, rows) for rows in self.stretches]
-        return replace(links, bands_hz=np.max([bands_of(x, self.noise) for x in parts], axis=0))
+        bands = []
+        for rows in self.stretches:
+            part = replace(links, **{key: getattr(links, key)[rows] for key in MOTION})
+            bands.append(bands_of(part, self.noise))
+        return replace(links, bands_hz=np.max(bands, axis=0))
 
     @property
     def stretches(self) -> list[slice]:
@@ -138,12 +142,9 @@ class Signals:
         sizes = [_size_of_low(x.stop - x.start) - 2 * self.trim for x in self.stretches]
         return tuple(int(x) for x in np.cumsum([0, *sizes[:-1]]))
 
-    @property
+    @cached_property
     def counted(self) -> Array:
         """(k, n) zero where a torque or what was before it is not known, else one."""
-        return self.once("counted", self._counted)
-
-    def _counted(self) -> Array:
         out = minimum_filter1d(self.heard, ORDER + 1, axis=0, origin=ORDER // 2)
         for begin in self.seams[1:]:
             out[begin : begin + ORDER] = 0.0
@@ -180,38 +181,19 @@ class Signals:
         out[:, :, joint] = self.low(basis).T
         return out
 
-    @property
+    @cached_property
     def low_regressor(self) -> Array:
         """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""
-        return self.once("regressor", self._low_regressor)
+        whole = self.low_of(lambda rows: regressor_of(self.motion, rows))
+        return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
 
-    @property
+    @cached_property
     def low_start(self) -> Array:
         """(s n, k, n) what is left of a unit of friction that a joint held at the first sample.
 
         Of each joint in each of s stretches. A joint that rests holds what static friction lets
         it, and forgets it as it slides.
         """
-        return self.once("start", self._low_start)
-
-    @property
-    def slowness(self) -> Array:
-        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
-
-        What static friction holds at a rest is one unknown value, however long the rest lasts.
-        """
-        return self.once("slowness", self._slowness)
-
-    def _slowness(self) -> Array:
-        dq = np.abs(self.low(self.motion.dq))
-        out = np.exp(-np.square(dq / STRIBECK_SPEED))
-        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
-            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
-            rows = np.diff(begins, append=len(rests))
-            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
-        return out
-
-    def _low_start(self) -> Array:
         q = self.motion.q
         out = np.zeros((len(self.begins), q.shape[1], *self.tau.shape))
         cuts = pairwise((*self.seams, len(self.tau)))
@@ -221,19 +203,24 @@ class Signals:
             own[:, begin:end] = left.T[:, :, None] * np.eye(q.shape[1])[:, None]
         return out.reshape(-1, *self.tau.shape)
 
-    def _low_regressor(self) -> Array:
-        whole = self.low_of(lambda rows: regressor_of(self.motion, rows))
-        return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
+    @cached_property
+    def slowness(self) -> Array:
+        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
+
+        What static friction holds at a rest is one unknown value, however long the rest lasts.
+        """
+        dq = np.abs(self.low(self.motion.dq))
+        out = np.exp(-np.square(dq / STRIBECK_SPEED))
+        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
+            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
+            rows = np.diff(begins, append=len(rests))
+            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
+        return out
 
 
 def regressor_of(motion: Motion, rows: slice) -> Array:
     """(k, n, 10 n) regressor at some instants of a motion."""
     return motion.arm.regressor(motion.q[rows], motion.dq[rows], motion.ddq[rows])
-
-
-def motion_rows(motion: Motion, rows: slice) -> Motion:
-    """Some instants of a motion."""
-    return replace(motion, **{key: getattr(motion, key)[rows] for key in MOTION})
 
 
 def _size_of_low(rows: int) -> int:
@@ -262,17 +249,23 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     smoothed = source.smoothed()
     q, dq, ddq = smoothed.at(grid)
     noise = 2.0 * float(np.median(np.diff(source.t))) * smoothed.dq_noise**2
-    motion = Motion(grid, q, dq, ddq, arm)
-    motion = replace(motion, bands_hz=bands_of(motion, noise))
-    band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
     tau, known = (on_grid(grid, t, x) for x in (recording.tau, recording.heard.astype(float)))
-    return Signals(motion, noise, low(tau), band_t, heard_in(known))
+    return in_band(Motion(grid, q, dq, ddq, arm), noise, tau, known)
 
 
-def heard_in(known: Array) -> Array:
-    """(k, n) in the band where a torque was measured all the while; `known` (m, n) at 250 Hz."""
-    whole = minimum_filter1d(known, TAPS, axis=0)[TAPS // 2 : -(TAPS // 2) : DECIMATION]
-    return np.asarray((whole > HEARD).astype(float))
+def in_band(motion: Motion, noise: Array, tau: Array, known: Array, trim: int = 0) -> Signals:
+    """A motion without a pause; its bands are found where it has none.
+
+    Args:
+        noise: (n,) of its velocities; tau: (m, n) N m at its instants.
+        known: (m, n) one where that was measured; trim: see `Signals`.
+    """
+    if motion.bands_hz is None:
+        motion = replace(motion, bands_hz=bands_of(motion, noise))
+    at = slice(TAPS // 2, -(TAPS // 2), DECIMATION)
+    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > HEARD).astype(float)
+    own, t, heard = (x[trim : len(x) - trim] for x in (low(tau), motion.t[at], heard))
+    return Signals(motion, noise, own, t, heard, trim=trim)
 
 
 def together(parts: Sequence[Signals]) -> Signals:

@@ -36,7 +36,7 @@ from adapter.gap.long_recording import (
     sampling_words,
 )
 from adapter.gap.nominal import nominal_fit
-from adapter.gap.result import Finding, GapResult
+from adapter.gap.result import GapResult
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import RATE_HZ, Recorded
@@ -326,7 +326,8 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     told, left = told_of(found, ends, trusted)
     findings = tuple(f for f in told if f.evidence >= NO_NAME)
     notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]
-    if np.abs(found.fit.dtheta / trusted).max() > ODD and not any(map(_of_a_body, findings)):
+    placed = any(CATALOGUE[f.effect].is_theta for f in findings)
+    if np.abs(found.fit.dtheta / trusted).max() > ODD and not placed:
         notes.append(UNPLACED)
     if found.weak:
         notes.append(ASSUMED)
@@ -360,7 +361,3 @@ def unnamed(title: str, joints: Sequence[int]) -> str:
     return (
         f"the model has a {title} {where}that is no surer than its rivals: it is not told by name"
     )
-
-
-def _of_a_body(finding: Finding) -> bool:
-    return CATALOGUE[finding.effect].is_theta
