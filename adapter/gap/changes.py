@@ -23,10 +23,13 @@ from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.evidence import ORDER
 from adapter.gap.fit import EDGE_S, Fit
 from adapter.gap.long_recording import LongRecording, Span
-from adapter.gap.real_arm import load_in, loaded_arm
-from adapter.gap.signals import regressor_of
+from adapter.gap.nominal import nominal_fit
+from adapter.gap.real_arm import load_in, loaded_arm, real_arm
+from adapter.gap.signals import RATE_HZ, regressor_of
 from adapter.gap.weighed import pieces_of
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.screening.screen import moving_joints
 
 WINDOW_S, MOST_WINDOWS = 2.0, 2048
 BY_LOAD = 0.7  # of what a change explains: it is one of the load
@@ -85,7 +88,16 @@ class Windows:
     @cached_property
     def changes(self) -> list[int]:
         """First windows behind a change, those that explain most first."""
-        return self._changes(LEAST_CHI2 * max(self.usual, 1.0))
+        found: list[int] = []
+        spans = [(0, len(self.rows))]
+        while spans and len(found) < CHANGES:
+            chi2, k, span = max((*self._best(*span), span) for span in spans)
+            if chi2 < LEAST_CHI2 * max(self.usual, 1.0):
+                break
+            found.append(k)
+            spans.remove(span)
+            spans += [(span[0], k), (k, span[1])]
+        return found
 
     @property
     def loads_s(self) -> list[float]:
@@ -114,19 +126,6 @@ class Windows:
     def _around(self, k: float) -> Span:
         middle = self.every_s * k
         return max(middle - 0.5 * AROUND_S, 0.0), middle + 0.5 * AROUND_S
-
-    def _changes(self, least: float) -> list[int]:
-        found: list[int] = []
-        spans = [(0, len(self.rows))]
-        while spans and len(found) < CHANGES:
-            tried = [(*self._best(a, b), (a, b)) for a, b in spans]
-            chi2, k, span = max(tried)
-            if chi2 < least:
-                break
-            found.append(k)
-            spans.remove(span)
-            spans += [(span[0], k), (k, span[1])]
-        return found
 
     def _best(self, begin: int, end: int) -> tuple[float, int]:
         """What a change explains between two windows, and before which window it is."""
@@ -157,6 +156,16 @@ def _chi2(G: Array, g: Array, prior_std: Array) -> Array:
     A = G * np.outer(prior_std, prior_std) + np.eye(len(prior_std))
     b = g * prior_std
     return np.asarray(np.einsum("bi,bi->b", b, np.linalg.solve(A, b[..., None])[..., 0]))
+
+
+def with_changes(own: LongRecording, model: SelfModel, inertia_prior: float) -> LongRecording:
+    """A recording with stretches where something changes or is loud, and when its load does."""
+    nominal = nominal_fit([own], model, inertia_prior, own.survey.clock.period_s)
+    motion = nominal.recordings[0].motion
+    moving = nominal.heard.intersection(moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ))
+    windows = Windows.of(real_arm(nominal, sorted(moving), (0,)).fit.with_noise(), own)
+    own = own.taking([*own.survey.spread(own.span), *windows.stretches()])
+    return replace(own, loads_s=tuple(windows.loads_s))
 
 
 def loaded(nominal: Fit, joints: Sequence[int], times_s: Sequence[float]) -> Fit:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from adapter.gap.evidence import Carried, Moments
 from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
+from adapter.gap.long_recording import LongRecording
 from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
@@ -135,14 +137,17 @@ def rollout_errors(
     if len(recording.begins) > 1:
         parts = [rollout_errors(x, before, after, simulate, block) for x in recording.stretches()]
         first, second, third, fourth = (np.concatenate([x[k] for x in parts]) for k in range(4))
-        return RolloutErrors(first, second, third, fourth, _in_turn([x.curves for x in parts]))
+        columns = ([getattr(x.curves, f.name) for x in parts] for f in fields(RolloutCurves))
+        curves = RolloutCurves(*map(np.concatenate, columns))
+        return RolloutErrors(first, second, third, fourth, curves)
     t = recording.grid()
     q, dq, _ = recording.smoothed().at(t)
     u, drive = recording.drive(t)
     heard = np.logical_or(recording.heard_at(t).all(axis=1), drive == COMMANDS)
+    length = round(SEGMENT_S / ROLLOUT_STEP_S)
     segments = [
-        (a, b)
-        for a, b in _segments(len(t))
+        (a, b)  # the row at b is the next start
+        for a, b in pairwise(range(0, len(t), length))
         if heard[a:b].all() and recording.is_whole(t[a], t[b - 1])
     ]
     motion = DrivenMotion(t, q, dq, u)
@@ -160,18 +165,6 @@ def rollout_errors(
         _off(new_dq, dq)[told],
         curves,
     )
-
-
-def _in_turn(parts: Sequence[RolloutCurves]) -> RolloutCurves:
-    """Curves of stretches behind one another."""
-    columns = ([getattr(x, f.name) for x in parts] for f in fields(RolloutCurves))
-    return RolloutCurves(*map(np.concatenate, columns))
-
-
-def _segments(rows: int) -> list[tuple[int, int]]:
-    """[start, stop) of 0.5 s each; the row at stop is the next start."""
-    length = round(SEGMENT_S / ROLLOUT_STEP_S)
-    return [(k, k + length) for k in range(0, rows - length, length)]
 
 
 def _along(
@@ -251,8 +244,8 @@ def measure(
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
     searched, found = found.fit, _paying(task, refined(found))
-    whole = task.fitted[0].whole
-    if whole is not None and len(task.fitted) == 1:
+    whole = task.fitted[0]
+    if isinstance(whole, LongRecording) and len(task.fitted) == 1:
         progress("weighing it on the whole recording")
         found = weighed(found, whole)
     fit = possible(found.fit, found.carried)

@@ -15,10 +15,9 @@ import numpy as np
 
 from adapter.gap.fit import Fit, honest_covariance, place_of, under_own_noise
 from adapter.gap.hand import hand_frame
-from adapter.gap.long_recording import is_long
+from adapter.gap.long_recording import LongRecording, Survey, is_long, sampling_words
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import SHARES, real_arm
-from adapter.gap.sampled import Sampled, sampling_words
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.weighed import moments_of
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
@@ -31,11 +30,12 @@ from adapter.screening.screen import (
     cleaned,
     judged,
     moving_joints,
+    of_this_robot,
     silent,
     smoothed_rows,
 )
 from adapter.screening.timing import lateness
-from adapter.signals.matching import matching, present
+from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
 
@@ -124,8 +124,8 @@ def find_load(
     )
     moving = {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq, STEP_S)}
     arm = real_arm(start, sorted(moving & start.heard), (0,), shares)
-    whole = taken[0].recorded.whole
-    if whole is not None and empty is None:
+    whole = taken[0].recorded
+    if isinstance(whole, LongRecording) and empty is None:
         known = moments_of(arm.fit, whole)
         arm = replace(arm, fit=arm.fit.at(known.x), known=known)
     fit, at = arm.fit, place_of(arm.fit, 0)
@@ -155,13 +155,11 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         moves, torque, more = _judged(own, model)
         recorded = Recorded.of(torque.in_time(own), lateness(clock)).cut()
         return _Taken(recorded, moves, clock.period_s, own.warnings + said + more)
-    long = Sampled.of(log, log.path.name, model)
-    part, _, said = cleaned(long.busiest(log), model)
+    survey = Survey.of(of_this_robot(log, model))
+    part, _, said = cleaned(survey.busiest(log), model)
     moves, torque, more = _judged(part, model)
-    if torque.late_s:
-        long = Sampled.of(torque.in_time(matching(log, model)), log.path.name, model)
-    period_s = long.survey.clock.period_s
-    return _Taken(long.recorded(), moves, period_s, log.warnings + said + more)
+    long = LongRecording.through(survey.in_time(torque), log.path.name)
+    return _Taken(long, moves, survey.clock.period_s, log.warnings + said + more)
 
 
 def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:

@@ -1,9 +1,10 @@
 """A recording that is too long to be held at once: read in pieces, searched in a few stretches.
 
-It is gone through twice. The first time each piece is cleaned and told by what moves in it, so
-that stretches can be chosen that are spread over the whole time and move most differently. The
-second time splines go through it, piece by piece, and the smooth motion waits in a file at the
-rate of the models. What a search needs rows for takes the stretches; what adds up takes all.
+It is gone through twice. The first time each piece is cleaned, and windows are told by what moves
+in them, so that stretches can be chosen that are spread over the whole time and move most
+differently. The second time splines go through it, piece by piece, and the smooth motion waits in
+a file at the rate of the models. What a search needs rows for takes the stretches; what adds up
+takes all.
 
 Pieces overlap by so much that a spline's inner rows are those of one spline through everything.
 """
@@ -13,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,20 +30,23 @@ from adapter.gap.signals import (
     Signals,
     Smoothness,
     Splines,
-    bands_of,
-    heard_in,
-    low,
+    in_band,
     on_grid,
     smoothness_of,
     together,
 )
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.rows import stuck
-from adapter.screening.screen import RecordingFault, RecordingRefused, at_source
+from adapter.screening.screen import (
+    Judged,
+    RecordingFault,
+    RecordingRefused,
+    at_source,
+    of_this_robot,
+)
 from adapter.screening.timing import RecordingClock, check_timing, joined, lateness, uniform
-from adapter.signals.source_clock import source_stamps
-from drivers.files.mcap import Log
-from drivers.files.rows import RowsFile
+from drivers.files.mcap import Log, mapped
+from drivers.files.rows import RowsFile, stretches
 
 LONG_S = 60.0  # what is longer is searched in stretches
 PIECE_S = 30.0  # of a recording that is worked on at once
@@ -52,65 +56,161 @@ OVERLAP_S = 2.0  # by which splines reach over a piece; their memory is some 0.1
 HOLE_S = 0.5  # without samples: nobody knows how the arm moved, the motion is cut there
 STRETCH_S, STRETCHES = 5.0, 6  # of a search: length, and how many
 MOST_WINDOWS = 1500  # that stretches are chosen among
+NANO_S = 1e-9  # a time less so much is before it
 EVERY_S = 0.02  # samples by which a window is told
 WHOLE_SHARE = 0.8  # of the samples that a window should have
 SCREENED_S = 40.0  # in one piece, where most moves: units, signs and order are judged there
 SCORED_EDGE_S = 0.3  # around a stretch, see `signals.validation`
 TRIM = 20  # samples of the band (0.8 s) at either end, in which filters settle
 APART = 2 * TRIM + TAPS // DECIMATION + 1  # samples between stretches that share no motion
+LEAST_SAMPLES = round(LEAST_S * RATE_HZ / DECIMATION)
 
 Span = tuple[float, float]  # s since the first sample
 
 
+def is_long(log: Log) -> bool:
+    """Whether a recording is searched in stretches: by its samples, for one stamp may be wrong."""
+    if len(log) < FEWEST or 1e-9 * (log.end_ns - log.begin_ns) <= LONG_S:
+        return False
+    return len(log) * _step_s(log) > LONG_S
+
+
+def _step_s(log: Log) -> float:
+    """The usual step between stamps."""
+    steps = np.diff(log.piece(0, FIRST).stamp_ns)
+    return 1e-9 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+
+
+def _usable(log: Log, clocks: list[tuple[int, RecordingClock]]) -> Iterator[Log]:
+    """Usable samples in order, piece by piece; `clocks` gets each one's first stamp and clock."""
+    size, last = max(round(PIECE_S / _step_s(log)), FEWEST), -np.inf
+    for start in range(0, len(log), size):
+        seen = log.piece(start, start + size + AHEAD)
+        rows, raw = uniform(seen.stamp_ns, seen.q, seen.dq, seen.tau), seen.piece(0, size)
+        own = raw.take(rows[rows < size])
+        if len(own):
+            clock = check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau)
+            own, clock, _ = at_source(own, clock)
+            own = own.take(own.stamp_ns > last)
+        if len(own):
+            clocks.append((own.first_ns, clock))
+            last = own.end_ns
+            yield own
+
+
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """What a first look at a recording tells.
+    """What a first look at a long recording tells.
 
     Attributes:
-        begin_ns: stamp of its first sample; end_s: of the last, since then.
-        clock: of all pieces.
-        pieces: (p, 2) s, first and last sample of each.
-        windows: (w, 2) s; rows: (w, 2) of the recording, where they begin and end.
+        log: its usable samples.
+        clock: of the recording as it was.
+        begins: (w,) s since the first sample, of windows of `STRETCH_S`.
         moments: (w, f, f) mean products of one, positions and velocities in them; nan in those
             that lack samples.
     """
 
-    begin_ns: int
-    end_s: float
+    log: Log
     clock: RecordingClock
-    pieces: Array
-    windows: Array
-    rows: np.ndarray
+    begins: Array
     moments: Array
 
-    def spread(self, span: Span, count: int = STRETCHES) -> list[Span]:
+    @classmethod
+    def of(cls, log: Log) -> Survey:
+        """Of a recording with the joints of its model.
+
+        Raises:
+            RecordingRefused: no sample of it is usable.
+        """
+        clocks: list[tuple[int, RecordingClock]] = []
+        own = replace(mapped(log, _usable(log, clocks)), commands=log.commands)
+        if not clocks:
+            said = f"{log.path}: none of its {len(log)} samples is usable"
+            raise RecordingRefused(RecordingFault.DATA, said)
+        begins_s = [1e-9 * (stamp - own.first_ns) for stamp, _ in clocks]
+        clock = joined([clock for _, clock in clocks], begins_s)
+        bare = cls(own, clock, np.zeros(0), np.zeros(0))
+        every = max(STRETCH_S, bare.end_s / MOST_WINDOWS)
+        step = max(round(EVERY_S * clock.rate_hz), 1)
+        told = []
+        for begin in every * np.arange(max(int(bare.end_s / every), 1)):
+            some = own.piece(*bare.rows(begin, begin + STRETCH_S - NANO_S))
+            signals = np.column_stack([np.ones(len(some)), some.q, some.dq])[::step]
+            if len(signals):
+                told.append((begin, len(signals), signals.T @ signals / len(signals)))
+        begins, counts, moments = (np.array(x) for x in zip(*told, strict=True))
+        moments[counts < WHOLE_SHARE * counts.max()] = np.nan
+        return replace(bare, begins=begins, moments=moments)
+
+    def in_time(self, torque: Judged) -> Survey:
+        """The same where torques come in time, else of the recording with them put in time."""
+        return Survey.of(torque.in_time(self.log)) if torque.late_s else self
+
+    @property
+    def end_s(self) -> float:
+        """When the last sample is."""
+        return 1e-9 * (int(self.log.stamp_ns[-1]) - self.log.first_ns)
+
+    def rows(self, begin_s: float, end_s: float) -> tuple[int, int]:
+        """Rows of the samples from one time to another, which counts as well."""
+        begin, end = (self.log.first_ns + round(1e9 * t) for t in (begin_s, end_s))
+        first, last = np.searchsorted(self.log.stamp_ns, (begin, end + 1)).tolist()
+        return first, last
+
+    def recorded(self, first: int, last: int) -> Recorded:
+        """Some rows of the samples."""
+        return Recorded.of(self.log.piece(first, last), lateness(self.clock), self.log.first_ns)
+
+    def spread(self, span: Span) -> list[Span]:
         """Windows of a time that move most and most differently, one in each part of it."""
-        inside = (self.windows[:, 0] >= span[0]) & (self.windows[:, 1] <= span[1])
+        inside = (self.begins >= span[0]) & (self.begins + STRETCH_S <= span[1])
         usable = np.flatnonzero(inside & np.isfinite(self.moments[:, 0, 0]))
         if not len(usable):
-            return []
+            return [span]
         scale = np.sqrt(np.diagonal(self.moments[usable].mean(axis=0)))
         M = self.moments[usable] / np.maximum(np.outer(scale, scale), 1e-12)
         known, chosen = 1e-3 * np.eye(len(scale)), []
-        parts = np.array_split(np.arange(len(usable)), count)
+        parts = np.array_split(np.arange(len(usable)), STRETCHES)
         for part in (parts[0], parts[-1], *parts[1:-1]):  # what changes shows at both ends best
             if len(part):
                 best = part[int(np.argmax(np.linalg.slogdet(known + M[part])[1]))]
                 known = known + M[best]
-                chosen.append(int(usable[best]))
-        return [(float(a), float(b)) for a, b in self.windows[sorted(set(chosen))]]
+                chosen.append(float(self.begins[usable[best]]))
+        return [(begin, begin + STRETCH_S) for begin in sorted(chosen)]
 
-    def busiest(self, seconds: float, end_s: float | None = None) -> tuple[int, int]:
-        """Rows of so many seconds, in one and before an end, in which joints move most."""
-        n = (self.moments.shape[1] - 1) // 2
+    def busiest(self, log: Log, end_s: float | None = None) -> Log:
+        """The part in one piece in which joints move most.
+
+        Args:
+            log: the recording as it was read; end_s: the part lies before it.
+        """
+        n = len(self.log.joint_names)
         speed = np.nan_to_num(np.diagonal(self.moments, axis1=1, axis2=2)[:, 1 + n :])
         moved = np.sqrt(speed / np.maximum(speed.max(axis=0), 1e-12)).sum(axis=1)
-        step = float(np.median(np.diff(self.windows[:, 0]))) if len(moved) > 1 else STRETCH_S
-        moved = moved[self.windows[:, 1] <= (self.end_s if end_s is None else end_s)]
-        count = min(max(int(seconds / step), 1), len(moved))
-        sums = np.convolve(moved, np.ones(count), "valid")
-        begin = int(self.rows[int(np.argmax(sums)), 0])
-        return begin, begin + round(seconds / self.clock.period_s)
+        step = float(np.median(np.diff(self.begins))) if len(moved) > 1 else STRETCH_S
+        moved = moved[self.begins + STRETCH_S <= (self.end_s if end_s is None else end_s)]
+        count = min(max(int(SCREENED_S / step), 1), len(moved))
+        begin_s = self.begins[int(np.argmax(np.convolve(moved, np.ones(count), "valid")))]
+        stamp = self.log.stamp_ns[self.rows(begin_s, begin_s)[0]]
+        off = np.concatenate([np.abs(x - stamp) for x in stretches(log.stamp_ns)])
+        begin = int(np.argmin(off))
+        return log.piece(begin, begin + round(SCREENED_S / self.clock.period_s))
+
+
+def part_of(log: Log, model: SelfModel, end_s: float | None = None) -> Log:
+    """Of a long recording the part in one piece in which most moves; a short one whole.
+
+    Args:
+        model: of the arm; end_s: the part lies before it, s.
+
+    Raises:
+        RecordingRefused: of another robot.
+    """
+    if is_long(log):
+        return Survey.of(of_this_robot(log, model)).busiest(log, end_s)
+    if end_s is None:
+        return log
+    return log.take(log.stamp_ns < log.first_ns + round(1e9 * end_s))
 
 
 class Run(NamedTuple):
@@ -137,45 +237,76 @@ class Run(NamedTuple):
         """The first sample from an instant on."""
         return int(np.ceil((t - self.t(0)) * RATE_HZ / DECIMATION - 1e-6))
 
-    def rows(self, begin: int, end: int) -> tuple[int, int]:
-        """Rows in the file that samples from one to before another need."""
-        stop = DECIMATION * (end - 1 + 2 * TRIM) + TAPS
-        return self.first + DECIMATION * begin, self.first + stop
 
-
-@dataclass(frozen=True, eq=False)
-class LongRecording:
-    """A recording of any length, clean and smooth.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LongRecording(Recorded):
+    """A recording of any length, smooth; in memory are some stretches of it.
 
     Attributes:
-        log: with the joints of the model.
-        survey: of it; span: the time that is used, s.
-        smoothness: of the splines; dq_late_s: how much later dq is than q.
+        survey: of it.
+        smoothness: of the splines.
         table: [q, dq, ddq, tau, where tau was measured] at 250 Hz; runs: without holes in it.
+        span: the time that is used, s; spans: the stretches, cut at holes.
     """
 
-    log: Log
     survey: Survey
-    span: Span
     smoothness: Smoothness
-    dq_late_s: float
     table: RowsFile
     runs: tuple[Run, ...]
+    span: Span
+    spans: tuple[Span, ...] = ()
+
+    @classmethod
+    def through(cls, survey: Survey, name: str) -> LongRecording:
+        """Smooth a recording, and take stretches that are spread over it."""
+        span = 0.0, survey.end_s
+        probes = [survey.recorded(*survey.rows(*x)) for x in survey.spread(span)]
+        smoothness = smoothness_of([Splines.through(x.t, x.q, x.dq, x.dq_late_s) for x in probes])
+        table, runs = _smooth(survey, smoothness)
+        none = survey.recorded(0, 0)
+        signals = name, none.t, none.q, none.dq, none.tau, None, None, none.dq_late_s
+        return cls(
+            *signals, survey=survey, smoothness=smoothness, table=table, runs=runs, span=span
+        ).between(*span)
+
+    @property
+    def end_s(self) -> float:
+        """When what is used of it ends."""
+        return self.span[1]
 
     @property
     def seconds(self) -> float:
+        """How much of it is in memory."""
+        return sum(b - a for a, b in self.spans)
+
+    @property
+    def whole_s(self) -> float:
         """How much of it there is."""
         return sum(max(run.samples, 0) for run in self.runs) * DECIMATION / RATE_HZ
 
-    def signals(self, spans: Sequence[Span], arm: ArmDynamics) -> Signals:
-        """Some stretches of it, as the search sees a recording."""
-        noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
-        parts = []
-        for run, begin, end in self._samples(spans):
-            motion, tau, known = self._motion(run.rows(begin, end), run, arm)
-            motion = replace(motion, bands_hz=bands_of(motion, noise))
-            parts.append(_banded(motion, tau, known, noise))
-        return together(parts)
+    def between(self, begin_s: float, end_s: float) -> LongRecording:
+        """The same in a part of its time alone."""
+        own = replace(self, span=(max(begin_s, self.span[0]), min(end_s, self.span[1])))
+        return own.taking(self.survey.spread(own.span))
+
+    def taking(self, spans: Sequence[Span]) -> LongRecording:
+        """With these stretches; those that touch are one."""
+        spans = [(run.t(a), run.t(b - 1)) for run, a, b in self._samples(spans)]
+        edge, survey = SCORED_EDGE_S, self.survey
+        parts = [survey.recorded(*survey.rows(a - edge, b + edge)) for a, b in spans]
+        begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
+        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in parts]) for k in _RAW)
+        own = replace(self, t=t, q=q, dq=dq, tau=tau, spans=tuple(spans))
+        own = replace(own, begins=tuple(begins.tolist()))
+        if any(x.commands is None for x in parts):
+            return replace(own, command_t=None, commands=None)
+        at, commands = (np.concatenate([getattr(x, k) for x in parts]) for k in _COMMANDS)
+        _, first = np.unique(at, return_index=True)
+        return replace(own, command_t=at[first], commands=commands[first])
+
+    def signals(self, arm: ArmDynamics) -> Signals:
+        """The stretches as the search sees a recording."""
+        return together([self._part(*x, arm) for x in self._samples(self.spans)])
 
     def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
         """All of it, piece by piece; each begins so many samples before what is its own.
@@ -188,28 +319,7 @@ class LongRecording:
             last = min(run.samples, run.sample(self.span[1]))
             for begin in range(max(before, run.sample(self.span[0])), last, size):
                 end = min(begin + size, last)
-                rows = run.rows(begin - before, end)
-                motion, tau, known = self._motion(rows, run, like.motion.arm)
-                motion = replace(motion, bands_hz=like.motion.bands_hz)
-                yield _banded(motion, tau, known, like.noise)
-
-    def recorded(self, spans: Sequence[Span], name: str) -> Recorded:
-        """Samples of some stretches, as they were recorded."""
-        spans = self.near(spans)
-        parts = [self.samples(begin - SCORED_EDGE_S, end + SCORED_EDGE_S) for begin, end in spans]
-        begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
-        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in parts]) for k in _RAW)
-        own = replace(parts[0], name=name, t=t, q=q, dq=dq, tau=tau, whole=self)
-        own = replace(own, begins=tuple(map(int, begins)), spans=tuple(spans))
-        if any(x.commands is None for x in parts):
-            return own
-        at, commands = (np.concatenate([getattr(x, k) for x in parts]) for k in _COMMANDS)
-        _, first = np.unique(at, return_index=True)
-        return replace(own, command_t=at[first], commands=commands[first])
-
-    def near(self, spans: Sequence[Span]) -> list[Span]:
-        """Stretches as they are in the motion: cut at its holes, those that touch in one."""
-        return [(run.t(a), run.t(b - 1)) for run, a, b in self._samples(spans)]
+                yield self._part(run, begin - before, end, like.motion.arm, like.motion.bands_hz)
 
     def _samples(self, spans: Sequence[Span]) -> list[tuple[Run, int, int]]:
         """Run and samples of stretches; those too near one another to be two are one."""
@@ -226,261 +336,78 @@ class LongRecording:
                 out.append((run, a, b))
         return out
 
-    def _motion(
-        self, rows: tuple[int, int], run: Run, arm: ArmDynamics
-    ) -> tuple[Motion, Array, Array]:
-        """Of rows in the file, with their torque and where it was measured."""
-        parts = np.split(self.table.rows(*rows), 5, axis=1)
+    def _part(
+        self, run: Run, begin: int, end: int, arm: ArmDynamics, bands_hz: Array | None = None
+    ) -> Signals:
+        """Samples of the band from one to before another; its bands are its own where None."""
+        first, last = DECIMATION * begin, DECIMATION * (end - 1 + 2 * TRIM) + TAPS
+        parts = np.split(self.table.rows(run.first + first, run.first + last), 5, axis=1)
         q, dq, ddq, tau, known = map(np.ascontiguousarray, parts)
-        t = run.begin_s + np.arange(rows[0] - run.first, rows[1] - run.first) / RATE_HZ
-        return Motion(t, q, dq, ddq, arm), tau, known
-
-    def samples(self, begin_s: float, end_s: float) -> Recorded:
-        """Samples of a time, as they were recorded."""
-        parts = []
-        for k, (first, last) in enumerate(self.survey.pieces):
-            if last >= begin_s and first <= end_s:
-                parts.append(_piece(self.log, k))
-        whole = [Recorded.of(x, self.dq_late_s, self.survey.begin_ns) for x in parts]
-        t = np.concatenate([x.t for x in whole])
-        rows = np.flatnonzero((t >= begin_s) & (t <= end_s) & np.append(True, np.diff(t) > 0))
-        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in whole])[rows] for k in _RAW)
-        own = replace(whole[0], t=t, q=q, dq=dq, tau=tau)
-        if any(x.commands is None for x in whole):
-            return replace(own, command_t=None, commands=None)
-        at, commands = (np.concatenate([getattr(x, k) for x in whole]) for k in _COMMANDS)
-        inside = (at >= begin_s - HOLE_S) & (at <= end_s + HOLE_S)
-        return replace(own, command_t=at[inside], commands=commands[inside])
+        t = run.begin_s + np.arange(first, last) / RATE_HZ
+        noise = 2.0 * self.survey.clock.period_s * self.smoothness.dq_noise**2
+        return in_band(Motion(t, q, dq, ddq, arm, bands_hz=bands_hz), noise, tau, known, TRIM)
 
 
-LEAST_SAMPLES = round(LEAST_S * RATE_HZ / DECIMATION)
 _RAW = ("t", "q", "dq", "tau")
 _COMMANDS = "command_t", "commands"
 
 
-def _banded(motion: Motion, tau: Array, known: Array, noise: Array) -> Signals:
-    """A stretch in the band, trimmed; its torque and where that was measured (m, n) at 250 Hz."""
-    t = motion.t[TAPS // 2 : -(TAPS // 2) : DECIMATION][TRIM:-TRIM]
-    own, heard = (x[TRIM:-TRIM] for x in (low(tau), heard_in(known)))
-    return Signals(motion, noise, own, t, heard, trim=TRIM)
-
-
-def is_long(log: Log) -> bool:
-    """Whether a recording is searched in stretches: by its samples, for one stamp may be wrong."""
-    if len(log) < FEWEST or 1e-9 * (log.end_ns - log.begin_ns) <= LONG_S:
-        return False
-    return len(log) * _step_s(log) > LONG_S
-
-
-def surveyed(log: Log) -> Survey:
-    """A first look at a recording with the joints of its model.
-
-    Raises:
-        RecordingRefused: no sample of it is usable.
-    """
-    clocks: list[RecordingClock] = []
-    pieces: list[Span] = []
-    begin_ns, end_ns = _ends(log)
-    windows = _Windows(1e-9 * (end_ns - begin_ns), len(log.joint_names))
-    for k in range(_count(log)):
-        raw, rows = _read(log, k)
-        clock = check_timing(raw.stamp_ns, raw.q, raw.dq, raw.tau)
-        if not len(rows):
+def _smooth(survey: Survey, smoothness: Smoothness) -> tuple[RowsFile, tuple[Run, ...]]:
+    """Splines through a recording in pieces that overlap, and the runs between its holes."""
+    log, size = survey.log, round(PIECE_S * RATE_HZ)
+    table, runs, holes, row, before = RowsFile(5 * len(log.joint_names)), [], [], 0, log.first_ns
+    for stamps in stretches(log.stamp_ns):
+        steps = np.diff(stamps, prepend=before)
+        holes += (row + np.flatnonzero(steps > 1e9 * HOLE_S)).tolist()
+        row, before = row + len(stamps), stamps[-1]
+    for first, last in pairwise((0, *holes, len(log))):
+        begin, end = (survey.recorded(k, k + 1).t[0] for k in (first, last - 1))
+        if end - begin <= LEAST_S:
             continue
-        own = raw.take(rows)
-        own, clock, _ = at_source(own, clock)
-        t = 1e-9 * (own.stamp_ns - begin_ns).astype(np.float64)
-        clocks.append(clock)
-        pieces.append((float(t[0]), float(t[-1])))
-        windows.take(t, own, rows + k * _size(log), clock.period_s)
-    begins = [first for first, _ in pieces]
-    table, rows, moments = windows.told()
-    return Survey(
-        begin_ns, pieces[-1][1], joined(clocks, begins), np.array(pieces), table, rows, moments
+        # the last piece of a run reaches to its end, so that none is shorter than an overlap
+        count = int(np.ceil((end - begin - 2.0 * EDGE_S) * RATE_HZ - 1e-9))
+        short = round((OVERLAP_S - EDGE_S) * RATE_HZ)
+        run = Run(float(begin + EDGE_S), len(table), count)
+        for a, b in pairwise((0, *range(size, count - short, size), count)):
+            grid = run.begin_s + np.arange(a, b) / RATE_HZ
+            rows = survey.rows(grid[0] - OVERLAP_S, grid[-1] + 1.0 / RATE_HZ + OVERLAP_S)
+            part = survey.recorded(max(rows[0], first), min(rows[1], last))
+            knots = np.arange(
+                np.floor((part.t[0] - begin) / KNOT_S), np.ceil((part.t[-1] - begin) / KNOT_S) + 1
+            )
+            inner = begin + KNOT_S * knots
+            splines = Splines.through(part.t, part.q, part.dq, part.dq_late_s, inner)
+            told = splines.smoothed(smoothness).at(grid)
+            torque = (on_grid(grid, part.t, x) for x in (part.tau, part.heard.astype(float)))
+            table.append(np.column_stack([*told, *torque]))
+        if run.samples > 0:
+            runs.append(run)
+    return table, tuple(runs)
+
+
+def sampling(recordings: Sequence[Recorded]) -> tuple[dict[str, Any], ...]:
+    """What was taken of long recordings, for the JSON file."""
+    return tuple(
+        {
+            "recording": own.name,
+            "seconds": own.whole_s,
+            "searched_s": own.seconds,
+            "stretches_s": [[float(a), float(b)] for a, b in own.spans],
+            "weighed_on_all": len(recordings) == 1,
+        }
+        for own in recordings
+        if isinstance(own, LongRecording)
     )
 
 
-class _Windows:
-    """Windows of a recording and what moves in them."""
-
-    def __init__(self, seconds: float, n: int) -> None:
-        self.every = max(STRETCH_S, seconds / MOST_WINDOWS)
-        count = max(int(seconds / self.every), 1)
-        self.moments = np.zeros((count, 2 * n + 1, 2 * n + 1))
-        self.seen = np.zeros(count)
-        self.rows = np.full((count, 2), -1)
-        self.first = np.full(count, np.inf)
-        self.last = np.full(count, -np.inf)
-
-    def take(self, t: Array, log: Log, rows: np.ndarray, period_s: float) -> None:
-        """Take a piece: t (m,) s, and which rows of the whole its samples are."""
-        place = (t // self.every).astype(int)
-        inside = (place >= 0) & (place < len(self.seen)) & (t - place * self.every < STRETCH_S)
-        step = max(round(EVERY_S / period_s), 1)
-        for w in np.unique(place[inside]):
-            own = np.flatnonzero(inside & (place == w))
-            some = own[::step]
-            signals = np.column_stack([np.ones(len(some)), log.q[some], log.dq[some]])
-            self.moments[w] += signals.T @ signals
-            self.seen[w] += len(some) * step * period_s
-            self.first[w] = min(self.first[w], t[own[0]])
-            self.last[w] = max(self.last[w], t[own[-1]])
-            self.rows[w] = (
-                rows[own[0]] if self.rows[w, 0] < 0 else self.rows[w, 0],
-                rows[own[-1]] + 1,
-            )
-
-    def told(self) -> tuple[Array, np.ndarray, Array]:
-        """Windows (w, 2) s, their rows (w, 2) and moments (w, f, f), of those that have any."""
-        there = self.rows[:, 0] >= 0
-        counts = np.maximum(self.moments[:, :1, :1], 1.0)
-        moments = self.moments / counts
-        moments[self.seen < WHOLE_SHARE * self.seen.max()] = np.nan
-        begin = self.every * np.arange(len(self.seen))
-        windows = np.column_stack([begin, begin + STRETCH_S])
-        return windows[there], self.rows[there], moments[there]
-
-
-def _step_s(log: Log) -> float:
-    """The usual step between stamps."""
-    steps = np.diff(log.piece(0, FIRST).stamp_ns)
-    return 1e-9 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-
-
-def _size(log: Log) -> int:
-    """Samples of a piece."""
-    return max(round(PIECE_S / _step_s(log)), FEWEST)
-
-
-def _count(log: Log) -> int:
-    return int(np.ceil(len(log) / _size(log)))
-
-
-def _ends(log: Log) -> tuple[int, int]:
-    """The first usable stamp and the last, ns. Raises RecordingRefused."""
-    kept = (raw.stamp_ns[rows] for raw, rows in (_read(log, k) for k in range(_count(log))))
-    first = next((x for x in kept if len(x)), None)
-    back = (_read(log, k) for k in reversed(range(_count(log))))
-    last = next((raw.stamp_ns[rows] for raw, rows in back if len(rows)), None)
-    if first is None or last is None:
-        raise RecordingRefused(
-            RecordingFault.DATA, f"{log.path}: none of its {len(log)} samples is usable"
+def sampling_words(recordings: Sequence[Recorded]) -> list[str]:
+    """What was taken of long recordings, a sentence each."""
+    alone, said = len(recordings) == 1, []
+    for x in sampling(recordings):
+        who, spans = "" if alone else f"{x['recording']}: ", x["stretches_s"]
+        said.append(
+            f"{who}searched and scored in {x['searched_s']:.0f} s of {x['seconds']:.0f} s, in "
+            f"{len(spans)} stretches from {spans[0][0]:.0f} s to {spans[-1][1]:.0f} s"
+            + (", weighed on all" if alone else "")
         )
-    return int(first[0]), int(last[-1])
-
-
-def _read(log: Log, k: int) -> tuple[Log, np.ndarray]:
-    """The k-th piece as it is, and its rows worth keeping."""
-    start, size = k * _size(log), _size(log)
-    seen = log.piece(start, start + size + AHEAD)
-    rows = uniform(seen.stamp_ns, seen.q, seen.dq, seen.tau)
-    return seen.piece(0, size), rows[rows < size]
-
-
-def _piece(log: Log, k: int) -> Log:
-    """The usable samples of the k-th piece."""
-    raw, rows = _read(log, k)
-    own = raw.take(rows)
-    return replace(own, stamp_ns=source_stamps(own.stamp_ns, own.q, own.dq))
-
-
-def _pieces(log: Log, survey: Survey) -> Iterator[tuple[Array, Array, Array, Array]]:
-    """t, q, dq, tau of usable samples, in order."""
-    last = -np.inf
-    for k in range(_count(log)):
-        own = _piece(log, k)
-        if not len(own):
-            continue
-        t = 1e-9 * (own.stamp_ns - survey.begin_ns).astype(np.float64)
-        kept = t > last
-        if kept.any():
-            last = float(t[-1])
-            yield t[kept], own.q[kept], own.dq[kept], own.tau[kept]
-
-
-class _Smoother:
-    """Splines through pieces that overlap, into a table.
-
-    Args:
-        smoothness: of all; dq_late_s: how much later dq is than q; n: joints.
-    """
-
-    def __init__(self, smoothness: Smoothness, dq_late_s: float, n: int) -> None:
-        self.smoothness, self.late = smoothness, dq_late_s
-        self.table = RowsFile(5 * n)
-        self.runs: list[Run] = []
-        self._kept: list[tuple[Array, ...]] = []
-        self._begin, self._done, self._first = 0.0, 0, 0
-
-    def take(self, rows: tuple[Array, ...]) -> None:
-        """Take samples that follow."""
-        t = rows[0]
-        before = self._kept[-1][0][-1] if self._kept else t[0]
-        holes = np.flatnonzero(np.diff(t, prepend=before) > HOLE_S).tolist()
-        for a, b in pairwise(sorted({0, *holes, len(t)})):
-            if a in holes:
-                self.finish()
-            self._add(tuple(x[a:b] for x in rows))
-
-    def _add(self, rows: tuple[Array, ...]) -> None:
-        if not self._kept:
-            self._begin, self._done, self._first = float(rows[0][0]), 0, len(self.table)
-        self._kept.append(rows)
-        while self._kept[-1][0][-1] > self._next() + PIECE_S + OVERLAP_S:
-            self._smooth(self._next() + PIECE_S)
-
-    def _next(self) -> float:
-        """The next instant that is to be told, s."""
-        return self._begin + EDGE_S + self._done / RATE_HZ
-
-    def finish(self) -> None:
-        """Tell what is left of a run."""
-        if self._kept:
-            end = self._kept[-1][0][-1]
-            if end - self._begin > LEAST_S:
-                self._smooth(end - EDGE_S)
-            count = len(self.table) - self._first
-            run = Run(self._begin + EDGE_S, self._first, count)
-            if run.samples > 0:
-                self.runs.append(run)
-            self._kept = []
-
-    def _smooth(self, end_s: float) -> None:
-        """Tell all instants before one."""
-        t, q, dq, tau = (np.concatenate(x) for x in zip(*self._kept, strict=True))
-        reach = self._next() - OVERLAP_S
-        used = slice(int(np.searchsorted(t, reach)), int(np.searchsorted(t, end_s + OVERLAP_S)))
-        part = t[used]
-        knots = np.arange(
-            int(np.floor((part[0] - self._begin) / KNOT_S)),
-            int(np.ceil((part[-1] - self._begin) / KNOT_S)) + 1,
-        )
-        inner = self._begin + KNOT_S * knots.astype(np.float64)
-        splines = Splines.through(part, q[used], dq[used], self.late, inner)
-        count = int(np.ceil((end_s - self._next()) * RATE_HZ - 1e-9))
-        grid = self._begin + EDGE_S + (self._done + np.arange(count)) / RATE_HZ
-        told = splines.smoothed(self.smoothness).at(grid)
-        known = ~stuck(part, dq[used], tau[used])
-        torque = (on_grid(grid, part, x) for x in (tau[used], known.astype(float)))
-        self.table.append(np.column_stack([*told, *torque]))
-        self._done += count
-        keep = int(np.searchsorted(t, self._next() - OVERLAP_S))
-        self._kept = [tuple(x[keep:] for x in (t, q, dq, tau))]
-
-
-def long_recording(log: Log, survey: Survey) -> LongRecording:
-    """Smooth a recording.
-
-    Args:
-        log: with the joints of the model; survey: of it.
-    """
-    late, span = lateness(survey.clock), (0.0, survey.end_s)
-    nothing = Smoothness(np.zeros(0), np.zeros(0), np.zeros(0))
-    raw = LongRecording(log, survey, span, nothing, late, RowsFile(1), ())
-    probes = [raw.samples(*x) for x in survey.spread(span)]
-    smoothness = smoothness_of([Splines.through(x.t, x.q, x.dq, late) for x in probes])
-    smoother = _Smoother(smoothness, late, len(log.joint_names))
-    for rows in _pieces(log, survey):
-        smoother.take(rows)
-    smoother.finish()
-    return replace(raw, smoothness=smoothness, table=smoother.table, runs=tuple(smoother.runs))
+    return said

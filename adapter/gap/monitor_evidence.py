@@ -167,10 +167,6 @@ class Evidence:
             G[k], b[k] = C - X.T @ X, own - self._pull @ X
         return G, b
 
-    def from_row(self, first: int) -> tuple[Array, Array]:
-        """(1, K, K) G and (1, K) b of all columns for a start at one row."""
-        return self.information(len(self._S) - first, first=first)
-
     def leftover(self, candidate: Signature, a: Array, first: int) -> Array:
         """(rows, n) residual that stays when the candidate acts with coefficients a."""
         added = self.rows.S[:, :, candidate.columns] @ a

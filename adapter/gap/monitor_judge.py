@@ -151,7 +151,7 @@ class DisagreementDetector:
         since_s = float(t[first]) - HALF_ROW_S
         weight[np.abs(t - since_s) < EDGE_S] = 0.0
         clear = self._evidence(weight)
-        G, b = clear.from_row(first)
+        G, b = clear.information(len(clear.rows.S) - first, first=first)
         best = self._all.evidence(G, b)[:, 0]
         order = np.argsort(-best)
         which = int(order[0])

@@ -9,6 +9,7 @@ import numpy as np
 from adapter.effects.active import active_effects
 from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
 from adapter.gap.hand import hand_of
+from adapter.gap.long_recording import LongRecording
 from adapter.gap.signals import Recorded, prepare
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -30,9 +31,9 @@ def nominal_fit(
         others: recordings of the same motion may be among these too.
     """
     arm = RigidArm.of(model)
-    every = tuple(dict.fromkeys((*recordings, *others)))
+    every = [x for x in (*recordings, *others) if not isinstance(x, LongRecording)]
     signals = tuple(
-        prepare(r, arm, r.repeated_in(every)) if r.whole is None else r.whole.signals(r.spans, arm)
+        r.signals(arm) if isinstance(r, LongRecording) else prepare(r, arm, r.repeated_in(every))
         for r in recordings
     )
     known = active_effects(model.effects, arm.n)

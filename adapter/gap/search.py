@@ -274,16 +274,13 @@ def _with(
         trial, carried = under_own_noise(trial)
         bad = worst(trial, weak(trial, carried, before))
         if bad is None:  # what no arm has beside the new ones: it is found again by a better name
-            bad = next((k for k in range(before) if _is_impossible(trial.named[k])), None)
+            old = enumerate(trial.named[:before])
+            bad = next((k for k, e in old if not (e.assumed or e.possible)), None)
         if bad is None:
             return trial
         trial, before = trial.without(bad), before - (bad < before)
         if len(trial.named) == before:
             return None
-
-
-def _is_impossible(e: Named) -> bool:
-    return not (e.assumed or e.possible)
 
 
 def _named(lead: Lead) -> Named:

@@ -9,10 +9,11 @@ as the band of 10 Hz has independent ones; counting those at 1 kHz would name no
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
-from adapter.effects.base import ArmDynamics, Motion
+from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
 from adapter.gap.evidence import ORDER
@@ -122,8 +123,11 @@ class Signals:
 
         Where a joint jumped and its link did not, it is the link's torques that count.
         """
-        parts = [motion_rows(links, rows) for rows in self.stretches]
-        return replace(links, bands_hz=np.max([bands_of(x, self.noise) for x in parts], axis=0))
+        bands = []
+        for rows in self.stretches:
+            part = replace(links, **{key: getattr(links, key)[rows] for key in MOTION})
+            bands.append(bands_of(part, self.noise))
+        return replace(links, bands_hz=np.max(bands, axis=0))
 
     @property
     def stretches(self) -> list[slice]:
@@ -138,12 +142,9 @@ class Signals:
         sizes = [_size_of_low(x.stop - x.start) - 2 * self.trim for x in self.stretches]
         return tuple(int(x) for x in np.cumsum([0, *sizes[:-1]]))
 
-    @property
+    @cached_property
     def counted(self) -> Array:
         """(k, n) zero where a torque or what was before it is not known, else one."""
-        return self.once("counted", self._counted)
-
-    def _counted(self) -> Array:
         out = minimum_filter1d(self.heard, ORDER + 1, axis=0, origin=ORDER // 2)
         for begin in self.seams[1:]:
             out[begin : begin + ORDER] = 0.0
@@ -180,38 +181,19 @@ class Signals:
         out[:, :, joint] = self.low(basis).T
         return out
 
-    @property
+    @cached_property
     def low_regressor(self) -> Array:
         """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""
-        return self.once("regressor", self._low_regressor)
+        whole = self.low_of(lambda rows: regressor_of(self.motion, rows))
+        return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
 
-    @property
+    @cached_property
     def low_start(self) -> Array:
         """(s n, k, n) what is left of a unit of friction that a joint held at the first sample.
 
         Of each joint in each of s stretches. A joint that rests holds what static friction lets
         it, and forgets it as it slides.
         """
-        return self.once("start", self._low_start)
-
-    @property
-    def slowness(self) -> Array:
-        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
-
-        What static friction holds at a rest is one unknown value, however long the rest lasts.
-        """
-        return self.once("slowness", self._slowness)
-
-    def _slowness(self) -> Array:
-        dq = np.abs(self.low(self.motion.dq))
-        out = np.exp(-np.square(dq / STRIBECK_SPEED))
-        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
-            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
-            rows = np.diff(begins, append=len(rests))
-            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
-        return out
-
-    def _low_start(self) -> Array:
         q = self.motion.q
         out = np.zeros((len(self.begins), q.shape[1], *self.tau.shape))
         cuts = pairwise((*self.seams, len(self.tau)))
@@ -221,19 +203,24 @@ class Signals:
             own[:, begin:end] = left.T[:, :, None] * np.eye(q.shape[1])[:, None]
         return out.reshape(-1, *self.tau.shape)
 
-    def _low_regressor(self) -> Array:
-        whole = self.low_of(lambda rows: regressor_of(self.motion, rows))
-        return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
+    @cached_property
+    def slowness(self) -> Array:
+        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
+
+        What static friction holds at a rest is one unknown value, however long the rest lasts.
+        """
+        dq = np.abs(self.low(self.motion.dq))
+        out = np.exp(-np.square(dq / STRIBECK_SPEED))
+        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
+            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
+            rows = np.diff(begins, append=len(rests))
+            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
+        return out
 
 
 def regressor_of(motion: Motion, rows: slice) -> Array:
     """(k, n, 10 n) regressor at some instants of a motion."""
     return motion.arm.regressor(motion.q[rows], motion.dq[rows], motion.ddq[rows])
-
-
-def motion_rows(motion: Motion, rows: slice) -> Motion:
-    """Some instants of a motion."""
-    return replace(motion, **{key: getattr(motion, key)[rows] for key in MOTION})
 
 
 def _size_of_low(rows: int) -> int:
@@ -262,17 +249,23 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
     smoothed = source.smoothed()
     q, dq, ddq = smoothed.at(grid)
     noise = 2.0 * float(np.median(np.diff(source.t))) * smoothed.dq_noise**2
-    motion = Motion(grid, q, dq, ddq, arm)
-    motion = replace(motion, bands_hz=bands_of(motion, noise))
-    band_t = grid[TAPS // 2 : -(TAPS // 2)][::DECIMATION]
     tau, known = (on_grid(grid, t, x) for x in (recording.tau, recording.heard.astype(float)))
-    return Signals(motion, noise, low(tau), band_t, heard_in(known))
+    return in_band(Motion(grid, q, dq, ddq, arm), noise, tau, known)
 
 
-def heard_in(known: Array) -> Array:
-    """(k, n) in the band where a torque was measured all the while; `known` (m, n) at 250 Hz."""
-    whole = minimum_filter1d(known, TAPS, axis=0)[TAPS // 2 : -(TAPS // 2) : DECIMATION]
-    return np.asarray((whole > HEARD).astype(float))
+def in_band(motion: Motion, noise: Array, tau: Array, known: Array, trim: int = 0) -> Signals:
+    """A motion without a pause; its bands are found where it has none.
+
+    Args:
+        noise: (n,) of its velocities; tau: (m, n) N m at its instants.
+        known: (m, n) one where that was measured; trim: see `Signals`.
+    """
+    if motion.bands_hz is None:
+        motion = replace(motion, bands_hz=bands_of(motion, noise))
+    at = slice(TAPS // 2, -(TAPS // 2), DECIMATION)
+    heard = (minimum_filter1d(known, TAPS, axis=0)[at] > HEARD).astype(float)
+    own, t, heard = (x[trim : len(x) - trim] for x in (low(tau), motion.t[at], heard))
+    return Signals(motion, noise, own, t, heard, trim=trim)
 
 
 def together(parts: Sequence[Signals]) -> Signals:
@@ -320,24 +313,6 @@ def on_grid(grid: Array, t: Array, tau: Array) -> Array:
     return oaconvolve(raw, _ANTI_ALIAS[:, None], mode="valid", axes=0)[::factor][: len(grid)]
 
 
-class WholeMotion(Protocol):
-    """A long recording of which some stretches are in memory, see `long_recording`."""
-
-    @property
-    def span(self) -> tuple[float, float]:
-        """From when to when it is used, s."""
-
-    @property
-    def seconds(self) -> float:
-        """How much of it there is."""
-
-    def signals(self, spans: Sequence[tuple[float, float]], arm: ArmDynamics) -> Signals:
-        """Some stretches of it."""
-
-    def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
-        """All of it, piece by piece."""
-
-
 @dataclass(frozen=True, eq=False)
 class Recorded:
     """One recording.
@@ -348,8 +323,6 @@ class Recorded:
         command_t, commands: (k,) s and (k, n) N m; None where none were recorded.
         dq_late_s: how much later dq is than q.
         begins: rows at which its stretches begin; between these time is left out.
-        whole: of which it holds some stretches; None where it is all there is.
-        spans: (begin, end) s of the stretches.
         loads_s: about when what the hand holds changed, where that is known already.
     """
 
@@ -362,8 +335,6 @@ class Recorded:
     commands: Array | None = None
     dq_late_s: float = 0.0
     begins: tuple[int, ...] = (0,)
-    whole: WholeMotion | None = None
-    spans: tuple[tuple[float, float], ...] = ()
     loads_s: tuple[float, ...] = ()
 
     @classmethod
@@ -416,13 +387,11 @@ class Recorded:
     @property
     def end_s(self) -> float:
         """When the recording ends."""
-        return float(self.t[-1]) if self.whole is None else self.whole.span[1]
+        return float(self.t[-1])
 
     @property
     def seconds(self) -> float:
         """How much of it there is in memory."""
-        if self.whole is not None:
-            return sum(b - a for a, b in self.spans)
         return sum(float(x.t[-1] - x.t[0]) for x in self.stretches())
 
     def stretches(self) -> list[Recorded]:
@@ -437,8 +406,6 @@ class Recorded:
         return next((x for x in others if x is not self and self._repeats(x)), None)
 
     def _repeats(self, other: Recorded) -> bool:
-        if self.whole is not None or other.whole is not None:
-            return False
         if abs(self.t[-1] - other.t[-1]) > SAME_S or abs(self.t[0] - other.t[0]) > SAME_S:
             return False
         span = max(self.t[0], other.t[0]), min(self.t[-1], other.t[-1])

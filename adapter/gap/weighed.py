@@ -15,16 +15,16 @@ from scipy.linalg import eigh, solve
 from adapter.gap.evidence import ORDER, Moments, Noise
 from adapter.gap.fit import BLOCK, Fit
 from adapter.gap.folds import FOLDS, block_s, fold_of
+from adapter.gap.long_recording import LongRecording
 from adapter.gap.refine import DoubtedNoise, doubt_of
 from adapter.gap.search import Found
-from adapter.gap.signals import WholeMotion
 from adapter.model.spatial import Array
 
 STEPS = 2  # of Gauss and Newton where the model is not linear
 NEAR = 0.3  # standard deviations: a step that needs no further one
 
 
-def weighed(found: Found, whole: WholeMotion) -> Found:
+def weighed(found: Found, whole: LongRecording) -> Found:
     """What was found in some stretches of a recording, fitted to all of it."""
     under = found.under or found.fit
     for _ in range(STEPS):
@@ -43,7 +43,7 @@ def weighed(found: Found, whole: WholeMotion) -> Found:
     return replace(found, fit=fit, carried=moments, known=known)
 
 
-def moments_of(fit: Fit, whole: WholeMotion) -> Moments:
+def moments_of(fit: Fit, whole: LongRecording) -> Moments:
     """Moments of a recording about a fit to some of its stretches.
 
     Args:
@@ -70,7 +70,7 @@ def moments_of(fit: Fit, whole: WholeMotion) -> Moments:
     return Moments((G, g, power), fit.prior_std, seconds)
 
 
-def pieces_of(fit: Fit, whole: WholeMotion) -> Iterator[Fit]:
+def pieces_of(fit: Fit, whole: LongRecording) -> Iterator[Fit]:
     """A fit on each piece of a recording, under its noise; the first `ORDER` samples are before."""
     noise = fit.noise[0]
     doubted = isinstance(noise, DoubtedNoise)

@@ -85,7 +85,8 @@ def span(finding: Finding) -> str:
 
 def leftover_sentence(leftover: Leftover) -> str:
     """What stays unexplained on one joint, and what it follows."""
-    return f"joint {leftover.joint}: {plain(leftover.rmse_nm, 2)} N m {_follows(leftover)}"
+    followed, size = listed(list(leftover.depends_on)) or "no signal", plain(leftover.rmse_nm, 2)
+    return f"joint {leftover.joint}: {size} N m that follow {followed} {NOT_EXPLAINED}"
 
 
 def rivals(findings: Sequence[Finding]) -> str:
@@ -296,11 +297,6 @@ def _left(unexplained: Sequence[Leftover]) -> str:
     joints = sorted(worst)
     sizes = listed([plain(worst[j].rmse_nm, 2) for j in joints])
     return f"joints {numbered(joints)}: {sizes} N m {NOT_EXPLAINED}"
-
-
-def _follows(leftover: Leftover) -> str:
-    followed = listed(list(leftover.depends_on)) or "no signal"
-    return f"that follow {followed} {NOT_EXPLAINED}"
 
 
 def _instant(t: float) -> str:

@@ -21,26 +21,40 @@ import numpy as np
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
 from adapter.gap.at_rest import held_at_rest
-from adapter.gap.changes import loaded
+from adapter.gap.changes import loaded, with_changes
 from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
 from adapter.gap.fit import Fit, theta_prior
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
-from adapter.gap.long_recording import is_long
+from adapter.gap.long_recording import (
+    LongRecording,
+    Survey,
+    is_long,
+    part_of,
+    sampling,
+    sampling_words,
+)
 from adapter.gap.nominal import nominal_fit
-from adapter.gap.result import Finding, GapResult
-from adapter.gap.sampled import Sampled, part_of, sampling, sampling_words
+from adapter.gap.result import GapResult
 from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
-from adapter.gap.signals import Recorded
+from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.screen import RecordingFault, RecordingRefused, Screened, refuse
+from adapter.screening.screen import (
+    RecordingFault,
+    RecordingRefused,
+    Screened,
+    moving_joints,
+    of_this_robot,
+    refuse,
+    standing,
+)
 from adapter.screening.timing import lateness
-from adapter.signals.matching import matching, present
+from adapter.signals.matching import present
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.mcap import Log, read_log
 
@@ -192,7 +206,7 @@ def _task(
             progress(f"reading {name} in pieces")
         taken.append(_taken(log, name, model))
     if len(kept) == 1:
-        taken[0] = _divided(taken[0], settings, progress)
+        taken[0] = _divided(taken[0], model, settings, progress)
     fitted = tuple(x.fitted for x in taken[: len(kept)])
     scored = tuple(x.fitted for x in taken[len(kept) :]) if held else fitted
     if taken[0].scored is not None:
@@ -213,50 +227,45 @@ def _task(
 
 
 class _Taken(NamedTuple):
-    """A recording, screened, and what of it is fitted; what is scored where that is another part.
-
-    `sampled` is None where all of it is taken.
-    """
+    """A recording, screened, and what of it is fitted; what is scored where that is another."""
 
     screened: Screened
     fitted: Recorded
-    sampled: Sampled | None
     scored: Recorded | None = None
 
 
 def _taken(log: Log, name: str, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
+    arm = RigidArm.of(model)
     if is_long(log):
-        sampled = Sampled.of(log, name, model)
-        seen = sampled.screened(log)
-        if seen.torque.late_s:
-            sampled = Sampled.of(seen.torque.in_time(matching(log, model)), name, model)
-        return _Taken(seen, sampled.recorded(), sampled)
-    seen = refuse(log, model, RigidArm.of(model))
+        survey = Survey.of(of_this_robot(log, model))
+        seen = refuse(survey.busiest(log), model, arm)
+        long = LongRecording.through(survey.in_time(seen.torque), name)
+        motion = long.signals(arm).motion
+        moving = moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ) or seen.moving
+        said = standing(model.tree.joint_names, moving, motion.q, motion.dq)
+        return _Taken(replace(seen, timing=survey.clock, moving=moving, standing=said), long)
+    seen = refuse(log, model, arm)
     own = seen.torque.in_time(seen.log)
     fitted = replace(Recorded.of(own, lateness(seen.timing)).cut(), name=name)
-    return _Taken(seen, fitted, None)
+    return _Taken(seen, fitted)
 
 
-def _divided(taken: _Taken, settings: GapSettings, progress: Progress) -> _Taken:
+def _divided(taken: _Taken, model: SelfModel, settings: GapSettings, progress: Progress) -> _Taken:
     """The only recording, with what is fitted and what is scored of it."""
-    at_s, whole, sampled = settings.validate_from_s, taken.fitted, taken.sampled
+    at_s, whole = settings.validate_from_s, taken.fitted
     if at_s is not None:
         if not whole.t[0] + FIT_S < at_s < whole.end_s - SCORE_S:
             raise ValueError(
                 f"validation from {at_s} s needs {FIT_S:g} s before and {SCORE_S:g} s after it; "
                 f"{whole.name} has {whole.end_s:.1f} s"
             )
-        if sampled is None:
-            rest = whole.between(at_s, np.inf)
-            return taken._replace(fitted=whole.between(0.0, at_s), scored=rest)
-        rest = sampled.within((at_s, whole.end_s)).recorded()
-        sampled = sampled.within((0.0, at_s))
-        taken = taken._replace(scored=rest)
-    if sampled is None:
-        return taken
-    progress("looking for changes in all of it")
-    return taken._replace(fitted=sampled.with_changes(settings.inertia_prior).recorded())
+        taken = taken._replace(scored=whole.between(at_s, np.inf))
+        whole = whole.between(0.0, at_s)
+    if isinstance(whole, LongRecording):
+        progress("looking for changes in all of it")
+        whole = with_changes(whole, model, settings.inertia_prior)
+    return taken._replace(fitted=whole)
 
 
 def names_of(logs: Sequence[Path | str | Log]) -> list[str]:
@@ -317,7 +326,8 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     told, left = told_of(found, ends, trusted)
     findings = tuple(f for f in told if f.evidence >= NO_NAME)
     notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]
-    if np.abs(found.fit.dtheta / trusted).max() > ODD and not any(map(_of_a_body, findings)):
+    placed = any(CATALOGUE[f.effect].is_theta for f in findings)
+    if np.abs(found.fit.dtheta / trusted).max() > ODD and not placed:
         notes.append(UNPLACED)
     if found.weak:
         notes.append(ASSUMED)
@@ -351,7 +361,3 @@ def unnamed(title: str, joints: Sequence[int]) -> str:
     return (
         f"the model has a {title} {where}that is no surer than its rivals: it is not told by name"
     )
-
-
-def _of_a_body(finding: Finding) -> bool:
-    return CATALOGUE[finding.effect].is_theta

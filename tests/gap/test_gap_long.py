@@ -8,12 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from adapter.gap.changes import Windows, loaded
+from adapter.gap.changes import Windows, loaded, with_changes
 from adapter.gap.fit import Fit, Model
-from adapter.gap.long_recording import RATE_HZ, LongRecording, is_long, long_recording, surveyed
+from adapter.gap.long_recording import RATE_HZ, LongRecording, Survey, is_long
 from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import as_driven, real_arm
-from adapter.gap.sampled import Sampled
 from adapter.gap.signals import KNOT_S, Recorded, Signals, Splines, on_grid
 from adapter.gap.weighed import moments_of
 from adapter.gap.workflow import find_gap
@@ -33,7 +32,7 @@ def log(hidden: bool = False) -> Log:
 
 @cache
 def whole() -> LongRecording:
-    return long_recording(log(), surveyed(log()))
+    return LongRecording.through(Survey.of(log()), "a")
 
 
 def arm() -> RigidArm:
@@ -43,7 +42,7 @@ def arm() -> RigidArm:
 def at_once() -> Signals:
     """The recording through one spline, in one."""
     own, run = Recorded.of(log(), whole().dq_late_s), whole().runs[0]
-    like = whole().signals([(0.0, SECONDS)], arm())
+    like = whole().taking([(0.0, SECONDS)]).signals(arm())
     t = run.begin_s + np.arange(len(like.motion.t)) / RATE_HZ
     knots = KNOT_S * np.arange(int(np.ceil(own.t[-1] / KNOT_S)) + 1)
     splines = Splines.through(own.t, own.q, own.dq, whole().dq_late_s, knots)
@@ -55,7 +54,7 @@ def at_once() -> Signals:
 
 def test_pieces_are_the_whole_to_rounding() -> None:
     one = at_once()
-    pieces = whole().signals([(0.0, SECONDS)], arm())
+    pieces = whole().taking([(0.0, SECONDS)]).signals(arm())
     np.testing.assert_allclose(pieces.motion.q, one.motion.q, rtol=0, atol=1e-12)
     np.testing.assert_allclose(pieces.motion.dq, one.motion.dq, rtol=0, atol=1e-10)
     np.testing.assert_allclose(pieces.motion.ddq, one.motion.ddq, rtol=0, atol=1e-8)
@@ -64,8 +63,7 @@ def test_pieces_are_the_whole_to_rounding() -> None:
 
 
 def test_moments_of_pieces_are_those_of_the_whole_within_a_fraction_of_a_deviation() -> None:
-    spans = whole().survey.spread(whole().span)
-    nominal = nominal_fit([whole().recorded(spans, "a")], documented("panda"), 0.02, 1.0 / HZ)
+    nominal = nominal_fit([whole()], documented("panda"), 0.02, 1.0 / HZ)
     fit = as_driven(nominal, JOINTS, ()).with_noise()
     known = moments_of(fit, whole())
     one = at_once()
@@ -84,8 +82,8 @@ def test_moments_of_pieces_are_those_of_the_whole_within_a_fraction_of_a_deviati
 def test_what_was_left_out_does_not_pass_for_motion() -> None:
     """Stretches are looked at apart: each one's rows are those of that stretch alone."""
     spans = [(5.0, 12.0), (40.0, 46.0), (80.0, 88.0)]
-    both = whole().signals(spans, arm())
-    single = [whole().signals([span], arm()) for span in spans]
+    both = whole().taking(spans).signals(arm())
+    single = [whole().taking([span]).signals(arm()) for span in spans]
     np.testing.assert_array_equal(both.tau, np.concatenate([x.tau for x in single]))
     regressors = np.concatenate([x.low_regressor for x in single], axis=1)
     np.testing.assert_array_equal(both.low_regressor, regressors)
@@ -99,10 +97,10 @@ def test_stretches_are_spread_and_move() -> None:
 
 def test_a_load_picked_up_is_found_and_dated_in_all_of_it() -> None:
     hidden, model = Hidden(SECONDS), documented("panda")
-    sampled = Sampled.of(log(hidden=True), "a", model).with_changes(0.02)
+    sampled = with_changes(LongRecording.through(Survey.of(log(hidden=True)), "a"), model, 0.02)
     assert any(abs(t - hidden.changed_s) < 3.0 for t in sampled.loads_s), sampled.loads_s
     assert any(a < hidden.pushed_s + 1.5 < b for a, b in sampled.spans), sampled.spans
-    nominal = nominal_fit([sampled.recorded()], model, 0.02, 1.0 / HZ)
+    nominal = nominal_fit([sampled], model, 0.02, 1.0 / HZ)
     fit = loaded(nominal, JOINTS, sampled.loads_s)
     dated = {e.interval_s[0]: e.x[0] for e in fit.named}
     begin = min(dated, key=lambda t: abs(t - hidden.changed_s))
@@ -111,8 +109,7 @@ def test_a_load_picked_up_is_found_and_dated_in_all_of_it() -> None:
 
 
 def test_nothing_changes_where_nothing_does() -> None:
-    spans = whole().survey.spread(whole().span)
-    nominal = nominal_fit([whole().recorded(spans, "a")], documented("panda"), 0.02, 1.0 / HZ)
+    nominal = nominal_fit([whole()], documented("panda"), 0.02, 1.0 / HZ)
     fit = real_arm(nominal, JOINTS, (0,)).fit.with_noise()
     assert Windows.of(fit, whole()).loads_s == []
 
