@@ -18,14 +18,14 @@ if TYPE_CHECKING:  # for type checkers and editors; at run time `__getattr__` fi
     from adapter.screening.screen import RecordingFault, RecordingRefused
 
 _FROM = {
-    "Finding": "result",
-    "GapResult": "result",
-    "GapSettings": "workflow",
-    "Leftover": "result",
-    "Monitor": "monitor",
-    "RecordingFault": "screen",
-    "RecordingRefused": "screen",
-    "find_gap": "workflow",
+    "Finding": "gap.result",
+    "GapResult": "gap.result",
+    "GapSettings": "gap.workflow",
+    "Leftover": "gap.result",
+    "Monitor": "gap.monitor",
+    "RecordingFault": "screening.screen",
+    "RecordingRefused": "screening.screen",
+    "find_gap": "gap.workflow",
 }
 
 __all__ = [
@@ -43,4 +43,4 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _FROM:
         raise AttributeError(f"module 'adapter.gap' has no '{name}'")
-    return getattr(import_module(f"adapter.gap.{_FROM[name]}"), name)
+    return getattr(import_module(f"adapter.{_FROM[name]}"), name)
