@@ -29,7 +29,10 @@ def stuck(t: Array, dq: Array, tau: Array) -> NDArray[np.bool_]:
     Args:
         t: (m,) s; dq, tau: (m, n) rad/s, N m.
     """
-    out = np.broadcast_to(np.ptp(tau, axis=0) == 0.0, tau.shape).copy()
+    out = np.zeros(tau.shape, dtype=bool)
+    if len(t) < 2 or t[-1] - t[0] < STUCK_S or not (np.abs(dq) > STUCK_DQ).any():
+        return out
+    out[:] = np.ptp(tau, axis=0) == 0.0
     for j in np.flatnonzero(~out.all(axis=0)):
         x, edges = tau[:, j], np.flatnonzero(np.diff(tau[:, j])) + 1
         first, last = np.r_[0, edges], np.r_[edges, len(t)] - 1

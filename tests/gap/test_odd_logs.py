@@ -16,6 +16,7 @@ from adapter.cli import main
 from adapter.errors import ModelWarning
 from adapter.gap.load import HandLoad, find_load
 from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.rows import stuck
 from adapter.screening.screen import RecordingRefused, check_torque
 from drivers.files.mcap import Log, McapWriter
 from sim.effects import payload, per_joint
@@ -142,6 +143,13 @@ def test_who_learns_is_given_torques_of_the_arm_alone(name: str) -> None:
     _, ours, theirs = np.intersect1d(log.stamp_ns, base().stamp_ns, return_indices=True)
     off = np.sqrt(np.mean((log.tau[ours] - base().tau[theirs]) ** 2, axis=0))
     assert len(log) > 0.95 * len(base()) and off.max() < 1.0
+
+
+def test_an_arm_that_rests_may_well_hold_the_same_torque() -> None:
+    t, tau = 1e-3 * np.arange(2000), np.broadcast_to(base().tau[0], (2000, 7))
+    assert not stuck(t, 0.01 * np.ones_like(tau), tau).any()
+    assert stuck(t, np.ones_like(tau), tau).all()
+    assert not stuck(t[:1], np.ones_like(tau[:1]), tau[:1]).any()
 
 
 WRONG = {
