@@ -243,7 +243,9 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
         return together([prepare(x, arm, repeat) for x in recording.stretches()])
     t = recording.t
     if t[-1] - t[0] < LEAST_S:
-        raise ValueError(f"the search needs {LEAST_S:g} s of data, got {t[-1] - t[0]:.2f} s")
+        raise ValueError(
+            f"{recording.name}: at most {t[-1] - t[0]:.2f} s without a pause; the least is {LEAST_S:g} s"
+        )
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
     source = repeat or recording
     smoothed = source.smoothed()
@@ -355,14 +357,16 @@ class Recorded:
         """The stretches between its pauses, those that are long enough for the filters.
 
         Nobody knows how the arm moved in a pause: no spline, filter or memory reaches over one.
+        Where none is long the less long ones are taken, or the longest, for `prepare` to refuse.
         """
         cuts = pauses(self.t) + 1
         if not len(cuts):
             return replace(self, begins=(0,))
-        edges = pairwise((0, *cuts.tolist(), len(self.t)))
-        rows = [np.arange(a, b) for a, b in edges if self.t[b - 1] - self.t[a] > STRETCH_LEAST_S]
-        if not rows:  # whoever asks for its motion says that it is too short
-            return replace(self, begins=(0,))
+        every = [np.arange(a, b) for a, b in pairwise((0, *cuts.tolist(), len(self.t)))]
+        lengths_s = np.array([self.t[x[-1]] - self.t[x[0]] for x in every])
+        least_s = STRETCH_LEAST_S if lengths_s.max() > STRETCH_LEAST_S else LEAST_S
+        rows = [x for x, s in zip(every, lengths_s, strict=True) if s >= least_s]
+        rows = rows or [every[int(np.argmax(lengths_s))]]
         begins = np.cumsum([0, *(len(x) for x in rows[:-1])])
         return replace(self.part(np.concatenate(rows)), begins=tuple(map(int, begins)))
 

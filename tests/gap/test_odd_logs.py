@@ -152,6 +152,13 @@ def test_an_arm_that_rests_may_well_hold_the_same_torque() -> None:
     assert not stuck(t[:1], np.ones_like(tau[:1]), tau[:1]).any()
 
 
+def test_pauses_that_leave_no_second_together_are_told() -> None:
+    short = base().take(slice(0, 2200))
+    late = (np.arange(2200) > 1100) * 60_000_000_000
+    with pytest.raises(ValueError, match=r"at most 1\.10 s without a pause"):
+        find_load(replace(short, stamp_ns=short.stamp_ns + late), panda_model())
+
+
 WRONG = {
     "sign": lambda tau: tau * np.where(np.arange(7) == 1, -1.0, 1.0),
     "scale": lambda tau: 100.0 * tau,
