@@ -243,9 +243,8 @@ def prepare(recording: Recorded, arm: RigidArm, repeat: Recorded | None = None) 
         return together([prepare(x, arm, repeat) for x in recording.stretches()])
     t = recording.t
     if t[-1] - t[0] < LEAST_S:
-        raise ValueError(
-            f"{recording.name}: at most {t[-1] - t[0]:.2f} s without a pause; the least is {LEAST_S:g} s"
-        )
+        told = f"{recording.name}: at most {t[-1] - t[0]:.2f} s without a pause"
+        raise ValueError(f"{told}; the filters need {LEAST_S:g} s")
     grid = np.arange(t[0] + EDGE_S, t[-1] - EDGE_S, 1.0 / RATE_HZ)
     source = repeat or recording
     smoothed = source.smoothed()
