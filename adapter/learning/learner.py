@@ -102,7 +102,7 @@ class Watch(Protocol):
 
 
 class TorqueVerdict(NamedTuple):
-    """Whether torques are those of the arm that is learned; see `adapter.gap.screen`.
+    """Whether torques are those of the arm that is learned; see `adapter.screening.screen`.
 
     Attributes:
         judged: there was motion enough to tell.

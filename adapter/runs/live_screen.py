@@ -9,14 +9,7 @@ from adapter.learning.learner import TorqueVerdict
 from adapter.learning.trace import Trace
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.screening.screen import (
-    FEWEST_JUDGED,
-    SHORTEST_S,
-    RecordingRefused,
-    check_torque,
-    moving_joints,
-    smoothed_rows,
-)
+from adapter.screening.screen import SHORTEST_S, RecordingRefused, torque_verdict
 from adapter.signals.records import StateLayout, stamp_of, stamps_of
 from adapter.signals.told import Told
 from drivers.files.mcap import Log
@@ -67,13 +60,12 @@ class LiveScreen:
         rows, at = self._states.rows, self._at
         signals = stamps_of(rows), rows[:, at.q], rows[:, at.dq], rows[:, at.tau]
         log = Log(Path("live"), self._arm.tree.joint_names, *signals, metadata=self._told)
-        q, dq, *_ = smoothed_rows(log)
-        if len(q) < FEWEST_JUDGED or not moving_joints(q, dq):
-            return self._verdict
         _, before, notes = self._verdict
         refusal = None
         try:
-            _, lines = check_torque(log, self._arm)
+            torque, lines = torque_verdict(log, self._arm)
+            if torque is None:
+                return self._verdict
         except RecordingRefused as refused:
             refusal = str(refused)
             lines = [f"{refusal} Until that is mended nothing is called converged."]

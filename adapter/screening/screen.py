@@ -93,6 +93,12 @@ class RecordingRefused(ValueError):
         self.kind = kind
 
 
+def _unmeasured(log: Log) -> NDArray[np.bool_]:
+    """(m, n) where a torque is not measured."""
+    t = 1e-9 * (log.stamp_ns - log.stamp_ns[0])
+    return stuck(t, log.dq, log.tau) | unsaid(log.tau)[:, None]
+
+
 @dataclass(frozen=True)
 class Judged:
     """The torques of a recording that passes.
@@ -133,10 +139,10 @@ class Judged:
             return log
 
         def told(piece: Log) -> Log:
-            t = 1e-9 * (piece.stamp_ns - piece.stamp_ns[0])
-            missing = stuck(t, piece.dq, piece.tau) | unsaid(piece.tau)[:, None]
+            missing = _unmeasured(piece)
             if not missing.any():
                 return piece
+            t = 1e-9 * (piece.stamp_ns - piece.stamp_ns[0])
             around = max(round(DDQ_S / max(float(np.median(np.diff(t))), 1e-9)), 1)
             back, ahead = (np.clip(np.arange(len(t)) + k, 0, len(t) - 1) for k in (-around, around))
             span = np.maximum(t[ahead] - t[back], GRID_S)[:, None]
@@ -144,7 +150,7 @@ class Judged:
             model = torque_of(Rows(piece.q, piece.dq, ddq, piece.tau))
             return replace(piece, tau=np.where(missing, model, piece.tau))
 
-        return log.changed(told) if any(map(_lacks_torques, log.pieces())) else log
+        return log.changed(told) if any(_unmeasured(x).any() for x in log.pieces()) else log
 
 
 @dataclass(frozen=True)
@@ -393,11 +399,6 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
     return said
 
 
-def _lacks_torques(log: Log) -> bool:
-    t = 1e-9 * log.stamp_ns.astype(np.float64)
-    return bool(stuck(t, log.dq, log.tau).any() or unsaid(log.tau).any())
-
-
 def judge_torque(
     log: Log,
     model: SelfModel,
@@ -526,15 +527,11 @@ def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
     return q, dq, ddq, tau
 
 
-def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
-    """A recording as it is learned from; refuses efforts that are no joint torques of this arm.
+def torque_verdict(log: Log, model: SelfModel) -> tuple[Judged | None, list[str]]:
+    """What is found of a recording's torques, and notes; None where too little moves to tell.
 
     Args:
         log: joints in the model's order; model: of an arm whose base is fixed.
-
-    Returns:
-        The recording with torques in time, and the model's where none were measured; notes on it.
-        Where there is too little motion to tell, it is as it was.
 
     Raises:
         Refusal: units, sign, order or meaning of the torques.
@@ -542,14 +539,24 @@ def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
     part = most_moved(log)
     rows = uniform(part.stamp_ns, part.q, part.dq, part.tau)
     if len(rows) < FEWEST or 1e-9 * np.ptp(part.stamp_ns[rows]) < SHORTEST_S:
-        return log, []
+        return None, []
     part = part.take(rows)
     smoothed = smoothed_rows(part)
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
-        return log, []
+        return None, []
     said = silent(part, model.tree.joint_names)
     torque = judged(part, model, RigidArm.of(model), smoothed)
-    return torque.whole(torque.in_time(log)), [*said, *torque.notes]
+    return torque, [*said, *torque.notes]
+
+
+def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
+    """A recording as it is learned from, and notes on it; see `torque_verdict`.
+
+    Torques are in time, and the model's where none were measured. Where too little moves to tell,
+    it is as it was.
+    """
+    torque, said = torque_verdict(log, model)
+    return (log if torque is None else torque.whole(torque.in_time(log))), said
 
 
 def compared(
