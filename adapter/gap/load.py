@@ -23,7 +23,6 @@ from adapter.gap.weighed import moments_of
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import (
     MOVES_DQ,
     Judged,
@@ -172,7 +171,7 @@ def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:
         rests = ["the arm hardly moves: static friction in its joints counts as load"]
         return False, Judged(), rests
     dead = silent(log, model.tree.joint_names)
-    torque = judged(log, model, RigidArm.of(model), smoothed)
+    torque = judged(log, model, smoothed)
     return True, torque, dead + torque.notes
 
 

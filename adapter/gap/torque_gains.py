@@ -32,8 +32,8 @@ from adapter.gap.signals import RATE_HZ, Recorded, prepare
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.motor_currents import TorqueShares, torque_shares
-from adapter.screening.screen import cleaned, compared, moving_joints, smoothed_rows
+from adapter.screening.readings import TorqueShares, torque_shares
+from adapter.screening.screen import cleaned, judged_rows, moving_joints, smoothed_rows
 from adapter.screening.timing import lateness
 from adapter.signals.matching import present
 from adapter.signals.told import Told
@@ -205,14 +205,15 @@ class _GainTask:
 
 
 def _shares(log: Log, model: SelfModel) -> TorqueShares:
-    return torque_shares(*compared(model, RigidArm.of(model), smoothed_rows(log)))
+    rows, telling = judged_rows(log, model, smoothed_rows(log))
+    return torque_shares(rows, telling)
 
 
 def _first_gains(shares: Sequence[TorqueShares]) -> Array:
     """(n,) of each joint from the recording that tells most of it; else the middle of the told."""
     doubt = np.array([np.where(x.tells, x.std / np.abs(x.share), np.inf) for x in shares])
     best = np.argmin(doubt, axis=0)
-    own = np.array([shares[k].times[j] for j, k in enumerate(best)])
+    own = np.array([1.0 / abs(shares[k].factor[j]) for j, k in enumerate(best)])
     told = np.isfinite(doubt).any(axis=0)
     return np.asarray(np.where(told, own, np.median(own[told])))
 

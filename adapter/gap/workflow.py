@@ -236,16 +236,15 @@ class _Taken(NamedTuple):
 
 def _taken(log: Log, name: str, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
-    arm = RigidArm.of(model)
     if is_long(log):
         survey = Survey.of(of_this_robot(log, model))
-        seen = refuse(survey.busiest(log), model, arm)
+        seen = refuse(survey.busiest(log), model)
         long = LongRecording.through(survey.in_time(seen.torque), name)
-        motion = long.signals(arm).motion
+        motion = long.signals(RigidArm.of(model)).motion
         moving = moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ) or seen.moving
         said = standing(model.tree.joint_names, moving, motion.q, motion.dq)
         return _Taken(replace(seen, timing=survey.clock, moving=moving, standing=said), long)
-    seen = refuse(log, model, arm)
+    seen = refuse(log, model)
     own = seen.torque.in_time(seen.log)
     fitted = replace(Recorded.of(own, lateness(seen.timing)).cut(), name=name)
     return _Taken(seen, fitted)

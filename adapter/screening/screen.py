@@ -1,4 +1,4 @@
-"""What stops the search for the gap: recordings that would only yield false names."""
+"""Whether a recording is one that an arm can be learned from: what is refused, and what is told."""
 
 from __future__ import annotations
 
@@ -10,20 +10,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.torque import ModelTorque
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.joint_readings import (
-    ROWS,
-    Rows,
-    Telling,
-    explains_nothing,
-    lateness_s,
-    otherwise_told,
-)
-from adapter.screening.motor_currents import in_words as currents_in_words
-from adapter.screening.motor_currents import torque_shares
+from adapter.screening.likelihood import ROWS, Rows, Telling, explains_nothing, lateness_s
+from adapter.screening.readings import otherwise_told
 from adapter.screening.rows import pauses, stuck
 from adapter.screening.timing import (
     RecordingClock,
@@ -33,7 +23,6 @@ from adapter.screening.timing import (
     unsaid,
     unwrapped,
 )
-from adapter.screening.torque_units import TorqueComparison, convincing, in_words, readings, unit
 from adapter.signals.matching import matching, most_moved
 from adapter.signals.source_clock import source_stamps
 from adapter.signals.told import told_of
@@ -48,13 +37,10 @@ WANTED_RAD, WANTED_DQ = 0.3, 0.3  # what to ask for
 DEGREES = 180.0 / np.pi
 TURNS_RAD = 4.0 * np.pi  # no arm joint turns further than two turns either way
 BEYOND_RAD, BEYOND_SHARE = 0.2, 0.05  # over the limit, and in which share of the samples
-TILT_RAD = np.deg2rad(20.0)  # of gravity; less is a base that stands askew
-FOREIGN_COST = 400.0  # of the best reading; an own arm with 40 % wrong inertias stays below 100
-NAMED_UNIT_COST = 80.0  # a factor of a known unit may cost so much more than the best one
-EVERY, MOST_ROWS = 40, 2000  # ms between the rows that are judged; and how many of them
+EVERY = 40  # ms at least between the rows that are judged
 FEWEST_JUDGED = 1000  # ms of motion without pauses, of which `EDGE` is left out at either end
 PAUSE_S = 1.0  # what is left of a longer pause where nobody asks for the time
-NAMED_LATE_S = 0.04  # of torques: what is less a sensor's filter makes, which `gap` names
+NAMED_LATE_S = 0.02  # of torques: what is less a bus and a filter make, which `gap` names
 DDQ_S = 0.02  # either side of an instant, over which velocities tell accelerations
 EDGE = 300  # ms at either end, where the filter has no neighbours
 
@@ -180,11 +166,11 @@ class Screened:
         return [*self.timing.words(), *self.beyond, *self.standing, *self.silent]
 
 
-def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
+def refuse(log: Log, model: SelfModel) -> Screened:
     """Let a recording pass or say in one sentence why not.
 
     Args:
-        log: as read; model: whose joints it should have; arm: the model's rigid body.
+        log: as read; model: whose joints it should have.
 
     Raises:
         Refusal: another robot; no second of data; units or sign of velocities or positions;
@@ -197,7 +183,7 @@ def refuse(log: Log, model: SelfModel, arm: RigidArm) -> Screened:
     moving = moving_joints(q, dq)
     _check_motion(log, names, q, dq, moving)
     dead = silent(log, names)
-    torque = judged(log, model, arm, (q, dq, ddq, tau), recorded if renamed else ())
+    torque = judged(log, model, (q, dq, ddq, tau), recorded if renamed else ())
     said = standing(names, moving, q, dq)
     if abs(torque.late_s) < NAMED_LATE_S:
         torque = replace(torque, late_s=0.0)
@@ -399,111 +385,85 @@ def silent(log: Log, names: Sequence[str]) -> list[str]:
     return said
 
 
-def judge_torque(
+def judged(
     log: Log,
     model: SelfModel,
-    arm: RigidArm,
     smoothed: tuple[Array, Array, Array, Array],
     renamed: Sequence[str] = (),
-    unit_known: bool = False,
 ) -> Judged:
-    """Refuse torques in another unit, sign, order or without gravity.
+    """Judge the torques of a recording as it was told; one that is trusted is never refused.
 
     Args:
         smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
         renamed: joint names of a recording whose joints were matched by number, so that it may be
             one of another arm altogether.
-        unit_known: somebody says that torques are in N m, however large they are.
 
     Raises:
-        Refusal: see there.
+        Refusal: units, sign, order or meaning of the torques; joints told otherwise.
     """
-    comparison, tau = compared(model, arm, smoothed)
-    alive = np.ptp(log.tau, axis=0) > 0.0
-    tau = np.where(alive, tau, comparison.model)  # a dead torque says nothing of the others
-    as_is, *others = readings(comparison, tau)
-    best = others[0]
-    if renamed and min(as_is.cost, best.cost) > FOREIGN_COST:
-        why = "the joints are named otherwise and its torques are not those of such an arm"
-        raise _another_robot(log, model, renamed, why)
-    tilt = best.kind == "mounting" and _angle(best.detail, arm.gravity) < TILT_RAD
-    convinced = convincing(comparison, best, as_is) and not tilt
-    if best.kind == "scale":
-        cheap = (r for r in others if r.cost < best.cost + NAMED_UNIT_COST)
-        best = next((r for r in cheap if unit(r)), best)
-    if unit_known:
-        convinced = convinced and best.kind != "scale"
-    elif not (convinced and best.kind == "scale" and unit(best)):
-        shares = torque_shares(comparison, tau)
-        if shares.are_currents:
-            said = currents_in_words(shares, model.tree.joint_names)
-            raise RecordingRefused(RecordingFault.SCALE, f"{log.path}: {said}")
-    if not convinced:
-        return _check_joints(log, model, arm, smoothed, alive, unit_known)
-    raise RecordingRefused(
-        RecordingFault(best.kind),
-        f"{log.path}: {in_words(best, as_is, comparison, model.tree, tau)}",
-    )
+    told = told_of(log)
+    try:
+        return _judged(log, model, smoothed, renamed, told.unit_known)
+    except RecordingRefused as refusal:
+        if told.trusted:
+            return Judged(doubts=(f"{refusal} It is trusted all the same.",))
+        said = f"{refusal} If it is as the model has it, --trust-log takes it so."
+        raise RecordingRefused(refusal.kind, said) from None
 
 
-def _check_joints(
+def _judged(
     log: Log,
     model: SelfModel,
-    arm: RigidArm,
     smoothed: tuple[Array, Array, Array, Array],
-    alive: NDArray[np.bool_],
+    renamed: Sequence[str],
     unit_known: bool,
 ) -> Judged:
-    """Refuse joints told otherwise than the model has them, and torques of no such arm."""
-    q, dq, ddq, tau = signals = [x[EDGE:-EDGE] for x in smoothed]
-    telling = Telling(model, arm, alive, GRID_S * len(q), unit_known)
-    at = np.arange(0, len(q), max(EVERY, len(q) // ROWS))
-    rows = Rows(q[at], dq[at], ddq[at], tau[at])
-    said, now = otherwise_told(rows, telling)
-    late_s = lateness_s(signals, telling)
+    rows, telling = judged_rows(log, model, smoothed, unit_known)
+    found, now = otherwise_told(rows, telling)
+    late_s = lateness_s([x[EDGE:-EDGE] for x in smoothed], telling)
     if late_s:
-        late = at + round(late_s / GRID_S)
-        at, late = (x[(late >= 0) & (late < len(q))] for x in (at, late))
-        rows = Rows(q[at], dq[at], ddq[at], tau[late])
-        said_then, then = otherwise_told(rows, telling)
-        if then.cost < now.cost:
-            said, now = said_then, then
-        else:
-            late_s = 0.0
-    moving = [j for j in moving_joints(q, dq) if alive[j]]
-    share = now.share[moving]
+        behind = round(late_s / GRID_S)
+        ends = slice(max(-behind, 0), len(smoothed[0]) - max(behind, 0))
+        tau = np.roll(smoothed[3], -behind, axis=0)
+        in_time = [x[ends] for x in (*smoothed[:3], tau)]
+        rows, telling = judged_rows(log, model, in_time, unit_known)
+        found_then, then = otherwise_told(rows, telling)
+        late_s = late_s if then.cost < now.cost else 0.0
+        if late_s:
+            found, now = found_then, then
+    moving = moving_joints(*smoothed[:2])
+    share = now.share[[j for j in moving if telling.alive[j]]]
     if explains_nothing(share):
+        if renamed:
+            why = "the joints are named otherwise and its torques are not those of such an arm"
+            raise _another_robot(log, model, renamed, why)
         raise RecordingRefused(
             RecordingFault.TORQUE,
             f"{log.path}: the torques are not those of this motion of {model.name}: whatever its "
             f"load, friction and inertias, the model explains {100 * np.median(share):.0f} "
             "% of how they change; are they measured, of this arm and of the same instants?",
         )
-    if said:
+    if found:
+        said = "; ".join(reading.said for reading in found)
         raise RecordingRefused(
-            RecordingFault.JOINT,
-            f"{log.path}: {'; '.join(said)}; the model explains the torques then and not as "
-            "recorded.",
+            RecordingFault(found[0].kind),
+            f"{log.path}: {said}; the model explains the torques then and not as recorded.",
         )
     return Judged(late_s, partial(telling.corrected, now.x))
 
 
-def judged(
+def judged_rows(
     log: Log,
     model: SelfModel,
-    arm: RigidArm,
-    smoothed: tuple[Array, Array, Array, Array],
-    renamed: Sequence[str] = (),
-) -> Judged:
-    """The same of a recording as it was told; one that is trusted is never refused."""
-    told = told_of(log)
-    try:
-        return judge_torque(log, model, arm, smoothed, renamed, told.unit_known)
-    except RecordingRefused as refusal:
-        if told.trusted:
-            return Judged(doubts=(f"{refusal} It is trusted all the same.",))
-        said = f"{refusal} If it is as the model has it, --trust-log takes it so."
-        raise RecordingRefused(refusal.kind, said) from None
+    smoothed: Sequence[Array],
+    unit_known: bool = False,
+) -> tuple[Rows, Telling]:
+    """The instants of a recording that are judged, and by what; see `judged`."""
+    q, dq, ddq, tau = (x[EDGE:-EDGE] for x in smoothed)
+    at = slice(None, None, max(EVERY, len(q) // ROWS))
+    alive = np.ptp(log.tau, axis=0) > 0.0
+    telling = Telling(model, alive, GRID_S * len(q), unit_known)
+    return Rows(q[at], dq[at], ddq[at], tau[at]), telling
 
 
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
@@ -545,7 +505,7 @@ def torque_verdict(log: Log, model: SelfModel) -> tuple[Judged | None, list[str]
     if len(smoothed[0]) < FEWEST_JUDGED or not moving_joints(smoothed[0], smoothed[1]):
         return None, []
     said = silent(part, model.tree.joint_names)
-    torque = judged(part, model, RigidArm.of(model), smoothed)
+    torque = judged(part, model, smoothed)
     return torque, [*said, *torque.notes]
 
 
@@ -557,21 +517,3 @@ def check_torque(log: Log, model: SelfModel) -> tuple[Log, list[str]]:
     """
     torque, said = torque_verdict(log, model)
     return (log if torque is None else torque.whole(torque.in_time(log))), said
-
-
-def compared(
-    model: SelfModel, arm: RigidArm, smoothed: tuple[Array, Array, Array, Array]
-) -> tuple[TorqueComparison, Array]:
-    """What efforts (m, n) are held against, and these, at so many instants as are judged.
-
-    Args:
-        smoothed: q, dq, ddq, tau (m, n) on the grid of `validation.smooth`.
-    """
-    every = max(EVERY, len(smoothed[0]) // MOST_ROWS)
-    q, dq, ddq, tau = (x[EDGE:-EDGE:every] for x in smoothed)
-    return TorqueComparison(arm, q, dq, ddq, ModelTorque(model)(q, dq, ddq)), tau
-
-
-def _angle(a: Array, b: Array) -> float:
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return float(np.arccos(np.clip(a @ b / size, -1.0, 1.0))) if size else 0.0

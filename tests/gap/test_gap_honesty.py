@@ -282,17 +282,17 @@ def test_positions_beyond_either_limit_are_noted(side: str) -> None:
     """The model's limits are moved, not the arm: only the note may change."""
     noisy = recording(8)
     log = log_of(noisy.q, noisy.dq, noisy.tau)
-    inside = refuse(log, PANDA, ARM)
+    inside = refuse(log, PANDA)
     assert not [note for note in inside.notes if "may go from" in note]
     q = noisy.q[:, 2]
     bound = getattr(PANDA.limits, side).copy()
     bound[2] = np.median(q) + (0.3 if side == "lower" else -0.3)
     tight = replace(PANDA, limits=replace(PANDA.limits, **{side: bound}))
-    (note,) = [note for note in refuse(log, tight, ARM).notes if "may go from" in note]
+    (note,) = [note for note in refuse(log, tight).notes if "may go from" in note]
     assert note.startswith("panda_joint3 goes from")
     numbered = replace(log, joint_names=tuple(f"other{k}" for k in range(1, 8)))
     with pytest.raises(RecordingRefused) as refused:
-        refuse(numbered, tight, ARM)
+        refuse(numbered, tight)
     assert refused.value.kind is RecordingFault.ROBOT
 
 
@@ -302,7 +302,7 @@ def test_degrees_of_an_arm_whose_joints_only_turn_backwards() -> None:
     degrees = 180.0 / np.pi
     q = -np.abs(MOVED[0]) - 0.5
     with pytest.raises(RecordingRefused) as refused:
-        refuse(log_of(degrees * q, degrees * -np.sign(MOVED[0]) * MOVED[1]), model, ARM)
+        refuse(log_of(degrees * q, degrees * -np.sign(MOVED[0]) * MOVED[1]), model)
     assert refused.value.kind is RecordingFault.DEGREES
 
 

@@ -26,7 +26,7 @@ ORDER = [0, 1, 2, 3, 4, 6, 5]
 
 def taken(log: Log, model: SelfModel | None = None) -> Screened:
     model = model or panda_model()
-    return refuse(log, model, RigidArm.of(model))
+    return refuse(log, model)
 
 
 def refused(log: Log, kind: str, model: SelfModel | None = None) -> str:

@@ -14,7 +14,6 @@ from adapter.gap.nominal import nominal_fit
 from adapter.gap.real_arm import RealArm, real_arm
 from adapter.gap.signals import Recorded
 from adapter.model.self_model import SelfModel
-from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import refuse
 from adapter.screening.timing import lateness
 from drivers.files.mcap import Log
@@ -60,7 +59,7 @@ def loaded(signals: tuple[Array, ...], mass: float, piece: tuple[float, float]) 
 
 
 def weighed(log: Log, model: SelfModel) -> RealArm:
-    screened = refuse(log, model, RigidArm.of(model))
+    screened = refuse(log, model)
     own = Recorded.of(screened.log, lateness(screened.timing))
     return real_arm(
         nominal_fit([own], model, PRIOR, screened.timing.period_s), screened.moving, (0,)

@@ -40,7 +40,7 @@ def fitted(twin: Twin) -> tuple[RealArm, list[int]]:
     """All that the arm of a twin may have, and the joints that move."""
     model = documented()
     log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
-    screened = refuse(log, model, RigidArm.of(model))
+    screened = refuse(log, model)
     own = Recorded.of(screened.log, lateness(screened.timing))
     fit = nominal_fit([own], model, PRIOR, screened.timing.period_s)
     return real_arm(fit, screened.moving, (0,)), list(screened.moving)

@@ -13,7 +13,6 @@ from adapter.effects.robots import read_robot
 from adapter.errors import SettingsError
 from adapter.gap.torque_gains import as_told, learn_gains
 from adapter.model.self_model import SelfModel
-from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingRefused, check_torque, refuse
 from adapter.signals.importer import ImportSpec, table_log
 from adapter.signals.matching import matching
@@ -31,7 +30,7 @@ UR10_GAINS = np.array([13.5841, 14.2959, 11.3716, 11.2408, 11.7681, 11.7682])
 
 def said_of(log: Log, model: SelfModel) -> str:
     with pytest.raises(RecordingRefused) as caught:
-        refuse(log, model, RigidArm.of(model))
+        refuse(log, model)
     assert caught.value.kind == "scale"
     with pytest.raises(RecordingRefused) as again:
         check_torque(log, model)

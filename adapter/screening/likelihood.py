@@ -1,49 +1,38 @@
-"""Whether a joint as a whole is told otherwise than the model has it.
+"""How likely a recording's torques are, of an arm that may differ from its model as arms do.
 
-A joint that counts the other way, whose zero is elsewhere, that goes by another's name, or that is
-told against the world turns its position, velocity and torque at once: no reading of the torques
-alone mends that. Each such reading moves the model's own torques, and is judged by the likelihood
-of what it leaves: inertias, a payload, friction, offsets and gains have their priors, and each
-joint's noise is unknown, so that an arm that is not quite its model needs more evidence than one
+Inertias, a payload, friction, offsets and gains have their priors, and each joint's noise is
+unknown, so that an arm that is not quite its model needs more evidence for anything else than one
 that is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.by_joint import smooth_sign
+from adapter.effects.torque import ModelTorque
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.torque_units import (
-    FLOOR_NM,
-    FLOOR_SHARE,
-    FRICTION,
-    SEEN_NM,
-    SMOOTHING_S,
-    inertial_std,
-    tau_gain,
-)
 
+FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m, share of the torque
+INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
+PAYLOAD = (3.0, 0.3, 0.05)  # kg, kg m, kg m2
+FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
+SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 ROUNDS = 6  # of noise after fit; it settles in three
-EVIDENCE = 25.0  # twice the log-likelihood that a reading must gain: odds of 1 to 270 000
-MOST = 3  # readings in one recording
+EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
 ROWS = 100  # instants that are judged
-ZEROS = np.deg2rad([-90.0, 90.0, 180.0, -45.0, 45.0])
 BEYOND_RAD, BEYOND = 0.2, 100.0  # over a limit; what a recording all beyond it costs
-SIZE_ROUNDS = 4  # of one joint's size beside all else
-LEAST_FACTOR = 1.5  # of one joint's torque; gains and friction explain less
-NEAR = 2  # joints up to which an axis may be told against another (parallel links)
 # Of the variance of torques: middle joint and best one. Real arms: 0.9 and 0.97 at least.
 EXPLAINED, BEST_EXPLAINED = 0.5, 0.85
 # Of torques that come late: steps in which it is sought and how many, ms; less than `LATE_S` is
@@ -85,17 +74,21 @@ class Telling:
     """What is likely of the recordings of an arm.
 
     Attributes:
-        model: of the arm; arm: its rigid body.
+        model: of the arm.
         alive: (n,) joints whose torque is measured.
         span_s: of the rows; so many samples of a misfit with memory are independent.
         unit_known: somebody says that torques are in N m.
     """
 
     model: SelfModel
-    arm: RigidArm
     alive: NDArray[np.bool_]
     span_s: float
     unit_known: bool = False
+
+    @cached_property
+    def arm(self) -> RigidArm:
+        """Rigid body of the model."""
+        return RigidArm.of(self.model)
 
     @property
     def samples(self) -> float:
@@ -135,16 +128,16 @@ class Telling:
 
     def torque(self, rows: Rows) -> Array:
         """(m, n) N m of the model without corrections."""
-        return np.asarray(self.arm.torque(rows.q, rows.dq, rows.ddq))
+        return ModelTorque(self.model)(rows.q, rows.dq, rows.ddq)
 
     def corrected(self, x: Array, rows: Rows) -> Array:
         """(m, n) N m of the model with corrections x, see `Explained`; `rows.tau` is not used."""
         n, model = self.arm.n, self.torque(rows)
         own = x[10 * n :].reshape(len(FRICTION), n) * np.array(FRICTION)[:, None]
-        arm = self.arm.changed(self.arm.theta + inertial_std(self.arm) * x[: 10 * n].reshape(n, 10))
+        bodies = self.arm.changed(inertial_std(self.arm) * x[: 10 * n].reshape(n, 10))
         step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
         friction = own[0] + own[1] * step + own[2] * rows.dq + own[3] * model
-        return np.asarray(arm.torque(rows.q, rows.dq, rows.ddq) + friction)
+        return np.asarray(model + bodies.torque(rows.q, rows.dq, rows.ddq) + friction)
 
     def apart(self, rows: Rows) -> float:
         """How far the model without corrections is from rows; a true reading brings it nearer."""
@@ -154,7 +147,7 @@ class Telling:
     def _columns(self, rows: Rows) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
-        model = regressor @ self.arm.theta.ravel()
+        model = self.torque(rows)
         m, n = model.shape
         step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
         joint = np.zeros((m, n, len(FRICTION), n))
@@ -168,70 +161,6 @@ class Telling:
         low, high = self.model.limits.lower, self.model.limits.upper
         over = (np.maximum(q - high, low - q) > BEYOND_RAD) & (high > low)
         return BEYOND * float(over.mean(axis=0).sum())
-
-
-def _own(rows: Rows, names: Sequence[str], j: int) -> Iterator[tuple[str, Rows]]:
-    """Readings of joint j alone."""
-    (q, dq, ddq, tau, scaled), unit = rows, np.eye(len(names))[j]
-    turn = 1.0 - 2.0 * unit
-    yield (
-        f"{names[j]} counts the other way round: --turn {names[j]}",
-        Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled),
-    )
-    for zero in ZEROS:
-        way = "more" if zero > 0.0 else "less"
-        yield (
-            f"the zero of {names[j]} is elsewhere than the model's: its own angle is "
-            f"{abs(np.degrees(zero)):.0f} degrees {way} than what is recorded: "
-            f"--zero {names[j]}={-zero:.6g}",
-            Rows(q + zero * unit, dq, ddq, tau, scaled),
-        )
-
-
-def _coupled(rows: Rows, names: Sequence[str], i: int, j: int) -> Iterator[tuple[str, Rows]]:
-    """Joint j told against what carries joint i: its own angle is the sum of both, or what is left.
-
-    Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or does not.
-    """
-    q, dq, ddq, tau, scaled = rows
-    for sign, word in ((-1.0, "minus"), (1.0, "plus")):
-        turn = np.eye(len(names))
-        turn[j, i] = sign
-        said = (
-            f"{names[j]} is told together with {names[i]} (coupled axes): its angle is what is "
-            f"recorded {word} that of {names[i]}; record each joint's own angle and torque"
-        )
-        own = Rows(q @ turn.T, dq @ turn.T, ddq @ turn.T, tau, scaled)
-        yield said, own
-        yield said, own._replace(tau=tau @ np.linalg.inv(turn))
-
-
-def _sizes(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
-    """Torques in a size of its own: of one joint, or in shares of what each joint may."""
-    names, rated = telling.model.tree.joint_names, telling.model.limits.effort
-    model = telling.torque(rows)
-    for j, name in enumerate(names):
-        size = float(model[:, j] @ model[:, j])
-        factor = float(rows.tau[:, j] @ model[:, j]) / size if size else 0.0
-        seen = telling.alive[j] and factor > 0.0 and size > len(model) * SEEN_NM**2
-        if seen and abs(np.log(factor)) > np.log(LEAST_FACTOR):
-            times = np.ones(len(names))
-            times[j] = factor
-            for _ in range(SIZE_ROUNDS):  # a load, which the model lacks, is no size
-                times[j] *= telling.explained(_divided(rows, times)).size[j]
-            if abs(np.log(times[j])) > np.log(LEAST_FACTOR):
-                said = f"the torque of {name} is {times[j]:.3g} times what the model needs"
-                yield f"{said}: {tau_gain(1.0 / times)}", _divided(rows, times)
-    if np.all(np.isfinite(rated) & (rated > 0.0)):
-        for whole, word in ((1.0, "shares"), (100.0, "percent"), (1000.0, "per mille")):
-            said = f"the torques are {word} of each joint's rated torque"
-            yield f"{said}: {tau_gain(rated / whole)}", _divided(rows, whole / rated)
-
-
-def _divided(rows: Rows, factor: Array) -> Rows:
-    """Rows whose torques were recorded so many times (n,) too large."""
-    more = float(np.log(factor**2).sum())
-    return rows._replace(tau=rows.tau / factor, scaled=rows.scaled + more)
 
 
 def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
@@ -257,40 +186,15 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     return 1e-3 * late_ms if clear and abs(late_ms) > 1e3 * LATE_S else 0.0
 
 
-def joint_readings(rows: Rows, telling: Telling) -> Iterator[tuple[str, Rows]]:
-    """Sentences on how the joints may be told, and the rows if it is so."""
-    names, (q, dq, ddq, tau, _) = telling.model.tree.joint_names, rows
-    for j in range(len(names)):
-        yield from _own(rows, names, j)
-    for i, j in combinations(range(len(names)), 2):
-        order = [j if k == i else i if k == j else k for k in range(len(names))]
-        said = f"{names[i]} and {names[j]} are swapped: give each its own name in the recording"
-        yield said, Rows(q[:, order], dq[:, order], ddq[:, order], tau[:, order], rows.scaled)
-        if j - i <= NEAR:
-            yield from _coupled(rows, names, i, j)
-    if not telling.unit_known:
-        yield from _sizes(rows, telling)
-
-
-def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[str], Explained]:
-    """How the joints are told, where the recording is clear on it.
-
-    Returns:
-        A sentence for each reading, at most `MOST`; and how well the model explains the torques
-        with them.
-    """
-    now = telling.explained(rows)
-    said: list[str] = []
-    while len(said) < MOST:
-        far = telling.apart(rows)
-        nearer = [x for x in joint_readings(rows, telling) if telling.apart(x[1]) < far]
-        trials = [(telling.explained(x), word, x) for word, x in nearer]
-        best, word, changed = min(trials, key=lambda trial: trial[0].cost, default=(now, "", rows))
-        if best.cost > now.cost - EVIDENCE:
-            break
-        said.append(word)
-        now, rows = best, changed
-    return said, now
+def inertial_std(arm: RigidArm) -> Array:
+    """(n, 10) plausible errors of a model's inertias, a payload on the last link among them."""
+    theta = arm.theta
+    mass = np.abs(theta[:, :1])
+    first = INERTIA_SHARE * (np.abs(theta[:, 1:4]) + RADIUS_M * mass)
+    second = INERTIA_SHARE * (np.abs(theta[:, 4:]) + RADIUS_M**2 * mass)
+    std = np.concatenate([INERTIA_SHARE * mass, first, second], axis=1)
+    std[-1] += np.repeat(PAYLOAD, (1, 3, 6))
+    return np.asarray(std)
 
 
 def explains_nothing(share: Array) -> bool:
