@@ -44,8 +44,7 @@ BAND_MARGIN = 1.3  # of a torque's band, over where it no longer stands out of n
 CLEAR, TOP_HZ = 8.0, 2.0  # times the noise's power, over so much of the band at least
 MASSES = 20  # instants at which the mass matrix is asked for
 MANY = 100  # signals that are worth a look whether some are zero
-LEAST_S = 1.2  # of a recording
-STRETCH_LEAST_S = 2.0  # between pauses; a shorter stretch is all edge
+LEAST_S = 1.2  # of a recording, and of a stretch between pauses
 HEARD = 0.999  # of a sample at 250 Hz: that all it is made of was measured
 EDGE_S = 0.1  # a spline's ends know their neighbours on one side only
 MOTION = ("t", "q", "dq", "ddq")
@@ -356,15 +355,14 @@ class Recorded:
         """The stretches between its pauses, those that are long enough for the filters.
 
         Nobody knows how the arm moved in a pause: no spline, filter or memory reaches over one.
-        Where none is long the less long ones are taken, or the longest, for `prepare` to refuse.
+        Where none is, the longest is taken, for `prepare` to refuse.
         """
         cuts = pauses(self.t) + 1
         if not len(cuts):
             return replace(self, begins=(0,))
         every = [np.arange(a, b) for a, b in pairwise((0, *cuts.tolist(), len(self.t)))]
         lengths_s = np.array([self.t[x[-1]] - self.t[x[0]] for x in every])
-        least_s = STRETCH_LEAST_S if lengths_s.max() > STRETCH_LEAST_S else LEAST_S
-        rows = [x for x, s in zip(every, lengths_s, strict=True) if s >= least_s]
+        rows = [x for x, s in zip(every, lengths_s, strict=True) if s >= LEAST_S]
         rows = rows or [every[int(np.argmax(lengths_s))]]
         begins = np.cumsum([0, *(len(x) for x in rows[:-1])])
         return replace(self.part(np.concatenate(rows)), begins=tuple(map(int, begins)))
