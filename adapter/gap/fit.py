@@ -34,8 +34,6 @@ JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BAND_HZ = 25.0  # samples a second
 BLOCK = 25  # samples: errors of the model last so long, noise does not
-LIGHT_KG, SMALL_M = 0.1, 0.05
-SPREAD = 0.25  # a parameter of zero may be off by the share of so much of its kind's size
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
 
@@ -87,22 +85,6 @@ class Named:
         """(m, 1) one where it acts, zero elsewhere."""
         begin, end = self.interval_s
         return np.asarray(((t >= begin) & (t < end)).astype(float)[:, None])
-
-
-def theta_prior(theta: Array, share: float) -> Array:
-    """(n, 10) standard deviation of inertial parameters that are known to a `share` of their size.
-
-    A parameter that happens to be near zero is no better known than its like: to its own size a
-    quarter of its kind's (mass, first moment, mean moment of inertia) is added, and no body is
-    lighter than 0.1 kg or smaller than 5 cm for that.
-    """
-    kind = np.empty_like(theta)
-    mass = np.maximum(theta[:, :1], LIGHT_KG)
-    kind[:, :1] = mass
-    first, second = np.linalg.norm(theta[:, 1:4], axis=1), theta[:, [4, 7, 9]].mean(axis=1)
-    kind[:, 1:4] = np.maximum(first[:, None], SMALL_M * mass)
-    kind[:, 4:] = np.maximum(np.abs(second)[:, None], SMALL_M**2 * mass)
-    return np.asarray(share * np.hypot(theta, SPREAD * kind))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,49 +1,47 @@
 """What the hand carries: the load of a recording, as the numbers that a robot asks for.
 
 The payload's ten parameters, friction, offsets and motor inertia of every joint, and the errors of
-the documented inertias are fitted together by the search's own least squares (`fit.Fit`: smoothed
-motion, coloured noise, priors). With a second recording without the load all but the load is
-common to both, so that the arm's own errors cancel.
+the documented inertias are judged together (`adapter.judgement`). With a second recording without
+the load all but the load is common to both, so that the arm's own errors cancel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adapter.gap.fit import Fit, honest_covariance, place_of, under_own_noise
 from adapter.gap.hand import hand_frame
-from adapter.gap.long_recording import LongRecording, Survey, is_long, sampling_words
-from adapter.gap.nominal import nominal_fit
-from adapter.gap.real_arm import SHARES, real_arm
-from adapter.gap.signals import RATE_HZ, Recorded
-from adapter.gap.weighed import moments_of
+from adapter.gap.long_recording import Survey, is_long
+from adapter.judgement.posterior import SEGMENTS, Moments, Part, judge, moments_of
+from adapter.judgement.priors import DOCUMENTED_SHARE, prior_std
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
+from adapter.screening.likelihood import Rows
 from adapter.screening.screen import (
     MOVES_DQ,
     Judged,
     cleaned,
     judged,
-    moving_joints,
     of_this_robot,
     silent,
     smoothed_rows,
 )
-from adapter.screening.timing import lateness
 from adapter.signals.matching import present
 from adapter.signals.validation import GRID_S
 from drivers.files.mcap import Log
 
-DOCUMENTED_STD, SHARED_STD = 0.02, 0.2  # of the inertias: alone, and with a log without the load
+SHARED_SHARE = 0.2  # of the inertias, with a log without the load
 MOVES_S = 1.0  # of motion, or the arm hardly moves
 SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
-STEP, STEP_S = 1e-6, 1.0 / RATE_HZ
-DATES = tuple(np.linspace(0.1, 0.9, 9))  # shares of a recording at which the load may change
+STEP = 1e-6
+EDGE, EVERY = 60, 10  # ms at either end, where the filter has no neighbours; between rows
 CLEAR, LEAST_CHANGE_KG = 6.0, 0.05  # standard deviations of a change; what is less is not told
 
 
@@ -112,53 +110,56 @@ def find_load(
         model, said = present(model, one.joint_names, one.path.name)
         notes += [*one.warnings, *said]
     riding = hand_frame(model, frame)
-    if inertia_prior is None:
-        inertia_prior, shares = (DOCUMENTED_STD, SHARES) if empty is None else (SHARED_STD, (1.0,))
-    else:
-        shares = (1.0,)
+    share = inertia_prior or (DOCUMENTED_SHARE if empty is None else SHARED_SHARE)
     taken = [_taken(one, model) for one in logs]
     notes += [note for x in taken for note in x.notes]
-    start = nominal_fit(
-        [x.recorded for x in taken], model, inertia_prior, max(x.period_s for x in taken)
-    )
-    moving = {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq, STEP_S)}
-    arm = real_arm(start, sorted(moving & start.heard), (0,), shares)
-    whole = taken[0].recorded
-    if isinstance(whole, LongRecording) and empty is None:
-        known = moments_of(arm.fit, whole)
-        arm = replace(arm, fit=arm.fit.at(known.x), known=known)
-    fit, at = arm.fit, place_of(arm.fit, 0)
-    turn = fit.named[0].candidate.theta
-    theta = fit.coefficients[at] @ turn
-    covariance = turn.T @ honest_covariance(fit, arm.known)[np.ix_(at, at)] @ turn
-    notes += _changed(fit) if taken[0].moves else []
-    notes += sampling_words([x.recorded for x in taken])
-    before, left = (np.sqrt(np.mean(x.model.residual(0) ** 2, axis=0)) for x in (start, fit))
-    found = load_of(theta, covariance, riding)
-    return replace(found, before_nm=before, left_nm=left, notes=tuple(dict.fromkeys(notes)))
+    std, alive = prior_std(model.theta, share), np.any([x.alive for x in taken], axis=0)
+    parts, n = [Part(taken[0].moments, slice(None), np.arange(len(std)))], model.tree.n
+    if empty is not None:  # the same arm: its load is nothing, its static friction another
+        at = np.arange(len(std))
+        at[:10], at[-n:] = len(std) + np.arange(10), len(std) + 10 + np.arange(n)
+        parts.append(Part(taken[1].moments, slice(None), at))
+        std = np.r_[std, np.zeros(10), std[-n:]]
+    found = judge(parts, std, alive)
+    if taken[0].moves:
+        notes += _changed(parts, std, alive, 1e-9 * (log.end_ns - log.begin_ns))
+    load = load_of(found.x[:10], found.covariance[:10, :10], riding)
+    left = found.left_nm, taken[0].moments.rms
+    return replace(load, left_nm=left[0], before_nm=left[1], notes=tuple(dict.fromkeys(notes)))
 
 
 class _Taken(NamedTuple):
-    """A recording as it is fitted, whether the arm moves in it, and notes."""
+    """A recording as it is judged, whether the arm moves in it, and notes."""
 
-    recorded: Recorded
+    moments: Moments
     moves: bool
-    period_s: float
+    alive: NDArray[np.bool_]
     notes: list[str]
 
 
 def _taken(log: Log, model: SelfModel) -> _Taken:
     """Raises RecordingRefused."""
-    if not is_long(log):
-        own, clock, said = cleaned(log, model)
-        moves, torque, more = _judged(own, model)
-        recorded = Recorded.of(torque.in_time(own), lateness(clock)).cut()
-        return _Taken(recorded, moves, clock.period_s, own.warnings + said + more)
-    survey = Survey.of(of_this_robot(log, model))
-    part, _, said = cleaned(survey.busiest(log), model)
-    moves, torque, more = _judged(part, model)
-    long = LongRecording.through(survey.in_time(torque), log.path.name)
-    return _Taken(long, moves, survey.clock.period_s, log.warnings + said + more)
+    own, survey = log, None
+    if is_long(log):
+        survey = Survey.of(of_this_robot(log, model))
+        own = survey.busiest(log)
+    own, _, said = cleaned(own, model)
+    moves, torque, more = _judged(own, model)
+    alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
+    own = torque.in_time(own if survey is None else survey.log)
+    pieces = (_moments(x, model, own) for x in ([own] if survey is None else own.pieces()))
+    return _Taken(reduce(Moments.with_more, pieces), moves, alive, notes)
+
+
+def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:
+    """What a piece of a recording tells."""
+    q, dq, ddq, tau = (x[EDGE:-EDGE:EVERY] for x in smoothed_rows(piece))
+    begin, end = (
+        (stamp - whole.first_ns) / max(whole.end_ns - whole.first_ns, 1)
+        for stamp in (piece.first_ns, piece.end_ns)
+    )
+    at = np.linspace(begin, end, len(q))
+    return moments_of(model, Rows(q, dq, ddq, tau), EVERY * GRID_S, at)
 
 
 def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:
@@ -175,19 +176,24 @@ def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:
     return True, torque, dead + torque.notes
 
 
-def _changed(fit: Fit) -> list[str]:
-    """That the hand's load, the first effect of a fit, clearly is another from some time on."""
-    t, found = fit.recordings[0].t, (CLEAR, 0.0, 0.0)
-    change = replace(fit.named[0], x=np.zeros(len(fit.named[0].x)), recording=0)
-    for share in DATES:
-        at = float(t[0] + share * (t[-1] - t[0]))
-        trial = fit.with_named([*fit.named, replace(change, interval_s=(at, np.inf))])
-        trial, known = under_own_noise(trial)
-        place = place_of(trial, len(fit.named))[0]
-        mass = float(trial.named[-1].x[0])
-        clear = abs(mass) / float(np.sqrt(honest_covariance(trial, known)[place, place]))
+def _changed(
+    parts: Sequence[Part], std: Array, alive: NDArray[np.bool_], span_s: float
+) -> list[str]:
+    """That the hand's load clearly is another from some time on: it is judged as two."""
+    whole, found = parts[0], (CLEAR, 0.0, 0.0)
+    later = np.r_[len(std) + np.arange(10), whole.at[10:]]
+    two, weigh = np.r_[std, std[:10]], np.zeros(len(std) + 10)
+    weigh[0], weigh[len(std)] = -1.0, 1.0
+    for segment in range(1, SEGMENTS):
+        before = Part(whole.moments, slice(segment), whole.at)
+        after = Part(whole.moments, slice(segment, None), later)
+        if not all(x.moments.rows[x.segments].any() for x in (before, after)):
+            continue
+        trial = judge([before, after, *parts[1:]], two, alive)
+        mass = float(weigh @ trial.x)
+        clear = abs(mass) / float(np.sqrt(weigh @ trial.covariance @ weigh))
         if abs(mass) > LEAST_CHANGE_KG:
-            found = max(found, (clear, at, mass))
+            found = max(found, (clear, span_s * segment / SEGMENTS, mass))
     clear, at, mass = found
     if not at:
         return []

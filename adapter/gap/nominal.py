@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.effects.active import active_effects
-from adapter.gap.fit import TIMING_STD_S, Fit, Model, theta_prior
+from adapter.gap.fit import TIMING_STD_S, Fit, Model
 from adapter.gap.hand import hand_of
 from adapter.gap.long_recording import LongRecording
 from adapter.gap.signals import Recorded, prepare
+from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.timing import TIMING_SHARE

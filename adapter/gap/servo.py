@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.gap.fit import theta_prior
 from adapter.gap.servo_fit import (
     DELAY,
     PARAMETERS,
@@ -25,6 +24,7 @@ from adapter.gap.servo_fit import (
 from adapter.gap.servo_kernels import DAMPING, INERTIA, LEAD, RUBS, A, Load
 from adapter.gap.servo_model import ServoModel
 from adapter.gap.servo_signals import Track, loads
+from adapter.judgement.priors import theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm

@@ -23,7 +23,7 @@ from adapter.effects.robots import read_robot
 from adapter.gap.at_rest import held_at_rest
 from adapter.gap.changes import loaded, with_changes
 from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
-from adapter.gap.fit import Fit, theta_prior
+from adapter.gap.fit import Fit
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
@@ -41,6 +41,7 @@ from adapter.gap.search import ROUNDS, search
 from adapter.gap.several import Several
 from adapter.gap.signals import RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
+from adapter.judgement.priors import theta_prior
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm

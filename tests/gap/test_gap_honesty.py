@@ -19,7 +19,7 @@ from adapter.gap import GapSettings, RecordingFault, RecordingRefused
 from adapter.gap.candidates import Candidate, log_odds, signatures, stages_of
 from adapter.gap.evidence import Noise
 from adapter.gap.findings import doubted, findings_of, parameter_std, told_of
-from adapter.gap.fit import Fit, Model, Named, refitted, theta_prior, worth
+from adapter.gap.fit import Fit, Model, Named, refitted, worth
 from adapter.gap.folds import (
     FOLD_S,
     FOLDS,
@@ -44,6 +44,7 @@ from adapter.gap.scan import BELIEF
 from adapter.gap.search import Budget, Found, search, weak, worst
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.words import as_json, console_summary, headline
+from adapter.judgement.priors import theta_prior
 from adapter.model.inertia import theta_from_body
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm

@@ -35,7 +35,6 @@ from adapter.gap.fit import (
     beside,
     place_of,
     refitted,
-    theta_prior,
     under_own_noise,
     worth,
 )
@@ -47,6 +46,7 @@ from adapter.gap.rivals import Rival, Standing, standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves
 from adapter.gap.search import Found
 from adapter.gap.signals import RATE_HZ, Recorded, Signals, low, prepare, smooth_motion
+from adapter.judgement.priors import theta_prior
 from adapter.model.inertia import is_consistent
 from adapter.model.robots import documented
 from adapter.physics.rigid_arm import RigidArm

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adapter.gap.fit import Fit, Model, place_of, theta_prior
+from adapter.gap.fit import Fit, Model, place_of
 from adapter.gap.load import hand_frame
 from adapter.gap.several import Several
 from adapter.gap.signals import Recorded, prepare
 from adapter.gap.together import Part, Together
 from adapter.gap.workflow import names_of
+from adapter.judgement.priors import theta_prior
 from adapter.physics.rigid_arm import RigidArm
 from drivers.files.mcap import Log
 from sim.effects import Effect, payload, per_joint
