@@ -9,14 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap_ros2._dynamic import generate_dynamic, serialize_dynamic
 
-from drivers.files.ros import (
-    CdrError,
-    JointStateEncoder,
-    MotionEncoder,
-    decode_many,
-    parse_joint_state,
-    parse_motion,
-)
+from drivers.files.messages import JointStateEncoder, MotionEncoder
+from drivers.files.ros import CdrError, decode_many, parse_joint_state, parse_motion
 from drivers.files.ros_types import ACCEL_STAMPED, JOINT_STATE, SCHEMAS, TWIST_STAMPED
 
 READ = {name: generate_dynamic(name, text)[name] for name, text in SCHEMAS.items()}

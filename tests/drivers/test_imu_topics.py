@@ -13,7 +13,7 @@ from mcap_ros2.writer import Writer as RosWriter
 from adapter.cli import main
 from drivers.files.mcap import read_log
 from drivers.files.mcap.links import Carrier
-from drivers.files.ros import JointStateEncoder, MotionEncoder
+from drivers.files.messages import JointStateEncoder, MotionEncoder
 from drivers.files.ros_types import ACCEL_STAMPED, IMU, JOINT_STATE, SCHEMAS, TWIST_STAMPED
 from tests.helpers.mcap_tools import JOINTS, LINKS, START_NS
 from tests.helpers.ros_messages import UNMEASURED, header, imu

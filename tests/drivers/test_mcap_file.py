@@ -8,7 +8,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from drivers.files.mcap import McapWriter, derive_velocity, read_log, recover
-from drivers.files.ros import JointStateEncoder, MotionEncoder
+from drivers.files.messages import JointStateEncoder, MotionEncoder
 from drivers.files.ros_types import TWIST_STAMPED
 from drivers.interface import DriverError
 from tests.helpers.mcap_tools import (

@@ -11,8 +11,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from drivers.files.estimates import EstimateNames, estimate_fields, estimate_values
 from drivers.files.mcap import McapWriter, read_estimates, read_log, read_messages, recover
-from drivers.files.messages import Message, decode, encode, header
-from drivers.files.ros import CdrError, TransformsEncoder
+from drivers.files.messages import Message, TransformsEncoder, decode, encode, header
+from drivers.files.ros import CdrError
 from drivers.files.ros_types import DIAGNOSTICS, ESTIMATE, SCHEMAS, STRING, TF
 from tests.helpers.mcap_tools import START_NS, samples
 from tests.helpers.ros_readers import assert_read_by_everybody, same

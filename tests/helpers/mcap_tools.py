@@ -6,7 +6,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from drivers.files.mcap import McapWriter
-from drivers.files.ros import JointStateEncoder
+from drivers.files.messages import JointStateEncoder
 from drivers.files.ros_types import JOINT_STATE, SCHEMAS
 from drivers.interface import JointSample, LinkMotion
 

@@ -33,7 +33,6 @@ from drivers.files import names
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
 from drivers.files.mcap.series import PARSERS, schema_name
-from drivers.files.ros import JointStateEncoder
 from drivers.files.ros_types import FRANKA_STATE, JOINT_STATE
 from drivers.interface import DriverError
 
@@ -505,20 +504,17 @@ def _to_cdr(definitions: dict[str, str]) -> Callable[[str, bytes], bytes]:
         if empty:  # any number of them fits into a message, and would be walked over
             raise ValueError(f"{sorted(empty)[0]} has no bytes")
         store.register({k: v for k, v in found.items() if k not in store.fielddefs})
-    encoders: dict[int, JointStateEncoder] = {}
 
     def convert(kind: str, raw: bytes) -> bytes:
         try:
             cdr = bytes(store.ros1_to_cdr(raw, kind))
         except Exception:  # of whatever kind; the message is then counted as unreadable
             return b""
-        return _joint_state(store.deserialize_cdr(cdr, kind)) if kind == FRANKA_STATE else cdr
-
-    def _joint_state(state: Any) -> bytes:
-        n = len(state.q)
-        encoder = encoders.setdefault(n, JointStateEncoder([f"joint{i + 1}" for i in range(n)]))
-        stamp = state.header.stamp
-        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
-        return encoder.encode(stamp_ns, state.q, state.dq, state.tau_J)
+        if kind != FRANKA_STATE:
+            return cdr
+        state = store.deserialize_cdr(cdr, kind)
+        names = [f"joint{i + 1}" for i in range(len(state.q))]
+        told = store.types[JOINT_STATE](state.header, names, state.q, state.dq, state.tau_J)
+        return bytes(store.serialize_cdr(told, JOINT_STATE))
 
     return convert

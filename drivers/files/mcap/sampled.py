@@ -5,27 +5,26 @@ Nothing but the index and some chunks is read, however large the file is.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
 from mcap.records import ChunkIndex
-from mcap.summary import Summary
 
 from drivers.files.mcap.log import Log, Topic
 from drivers.files.mcap.read import assembled
-from drivers.files.mcap.records import HEAD, MAGIC, RECORD, McapScan, Region
+from drivers.files.mcap.records import HEAD, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
 
 SAMPLED_FROM = 2**26  # bytes; a smaller file is read whole
-_OTHERS = (Opcode.METADATA, Opcode.ATTACHMENT)
+_INDEXED = {
+    Opcode.METADATA_INDEX: Opcode.METADATA,
+    Opcode.ATTACHMENT_INDEX: Opcode.ATTACHMENT,
+}
 STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
 
 
@@ -45,15 +44,17 @@ def sample_log(
     file = Path(path)
     if not file.is_file() or file.stat().st_size < SAMPLED_FROM:
         return None
-    summary = _summary(file)
-    if summary is None or summary.statistics is None or not summary.chunk_indexes:
+    try:
+        scan = _Part(file)
+    except DriverError:  # the scan that reads all says what is wrong
         return None
-    chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+    chunks = sorted(scan.others[Opcode.CHUNK_INDEX], key=lambda c: c.chunk_start_offset)
+    if not chunks or not scan.others[Opcode.STATISTICS]:
+        return None
     stretches = _stretches(chunks)
     if sum(map(len, stretches)) > len(chunks) // 2:
         return None
-    scan = _Part(file)
-    scan.note_others(summary)
+    scan.note_others()
     found = []
     for stretch in stretches:
         scan.chosen = [chunks[i].chunk_start_offset for i in stretch]
@@ -65,24 +66,13 @@ def sample_log(
         return None
     first = found[0]
     warnings = list(dict.fromkeys(text for part in found for text in part.warnings))
-    topics = _topics(scan, summary)
+    topics = _topics(scan)
     parts = [
         replace(part, topics=topics, warnings=warnings)
         for part in found
         if (part.joint_names, part.topic) == (first.joint_names, first.topic)
     ]
     return parts, _holes(chunks, stretches)
-
-
-def _summary(path: Path) -> Summary | None:
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                return None
-            file.seek(0)
-            return make_reader(file).get_summary()
-    except (McapError, OSError, ValueError, struct.error, MemoryError):
-        return None  # the scan that reads all says what is wrong
 
 
 def _stretches(chunks: Sequence[ChunkIndex]) -> list[range]:
@@ -105,8 +95,8 @@ def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[f
     return found
 
 
-def _topics(scan: McapScan, summary: Summary) -> dict[str, Topic]:
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
+def _topics(scan: McapScan) -> dict[str, Topic]:
+    counts = scan.others[Opcode.STATISTICS][-1].channel_message_counts
     found: dict[str, Topic] = {}
     for channel in scan.channels.values():
         before = found[channel.topic].messages if channel.topic in found else 0
@@ -132,22 +122,22 @@ class _Part(McapScan):
         self._made = 0
         for place in self.chosen:
             self._give_back(place)
-            size = self.size - place
-            if size < HEAD or self._data[place] != Opcode.CHUNK:
-                self.sound = False
-                return
-            stop = place + HEAD + RECORD.unpack_from(self._data, place)[1]
-            if stop > self.size:
+            stop = self._end_of(place, Opcode.CHUNK)
+            if not stop:
                 self.sound = False
                 return
             yield from self._chunk(place, stop)
 
-    def note_others(self, summary: Summary) -> None:
+    def note_others(self) -> None:
         """Read metadata and attachments, which the index has the places of."""
-        for kind in (summary.metadata_indexes, summary.attachment_indexes):
-            for index in kind:
-                if 0 < index.offset <= self.size - HEAD:
-                    opcode, length = RECORD.unpack_from(self._data, index.offset)
-                    first = index.offset + HEAD
-                    if opcode in _OTHERS and first + length <= self.size:
-                        self._note(opcode, self._data[first : first + length])
+        for index, opcode in _INDEXED.items():
+            for place in self.others[index]:
+                if stop := self._end_of(place.offset, opcode):
+                    self._note(opcode, self._data[place.offset + HEAD : stop])
+
+    def _end_of(self, place: int, opcode: Opcode) -> int:
+        """Where a whole record there ends; 0 where there is none of that kind."""
+        if place + HEAD > self.size or self._data[place] != opcode:
+            return 0
+        stop = place + HEAD + int(RECORD.unpack_from(self._data, place)[1])
+        return stop if stop <= self.size else 0

@@ -14,14 +14,15 @@ import numpy as np
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from drivers.files.messages import Message, encode
-from drivers.files.ros import (
-    CdrError,
+from drivers.files.messages import (
     ImuEncoder,
     JointStateEncoder,
+    Message,
     MotionEncoder,
-    encode_joint_trajectory,
+    encode,
+    header,
 )
+from drivers.files.ros import SECOND_NS, CdrError
 from drivers.files.ros_types import (
     ACCEL_STAMPED,
     IMU,
@@ -143,8 +144,13 @@ class McapWriter:
 
     def write_trajectory(self, times_ns: NDArray[np.int64], motion: Array) -> None:
         """Write a planned motion as one trajectory: (m,) from its start, (m, 3, n) q, dq, ddq."""
-        data = encode_joint_trajectory(self.joint_names, times_ns, motion)
-        self._add(self._channel(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY), 0, data)
+        points = []
+        for since_ns, rows in zip(times_ns.tolist(), motion, strict=True):
+            after = dict(zip(("sec", "nanosec"), divmod(since_ns, SECOND_NS), strict=True))
+            point = zip(("positions", "velocities", "accelerations"), rows, strict=True)
+            points.append({**dict(point), "effort": (), "time_from_start": after})
+        fields = {"header": header(0), "joint_names": self.joint_names, "points": points}
+        self.write_message(Message(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY, 0, fields))
 
     def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
         """Record the measured motion of the links, in the order of `link_names`.
