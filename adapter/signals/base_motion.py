@@ -56,7 +56,7 @@ def with_base_motion(log: Log, robot: SelfModel, link: str) -> Log:
     """The recording with the base's motion at its joint samples (`Log.base`).
 
     Args:
-        log: read with `frames`.
+        log: read with what `frames` tell.
         robot: on a floating base.
         link: the base, or a frame fixed to it, which messages without a frame are taken to mean.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from drivers.files.ros import SECOND_NS, CdrError
-from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS, TF, TWIST_STAMPED
+from drivers.files.ros_types import IMU, JOINT_STATE, TF, TWIST_STAMPED, schemas
 from drivers.interface import Array
 
 Fields = Mapping[str, Any]
@@ -59,7 +60,7 @@ def stamp_of(fields: Fields) -> int:
 
 
 def encode(schema: str, fields: Fields | bytes) -> bytes:
-    """CDR (little endian) of a message of `SCHEMAS`; every field has to be there.
+    """CDR (little endian) of a message of `schemas`; every field has to be there.
 
     Bytes are taken as encoded.
 
@@ -81,14 +82,14 @@ def decode(schema: str, data: bytes, definition: str | None = None) -> dict[str,
     Args:
         schema: its type, package/msg/Name.
         data: CDR with its encapsulation header.
-        definition: as the recording has it; that of `SCHEMAS` where None.
+        definition: as the recording has it; that of `schemas` where None.
 
     Raises:
         CdrError: it is no such message, or nobody says what the type is.
     """
-    text = SCHEMAS.get(schema) if definition is None else definition
+    text = schemas().get(schema) if definition is None else definition
     if text is None:
-        raise CdrError(f"no definition of {schema}; have: {', '.join(SCHEMAS)}")
+        raise CdrError(f"no definition of {schema}; have: {', '.join(schemas())}")
     try:
         store = _store(schema, text)
         return dict(_plain(store, store.deserialize_cdr(data, schema)))
@@ -106,7 +107,7 @@ def _store(schema: str, definition: str) -> Typestore:
 
 @cache
 def _writer(schema: str) -> tuple[Callable[[Any, str], Any], Build]:
-    store = _store(schema, SCHEMAS[schema])
+    store = _store(schema, schemas()[schema])
     return store.serialize_cdr, _builder(store, schema)
 
 
@@ -165,11 +166,13 @@ class _Encoder:
         )
         edges = np.flatnonzero(np.diff(zeros != other)) + 1
         self._pieces = [piece.tobytes() for piece in np.split(zeros, edges)]
+        ends = np.cumsum([0, *map(len, self._pieces[1::2])])
+        self._parts = [slice(*pair) for pair in pairwise(ends.tolist())]
 
-    def _filled(self, *varying: bytes) -> bytes:
-        """One message of stamps and runs of doubles, as they follow one another."""
+    def _filled(self, varying: bytes) -> bytes:
+        """One message, of its stamps and doubles as they follow one another."""
         pieces = self._pieces.copy()
-        pieces[1::2] = filter(None, varying)
+        pieces[1::2] = [varying[part] for part in self._parts]
         return b"".join(pieces)
 
 
@@ -197,8 +200,8 @@ class JointStateEncoder(_Encoder):
     def encode(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bytes:
         """One message; arrays of absent fields are ignored. Raises CdrError on wrong shapes."""
         runs = zip(self._has, _RUNS, (q, dq, tau), strict=True)
-        told = (_raw(values, self._shape, name) for has, name, values in runs if has)
-        return self._filled(_stamp(stamp_ns), *told)
+        told = [_raw(values, self._shape, name) for has, name, values in runs if has]
+        return self._filled(b"".join((_stamp(stamp_ns), *told)))
 
 
 class MotionEncoder(_Encoder):
@@ -213,11 +216,11 @@ class MotionEncoder(_Encoder):
 
     def encode(self, stamp_ns: int, vector: Array) -> bytes:
         """One message of a (6,) vector, linear part first. Raises CdrError on a wrong shape."""
-        return self._filled(_stamp(stamp_ns), _raw(vector, (6,), "vector"))
+        return self._filled(_stamp(stamp_ns) + _raw(vector, (6,), "vector"))
 
 
-class ImuEncoder(_Encoder):
-    """Encodes Imu of one frame, without an orientation."""
+class ImuEncoder(MotionEncoder):
+    """Encodes Imu of one frame, without an orientation, from [w; a] (6,)."""
 
     def __init__(self, frame_id: str) -> None:
         told, unknown = ("angular_velocity", "linear_acceleration"), np.zeros(9)
@@ -231,12 +234,7 @@ class ImuEncoder(_Encoder):
                 **{f"{key}_covariance": unknown for key in told},
             }
 
-        super().__init__(IMU, message)
-
-    def encode(self, stamp_ns: int, vector: Array) -> bytes:
-        """One message of [w; a] (6,). Raises CdrError on a wrong shape."""
-        both = _raw(vector, (6,), "vector")
-        return self._filled(_stamp(stamp_ns), both[:24], both[24:])
+        _Encoder.__init__(self, IMU, message)
 
 
 class TransformsEncoder(_Encoder):
@@ -270,8 +268,8 @@ class TransformsEncoder(_Encoder):
         Raises CdrError on a wrong shape.
         """
         stamp, raw = _stamp(stamp_ns), _raw(numbers, self._shape, "transforms")
-        *rows, last = (raw[at : at + 56] for at in range(0, len(raw), 56))
-        return self._filled(stamp, *(row + stamp for row in rows), last)  # no byte lies between
+        rows = (stamp + raw[at : at + 56] for at in range(0, len(raw), 56))
+        return self._filled(b"".join(rows))
 
 
 def _vector(x: float) -> dict[str, float]:

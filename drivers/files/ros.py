@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,16 +63,18 @@ class Block:
     """Messages of one layout out of a batch.
 
     Attributes:
-        index: (k,) their places in the batch.
+        index: (k,) their places in the batch; of a topic's messages, in the topic's order.
         stamp_ns: (k,) header stamps, ns.
         layout: what they share.
         values: one (k, n_i) array for each run of doubles.
+        log_ns: (k,) log times, where they are of a topic.
     """
 
     index: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
     layout: Layout
     values: tuple[Array, ...]
+    log_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class _Cursor:
@@ -120,13 +122,17 @@ class _Cursor:
         start = self._advance(8 * number, self._double_align) if number else self._at
         return slice(start, start + 8 * number)
 
+    def joint_state(self) -> tuple[str, tuple[str, ...], tuple[slice, ...]]:
+        """Frame, names and runs of a JointState, behind its stamp."""
+        frame_id = self.text()
+        names = tuple(self.text() for _ in range(self.count()))
+        return frame_id, names, tuple(self.doubles(self.count()) for _ in range(3))
+
 
 def parse_joint_state(data: Bytes) -> Layout:
     """Layout of a JointState: runs position, velocity, effort. Raises CdrError."""
     cursor = _Cursor(data)
-    frame_id = cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
-    runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
+    frame_id, names, runs = cursor.joint_state()
     return Layout(cursor.little, frame_id, names, runs)
 
 
@@ -136,9 +142,7 @@ def parse_franka_robot_state(data: Bytes) -> Layout:
     cursor.text()
     flags = cursor.doubles(_COLLISION_DOUBLES)
     stamp = cursor.stamp()
-    frame_id = cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
-    runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
+    frame_id, names, runs = cursor.joint_state()
     return Layout(cursor.little, frame_id, names, runs, (flags, stamp, *runs))
 
 
@@ -183,27 +187,16 @@ def parse_dynamic_joint_state(data: Bytes) -> Layout:
     return Layout(cursor.little, frame_id, tuple(names), tuple(doubles), tuple(runs))
 
 
-def parse_motion(data: Bytes) -> Layout:
-    """Layout of a TwistStamped or AccelStamped: one run of six. Raises CdrError."""
-    cursor = _Cursor(data)
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(6),))
+def parse_doubles(data: Bytes, number: int, of_child: bool = False) -> Layout:
+    """Layout of a header, the name of a child frame where it is `of_child`, and a run of doubles.
 
-
-def parse_imu(data: Bytes) -> Layout:
-    """Layout of a sensor_msgs/Imu: one run of `IMU_DOUBLES`. Raises CdrError."""
-    cursor = _Cursor(data)
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(IMU_DOUBLES),))
-
-
-def parse_odometry(data: Bytes) -> Layout:
-    """Layout of a nav_msgs/Odometry: one run of `ODOMETRY_DOUBLES`; its frame is the child's.
-
-    Raises:
-        CdrError: it is no such message.
+    So are TwistStamped and AccelStamped (6), Imu (`IMU_DOUBLES`) and Odometry (`ODOMETRY_DOUBLES`;
+    its frame is the child's). Raises CdrError.
     """
     cursor = _Cursor(data)
-    cursor.text()  # the frame that the pose is told in
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(ODOMETRY_DOUBLES),))
+    if of_child:
+        cursor.text()  # the frame that the pose is told in
+    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(number),))
 
 
 def decode_many(

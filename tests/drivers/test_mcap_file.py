@@ -11,14 +11,7 @@ from drivers.files.mcap import McapWriter, derive_velocity, read_log, recover
 from drivers.files.messages import JointStateEncoder, MotionEncoder
 from drivers.files.ros_types import TWIST_STAMPED
 from drivers.interface import DriverError
-from tests.helpers.mcap_tools import (
-    JOINTS,
-    LINKS,
-    foreign,
-    payloads,
-    record,
-    samples,
-)
+from tests.helpers.mcap_tools import JOINTS, LINKS, foreign, payloads, record, samples
 from tests.helpers.ros_readers import assert_read_by_everybody
 
 

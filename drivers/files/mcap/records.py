@@ -311,7 +311,7 @@ class McapScan(Scan):
                 at = bound
             else:
                 if is_chunk:
-                    yield from self._cut_chunk(at)
+                    yield from self._chunk(at, stop)
                 break
         self._judge_end(at)
 
@@ -370,17 +370,21 @@ class McapScan(Scan):
             self.others[opcode].append(record)
 
     def _chunk(self, at: int, stop: int) -> Iterator[Region]:
+        """Its messages; of a cut one what can be had, and no checksum holds it to anything."""
+        cut = stop > self.size
         try:
             chunk = self._chunk_at(at)
             self._spend(chunk.uncompressed_size)
-            content = self._content(at, chunk)
+            content = decompress(chunk, cut=True) if cut else self._content(at, chunk)
             found = walk(content, 0, _IN_CHUNK)
-            if found.end != len(content):
+            if not cut and found.end != len(content):
                 raise DamagedChunk(f"its record at byte {found.end} is broken")
         except (DamagedChunk, struct.error, UnicodeDecodeError) as error:
-            self.lost_bytes += stop - at
-            self._warn(f"the chunk at byte {at} is damaged and was passed over: {error}")
+            if not cut:
+                self.lost_bytes += stop - at
+                self._warn(f"the chunk at byte {at} is damaged and was passed over: {error}")
             return
+        self._rescued = len(found.start) if cut else 0
         yield from self._use(found, content)
 
     def _content(self, at: int, chunk: Chunk) -> memoryview:
@@ -399,18 +403,6 @@ class McapScan(Scan):
         if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
             raise DamagedChunk("its checksum is wrong")
         return content
-
-    def _cut_chunk(self, at: int) -> Iterator[Region]:
-        """What can be decompressed of the last chunk; no checksum holds it to anything."""
-        try:
-            chunk = self._chunk_at(at)
-            self._spend(chunk.uncompressed_size)
-            content = decompress(chunk, cut=True)
-        except (DamagedChunk, struct.error, UnicodeDecodeError):
-            return
-        found = walk(content, 0, _IN_CHUNK)
-        self._rescued = len(found.start)
-        yield from self._use(found, content)
 
     def _spend(self, size: int) -> None:
         """Count what chunks make. Raises DamagedChunk where no recording makes so much."""

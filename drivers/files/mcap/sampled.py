@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
 
 from drivers.files.mcap.log import Log, Topic
-from drivers.files.mcap.read import assembled
+from drivers.files.mcap.read import Beside, assembled
 from drivers.files.mcap.records import HEAD, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
@@ -29,12 +28,12 @@ STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacke
 
 
 def sample_log(
-    path: str | Path, topic: str | None = None, **read: Any
+    path: str | Path, topic: str | None = None, beside: Beside = ""
 ) -> tuple[list[Log], list[tuple[float, float]]] | None:
     """A sample of a long MCAP file with an index; None of every other recording.
 
     Args:
-        path: of the file; topic: of the joint states; read: as `read_log` takes it.
+        path: of the file; topic: of the joint states; beside: as `read_log` takes it.
 
     Returns:
         Stretches in the order of time, of the same joints and topic, whose topics count the
@@ -51,7 +50,11 @@ def sample_log(
     chunks = sorted(scan.others[Opcode.CHUNK_INDEX], key=lambda c: c.chunk_start_offset)
     if not chunks or not scan.others[Opcode.STATISTICS]:
         return None
-    stretches = _stretches(chunks)
+    # Places of chunks, some in a row, spread evenly from the first to the last.
+    size = float(np.median([c.uncompressed_size for c in chunks]))
+    together = max(round(STRETCH_BYTES / max(size, 1.0)), 1)
+    starts = np.unique(np.linspace(0, max(len(chunks) - together, 0), STRETCHES).astype(int))
+    stretches = [range(i, min(i + together, len(chunks))) for i in starts.tolist()]
     if sum(map(len, stretches)) > len(chunks) // 2:
         return None
     scan.note_others()
@@ -59,29 +62,26 @@ def sample_log(
     for stretch in stretches:
         scan.chosen = [chunks[i].chunk_start_offset for i in stretch]
         try:
-            found.append(assembled(scan, topic=topic, **read))
+            found.append(assembled(scan, None, topic, beside))
         except DriverError:  # this stretch has no joint states, others may
             continue
     if not found or not scan.sound:
         return None
     first = found[0]
     warnings = list(dict.fromkeys(text for part in found for text in part.warnings))
-    topics = _topics(scan)
+    topics: dict[str, Topic] = {}
+    counts = scan.others[Opcode.STATISTICS][-1].channel_message_counts
+    for channel in sorted(scan.channels.values(), key=lambda c: str(c.topic)):
+        before = topics[channel.topic].messages if channel.topic in topics else 0
+        messages = before + counts.get(channel.id, 0)
+        about = schema_name(scan, channel), channel.message_encoding
+        topics[channel.topic] = Topic(*about, messages)
     parts = [
         replace(part, topics=topics, warnings=warnings)
         for part in found
         if (part.joint_names, part.topic) == (first.joint_names, first.topic)
     ]
     return parts, _holes(chunks, stretches)
-
-
-def _stretches(chunks: Sequence[ChunkIndex]) -> list[range]:
-    """Places of chunks, some in a row, spread evenly from the first to the last."""
-    size = float(np.median([c.uncompressed_size for c in chunks]))
-    together = max(round(STRETCH_BYTES / max(size, 1.0)), 1)
-    last = max(len(chunks) - together, 0)
-    starts = np.unique(np.linspace(0, last, STRETCHES).astype(int)).tolist()
-    return [range(start, min(start + together, len(chunks))) for start in starts]
 
 
 def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[float, float]]:
@@ -93,17 +93,6 @@ def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[f
         if i not in inside and behind > before:
             found.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
     return found
-
-
-def _topics(scan: McapScan) -> dict[str, Topic]:
-    counts = scan.others[Opcode.STATISTICS][-1].channel_message_counts
-    found: dict[str, Topic] = {}
-    for channel in scan.channels.values():
-        before = found[channel.topic].messages if channel.topic in found else 0
-        kind = schema_name(scan, channel)
-        messages = before + counts.get(channel.id, 0)
-        found[channel.topic] = Topic(kind, channel.message_encoding, messages)
-    return dict(sorted(found.items()))
 
 
 class _Part(McapScan):
