@@ -211,11 +211,7 @@ class Told:
                 f"{where}: {left_out} messages are of other joints "
                 f"({others or 'a part of these, or twice'}); left out"
             )
-        self._check_complete(sets[chosen], where, warnings)
-        return sets[chosen]
-
-    def _check_complete(self, own: JointRows, where: str, warnings: list[str]) -> None:
-        """Say which messages lack positions (or efforts). Raises DriverError where all do."""
+        own = sets[chosen]
         need = _NEED if TAU in self._needed else _NEED_POSITION
         what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
@@ -232,6 +228,7 @@ class Told:
                 f"{where}: {own.messages - len(own)} messages lack "
                 f"{' or '.join(what_of[run] for run in self._needed)}; left out"
             )
+        return own
 
 
 def joints_told(

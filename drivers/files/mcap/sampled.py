@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
 
 from drivers.files.mcap.log import Log, Topic
 from drivers.files.mcap.read import Beside, assembled
@@ -81,18 +80,13 @@ def sample_log(
         for part in found
         if (part.joint_names, part.topic) == (first.joint_names, first.topic)
     ]
-    return parts, _holes(chunks, stretches)
-
-
-def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[float, float]]:
     inside = {i for stretch in stretches for i in stretch[1:]}
-    begin = chunks[0].message_start_time
-    found = []
+    begin, holes = chunks[0].message_start_time, []
     for i in range(1, len(chunks)):
         before, behind = chunks[i - 1].message_end_time, chunks[i].message_start_time
         if i not in inside and behind > before:
-            found.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
-    return found
+            holes.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
+    return parts, holes
 
 
 class _Part(McapScan):
