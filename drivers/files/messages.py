@@ -188,20 +188,20 @@ class JointStateEncoder(_Encoder):
     def __init__(
         self, names: Sequence[str], frame_id: str = "", fields: Sequence[str] = _RUNS
     ) -> None:
-        self._shape, self._has = (len(names),), [field in fields for field in _RUNS]
+        self._shape = (len(names),)
+        self._told = [(k, field) for k, field in enumerate(_RUNS) if field in fields]
 
         def message(stamp_ns: int, x: float) -> Fields:
-            runs = (np.full(len(names) if has else 0, x) for has in self._has)
-            fixed = {"header": header(stamp_ns, frame_id), "name": list(names)}
-            return {**fixed, **dict(zip(_RUNS, runs, strict=True))}
+            runs = {field: np.full(len(names) if field in fields else 0, x) for field in _RUNS}
+            return {"header": header(stamp_ns, frame_id), "name": list(names), **runs}
 
         super().__init__(JOINT_STATE, message)
 
     def encode(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bytes:
         """One message; arrays of absent fields are ignored. Raises CdrError on wrong shapes."""
-        runs = zip(self._has, _RUNS, (q, dq, tau), strict=True)
-        told = [_raw(values, self._shape, name) for has, name, values in runs if has]
-        return self._filled(b"".join((_stamp(stamp_ns), *told)))
+        runs = q, dq, tau
+        told = [_raw(runs[k], self._shape, name) for k, name in self._told]
+        return self._filled(_stamp(stamp_ns) + b"".join(told))
 
 
 class MotionEncoder(_Encoder):
