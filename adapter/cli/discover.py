@@ -24,13 +24,14 @@ from adapter.errors import ModelError
 from adapter.model.model_file import save_model
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import labelled, output, say, show, warn, write_json
-from drivers.files.mcap import read_sensors
+from drivers.files.mcap import read_log
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     announce_compiling(say)
-    log = read_sensors(args.log, args.topic, (args.from_s, args.from_s + args.seconds))
+    part = args.from_s, args.from_s + args.seconds
+    log = read_log(args.log, topic=args.topic, beside="sensors", within_s=part)
     warn(log.warnings)
     found = discover(log, args.cutoff or CUTOFF_HZ, args.base)
     warn(list(found.notes))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from importlib import import_module
 from typing import Any
 
@@ -14,9 +15,8 @@ from adapter.effects.robots import read_robot
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.runs.terminal import show, warn, write_json
-from adapter.signals.importer import ImportSpec, import_table, table_log
+from adapter.signals.importer import ImportSpec, import_file, recording_log, table_log
 from adapter.signals.recording import describe, summary
-from adapter.signals.recording_import import import_recording, of_recording, recording_log
 from drivers.files.mcap import Log, recover
 
 TABLES = (".csv", ".tsv", ".txt", ".dat", ".npz", ".parquet")
@@ -36,9 +36,9 @@ def run_import(args: argparse.Namespace) -> int:
         episode=args.episode,
         topic=args.topic,
     )
-    report = (import_recording if of_recording(spec) else import_table)(spec, args.to)
+    report = import_file(spec, args.to)
     warn(list(report.warnings))
-    facts = report.as_dict()
+    facts = asdict(report) | {"out": str(report.out)}
     write_json(args.json, facts)
     show(f"{args.to}: {facts['samples']} samples")
     return 0

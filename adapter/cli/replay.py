@@ -43,7 +43,7 @@ PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99.9": 99.9, "max": 100.0}
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
     first, *more = args.logs
-    whole = read_log(first, topic=args.topic, frames=args.base is not None, imus=True)
+    whole = read_log(first, topic=args.topic, beside="imus" if args.base is None else "frames")
     recorded = whole.metadata.get("config")
     robot = robot_of_log(args, whole, args.base is not None)
     recorded = recorded if isinstance(recorded, dict) else None
@@ -194,7 +194,9 @@ def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | Non
     if args.validate_from is not None:
         return from_s(log, args.validate_from)
     if args.validate is not None:
-        other = read_log(args.validate, topic=args.topic, frames=args.base is not None)
+        other = read_log(
+            args.validate, topic=args.topic, beside="" if args.base is None else "frames"
+        )
         return _joined(args, other, robot)
     return None
 

@@ -86,7 +86,7 @@ class Information:
         self._model, self._arm = model, RigidArm.of(model)
         self._effects: list[LearnedEffect] = list(effects_by_name(effects))
         n = model.tree.n
-        joints = JointFilter(n, filtering)
+        joints = JointFilter(filtering)
         self._smoothing_s = joints.delay_s
         self.samples_per_s = 1.0 / (joints.noise_gain * joints.settings.period_s)
         if torque_std is None:

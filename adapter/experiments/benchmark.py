@@ -118,7 +118,7 @@ def _ours(robot: SelfModel, repeats: int) -> list[dict[str, Any]]:
 
     ticks = _timed(tick, WARM_UP + repeats)[WARM_UP:]
     rows = [_row("front end: checks, filter, twist synthesis", ticks, "per sample")]
-    gain = JointFilter(robot.tree.n).noise_gain
+    gain = JointFilter().noise_gain
     for effects, note in (((), "λ and θ"), (REAL_ARM_EFFECTS, "λ, θ and a real arm's effects")):
         settings = LearnerSettings(effects=effects)
         learner = OnlineLearner(robot.tree, robot.gravity, settings, Filtered(noise_gain=gain))

@@ -27,8 +27,7 @@ from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader
 from adapter.realtime.timing import COUNTED
 from drivers.files.estimates import EstimateNames, estimate_fields
 from drivers.files.mcap.writer import ESTIMATES
-from drivers.files.messages import Message, header
-from drivers.files.ros import TransformsEncoder
+from drivers.files.messages import Message, TransformsEncoder, header
 from drivers.files.ros_types import (
     DIAGNOSTICS,
     ESTIMATE,

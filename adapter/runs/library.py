@@ -95,7 +95,7 @@ def read_log(
     >>> adapter.read_log("recordings/panda_nominal_6s.mcap")
     Log(panda_nominal_6s.mcap: 6001 samples of 7 joints, 6.0 s)
     """
-    return read_mcap(path, joint_names, topic, sensors=False)
+    return read_mcap(path, joint_names, topic)
 
 
 def make_log(
@@ -465,7 +465,9 @@ def discover(log: Log | str | Path, *, base: str | None = None) -> Discovery:
         ...
     adapter.errors.SettingsError: ...
     """
-    return discover_tree(log if isinstance(log, Log) else read_mcap(log, sensors=True), base=base)
+    return discover_tree(
+        log if isinstance(log, Log) else read_mcap(log, beside="sensors"), base=base
+    )
 
 
 def export(model: SelfModel, path: str | Path, onto: str | Path | None = None) -> Path:

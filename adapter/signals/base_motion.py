@@ -56,7 +56,7 @@ def with_base_motion(log: Log, robot: SelfModel, link: str) -> Log:
     """The recording with the base's motion at its joint samples (`Log.base`).
 
     Args:
-        log: read with `frames`.
+        log: read with what `frames` tell.
         robot: on a floating base.
         link: the base, or a frame fixed to it, which messages without a frame are taken to mean.
 
@@ -72,7 +72,15 @@ def with_base_motion(log: Log, robot: SelfModel, link: str) -> Log:
     turning = [m for m in heard if np.isfinite(m.w).any()]
     w_of = next((m for m in turning if m is a_of), next(iter(turning), None))
     if a_of is None or w_of is None:
-        raise DriverError(_lacking(log, places, w_of is None, a_of is None))
+        no = {"angular velocity": w_of is None, "acceleration": a_of is None}
+        what = " and no ".join(name for name, lacks in no.items() if lacks)
+        have = [f"{m.topic} ({m.schema} of {m.frame or 'no frame'})" for m in log.frames]
+        imu, odometry, twist, accel = READERS
+        raise DriverError(
+            f"{log.path}: has no {what} of a base that floats; on any topic serve {imu}, or "
+            f"{accel} with {twist} or {odometry}, in one of the frames {', '.join(places)}; have: "
+            f"{', '.join(have) or 'none of these types'}"
+        )
     v_of = next((m for m in heard if np.isfinite(m.v).any()), None)
     w = _turned(w_of, w_of.w, places)
     a = _turned(a_of, a_of.a, places)
@@ -94,18 +102,6 @@ def with_base_motion(log: Log, robot: SelfModel, link: str) -> Log:
     if silent:
         said.append(f"{log.path}: no motion of the base at {silent} of {len(log)} joint samples")
     return replace(log, base=base, warnings=[*log.warnings, *said])
-
-
-def _lacking(log: Log, places: Mapping[str, Place], no_w: bool, no_a: bool) -> str:
-    """What is missing of the base's motion, what would serve, and what is there."""
-    what = [name for name, no in (("angular velocity", no_w), ("acceleration", no_a)) if no]
-    have = [f"{m.topic} ({m.schema} of {m.frame or 'no frame'})" for m in log.frames]
-    imu, odometry, twist, accel = READERS
-    return (
-        f"{log.path}: has no {' and no '.join(what)} of a base that floats; on any topic serve "
-        f"{imu}, or {accel} with {twist} or {odometry}, in one of the frames {', '.join(places)}; "
-        f"have: {', '.join(have) or 'none of these types'}"
-    )
 
 
 def _turned(motion: FrameMotion, x: Array, places: Mapping[str, Place]) -> Vectors:

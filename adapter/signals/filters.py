@@ -128,69 +128,28 @@ def filter_step(stamp_ns, signals, gains, state):
 
 
 class JointFilter:
-    """All joints in one filter; see the module.
+    """What the filter of an arm's joints does to their signals; see the module.
 
     Attributes:
         delay_s: age of the filtered instant against the sample, s, constant.
-        y, dy: (3 n,) filtered q, dq, tau and their rates.
+        gains: what `filter_step` takes.
     """
 
-    def __init__(self, n: int, settings: FilterSettings | None = None) -> None:
-        self.n = n
+    def __init__(self, settings: FilterSettings | None = None) -> None:
         self.settings = settings or FilterSettings()
         k1, k2 = steady_state_poles(self.settings)
         self.delay_s = k1 / k2
-        self.delay_ns = round(1e9 * self.delay_s)
-        self.gains = Gains(k1, k2, self.delay_ns, SETTLING_DELAYS * self.delay_ns)
-        zeros = (np.zeros(3 * n) for _ in range(3))
-        self.use(FilterState(np.array([NEVER, NEVER]), *zeros))
-
-    def use(self, state: FilterState) -> None:
-        """Keep what is remembered in these arrays from now on."""
-        self.state, self.y, self.dy = state, state.y, state.dy
+        delay_ns = round(1e9 * self.delay_s)
+        self.gains = Gains(k1, k2, delay_ns, SETTLING_DELAYS * delay_ns)
 
     @property
     def noise_gain(self) -> float:
         """Filtered states that one independent of white noise is worth (ENBW)."""
-        bandwidth_hz = self.gains.k2 / (
-            4.0 * self.gains.k1
-        )  # equivalent noise bandwidth of L, one-sided
+        # equivalent noise bandwidth of L, one-sided
+        bandwidth_hz = self.gains.k2 / (4.0 * self.gains.k1)
         s = self.settings
         by_band = 1.0 / (2.0 * bandwidth_hz * s.step_s * s.samples_per_state)
         return max(by_band, float(s.states_per_sample))
-
-    def reset(self) -> None:
-        """Forget everything; the next sample starts the filter anew, at rest on that sample."""
-        self.state.times[0] = NEVER
-
-    def step(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bool:
-        """Take one sample; returns whether the filter has settled since its last start.
-
-        The outputs are read from `q`, `dq`, `ddq`, `tau` and belong to stamp - delay_ns.
-        Stamps must increase; the caller has refused what does not.
-        """
-        u = np.concatenate([q, dq, tau])
-        return bool(filter_step(stamp_ns, u, self.gains, self.state))
-
-    @property
-    def q(self) -> Array:
-        """(n,) rad."""
-        return self.y[: self.n]
-
-    @property
-    def dq(self) -> Array:
-        """(n,) rad/s."""
-        return self.y[self.n : 2 * self.n]
-
-    @property
-    def ddq(self) -> Array:
-        """(n,) rad/s²."""
-        return self.dy[self.n : 2 * self.n]
-
-    @property
-    def tau(self) -> Array:
-        """(n,) N m."""
-        return self.y[2 * self.n :]
 
 
 def noise_from_samples(x: Array) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,17 +30,16 @@ from adapter.signals.settings import FilterSettings, FrontEndSettings
 from adapter.signals.twist import Raw, TwistSynthesis
 from drivers.interface import DriverError, JointSample
 
-NOTEWORTHY = (
-    Verdict.NON_FINITE,
-    Verdict.OUT_OF_RANGE,
-    Verdict.TIME_BACKWARDS,
-    Verdict.TORQUE_SATURATED,
-    Verdict.IMPLAUSIBLE_STEP,
-    Verdict.STUCK_JOINT,
-    Verdict.ENCODER_JUMP,
-    Verdict.BASE_UNHEARD,
-)
-
+SAID = {  # of the first sample of each kind; all others are counted
+    Verdict.NON_FINITE: "a reading is not a finite number; the sample was refused",
+    Verdict.OUT_OF_RANGE: "a reading is out of range",
+    Verdict.TIME_BACKWARDS: "time does not increase; the sample was refused",
+    Verdict.TORQUE_SATURATED: "a torque is at its limit; nothing is learned around it",
+    Verdict.IMPLAUSIBLE_STEP: "a reading steps further than the arm moves; the sample was refused",
+    Verdict.STUCK_JOINT: "a joint moves, its readings stand still; refused until they move",
+    Verdict.ENCODER_JUMP: "an encoder jumped",
+    Verdict.BASE_UNHEARD: "nothing is known of the base's motion; the sample was refused",
+}
 UNSEEN = (
     Mark.SATURATED_UNTIL,
     Mark.FIRST_MOVING,
@@ -54,29 +52,10 @@ BASE = 9  # numbers of a floating base's motion in a sample, [v, w, a]
 FASTER = 1.1  # of the documented speed, which is then not the arm's: said, not refused
 
 
-class Samples(NamedTuple):
-    """Raw samples: stamps (m,) int64 ns; signals (m, 3 n + b), see `process`."""
-
-    stamps: NDArray[np.int64]
-    signals: Array
-
-
-class Answers(NamedTuple):
-    """What became of samples.
-
-    Attributes:
-        verdicts: (m,) int64 of `Verdict`.
-        holes: (m, 2) int64 stamps before and behind a gap that restarted the filter; else 0.
-    """
-
-    verdicts: NDArray[np.int64]
-    holes: NDArray[np.int64]
-
-
 @jit
-def taken(samples, i, rules, memory, answers, records):
-    """Verdict on sample i; the states since the one before are filtered into its records."""
-    stamp, signals, marks = samples.stamps[i], samples.signals[i], memory.marks
+def taken(signals, answer, rules, memory, records):
+    """Verdict on a sample; the states since the one before are filtered into its records."""
+    stamp, hole, marks = answer[0], answer[2:], memory.marks
     times, gains, n = memory.filter.times, rules.gains, rules.effort.shape[0]
     x = signals[: 3 * n].reshape(3, n)
     verdict = judge(stamp, x[0], x[1], x[2], rules, memory)
@@ -105,10 +84,10 @@ def taken(samples, i, rules, memory, answers, records):
     marks[Mark.DOUBTED] = NEVER
     marks[Mark.AHEAD] = NEVER
     if gap:
-        answers.holes[i, 0], answers.holes[i, 1] = times[0], stamp
+        hole[0], hole[1] = times[0], stamp
         times[0] = NEVER
         if ahead_ns != NEVER and 0 < stamp - ahead_ns <= rules.gap_ns:  # it began there
-            answers.holes[i, 1] = ahead_ns
+            hole[1] = ahead_ns
             filtered(ahead_ns, np.inf, memory.ahead[: signals.shape[0]].copy(), gains, memory)
             dt_s = 1e-9 * (stamp - ahead_ns)
     settled, old, old_stamp = False, memory.filter.old[: signals.shape[0]].copy(), times[0]
@@ -192,13 +171,12 @@ def process(signals, rules, memory, whole, records, answers):
             given, the others are filled.
     """
     own, kept = borrowed(unpacked(rules, memory, whole))
-    samples = borrowed(Samples(answers[:, 0], signals))
-    found, records = borrowed((Answers(answers[:, 1], answers[:, 2:]), records))
+    signals, records, answers = borrowed((signals, records, answers))
     end = own.states
     for i in range(signals.shape[0]):
-        found.holes[i] = 0
-        found.verdicts[i] = taken(samples, i, own, kept, found, records[end - own.states : end])
-        if found.verdicts[i] == Verdict.GOOD:
+        answers[i, 2:] = 0
+        answers[i, 1] = taken(signals[i], answers[i], own, kept, records[end - own.states : end])
+        if answers[i, 1] == Verdict.GOOD:
             end += own.states
 
 
@@ -226,7 +204,7 @@ class FrontEnd:
         self.settings = settings or FrontEndSettings()
         self.names = documented.tree.joint_names
         self.layout = StateLayout(n, documented.tree.floating)
-        self.filter = JointFilter(n, filter_settings)
+        self.filter = JointFilter(filter_settings)
         self.twist = TwistSynthesis(documented, imus)
         self._rules = rules_of(documented.limits, self.settings, self.filter)
         self._packed = packed(self._rules)
@@ -238,7 +216,6 @@ class FrontEnd:
         self._memory.filter.times[:] = NEVER
         for mark in UNSEEN:
             self._memory.marks[mark] = NEVER
-        self.filter.use(self._memory.filter)
         self._signals, self._answers = np.empty((1, 3 * n + base)), np.zeros((1, 4), np.int64)
         self._records = self.layout.new(self._rules.states)
         self.refused: Counter[str] = Counter()
@@ -310,7 +287,9 @@ class FrontEnd:
         if answers[0, 1]:
             self._refuse(answers[0, 1], sample, answers[0, 2:])
             return self._records[:0]
-        self.twist.fill(self._records, sample)
+        said, last = sample.links, np.array([len(self._records) - 1])
+        links = None if said is None else (said.twist[None], said.accel[None])
+        self.twist.fill(self._records, Raw(last, sample.q[None], sample.dq[None], links))
         return self._records
 
     def step_table(
@@ -343,7 +322,7 @@ class FrontEnd:
         records = records[: states * len(good)]
         last = states - 1 + states * np.arange(len(good))  # the others are of instants in between
         own = None if links is None else (links[0][good], links[1][good])
-        self.twist.fill_table(records, Raw(last, q[good], dq[good], own))
+        self.twist.fill(records, Raw(last, q[good], dq[good], own))
         return records
 
     @property
@@ -364,7 +343,7 @@ class FrontEnd:
             self.gaps.append((before_ns, gap_s))
         reason = Verdict(verdict)
         name = reason.name.lower()
-        if reason in NOTEWORTHY and not self.refused[name]:
+        if reason in SAID and not self.refused[name]:
             self._told.append(self._sentence(reason, sample))
         self.refused[name] += 1
 
@@ -383,16 +362,4 @@ class FrontEnd:
                         f"{at}: {signal} of {self.names[j]} is {value[j]:.4g}, outside "
                         f"[{low[j]:.4g}, {high[j]:.4g}]{hint}"
                     )
-        if reason == Verdict.BASE_UNHEARD:
-            return f"{at}: nothing is known of the base's motion; the sample was refused"
-        if reason == Verdict.NON_FINITE:
-            return f"{at}: a reading is not a finite number; the sample was refused"
-        if reason == Verdict.TORQUE_SATURATED:
-            return f"{at}: a torque is at its limit; nothing is learned around it"
-        if reason == Verdict.IMPLAUSIBLE_STEP:
-            return f"{at}: a reading steps further than the arm moves; the sample was refused"
-        if reason == Verdict.STUCK_JOINT:
-            return f"{at}: a joint moves, its readings stand still; refused until they move"
-        if reason == Verdict.ENCODER_JUMP:
-            return f"{at}: {self.fault}"
-        return f"{at}: time does not increase; the sample was refused"
+        return f"{at}: {self.fault if reason == Verdict.ENCODER_JUMP else SAID[reason]}"

@@ -1,16 +1,18 @@
-"""Tables of joint signals from other tools, turned into a recording.
+"""Files of other tools, turned into a recording of the project's own.
 
-A specification says which file, column and unit holds which signal; tables are number files as
-other tools write them (CSV, whitespace, one value a line, npz, Parquet, LeRobot); the recording
-holds what they say, and the report what looks doubtful in it.
+Tables: a specification says which file, column and unit holds which signal; they are number files
+as other tools write them (CSV, whitespace, one value a line, npz, Parquet, LeRobot). Recordings
+(bags of either ROS, MCAP): what is read is what `replay`, `gap` and `info` read of them; written
+are joint states, commands and the links' motion that belongs to them. The report says what looks
+doubtful.
 """
 
 from __future__ import annotations
 
 import importlib.metadata
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.model.model_file import whole_file
-from adapter.signals.plausible import refuse_wild, value_doubts, velocity_doubts
+from adapter.signals.matching import corresponding
 from adapter.signals.source_table import (
     SourceTable,
     lerobot_joints,
@@ -27,7 +29,15 @@ from adapter.signals.source_table import (
     read_table,
 )
 from drivers.errors import choices
-from drivers.files.mcap import Log, derive_velocity, write_log
+from drivers.files.mcap import (
+    Log,
+    derive_velocity,
+    is_recording,
+    looks_like_degrees,
+    read_log,
+    read_position_log,
+    write_log,
+)
 from drivers.interface import Array, DriverError
 
 SIGNALS = ("time", "q", "dq", "tau")
@@ -50,6 +60,11 @@ _USUAL = {  # what signals are called where the user doesn't say
         *("observation.effort", "observation.torque"),
     ),
 }
+_OF_TABLES = {"columns": {}, "flat": False, "period_s": None, "episode": None}  # not given
+_MOST = {"time": 9e9, "q": 1e4, "dq": 1e6, "tau": 1e6}  # SI; beyond, it is another quantity
+_WHAT = {"time": "time", "q": "angle", "dq": "velocity", "tau": "torque"}
+_MOVING = 1e-2  # rad/s, a median slope below it says nothing
+_PLAUSIBLE = 0.2  # degrees for radians are a factor of 57, milliseconds for seconds of 1000
 _STEP_S = (5e-5, 0.2)  # a median step outside of these suggests a wrong unit of time
 
 
@@ -69,7 +84,7 @@ class ImportSpec:
         period_s: of the samples, where there is no time.
         overwrite: replace an existing recording.
         episode: of a data set with several.
-        topic: of the joint states, where the source is a recording (`signals.recording_import`).
+        topic: of the joint states, where the source is a recording.
     """
 
     sources: Mapping[str, Path]
@@ -151,37 +166,52 @@ class ImportReport:
     rate_hz: float
     warnings: list[str]
 
-    @classmethod
-    def of(
-        cls, out: Path, names: tuple[str, ...], stamp_ns: NDArray[np.int64], warnings: list[str]
-    ) -> ImportReport:
-        """From the stamps (m,) of what was written."""
-        duration_s = float(np.ptp(stamp_ns)) * 1e-9 if len(stamp_ns) else 0.0
-        rate_hz = (len(stamp_ns) - 1) / duration_s if duration_s > 0 else 0.0
-        return cls(out, len(stamp_ns), names, duration_s, rate_hz, warnings)
 
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self) | {"out": str(self.out)}
-
-
-def import_table(spec: ImportSpec, out: Path) -> ImportReport:
-    """Write a recording from tables; it appears under its name only when it is complete.
+def import_file(spec: ImportSpec, out: Path) -> ImportReport:
+    """Write a recording from tables or a recording; complete, or not at all under its name.
 
     Raises:
-        DriverError: a file, column, signal or unit is missing or unreadable; the sentence names
-            file, line or column, and the choices.
+        DriverError: a file, column, signal or unit is missing or unreadable, or another unit is
+            likely; the sentence names file, line or column, and the choices.
     """
-    log = table_log(spec)
     if out.exists() and not spec.overwrite:
         raise DriverError(f"{out}: exists; choose another name or delete it")
+    try:
+        version = importlib.metadata.version("panda-adapter")
+    except importlib.metadata.PackageNotFoundError:
+        version = "unknown"
+    recorded = False
+    for signal, path in spec.sources.items():
+        if is_recording(path) and signal != ALL:
+            raise DriverError(
+                f"{path}: is a recording with all signals; write it without {signal}="
+            )
+        recorded = recorded or is_recording(path)
+        if spec.topic is not None and not recorded:
+            raise DriverError(f"{path}: is no recording, so it has no topic {spec.topic}")
+    log = recording_log(spec, positions=True) if recorded else table_log(spec)
+    source = {
+        "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},
+        "columns": spec.columns,
+        "units": spec.units,
+        "topic": log.topic if recorded else None,
+    }
     with whole_file(out) as part:
-        write_log(log, part, imported_by(spec))
-    return ImportReport.of(out, log.joint_names, log.stamp_ns, log.warnings)
+        write_log(log, part, {"version": version, "imported": source})
+    left = [m.topic for m in log.frames if m.frame not in log.link_names]
+    if (log.twists is None) != (log.accels is None):
+        left.append("the links' motion (a half)")
+    stamp_ns, warnings = log.stamp_ns, log.warnings
+    if left:  # the recording tells it, and the copy does not
+        said = f"not taken: {', '.join(left)} (`adapter discover` reads the recording itself)"
+        warnings = [*warnings, f"{log.path}: {said}"]
+    duration_s = float(np.ptp(stamp_ns)) * 1e-9 if len(stamp_ns) else 0.0
+    rate_hz = (len(stamp_ns) - 1) / duration_s if duration_s > 0 else 0.0
+    return ImportReport(out, len(stamp_ns), log.joint_names, duration_s, rate_hz, warnings)
 
 
 def table_log(spec: ImportSpec) -> Log:
-    """What tables say, as a recording in memory. Raises DriverError like `import_table`."""
+    """What tables say, as a recording in memory. Raises DriverError like `import_file`."""
     warnings: list[str] = []
     reader = _Reader(spec)
     source = reader.source("q")
@@ -197,24 +227,66 @@ def table_log(spec: ImportSpec) -> Log:
         warnings.append(f"{where}: no velocities; derived from the positions")
     else:
         warnings += velocity_doubts(where, stamp_ns, q, dq)
-    warnings += _doubts(spec, where, stamp_ns, {"q": q, "dq": dq, "tau": tau})
-    columns = reader.taken
-    return Log(Path(where), names, stamp_ns, q, dq, tau, warnings=warnings, topic=columns)
+    warnings += _stamp_doubts(spec, where, stamp_ns)
+    warnings += _value_doubts(where, {"q": q, "dq": dq, "tau": tau}, spec.units)
+    said = " ".join(f"{s}={','.join(spec.columns[s])}" for s in SIGNALS if s in spec.columns)
+    topic = f"columns {said}" if said else "columns with the usual names"
+    return Log(Path(where), names, stamp_ns, q, dq, tau, warnings=warnings, topic=topic)
 
 
-def imported_by(spec: ImportSpec) -> dict[str, Any]:
-    """What a recording says of where it came from."""
-    try:
-        version = importlib.metadata.version("panda-adapter")
-    except importlib.metadata.PackageNotFoundError:
-        version = "unknown"
-    source = {
-        "files": {signal or "all": Path(path).name for signal, path in spec.sources.items()},
-        "columns": spec.columns,
-        "units": spec.units,
-        "topic": spec.topic,
-    }
-    return {"version": version, "imported": source}
+def recording_log(spec: ImportSpec, positions: bool = False) -> Log:
+    """What a recording says, in SI, its joints those of the specification, if it names any.
+
+    Args:
+        positions: take also one of an arm that takes positions and tells no efforts.
+
+    Raises:
+        DriverError: like `import_file`; or options go with it that are for tables.
+    """
+    path = Path(spec.sources[ALL])
+    given = [name for name, absent in _OF_TABLES.items() if getattr(spec, name) != absent]
+    if "time" in spec.units:
+        given.append("units time")
+    if given:
+        raise DriverError(
+            f"{path}: is a recording, whose messages have names and stamps; "
+            f"--{given[0].removesuffix('_s')} goes with tables"
+        )
+    factors = {name: unit_factor(spec.units, name) for name in ("q", "dq", "tau")}
+    found = read_position_log(path, spec.topic) if positions else None
+    signals = ("q", "dq", "tau") if found is None else ("q",)
+    read = read_log(path, topic=spec.topic, beside="frames") if found is None else found
+    log, said = _with_joints(read, spec.joint_names)
+    told = {name: np.multiply(getattr(log, name), factors[name]) for name in factors}
+    commands = log.commands
+    if commands is not None:
+        q = None if commands.q is None else commands.q * factors["q"]
+        commands = replace(commands, tau=commands.tau * factors["tau"], q=q)
+    # The reader's doubt about degrees is judged again here, in SI.
+    warnings = [x for x in log.warnings if "are these degrees?" not in x] + said
+    where = f"{path}: {log.topic}"
+    for name in signals:
+        _refuse_wild(where, lambda row: f"sample {row}", name, told[name])
+    warnings += _value_doubts(where, {name: told[name] for name in signals}, spec.units)
+    warnings += velocity_doubts(where, log.stamp_ns, told["q"], told["dq"])
+    return replace(log, **told, commands=commands, warnings=warnings)
+
+
+def _with_joints(log: Log, want: tuple[str, ...]) -> tuple[Log, list[str]]:
+    """These joints under these names, and what to say where they were called otherwise.
+
+    Names that differ in nothing but what stands before their number mean the same joint.
+    """
+    if not want:
+        return log, []
+    found, said = corresponding(want, log.joint_names, "joint")
+    missing = [name for name, have in zip(want, found, strict=True) if have is None]
+    if missing:
+        raise DriverError(
+            f"{log.path}: has no joint {', '.join(missing)}; {choices(missing[0], log.joint_names)}"
+        )
+    chosen = log.select([name for name in found if name is not None])
+    return replace(chosen, joint_names=want), [f"{log.path}: {sentence}" for sentence in said]
 
 
 class _Reader:
@@ -247,15 +319,8 @@ class _Reader:
             values = values * factor
         table = self._tables.get(path)
         place = table.place if table is not None else (lambda row: f"row {row}")
-        refuse_wild(str(path), place, signal, values)
+        _refuse_wild(str(path), place, signal, values)
         return values
-
-    @property
-    def taken(self) -> str:
-        """Which columns were taken for which signal."""
-        chosen = self._spec.columns
-        said = [f"{s}={','.join(chosen[s])}" for s in SIGNALS if s in chosen]
-        return f"columns {' '.join(said)}" if said else "columns with the usual names"
 
     def need(self, signal: str) -> Array:
         """Like `read`. Raises DriverError where the signal isn't there."""
@@ -315,7 +380,14 @@ def _signals(
     q, dq, tau = reader.need("q"), reader.read("dq"), reader.need("tau")
     if times is not None and times.shape[1] != 1:
         raise DriverError(f"{reader.source('time')}: time has {times.shape[1]} columns, need 1")
-    samples = _sample_count(reader, spec, times, q)
+    samples = len(q) if times is None else len(times)
+    if times is None and spec.flat:
+        if not spec.joint_names:
+            raise DriverError(
+                f"{reader.source('q')}: how many values make a sample? Name the joints, or a time "
+                "file"
+            )
+        samples = q.size // len(spec.joint_names)
     q, tau = _shape(reader, "q", q, samples), _shape(reader, "tau", tau, samples)
     dq = None if dq is None else _shape(reader, "dq", dq, samples)
     count = len(spec.joint_names) or q.shape[1]
@@ -332,18 +404,6 @@ def _signals(
     return np.round(seconds * 1e9).astype(np.int64), q, dq, tau
 
 
-def _sample_count(reader: _Reader, spec: ImportSpec, times: Array | None, q: Array) -> int:
-    if times is not None:
-        return len(times)
-    if not spec.flat:
-        return len(q)
-    if not spec.joint_names:
-        raise DriverError(
-            f"{reader.source('q')}: how many values make a sample? Name the joints, or a time file"
-        )
-    return q.size // len(spec.joint_names)
-
-
 def _shape(reader: _Reader, signal: str, values: Array, samples: int) -> Array:
     """(samples, n); a single column of n values a sample is cut into rows."""
     if len(values) == samples:
@@ -357,13 +417,11 @@ def _shape(reader: _Reader, signal: str, values: Array, samples: int) -> Array:
     )
 
 
-def _doubts(
-    spec: ImportSpec, where: str, stamp_ns: NDArray[np.int64], signals: dict[str, Array]
-) -> list[str]:
-    """Sentences on what looks wrong but can be recorded.
+def _stamp_doubts(spec: ImportSpec, where: str, stamp_ns: NDArray[np.int64]) -> list[str]:
+    """Sentences on stamps (m,) that look wrong but can be recorded.
 
     Raises:
-        DriverError: the unit of time or of q was not named, and another is likely.
+        DriverError: the unit of time was not named, and another is likely.
     """
     found = []
     steps = np.diff(stamp_ns)
@@ -381,4 +439,65 @@ def _doubts(
                 f"{said} s? Say --units time=UNIT ({', '.join(UNITS['time'])}; s takes it as it is)"
             )
         found.append(f"{said} {told or 's'}? (units: {', '.join(UNITS['time'])})")
-    return found + value_doubts(where, signals, spec.units)
+    return found
+
+
+def _refuse_wild(where: str, place: Callable[[int], str], signal: str, values: Array) -> None:
+    """Refuse numbers that no arm has.
+
+    Args:
+        where: the file; place: what stands at a row of it, in words.
+        signal: time, q, dq or tau; values: (m, k), SI.
+
+    Raises:
+        DriverError: one is larger than any of its kind; names the first.
+    """
+    wild = np.argwhere(np.abs(values) > _MOST[signal])
+    if len(wild):
+        row, column = wild[0].tolist()
+        raise DriverError(
+            f"{where}: {place(row)}: {values[row, column]:.4g} is no {_WHAT[signal]} (at most "
+            f"{_MOST[signal]:g} in SI units); are column and unit of {signal} right?"
+        )
+
+
+def _value_doubts(where: str, signals: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
+    """Sentences on samples that are no number, and on positions that look like degrees.
+
+    Args:
+        where: the file; signals: (m, n) by name, SI; units: those that the user named.
+
+    Raises:
+        DriverError: positions look like degrees, and their unit was not named.
+    """
+    found = []
+    for name, values in signals.items():
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            found.append(
+                f"{where}: {name} is not a number in {bad.size} samples, first in sample {bad[0]}"
+            )
+    if looks_like_degrees(signals["q"]):
+        said = (
+            f"{where}: positions reach {np.nanmax(np.abs(signals['q'])):.0f} rad; are they degrees?"
+        )
+        if "q" not in units:
+            raise DriverError(f"{said} Say --units q=deg (q=rad takes them as they are)")
+        found.append(f"{said} Say q=deg")
+    return found
+
+
+def velocity_doubts(where: str, stamp_ns: NDArray[np.int64], q: Array, dq: Array) -> list[str]:
+    """Whether the velocities are the positions' slope in the same unit."""
+    with np.errstate(invalid="ignore"):
+        slopes = np.abs(derive_velocity(stamp_ns, q))
+    if np.isnan(slopes).all() or np.isnan(dq).all():
+        return []
+    slope, said = np.nanmedian(slopes), np.nanmedian(np.abs(dq))
+    ratio = said / slope if slope > _MOVING and said > 0 else 1.0
+    if _PLAUSIBLE < ratio < 1 / _PLAUSIBLE:
+        return []
+    return [
+        f"{where}: velocities are {ratio:.3g} times the slope of the positions; are the units "
+        "of q, dq and time right?"
+    ]

@@ -26,7 +26,7 @@ def with_link_imus(
     """The recording with what sensors on the links read, w and a alone, and the links with one.
 
     Args:
-        log: read with `imus`, its joints those of the robot.
+        log: read with what `imus` tell, its joints those of the robot.
         robot: on a fixed base.
         asked: TOPIC=LINK, or TOPIC whose frame names the link; where empty all topics whose
             frames do, unless the motion of the links was measured whole; `NO_IMUS` for none.

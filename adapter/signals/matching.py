@@ -106,7 +106,8 @@ def corresponding(
     """For each wanted name the one in `have` (None: not there), and warnings."""
     if all(name in have for name in want):
         return list(want), []
-    spaced = [[x for x in have if _in_a_namespace(x, name)] for name in want]
+    ends = [tuple(f"{mark}{name}" for mark in "/:.") for name in want]
+    spaced = [[x for x in have if x.endswith(end)] for end in ends]
     if all(len(x) == 1 for x in spaced):  # of a namespace, beside joints of other things
         said = f"{what} names are taken without what stands before them: "
         return [x[0] for x in spaced], [said + ", ".join(x[0] for x in spaced)]
@@ -118,11 +119,6 @@ def corresponding(
         return [name if name in have else None for name in want], []
     pairs = ", ".join(f"{a} = {b}" for a, b in zip(found, want, strict=True))
     return found, [f"{what} names differ and are matched by their numbers: {pairs}"]
-
-
-def _in_a_namespace(recorded: str, name: str) -> bool:
-    before = recorded.removesuffix(name)
-    return before != recorded and before[-1:] in ("/", ":", ".")
 
 
 def _number(name: str) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.files.mcap import (
     JOINT_COMMANDS,
@@ -42,7 +41,7 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     """
     path, log = (path.path, path) if isinstance(path, Log) else (Path(path), None)
     try:
-        looked = _Looked.at(path, topic) if log is None else _Looked.of(log)
+        looked = _look(path, log, topic)
     except DriverError as error:
         topics, warnings, truncated = survey(path)
         facts: dict[str, Any] = {"problem": str(error)}
@@ -60,14 +59,12 @@ def describe(path: str | Path | Log, topic: str | None = None) -> dict[str, Any]
     }
 
 
-@dataclass(frozen=True)
-class _Looked:
+class _Looked(NamedTuple):
     """What of a recording was looked at.
 
     Attributes:
         parts: all of it, or stretches in the order of time.
-        samples, commands: of the whole.
-        warnings: of the whole.
+        samples, commands, warnings: of the whole.
         holes: (s since the first sample, s) that are known beside those in the parts.
     """
 
@@ -75,36 +72,28 @@ class _Looked:
     samples: int
     commands: int
     warnings: list[str]
-    holes: list[tuple[float, float]] = field(default_factory=list)
+    holes: list[tuple[float, float]]
 
-    @classmethod
-    def of(cls, log: Log) -> _Looked:
-        """A recording, a mapped one by a sample."""
-        parts = log.spread()
-        said = [_judged(parts, len(log))] if log.is_mapped else []
+
+def _look(path: Path, log: Log | None, topic: str | None) -> _Looked:
+    """A recording, a long one by a sample. Raises DriverError."""
+    sample = sample_log(path, topic, "frames") if log is None else None
+    holes: list[tuple[float, float]] = []
+    if sample is None:
+        log = read_log(path, topic=topic, beside="frames") if log is None else log
+        parts, samples, part = log.spread(), len(log), log.is_mapped
         commands = 0 if log.commands is None else len(log.commands.stamp_ns)
-        return cls(parts, len(log), commands, [*log.warnings, *said])
-
-    @classmethod
-    def at(cls, path: Path, topic: str | None) -> _Looked:
-        """A recording, a long one by a sample. Raises DriverError."""
-        sample = sample_log(path, topic, frames=True)
-        if sample is None:
-            return cls.of(read_log(path, topic=topic, frames=True))
+    else:
         parts, holes = sample
-        log, told = parts[0], parts[0].topics.get(JOINT_COMMANDS)
+        log, told, part = parts[0], parts[0].topics.get(JOINT_COMMANDS), True
         samples = log.topics[log.topic].messages
         commands = 0 if told is None or log.commands is None else told.messages
-        return cls(parts, samples, commands, [*log.warnings, _judged(parts, samples)], holes)
-
-
-def _judged(parts: list[Log], samples: int) -> str:
-    """What a sample says of itself."""
-    return (
+    judged = (
         f"judged from {sum(map(len, parts))} of {samples} samples, in {len(parts)} stretches from "
         "the first to the last: ranges, units, steps, repeats, holes and what is no number; count "
         "and duration are of the whole"
     )
+    return _Looked(parts, samples, commands, [*log.warnings, *([judged] if part else [])], holes)
 
 
 def summary(facts: dict[str, Any]) -> list[str]:
@@ -144,15 +133,13 @@ def _signal_lines(facts: dict[str, Any]) -> list[str]:
         f"{gaps['longest_s']:.3g} s",
         f"repeats: {facts['repeated_samples']} samples, {facts['repeated_stamps']} stamps; "
         f"{facts['backward_steps']} steps back in time; {facts['not_finite']} not a number",
-        *(_range_line(*item) for item in facts["range"].items()),
+        *(
+            f"{name}: {'  '.join(map('{:.3g}..{:.3g}'.format, found['min'], found['max']))}"
+            for name, found in facts["range"].items()
+        ),
         f"units: {facts['units']}",
         f"can teach: {facts['teaches']}",
     ]
-
-
-def _range_line(name: str, found: dict[str, list[float]]) -> str:
-    pairs = zip(found["min"], found["max"], strict=True)
-    return f"{name}: " + "  ".join(f"{low:.3g}..{high:.3g}" for low, high in pairs)
 
 
 def _units(parts: list[Log], q: Array, dq: Array, tau: Array) -> str:
@@ -193,6 +180,10 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
     tables = (np.concatenate([getattr(x, key) for x in parts]) for key in ("q", "dq", "tau"))
     signals = dict(zip(("q_rad", "dq_rad_s", "tau_nm"), tables, strict=True))
     q, dq, tau = signals.values()
+    repeated = 0
+    for part in parts:
+        same = [(x[1:] == x[:-1]).all(axis=1) for x in (part.q, part.dq, part.tau)]
+        repeated += int(np.all(same, axis=0).sum())
     finite = np.all([np.isfinite(v).all(axis=1) for v in signals.values()], axis=0)
     return {
         "joints": list(log.joint_names),
@@ -204,23 +195,16 @@ def _joint_facts(looked: _Looked) -> dict[str, Any]:
         "samples": looked.samples,
         "samples_judged": sum(map(len, parts)),
         "commands": looked.commands,
-        "repeated_samples": sum(int(_repeated(part).sum()) for part in parts),
+        "repeated_samples": repeated,
         "not_finite": int((~finite).sum()),
         "range": {
-            name: {"min": _listed(v[finite].min(axis=0)), "max": _listed(v[finite].max(axis=0))}
+            name: {k: getattr(v[finite], k)(axis=0).tolist() for k in ("min", "max")}
             for name, v in signals.items()
             if finite.any()
         },
         "metadata": log.metadata,
         "attachments": {name: len(data) for name, data in log.attachments.items()},
     }
-
-
-def _repeated(log: Log) -> NDArray[np.bool_]:
-    """(m - 1,) whether a sample is the one before in all of q, dq and tau."""
-    same = [(v[1:] == v[:-1]).all(axis=1) for v in (log.q, log.dq, log.tau)]
-    repeated: NDArray[np.bool_] = np.all(same, axis=0)
-    return repeated
 
 
 def _duration_s(looked: _Looked) -> float:
@@ -268,7 +252,3 @@ def _gaps(looked: _Looked) -> dict[str, Any]:
         "longest_s": float(steps_s.max(initial=0)),
         "first": listed,
     }
-
-
-def _listed(values: NDArray[np.float64]) -> list[float]:
-    return [float(v) for v in values]

@@ -72,27 +72,24 @@ class SourceTable:
         return list(range(first, last))
 
     def _named(self, selector: str, what: str) -> list[int]:
-        places = [i for i, name in enumerate(self.names) if name == selector]
-        places = places or [
-            i for i, name in enumerate(self.names) if name.startswith(f"{selector}[")
-        ]
-        places = places or [
-            i for i, name in enumerate(self.names) if fnmatch.fnmatchcase(name, selector)
-        ]
+        places = self._found(selector)
         if not places:
             having = self._having() or f"; it has no header, name columns 0 to {len(self) - 1}"
             raise DriverError(f"{self.path}: no column '{selector}' for {what}{having}")
         return places
+
+    def _found(self, selector: str) -> list[int]:
+        """Places of the columns of that name, else of that list, else of that pattern."""
+        ways = str.__eq__, lambda name, x: name.startswith(f"{x}["), fnmatch.fnmatchcase
+        places = ([i for i, x in enumerate(self.names) if fits(x, selector)] for fits in ways)
+        return next(filter(None, places), [])
 
     def __len__(self) -> int:
         return int(self.values.shape[1])
 
     def has(self, selector: str) -> bool:
         """Whether a name or pattern finds a column."""
-        return any(
-            fnmatch.fnmatchcase(name, selector) or name.startswith(f"{selector}[")
-            for name in self.names
-        )
+        return bool(self._found(selector))
 
     def _having(self) -> str:
         return f"; named {', '.join(self.names)}" if self.names else ""

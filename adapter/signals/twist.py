@@ -28,7 +28,6 @@ from adapter.physics.kernels import (
     link_motion,
 )
 from adapter.signals.records import KIND, LinkMotionKind, StateLayout, columns
-from drivers.interface import JointSample
 
 Indices = NDArray[np.intp]
 
@@ -67,14 +66,8 @@ class TwistSynthesis:
         self._frames = tuple(frames_of(documented.tree.parent, documented.lam))
         self._base = np.empty(0) if self.layout.floating else base_at_rest(documented.gravity)
 
-    def fill(self, records: Array, sample: JointSample) -> None:
-        """Complete records whose q, dq, ddq are filled, the last of this sample's instant."""
-        said, last = sample.links, np.array([len(records) - 1])
-        links = None if said is None else (said.twist[None], said.accel[None])
-        self.fill_table(records, Raw(last, sample.q[None], sample.dq[None], links))
-
-    def fill_table(self, records: Array, raw: Raw) -> None:
-        """Complete records (m, size) of these samples."""
+    def fill(self, records: Array, raw: Raw) -> None:
+        """Complete records (m, size) of these samples, whose q, dq, ddq are filled."""
         if self._imus:
             self._of_imus(records, raw)
             return

@@ -21,7 +21,7 @@ BLOCKS = 10  # stretches of a table
 
 # (q, dq, ddq), each (m, n), at stamps (m,) in s to torque (m, n)
 TorqueModel = Callable[[Array, Array, Array, Array], Array]
-Signals = tuple[Array, Array, Array, Array]
+Signals = tuple[Array, ...]
 
 
 def validation_error(stamp_s: Array, q: Array, dq: Array, tau: Array, torque: TorqueModel) -> Array:
@@ -94,18 +94,14 @@ def _windows(pieces: Iterable[Signals]) -> Iterator[Signals]:
             grid: Array = begin_s + GRID_S * np.arange(k, k + size, dtype=np.float64)
             last = int(np.searchsorted(latest, grid[-1])) + 1
             stamp_s, q, dq, tau = (x[:last] for x in held)
-            yield _inner(smooth(stamp_s, q, dq, tau, grid), skip, margin)
+            smoothed = smooth(stamp_s, q, dq, tau, grid)
+            yield tuple(x[skip:-margin] for x in smoothed)
             k, skip = k + size - 2 * margin, margin
             first = max(int(np.searchsorted(latest, begin_s + GRID_S * k, side="right")) - 1, 0)
             held, latest = [x[first:] for x in held], latest[first:]
     stamp_s, q, dq, tau = held
     grid = begin_s + GRID_S * np.arange(k, math.ceil((stamp_s[-1] - begin_s) / GRID_S))
-    yield _inner(smooth(stamp_s, q, dq, tau, grid), skip, edge)
-
-
-def _inner(signals: Signals, first: int, last: int) -> Signals:
-    q, dq, ddq, tau = (x[first:-last] for x in signals)
-    return q, dq, ddq, tau
+    yield tuple(x[skip:-edge] for x in smooth(stamp_s, q, dq, tau, grid))
 
 
 def smooth(stamp_s: Array, q: Array, dq: Array, tau: Array, grid: Array | None = None) -> Signals:

@@ -45,26 +45,21 @@ def estimate_fields(stamp_ns: int, names: EstimateNames, values: Mapping[str, An
         "torque_std": (n,),
     }
     tables = {key: _table(values.get(key), shape) for key, shape in shapes.items()}
-    spread = [(k, j) for k in range(e) for j in range(n)]
+    joints = zip(names.joints, *(tables[key] for key in (*JOINT_TABLES, "torque_std")), strict=True)
+    bodies = zip(names.bodies, *(tables[key] for key in BODY_TABLES), strict=True)
+    parts = dict(zip(("value", "std", "shape"), EFFECT_TABLES, strict=True))
     return {
         "header": header(stamp_ns),
         **{key: values[key] for key in FLAGS},
         "joints": [
-            {"name": name, **_rows(tables, JOINT_TABLES, j, LAMBDA_FIELDS)}
-            | {"torque_std": tables["torque_std"][j]}
-            for j, name in enumerate(names.joints)
+            {"name": name, **_rows(LAMBDA_FIELDS, value, std), "torque_std": torque_std}
+            for name, value, std, torque_std in joints
         ],
-        "bodies": [
-            {"name": name, **_rows(tables, BODY_TABLES, i, THETA_FIELDS)}
-            for i, name in enumerate(names.bodies)
-        ],
+        "bodies": [{"name": name, **_rows(THETA_FIELDS, *rows)} for name, *rows in bodies],
         "effects": [
-            {"effect": names.effects[k], "joint": names.joints[j]}
-            | {
-                field: tables[key][k, j]
-                for field, key in zip(("value", "std", "shape"), EFFECT_TABLES, strict=True)
-            }
-            for k, j in spread
+            {"effect": effect, "joint": joint, **{x: tables[y][k, j] for x, y in parts.items()}}
+            for k, effect in enumerate(names.effects)
+            for j, joint in enumerate(names.joints)
         ],
     }
 
@@ -109,12 +104,10 @@ def _table(value: Any, shape: tuple[int, ...]) -> Array:
     return table
 
 
-def _rows(
-    tables: Mapping[str, Array], keys: Sequence[str], row: int, names: Sequence[str]
-) -> dict[str, dict[str, float]]:
+def _rows(names: Sequence[str], value: Array, std: Array) -> dict[str, dict[str, float]]:
     """A row of a table and of its standard deviations, by the fields' names."""
-    value, std = (dict(zip(names, tables[key][row].tolist(), strict=True)) for key in keys)
-    return {"value": value, "std": std}
+    both = (dict(zip(names, row.tolist(), strict=True)) for row in (value, std))
+    return dict(zip(("value", "std"), both, strict=True))
 
 
 def _array(rows: Iterable[Sequence[float]], width: int) -> Array:

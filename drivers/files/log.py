@@ -49,23 +49,19 @@ class LogArm:
         self.log: Log = log
         self.warnings: list[str] = log.warnings
         self.joint_names: tuple[str, ...] = log.joint_names
-        self._has_links = self._links_present(log)
+        # (m,) whether a sample has link motion; None where the recording has none to give
+        self._has_links: NDArray[np.bool_] | None = None
+        if log.twists is not None and log.accels is not None:
+            self._has_links = ~np.all(np.isnan(log.twists) & np.isnan(log.accels), axis=(1, 2))
+        elif log.twists is not log.accels:
+            kind = "accelerations" if log.accels is None else "twists"
+            self.warnings.append(f"{log.path}: no link {kind}; link motion is left out")
         self.link_names: tuple[str, ...] = log.link_names if self._has_links is not None else ()
         steps = np.diff(log.stamp_ns)
         steps = steps[steps > 0]
         self.period_ns = int(np.median(steps)) if steps.size else _DEFAULT_PERIOD_NS
         self._next: int | None = None
         self.intake = Intake()
-
-    def _links_present(self, log: Log) -> NDArray[np.bool_] | None:
-        """(m,) whether a sample has link motion; None where the recording has none to give."""
-        if log.twists is None or log.accels is None:
-            if log.twists is not log.accels:
-                kind = "accelerations" if log.accels is None else "twists"
-                self.warnings.append(f"{log.path}: no link {kind}; link motion is left out")
-            return None
-        heard: NDArray[np.bool_] = ~np.all(np.isnan(log.twists) & np.isnan(log.accels), axis=(1, 2))
-        return heard
 
     def __len__(self) -> int:
         return len(self.log)

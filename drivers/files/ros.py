@@ -1,253 +1,42 @@
-"""Bytes of the ROS 2 messages in a recording, both ways, one at a time or many at once.
+"""Reads the ROS 2 messages of joints, links and bases in a recording, one or many at once.
 
-Written: CDR (XCDR1) little endian, encapsulation header 00 01 00 00. Read: plain CDR of either
-byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes). Alignment counts from
-the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4 (encapsulation, plain
-CDR). Imu and Odometry are only read, and so is the beginning of three more messages of joints:
+Plain CDR of either byte order and either version (XCDR2 aligns doubles to 4 instead of 8 bytes).
+Alignment counts from the byte behind the encapsulation header. Source: OMG DDS-XTypes 1.3, 7.4
+(encapsulation, plain CDR). Of three messages of joints only the beginning is read:
 control_msgs/DynamicJointState (ros-controls/control_msgs), franka_msgs/FrankaRobotState and
 franka_msgs/FrankaState (frankaemika/franka_ros2).
 
 Decoding is split in two: a parser finds *where* the numbers of a message lie (`Layout`), then
-numpy reads them, from one message or from all messages whose other bytes are the same. Encoders
-lay out the constant bytes of a message once.
+numpy reads them, from one message or from all messages whose other bytes are the same.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.interface import Array
 
-CDR_LE = b"\x00\x01\x00\x00"
 SECOND_NS = 1_000_000_000
-_STAMP_LE = struct.Struct("<iI")
-_SEC_LIMIT = 2**31
 Bytes = bytes | memoryview
 Rows = NDArray[np.uint8]
 _STAMP = slice(4, 12)  # int32 sec, uint32 nanosec, right behind the encapsulation header
 _MAX_ALIGN = {0: 8, 1: 8, 6: 4, 7: 4}  # encapsulation kind -> alignment of a double
 IMU_DOUBLES = 37  # orientation 4, its covariance 9, angular velocity 3, 9, acceleration 3, 9
 ODOMETRY_DOUBLES = 85  # pose 7, its covariance 36, twist 6 (child frame), its covariance 36
-TRANSFORM_DOUBLES = 7  # translation 3, rotation 4
-_COLLISION_DOUBLES = (
-    26  # flags before the joint state of a FrankaRobotState: 4 vectors, 2 of joints
-)
-_FRANKA_JOINTS = 7  # of the fixed arrays of a FrankaState, of which these follow its header:
-_FRANKA_RUNS = (
-    "",
-    "",
-    "q",
-    "",
-    "dq",
-    "",
-    "",
-    "",
-    "",
-    "tau",
-)  # between: q_d dq_d ddq_d theta dtheta
-_FRANKA_FLAGS = 6  # doubles of each of the first two
+# flags before the joint state of a FrankaRobotState: 4 vectors, 2 of joints
+_COLLISION_DOUBLES = 26
+# of a FrankaState behind its header: two of flags, q q_d dq dq_d ddq_d theta dtheta tau
+_FRANKA_RUNS = (6, 6, 7, 7, 7, 7, 7, 7, 7, 7)
 _LAYOUTS_VECTORISED = 16  # beyond this many layouts in one batch, messages are read one by one
 
 
 class CdrError(ValueError):
     """A message is not what its schema says, or values don't fit one."""
-
-
-class _MessageBuilder:
-    """Builds the constant stretches of a message: everything but its stamp and its doubles."""
-
-    def __init__(self) -> None:
-        self._size = 8  # the stamp
-        self._piece = bytearray()
-        self.pieces: list[bytes] = []
-
-    def _put(self, data: bytes, align: int) -> None:
-        padding = -self._size % align
-        self._piece += bytes(padding) + data
-        self._size += padding + len(data)
-
-    def text(self, value: str) -> None:
-        data = value.encode() + b"\0"
-        self.count(len(data))
-        self._put(data, 1)
-
-    def count(self, value: int) -> None:
-        self._put(struct.pack("<I", value), 4)
-
-    def doubles(self, number: int) -> None:
-        """End the stretch where `number` doubles go; an empty run isn't aligned."""
-        if number:
-            self._put(b"", 8)
-        self.pieces.append(bytes(self._piece))
-        self._piece.clear()
-        self._size += 8 * number
-
-    def rest(self) -> bytes:
-        """What follows the last run of doubles."""
-        return bytes(self._piece)
-
-
-def _stamp(stamp_ns: int) -> bytes:
-    sec, nanosec = divmod(stamp_ns, SECOND_NS)
-    if not -_SEC_LIMIT <= sec < _SEC_LIMIT:
-        raise CdrError(f"stamp {stamp_ns} ns does not fit a ROS time (32 bit seconds)")
-    return _STAMP_LE.pack(sec, nanosec)
-
-
-def _raw(values: Array, shape: tuple[int], what: str) -> bytes:
-    data = np.asarray(values, dtype="<f8")
-    if data.shape != shape:
-        raise CdrError(f"{what} has shape {data.shape}, expected {shape}")
-    return data.tobytes()
-
-
-class JointStateEncoder:
-    """Encodes JointState messages of the same joints; about 3 µs a message.
-
-    Args:
-        names: the joints, in the order of the arrays.
-        frame_id: of the header.
-        fields: which of position, velocity and effort the messages carry.
-    """
-
-    def __init__(
-        self,
-        names: Sequence[str],
-        frame_id: str = "",
-        fields: Sequence[str] = ("position", "velocity", "effort"),
-    ) -> None:
-        self._shape = (len(names),)
-        body = _MessageBuilder()
-        body.text(frame_id)
-        body.count(len(names))
-        for name in names:
-            body.text(name)
-        for field in ("position", "velocity", "effort"):
-            number = len(names) if field in fields else 0
-            body.count(number)
-            body.doubles(number)
-        self._pieces = tuple(body.pieces)
-        self._has = tuple(f in fields for f in ("position", "velocity", "effort"))
-
-    def encode(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bytes:
-        """One message; arrays of absent fields are ignored. Raises CdrError on wrong shapes."""
-        first, second, third = self._pieces
-        has_q, has_dq, has_tau = self._has
-        return b"".join(
-            (
-                CDR_LE,
-                _stamp(stamp_ns),
-                first,
-                _raw(q, self._shape, "position") if has_q else b"",
-                second,
-                _raw(dq, self._shape, "velocity") if has_dq else b"",
-                third,
-                _raw(tau, self._shape, "effort") if has_tau else b"",
-            )
-        )
-
-
-def encode_joint_trajectory(
-    joint_names: Sequence[str], times_ns: NDArray[np.int64], motion: Array
-) -> bytes:
-    """One JointTrajectory, without efforts, its stamp 0: to be started when it comes.
-
-    Args:
-        joint_names: n of them.
-        times_ns: (m,) from the start.
-        motion: (m, 3, n) q, dq, ddq: rad, rad/s, rad/s².
-    """
-    n, body = len(joint_names), _MessageBuilder()
-    body.text("")
-    body.count(n)
-    for name in joint_names:
-        body.text(name)
-    body.count(len(times_ns))
-    parts: list[bytes] = []
-    for since_ns, point in zip(times_ns, motion, strict=True):
-        for row in point:
-            body.count(n)
-            body.doubles(n)
-            parts += [body.pieces[-1], _raw(row, (n,), "point")]
-        body.count(0)  # efforts
-        for value in divmod(int(since_ns), SECOND_NS):
-            body.count(value)
-    return b"".join((CDR_LE, _stamp(0), *parts, body.rest()))
-
-
-class MotionEncoder:
-    """Encodes TwistStamped or AccelStamped (same bytes) of one frame."""
-
-    def __init__(self, frame_id: str) -> None:
-        body = _MessageBuilder()
-        body.text(frame_id)
-        body.doubles(6)
-        (self._piece,) = body.pieces
-
-    def encode(self, stamp_ns: int, vector: Array) -> bytes:
-        """One message of a (6,) vector, linear part first. Raises CdrError on a wrong shape."""
-        return b"".join((CDR_LE, _stamp(stamp_ns), self._piece, _raw(vector, (6,), "vector")))
-
-
-class ImuEncoder(MotionEncoder):
-    """Encodes Imu of one frame, without an orientation."""
-
-    def __init__(self, frame_id: str) -> None:
-        body = _MessageBuilder()
-        body.text(frame_id)
-        body.doubles(IMU_DOUBLES)
-        (self._piece,) = body.pieces
-
-    def encode(self, stamp_ns: int, vector: Array) -> bytes:
-        """One message of [w; a] (6,). Raises CdrError on a wrong shape."""
-        whole = np.zeros(IMU_DOUBLES)
-        whole[3], whole[4] = 1.0, -1.0  # no turn, and its covariance says that nothing is known
-        whole[13:16], whole[25:28] = vector[:3], vector[3:]
-        raw = _raw(whole, (IMU_DOUBLES,), "vector")
-        return b"".join((CDR_LE, _stamp(stamp_ns), self._piece, raw))
-
-
-class TransformsEncoder:
-    """Encodes tf2_msgs/TFMessage of the same frames; about 20 µs a message.
-
-    Args:
-        frames: (parent, child) of each transform.
-    """
-
-    def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        data = bytearray(struct.pack("<I", len(frames)))
-        stamps, numbers = [], []
-        for pair in frames:
-            data += bytes(-len(data) % 4)
-            stamps.append(len(data))
-            data += bytes(8)
-            for text in pair:
-                raw = text.encode() + b"\0"
-                data += bytes(-len(data) % 4) + struct.pack("<I", len(raw)) + raw
-            data += bytes(-len(data) % 8)
-            numbers.append(len(data))
-            data += bytes(8 * TRANSFORM_DOUBLES)
-        self._template = np.frombuffer(CDR_LE + bytes(data), np.uint8)
-        starts = np.add(len(CDR_LE), np.array([stamps, numbers]).reshape(2, -1))
-        self._stamps = starts[0][:, None] + np.arange(8)
-        self._numbers = starts[1][:, None] + np.arange(8 * TRANSFORM_DOUBLES)
-
-    def encode(self, stamp_ns: int, numbers: Array) -> bytes:
-        """One message of rows (m, 7): x y z in m, quaternion x y z w.
-
-        Raises CdrError on a wrong shape.
-        """
-        if numbers.shape != (len(self._numbers), TRANSFORM_DOUBLES):
-            raise CdrError(f"transforms have shape {numbers.shape}")
-        data = self._template.copy()
-        data[self._stamps] = np.frombuffer(_stamp(stamp_ns), np.uint8)
-        data[self._numbers] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
-        return data.tobytes()
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,16 +63,18 @@ class Block:
     """Messages of one layout out of a batch.
 
     Attributes:
-        index: (k,) their places in the batch.
+        index: (k,) their places in the batch; of a topic's messages, in the topic's order.
         stamp_ns: (k,) header stamps, ns.
         layout: what they share.
         values: one (k, n_i) array for each run of doubles.
+        log_ns: (k,) log times, where they are of a topic.
     """
 
     index: NDArray[np.int64]
     stamp_ns: NDArray[np.int64]
     layout: Layout
     values: tuple[Array, ...]
+    log_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class _Cursor:
@@ -331,13 +122,17 @@ class _Cursor:
         start = self._advance(8 * number, self._double_align) if number else self._at
         return slice(start, start + 8 * number)
 
+    def joint_state(self) -> tuple[str, tuple[str, ...], tuple[slice, ...]]:
+        """Frame, names and runs of a JointState, behind its stamp."""
+        frame_id = self.text()
+        names = tuple(self.text() for _ in range(self.count()))
+        return frame_id, names, tuple(self.doubles(self.count()) for _ in range(3))
+
 
 def parse_joint_state(data: Bytes) -> Layout:
     """Layout of a JointState: runs position, velocity, effort. Raises CdrError."""
     cursor = _Cursor(data)
-    frame_id = cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
-    runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
+    frame_id, names, runs = cursor.joint_state()
     return Layout(cursor.little, frame_id, names, runs)
 
 
@@ -347,9 +142,7 @@ def parse_franka_robot_state(data: Bytes) -> Layout:
     cursor.text()
     flags = cursor.doubles(_COLLISION_DOUBLES)
     stamp = cursor.stamp()
-    frame_id = cursor.text()
-    names = tuple(cursor.text() for _ in range(cursor.count()))
-    runs = tuple(cursor.doubles(cursor.count()) for _ in range(3))
+    frame_id, names, runs = cursor.joint_state()
     return Layout(cursor.little, frame_id, names, runs, (flags, stamp, *runs))
 
 
@@ -361,11 +154,9 @@ def parse_franka_state(data: Bytes) -> Layout:
     """
     cursor = _Cursor(data)
     frame_id = cursor.text()
-    runs = [cursor.doubles(_FRANKA_FLAGS if i < 2 else _FRANKA_JOINTS) for i in range(10)]
-    named = dict(zip(_FRANKA_RUNS, runs, strict=True))
-    names = tuple(f"joint{i + 1}" for i in range(_FRANKA_JOINTS))
-    doubles = (named["q"], named["dq"], named["tau"])
-    return Layout(cursor.little, frame_id, names, doubles, tuple(runs))
+    runs = tuple(cursor.doubles(number) for number in _FRANKA_RUNS)
+    names = tuple(f"joint{i + 1}" for i in range(_FRANKA_RUNS[-1]))
+    return Layout(cursor.little, frame_id, names, (runs[2], runs[4], runs[-1]), runs)
 
 
 def parse_dynamic_joint_state(data: Bytes) -> Layout:
@@ -396,27 +187,16 @@ def parse_dynamic_joint_state(data: Bytes) -> Layout:
     return Layout(cursor.little, frame_id, tuple(names), tuple(doubles), tuple(runs))
 
 
-def parse_motion(data: Bytes) -> Layout:
-    """Layout of a TwistStamped or AccelStamped: one run of six. Raises CdrError."""
-    cursor = _Cursor(data)
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(6),))
+def parse_doubles(data: Bytes, number: int, of_child: bool = False) -> Layout:
+    """Layout of a header, the name of a child frame where it is `of_child`, and a run of doubles.
 
-
-def parse_imu(data: Bytes) -> Layout:
-    """Layout of a sensor_msgs/Imu: one run of `IMU_DOUBLES`. Raises CdrError."""
-    cursor = _Cursor(data)
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(IMU_DOUBLES),))
-
-
-def parse_odometry(data: Bytes) -> Layout:
-    """Layout of a nav_msgs/Odometry: one run of `ODOMETRY_DOUBLES`; its frame is the child's.
-
-    Raises:
-        CdrError: it is no such message.
+    So are TwistStamped and AccelStamped (6), Imu (`IMU_DOUBLES`) and Odometry (`ODOMETRY_DOUBLES`;
+    its frame is the child's). Raises CdrError.
     """
     cursor = _Cursor(data)
-    cursor.text()  # the frame that the pose is told in
-    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(ODOMETRY_DOUBLES),))
+    if of_child:
+        cursor.text()  # the frame that the pose is told in
+    return Layout(cursor.little, cursor.text(), (), (cursor.doubles(number),))
 
 
 def decode_many(

@@ -51,6 +51,11 @@ class RowsFile:
         content = bytearray(self._file.read(8 * self.width * max(stop - start, 0)))
         return np.frombuffer(content, dtype=self._dtype).reshape(-1, self.width)
 
+    def stretches(self) -> Iterator[NDArray[Any]]:
+        """All rows, so many at a time."""
+        for start in range(0, self._count, AT_ONCE):
+            yield self.rows(start, start + AT_ONCE)
+
     def table(self, mapped: bool) -> NDArray[Any]:
         """All rows (m, width): in memory, or `mapped` into it, read from the file where used."""
         if not (mapped and self._count):

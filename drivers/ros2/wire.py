@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from drivers.files.ros_types import SCHEMAS
+from drivers.files.ros_types import schemas
 from drivers.interface import DriverError
 
 LOCAL = """<CycloneDDS><Domain Id="any"><General><Interfaces>
@@ -199,7 +199,7 @@ def described(found: Sequence[Found]) -> str:
 def dds_type(schema: str) -> Any:
     """The library's class for a message; its values go by as bytes."""
     package, _, name = schema.split("/")
-    texts = SCHEMAS[schema].split("=" * 80 + "\n")
+    texts = schemas()[schema].split("=" * 80 + "\n")
     fields = {f"{package}/{name}": texts[0]}
     for text in texts[1:]:
         head, _, rest = text.partition("\n")

@@ -15,8 +15,8 @@ from mcap_ros2.writer import Writer as RosWriter
 from adapter.cli import main
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
-from drivers.files.mcap import read_log, read_sensors
-from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS
+from drivers.files.mcap import read_log
+from drivers.files.ros_types import IMU, JOINT_STATE, schemas
 from drivers.interface import DriverError
 from tests.helpers.discovery_data import Case, Motion, anyhow, panda, record
 from tests.helpers.mcap_tools import START_NS, foreign, payloads, samples
@@ -51,8 +51,8 @@ def _write(
     stamp_ns = START_NS + log.stamp_ns + (JITTER_NS * rng.normal(size=len(log))).astype(np.int64)
     with path.open("wb") as file:
         writer = RosWriter(file)
-        states = writer.register_msgdef(JOINT_STATE, SCHEMAS[JOINT_STATE])
-        sensors = writer.register_msgdef(IMU, SCHEMAS[IMU])
+        states = writer.register_msgdef(JOINT_STATE, schemas()[JOINT_STATE])
+        sensors = writer.register_msgdef(IMU, schemas()[IMU])
         for i, at in enumerate(stamp_ns.tolist()):
             if i % 2 == 0:
                 state = {"header": header(at, ""), "name": list(log.joint_names)}
@@ -131,10 +131,10 @@ def test_other_commands_see_nothing_of_it(tmp_path) -> None:
     bare = foreign(tmp_path / "b.mcap", payloads(samples(5), fields=("position", "velocity")))
     with pytest.raises(DriverError, match="has no effort"):
         read_log(bare)
-    whole = read_log(bare, sensors=True)
+    whole = read_log(bare, beside="sensors")
     assert np.isnan(whole.tau).all() and "no efforts" in whole.warnings[0]
     ours = write_samples(tmp_path / "c.mcap", samples(40, links=True))
-    one, two = read_log(ours), read_log(ours, sensors=True)
+    one, two = read_log(ours), read_log(ours, beside="sensors")
     for name in ("stamp_ns", "q", "dq", "tau", "twists", "accels"):
         assert np.array_equal(getattr(one, name), getattr(two, name)), name
     assert one.warnings == two.warnings == []
@@ -142,8 +142,8 @@ def test_other_commands_see_nothing_of_it(tmp_path) -> None:
 
 def test_a_part_is_that_part_of_the_whole(tmp_path, capsys) -> None:
     path = _write(tmp_path / "a.mcap", _case(1, False, False), str)
-    whole = read_log(path, sensors=True)
-    part = read_sensors(path, within_s=(1.0, 2.0))
+    whole = read_log(path, beside="sensors")
+    part = read_log(path, beside="sensors", within_s=(1.0, 2.0))
     at = np.searchsorted(whole.stamp_ns, part.stamp_ns)
     assert 900 < len(part) <= 1001 and np.array_equal(whole.stamp_ns[at], part.stamp_ns)
     np.testing.assert_array_equal(part.q, whole.q[at])

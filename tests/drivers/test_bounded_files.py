@@ -2,8 +2,6 @@
 
 import json
 import struct
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -22,14 +20,9 @@ from drivers.files.bounded import DEPTH_LIMIT, parse_json, read_arrays
 from drivers.files.mcap import survey
 from drivers.files.mcap.records import MAGIC
 from tests.helpers.arm_data import learner_for
+from tests.helpers.mcap_tools import weighed_alone
 
 ZEROS = 2**28  # bytes, in a few kB of a chunk
-READ = """
-import sys
-from drivers.files.mcap import survey
-print(survey(sys.argv[1])[1])
-print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")))
-"""
 
 
 def chunk(name: bytes, content: bytes, size: int) -> bytes:
@@ -52,11 +45,8 @@ def test_a_chunk_does_not_grow_beyond_its_limit(tmp_path: Path, name: bytes, kin
     path, said = tmp_path / "bomb.mcap", 1000 if kind == "lying" else ZEROS
     content = chunk(name, frame(name), said)
     path.write_bytes(MAGIC + (content[:-100] if kind == "cut" else content))
-    done = subprocess.run(
-        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, timeout=60
-    )
-    told, most, *_ = done.stdout.splitlines()
-    assert int(most.split()[1]) < 300_000, done.stderr
+    told, most_kib = weighed_alone("survey", path)
+    assert most_kib < 300_000, told
     limit = {"honest": "at most 134217728 are read", "lying": "the 1000 bytes that it claims"}
     assert limit.get(kind, "incomplete record") in told
 

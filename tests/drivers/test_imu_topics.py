@@ -13,8 +13,8 @@ from mcap_ros2.writer import Writer as RosWriter
 from adapter.cli import main
 from drivers.files.mcap import read_log
 from drivers.files.mcap.links import Carrier
-from drivers.files.ros import JointStateEncoder, MotionEncoder
-from drivers.files.ros_types import ACCEL_STAMPED, IMU, JOINT_STATE, SCHEMAS, TWIST_STAMPED
+from drivers.files.messages import JointStateEncoder, MotionEncoder
+from drivers.files.ros_types import ACCEL_STAMPED, IMU, JOINT_STATE, TWIST_STAMPED, schemas
 from tests.helpers.mcap_tools import JOINTS, LINKS, START_NS
 from tests.helpers.ros_messages import UNMEASURED, header, imu
 
@@ -56,7 +56,7 @@ def _file(path: Path, topics: Sequence[tuple[str, str, list[tuple[int, bytes]]]]
         writer = Writer(file)
         writer.start(profile="ros2", library="somebody else")
         for topic, schema, messages in [("/joint_states", JOINT_STATE, states), *topics]:
-            number = writer.register_schema(schema, "ros2msg", SCHEMAS[schema].encode())
+            number = writer.register_schema(schema, "ros2msg", schemas()[schema].encode())
             channel = writer.register_channel(topic, "cdr", number)
             for at, data in messages:
                 writer.add_message(channel, at, data, at)
@@ -100,7 +100,7 @@ def test_what_a_sensor_does_not_measure_is_not_a_number(tmp_path) -> None:
         ("/b_again", IMU, _stream("two_raw", seed=1)),
         ("/d", IMU, _changed(_stream("four", seed=3), 27, 0.9)),
     ]
-    log = read_log(_file(tmp_path / "a.mcap", streams), sensors=True)
+    log = read_log(_file(tmp_path / "a.mcap", streams), beside="sensors")
     assert log.link_names == ("one", "two", "four")
     heard = np.isfinite(log.accels[:, :, 0]).sum(axis=0)
     assert heard.tolist() == [0, 200, 200] and np.isnan(log.accels[:, :, 3:]).all()
@@ -116,8 +116,8 @@ def test_covariances_lie_where_other_tools_write_them(tmp_path) -> None:
     path, ones = tmp_path / "a.mcap", np.ones(3)
     with path.open("wb") as file:
         writer = RosWriter(file)
-        states = writer.register_msgdef(JOINT_STATE, SCHEMAS[JOINT_STATE])
-        sensors = writer.register_msgdef(IMU, SCHEMAS[IMU])
+        states = writer.register_msgdef(JOINT_STATE, schemas()[JOINT_STATE])
+        sensors = writer.register_msgdef(IMU, schemas()[IMU])
         for at in range(START_NS, START_NS + 10**8, 10**7):
             state = {"header": header(at, ""), "name": ["j"], "position": [1e-9 * at]}
             writer.write_message("/joint_states", states, state, at)
@@ -125,7 +125,7 @@ def test_covariances_lie_where_other_tools_write_them(tmp_path) -> None:
                 message = imu(at, name, 2 * ones, 5.5 * ones, **{f"{name}_covariance": UNMEASURED})
                 writer.write_message(f"/{name}", sensors, message, at)
         writer.finish()
-    log = read_log(path, sensors=True)
+    log = read_log(path, beside="sensors")
     assert log.link_names == ("orientation", "linear_acceleration")
     assert np.array_equal(log.twists[:, :, 3:], np.full((10, 2, 3), 2.0))
     assert np.array_equal(log.accels[:, 0, :3], np.full((10, 3), 5.5))
@@ -136,11 +136,11 @@ def test_two_sensors_on_a_topic_and_a_clock_of_its_own(tmp_path) -> None:
     mixed = sorted(_stream("left") + _stream("right", seed=1, shift_ns=900_000))
     late = _stream("late", shift_ns=10**11)
     streams = [("/imu", IMU, mixed), ("/late", IMU, late)]
-    log = read_log(_file(tmp_path / "a.mcap", streams), sensors=True)
+    log = read_log(_file(tmp_path / "a.mcap", streams), beside="sensors")
     assert log.link_names == ("left", "right")
     assert any("do they share a clock" in line and "late" in line for line in log.warnings)
     streams = [("/imu", IMU, mixed), ("/more", IMU, _stream("left", seed=2))]
-    log = read_log(_file(tmp_path / "b.mcap", streams), sensors=True)
+    log = read_log(_file(tmp_path / "b.mcap", streams), beside="sensors")
     assert log.link_names == ("/imu:left", "/imu:right", "/more")
 
 
@@ -165,7 +165,7 @@ def test_frames_that_may_be_of_another_body_are_left_out(tmp_path, frames, kept)
         for prefix, schema in (("/link_twists/", TWIST_STAMPED), ("/link_accels/", ACCEL_STAMPED)):
             messages = [(at, encoder.encode(at, rng.normal(size=6))) for at in stamps]
             streams.append((prefix + link, schema, messages))
-    log = read_log(_file(tmp_path / "a.mcap", streams), sensors=True)
+    log = read_log(_file(tmp_path / "a.mcap", streams), beside="sensors")
     links = [] if log.twists is None else np.isfinite(log.twists).any(axis=(0, 2)).tolist()
     heard = tuple(n for n, there in zip(log.link_names, links, strict=True) if there)
     assert heard == tuple(kept)
@@ -190,7 +190,7 @@ def test_cut_and_garbled_messages_are_told_and_do_no_harm(tmp_path, seed: int) -
             stamps.add(at)
             messages.append((at, data))
         streams.append((f"/imu_{k}", IMU, messages))
-    log = read_log(_file(tmp_path / "a.mcap", streams), sensors=True)
+    log = read_log(_file(tmp_path / "a.mcap", streams), beside="sensors")
     assert len(log.link_names) == 3 and any("unreadable" in line for line in log.warnings)
     heard = np.isfinite(log.twists[:, :, 3]).sum(axis=0)
     assert (heard > 150).all() and (heard < 200).all()

@@ -11,13 +11,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from drivers.files.estimates import EstimateNames, estimate_fields, estimate_values
 from drivers.files.mcap import McapWriter, read_estimates, read_log, read_messages, recover
-from drivers.files.messages import Message, decode, encode, header
-from drivers.files.ros import CdrError, TransformsEncoder
-from drivers.files.ros_types import DIAGNOSTICS, ESTIMATE, SCHEMAS, STRING, TF
+from drivers.files.messages import Message, TransformsEncoder, decode, encode, header
+from drivers.files.ros import CdrError
+from drivers.files.ros_types import DIAGNOSTICS, ESTIMATE, STRING, TF, schemas
 from tests.helpers.mcap_tools import START_NS, samples
 from tests.helpers.ros_readers import assert_read_by_everybody, same
 
-PUBLIC = [name for name in SCHEMAS if not name.startswith("panda_adapter_msgs")]
+PUBLIC = [name for name in schemas() if not name.startswith("panda_adapter_msgs")]
 NAMES = EstimateNames(("shoulder", "elbow", "wrist"), ("upper", "lower"), ("coulomb_friction",))
 
 
@@ -35,7 +35,7 @@ def an_estimate(seed: int = 0) -> dict:
 def test_definitions_are_those_of_ros_2(name):
     """Every message in the text, nested ones too, as rosbags knows them of ROS 2 Humble."""
     known = get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    for found, (_, fields) in get_types_from_msg(SCHEMAS[name], name).items():
+    for found, (_, fields) in get_types_from_msg(schemas()[name], name).items():
         assert fields == known[found][1], found
 
 
@@ -43,7 +43,7 @@ def test_an_estimate_comes_back():
     values = an_estimate()
     fields = estimate_fields(7_000_000_001, NAMES, values)
     data = encode(ESTIMATE, fields)
-    theirs = generate_dynamic(ESTIMATE, SCHEMAS[ESTIMATE])[ESTIMATE](data)
+    theirs = generate_dynamic(ESTIMATE, schemas()[ESTIMATE])[ESTIMATE](data)
     assert theirs.joints[2].value.px == values["lambda"][2, 3]
     assert theirs.bodies[1].std.izz == values["theta_std"][1, 9]
     assert (theirs.effects[1].effect, theirs.effects[1].joint) == ("coulomb_friction", "elbow")
@@ -130,7 +130,7 @@ def old_recording(tmp_path) -> Path:
         learner = {"pipeline": {"learner": {"effects": ["coulomb_friction"]}}}
         entries = {"joint_names": json.dumps(names), "config": json.dumps(learner)}
         writer.add_metadata("panda_adapter", entries)
-        schema = writer.register_schema(state.schema, "ros2msg", SCHEMAS[state.schema].encode())
+        schema = writer.register_schema(state.schema, "ros2msg", schemas()[state.schema].encode())
         states = writer.register_channel("/joint_states", "cdr", schema)
         writer.add_message(states, 1, encode(state.schema, state.fields), 1)
         schema = writer.register_schema("panda_adapter.Estimate", "jsonschema", b"{}")

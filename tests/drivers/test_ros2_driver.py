@@ -13,8 +13,7 @@ import pytest
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="pip install 'panda-adapter[ros]'")
 
-from drivers.files.messages import encode  # noqa: E402
-from drivers.files.ros import JointStateEncoder  # noqa: E402
+from drivers.files.messages import JointStateEncoder, encode  # noqa: E402
 from drivers.files.ros_types import FLOAT64_MULTI_ARRAY, JOINT_STATE  # noqa: E402
 from drivers.interface import DriverError  # noqa: E402
 from drivers.ros2.arm import Ros2Arm  # noqa: E402

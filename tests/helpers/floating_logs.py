@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from mcap_ros2.writer import Writer
 
 from adapter.learning.tree_data import TreeData
 from adapter.model.spatial import Array
@@ -15,12 +14,10 @@ from drivers.files.ros_types import (
     IMU,
     JOINT_STATE,
     ODOMETRY,
-    SCHEMAS,
     TWIST_STAMPED,
 )
-from tests.helpers.ros_messages import header, imu
+from tests.helpers.ros_messages import header, imu, joint_state, ns, write
 
-START_NS = 7_000_000_000
 # Of usual parts, one sample each: rad, rad/s, share of a joint's torque; rad/s, m/s², m/s.
 Q_STD, DQ_STD, TAU_SHARE, W_STD, A_STD, V_STD = 2e-5, 2e-3, 0.02, 3e-3, 3e-2, 5e-3
 
@@ -66,7 +63,7 @@ def record(
     t, tau = np.arange(len(data)) / rates.joints, data.tau[:, -data.tree.n :]
     joints = noisy(data.q, Q_STD), noisy(data.dq, DQ_STD), noisy(tau, TAU_SHARE * tau.std(axis=0))
     messages = [
-        ("/joint_states", JOINT_STATE, at, _joints(data.tree.joint_names, at, *row))
+        ("/joint_states", JOINT_STATE, at, joint_state(data.tree.joint_names, at, *row))
         for at, *row in zip(t, *joints, strict=True)
     ]
     own = np.arange(0.0003, t[-1], 1.0 / rates.base)
@@ -77,7 +74,7 @@ def record(
     if mount is None:
         felt = noisy(a, A_STD)
         for at, *row in zip(own, seen, spun, felt, dw, strict=True):
-            head = header(_ns(at), base)
+            head = header(ns(at), base)
             messages.append(
                 ("/twist", TWIST_STAMPED, at, {"header": head, "twist": _six(*row[:2])})
             )
@@ -89,31 +86,11 @@ def record(
         felt = noisy(a + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)), A_STD)
         for at, *row in zip(own, seen, spun, felt, strict=True):
             turned = (x @ mount.rotation for x in row[1:])
-            messages.append(("/imu", IMU, at, imu(_ns(at), mount.name, *turned)))
-            child = {"header": header(_ns(at), "odom"), "child_frame_id": base}
+            messages.append(("/imu", IMU, at, imu(ns(at), mount.name, *turned)))
+            child = {"header": header(ns(at), "odom"), "child_frame_id": base}
             twist = {"twist": {"twist": _six(*row[:2])}}
             messages.append(("/odom", ODOMETRY, at, {**child, **twist}))
-    return _write(path, messages)
-
-
-def _write(path: Path, messages: list[tuple[str, str, float, dict]]) -> Path:
-    with path.open("wb") as file:
-        writer = Writer(file)
-        names = dict.fromkeys(name for _, name, *_ in messages)
-        types = {name: writer.register_msgdef(name, SCHEMAS[name]) for name in names}
-        for topic, name, at, message in messages:
-            writer.write_message(topic, types[name], message, _ns(at), _ns(at))
-        writer.finish()
-    return path
-
-
-def _ns(at: float) -> int:
-    return START_NS + round(1e9 * at)
-
-
-def _joints(names: tuple[str, ...], at: float, q: Array, dq: Array, tau: Array) -> dict:
-    told = {"position": q.tolist(), "velocity": dq.tolist(), "effort": tau.tolist()}
-    return {"header": header(_ns(at), ""), "name": names, **told}
+    return write(path, messages)
 
 
 def _six(linear: Array, angular: Array) -> dict:

@@ -8,18 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from mcap_ros2.writer import Writer
 from scipy.interpolate import CubicSpline
 
 from adapter.model.spatial import exp_rotation
 from drivers.files.mcap import FrameMotion, Log
-from drivers.files.ros_types import IMU, JOINT_STATE, SCHEMAS
+from drivers.files.ros_types import IMU, JOINT_STATE
 from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, pin_model, rnea, trajectory
-from tests.helpers.ros_messages import header, imu
-
-START_NS = 7_000_000_000
+from tests.helpers.ros_messages import START_NS, imu, joint_state, ns, write
 
 
 @dataclass(frozen=True)
@@ -66,23 +63,15 @@ class Glued:
     def write(self, path: Path, frames: Mapping[int, str] | None = None) -> Path:
         """As ROS 2 tools write it."""
         frames = frames or dict(enumerate(self.truth.link_names))
-        with path.open("wb") as file:
-            writer = Writer(file)
-            types = {x: writer.register_msgdef(x, SCHEMAS[x]) for x in (IMU, JOINT_STATE)}
-            rows = zip(self.t_s, self.q, self.dq, self.tau, strict=True)
-            for at, *row in rows:
-                ns, names = int(_ns(at)), list(self.truth.joint_names)
-                keys, told = ("position", "velocity", "effort"), map(np.ndarray.tolist, row)
-                message = {"header": header(ns, ""), "name": names}
-                message |= dict(zip(keys, told, strict=True))
-                writer.write_message("/joint_states", types[JOINT_STATE], message, ns, ns)
-            for i, (stamps, w, a) in self.sensors.items():
-                for at, *pair in zip(stamps, w, a, strict=True):
-                    ns = int(_ns(at))
-                    message = imu(ns, frames[i], *pair)
-                    writer.write_message(f"/imu{i + 1}", types[IMU], message, ns, ns)
-            writer.finish()
-        return path
+        rows = zip(self.t_s, self.q, self.dq, self.tau, strict=True)
+        messages = [
+            ("/joint_states", JOINT_STATE, at, joint_state(self.truth.joint_names, at, *row))
+            for at, *row in rows
+        ]
+        for i, readings in self.sensors.items():
+            for at, *pair in zip(*readings, strict=True):
+                messages.append((f"/imu{i + 1}", IMU, at, imu(ns(at), frames[i], *pair)))
+        return write(path, messages)
 
 
 def _ns(at: np.ndarray) -> np.ndarray:

@@ -1,19 +1,38 @@
 """Recordings for tests: ours, and such as other people's tools write."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from drivers.files.mcap import McapWriter
-from drivers.files.ros import JointStateEncoder
-from drivers.files.ros_types import JOINT_STATE, SCHEMAS
+from drivers.files.messages import JointStateEncoder
+from drivers.files.ros_types import JOINT_STATE, schemas
 from drivers.interface import JointSample, LinkMotion
 
 JOINTS = ("shoulder", "elbow", "wrist")
 LINKS = ("upper", "lower", "hand")
 START_NS = 5_000_000_000
 STEP_NS = 1_000_000
+_ALONE = """
+import sys
+from drivers.files import mcap
+try:
+    print(getattr(mcap, sys.argv[1])(sys.argv[2]))
+except Exception as error:
+    print(type(error).__name__, error)
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")))
+"""
+
+
+def weighed_alone(reader: str, path: Path) -> tuple[str, int]:
+    """What a reader says of a file in a process of its own, and the memory that it took, KiB."""
+    command = [sys.executable, "-c", _ALONE, reader, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    *told, most = done.stdout.strip().splitlines()
+    return "\n".join(told), int(most.split()[1])
 
 
 def samples(count: int, links: bool = False, seed: int = 0) -> list[JointSample]:
@@ -52,7 +71,7 @@ def foreign(
     with path.open("wb") as file:
         writer = Writer(file, compression=compression, use_chunking=chunking, chunk_size=4096)
         writer.start(profile="ros2", library="somebody else")
-        text = SCHEMAS.get(schema, "").encode()
+        text = schemas().get(schema, "").encode()
         number = writer.register_schema(schema, "ros2msg", text)
         channel = writer.register_channel(topic, encoding, number)
         for i, (log_time, data) in enumerate(messages):

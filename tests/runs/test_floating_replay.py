@@ -69,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def read(path: Path, link: str = "base") -> Log:
-    return with_base_motion(matching(read_log(path, frames=True), robot()), robot(), link)
+    return with_base_motion(matching(read_log(path, beside="frames"), robot()), robot(), link)
 
 
 @pytest.mark.parametrize("mount", [MOUNT, None])
@@ -86,7 +86,7 @@ def test_motion_of_a_base_is_that_of_its_origin(tmp_path: Path, mount: Mount | N
 
 
 def test_across_a_silence_nothing_is_made_up(folder: Path) -> None:
-    log = read_log(folder / "imu.mcap", frames=True)
+    log = read_log(folder / "imu.mcap", beside="frames")
     silent = [
         replace(m, **{k: getattr(m, k)[keep] for k in ("stamp_ns", "w", "a", "v")})
         for m in log.frames
@@ -146,7 +146,7 @@ def test_the_prior_is_as_wide_as_bodies_are_heavy(folder: Path, tmp_path: Path) 
     heavy = re.sub(key, lambda m: f'{m[1]}="{20.0 * float(m[2])!r}"', text())
     model, data = in_motion(heavy, True, WHOLE_S, 30, RATES.joints)
     path = record(tmp_path / "heavy.mcap", data, 2, rates=RATES)
-    log = with_base_motion(matching(read_log(path, frames=True), model), model, "base")
+    log = with_base_motion(matching(read_log(path, beside="frames"), model), model, "base")
     spreads = []
     for fall, arm in ((read(folder / "twist.mcap"), robot()), (log, model)):
         settings = PipelineSettings(learner=LearnerSettings())
@@ -164,7 +164,9 @@ def test_talos_is_learned_as_well_as_by_least_squares(tmp_path: Path) -> None:
     if not path.exists():
         pytest.skip(f"{path} is not there")
     model, data = in_motion(path.read_text(), True, 12.0, 5, RATES.joints)
-    recorded = read_log(record(tmp_path / "a.mcap", data, 1, base=link, rates=RATES), frames=True)
+    recorded = read_log(
+        record(tmp_path / "a.mcap", data, 1, base=link, rates=RATES), beside="frames"
+    )
     log = with_base_motion(matching(recorded, model), model, link)
     ours, batch, tau = errors_of(log, model, True, 10.0)
     assert (ours**2).mean() < 1.1**2 * (batch**2).mean()
@@ -204,7 +206,7 @@ def test_what_does_not_fit_is_refused_with_the_choices(folder: Path, tmp_path: P
         frames_on_base(robot(), "l0")
     with pytest.raises(ModelError, match="'pelvis' is not there; have: base, imu_link"):
         frames_on_base(robot(), "pelvis")
-    whole = read_log(folder / "imu.mcap", frames=True)
+    whole = read_log(folder / "imu.mcap", beside="frames")
     with pytest.raises(DriverError, match=r"no acceleration .*sensor_msgs/msg/Imu.*have: /odom"):
         odometry = tuple(m for m in whole.frames if m.topic == "/odom")
         with_base_motion(replace(whole, frames=odometry), robot(), "base")

@@ -48,7 +48,7 @@ def test_run_and_replay_agree(tmp_path) -> None:
             each=lambda sample, command: writer.write(sample),
         )
     arm.close()
-    log = read_log(path, imus=True)
+    log = read_log(path, beside="imus")
     assert {k for k, t in log.topics.items() if t.schema == IMU} == {
         f"/link_imus/{x}" for x in LINKS
     }

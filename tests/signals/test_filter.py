@@ -8,7 +8,14 @@ from filterpy.kalman import KalmanFilter
 from scipy.signal import csd, lsim
 
 from adapter.errors import SettingsError
-from adapter.signals.filters import JointFilter, noise_from_samples, steady_state_poles
+from adapter.signals.filters import (
+    NEVER,
+    FilterState,
+    JointFilter,
+    filter_step,
+    noise_from_samples,
+    steady_state_poles,
+)
 from adapter.signals.settings import FilterSettings
 from sim.scenarios import build
 from tests.helpers.arm_data import pin_model, rnea
@@ -19,11 +26,16 @@ BANDWIDTHS = (3.0, 6.0, 10.0, 25.0)
 
 def run(joint_filter: JointFilter, stamps_ns, signals) -> tuple[np.ndarray, np.ndarray]:
     """Outputs y, dy (m, 3 n) after every sample of signals (m, 3 n)."""
-    y, dy = np.empty_like(signals), np.empty_like(signals)
+    y, dy, state = np.empty_like(signals), np.empty_like(signals), fresh(signals.shape[1])
     for i, (stamp, row) in enumerate(zip(stamps_ns, signals, strict=True)):
-        joint_filter.step(int(stamp), *np.split(row, 3))
-        y[i], dy[i] = joint_filter.y, joint_filter.dy
+        filter_step(int(stamp), row, joint_filter.gains, state)
+        y[i], dy[i] = state.y, state.dy
     return y, dy
+
+
+def fresh(size: int) -> FilterState:
+    """What a filter of so many signals remembers before its first sample."""
+    return FilterState(np.array([NEVER, NEVER]), *np.zeros((3, size)))
 
 
 def transfer(joint_filter: JointFilter, hz: np.ndarray) -> np.ndarray:
@@ -66,7 +78,7 @@ def test_poles_are_those_of_filterpys_steady_state(settings: FilterSettings) -> 
 
 @pytest.mark.parametrize("hz", BANDWIDTHS)
 def test_the_corner_is_where_it_was_asked_for(hz: float) -> None:
-    joint_filter = JointFilter(1, FilterSettings(hz))
+    joint_filter = JointFilter(FilterSettings(hz))
     gain = np.abs(transfer(joint_filter, [hz]))[0]
     assert 20 * np.log10(gain) == pytest.approx(-3.0, abs=0.3)
 
@@ -79,7 +91,7 @@ def test_integration_is_exact_at_jittered_stamps(hz: float, seed: int) -> None:
     ticks = np.cumsum(rng.integers(20, 220, size=120))
     ticks -= ticks[0]
     signals = np.cumsum(rng.normal(size=(len(ticks), 3)), axis=0)
-    joint_filter = JointFilter(1, FilterSettings(hz))
+    joint_filter = JointFilter(FilterSettings(hz))
     y, dy = run(joint_filter, 10_000 * ticks, signals)
     grid = np.arange(ticks[-1] + 1)
     k1, k2 = joint_filter.gains.k1, joint_filter.gains.k2
@@ -100,7 +112,7 @@ def test_integration_is_exact_at_jittered_stamps(hz: float, seed: int) -> None:
 def test_repeated_and_missing_samples_change_nothing_on_a_straight_line(seed: int) -> None:
     """y is the line as it was delay_s ago, whichever samples arrive."""
     rng = np.random.default_rng(seed)
-    joint_filter = JointFilter(1)
+    joint_filter = JointFilter()
     stamps = PERIOD_NS * np.sort(rng.choice(3000, size=1200, replace=False))
     stamps[1:] += rng.integers(-400_000, 400_000, size=1199)
     stamps = np.sort(stamps)
@@ -113,9 +125,9 @@ def test_repeated_and_missing_samples_change_nothing_on_a_straight_line(seed: in
 
 
 def test_delay_is_constant_and_as_stated() -> None:
-    joint_filter = JointFilter(1)
+    joint_filter = JointFilter()
     assert joint_filter.delay_s == joint_filter.gains.k1 / joint_filter.gains.k2
-    assert joint_filter.delay_ns == round(1e9 * joint_filter.delay_s)
+    assert joint_filter.gains.delay_ns == round(1e9 * joint_filter.delay_s)
     hz = np.array([0.01, 0.1, 0.5, 1.0, 2.0])
     delay = -np.angle(transfer(joint_filter, hz)) / (2 * np.pi * hz)
     assert np.abs(delay[:2] - joint_filter.delay_s).max() < 1e-5
@@ -126,7 +138,7 @@ def test_all_signals_go_through_one_transfer() -> None:
     """q, dq, tau and ddq of the same sine: no phase between them, at any frequency."""
     t = PERIOD_NS * np.arange(6000)
     for hz in (0.5, 2.0, 5.0, 12.0):
-        joint_filter = JointFilter(1)
+        joint_filter = JointFilter()
         u = np.sin(2 * np.pi * hz * 1e-9 * t)
         y, dy = run(joint_filter, t, np.column_stack([u, u, u]))
         assert np.array_equal(y[:, 0], y[:, 1]) and np.array_equal(y[:, 0], y[:, 2])
@@ -137,14 +149,14 @@ def test_all_signals_go_through_one_transfer() -> None:
 
 
 def test_start_and_reset_settle_at_rest() -> None:
-    joint_filter = JointFilter(1)
+    gains, state = JointFilter().gains, fresh(3)
     u = np.array([0.3, 0.0, 5.0])
-    settled = [joint_filter.step(PERIOD_NS * k, *np.split(u, 3)) for k in range(400)]
-    assert np.allclose(joint_filter.y, u, rtol=1e-14) and np.abs(joint_filter.dy).max() < 1e-10
-    assert settled.index(True) == pytest.approx(1e3 * joint_filter.gains.settle_ns * 1e-9, abs=1)
-    joint_filter.reset()
-    assert not joint_filter.step(10**9, *np.split(2 * u, 3))
-    assert np.array_equal(joint_filter.y, 2 * u)
+    settled = [filter_step(PERIOD_NS * k, u, gains, state) for k in range(400)]
+    assert np.allclose(state.y, u, rtol=1e-14) and np.abs(state.dy).max() < 1e-10
+    assert settled.index(True) == pytest.approx(1e3 * gains.settle_ns * 1e-9, abs=1)
+    state.times[0] = NEVER
+    assert not filter_step(10**9, 2 * u, gains, state)
+    assert np.array_equal(state.y, 2 * u)
 
 
 @pytest.fixture(scope="module")
@@ -193,7 +205,7 @@ def lags(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
 def test_tau_and_ddq_belong_to_one_instant(moving_arm, hz: float) -> None:
     """Inverse dynamics of the filtered q, dq, ddq is the filtered tau: phase below 0.2 ms."""
     stamps, rows = moving_arm
-    y, dy = run(JointFilter(7, FilterSettings(hz)), stamps, rows)
+    y, dy = run(JointFilter(FilterSettings(hz)), stamps, rows)
     q, dq, tau = np.split(y, 3, axis=1)
     expected = rnea(pin_model(build("nominal").truth), q, dq, dy[:, 7:14])
     late = slice(1500, None)
@@ -208,17 +220,17 @@ def test_filtered_stamp_says_when() -> None:
     """Slow motion: the filtered q is the true q of stamp - delay."""
     stamps = PERIOD_NS * np.arange(4000)
     w = 2 * np.pi * 0.2
-    joint_filter = JointFilter(1)
+    joint_filter = JointFilter()
     q = np.sin(w * 1e-9 * stamps)
     y, _ = run(joint_filter, stamps, np.column_stack([q, q, q]))
-    then = 1e-9 * (stamps - joint_filter.delay_ns)
+    then = 1e-9 * (stamps - joint_filter.gains.delay_ns)
     assert np.abs(y[1000:, 0] - np.sin(w * then[1000:])).max() < 1e-4
 
 
 def test_noise_gain_is_the_variance_ratio() -> None:
     """White noise keeps 1 / noise_gain of its variance."""
     rng = np.random.default_rng(1)
-    joint_filter = JointFilter(8)
+    joint_filter = JointFilter()
     y, _ = run(joint_filter, PERIOD_NS * np.arange(20_000), rng.normal(size=(20_000, 24)))
     assert y[500:].var() * joint_filter.noise_gain == pytest.approx(1.0, rel=0.05)
 

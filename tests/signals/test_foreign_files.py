@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
@@ -154,12 +153,6 @@ def bag_makers():
     names = ("a", "b")
     wild = Motion(MOTION.stamp_ns, MOTION.q * 1e300, MOTION.dq, MOTION.tau * np.inf)
     still = Motion(MOTION.stamp_ns, MOTION.q, MOTION.dq, np.full((80, 2), np.nan))
-    for compression in (None, "BZ2", "LZ4"):
-        yield f"ros1 {compression}.bag", READ, write_ros1, topics, names, compression
-    for storage in StoragePlugin:
-        for mode in (None, CompressionMode.FILE, CompressionMode.MESSAGE):
-            label = f"ros2 {storage.name} {mode and mode.name}"
-            yield label, READ, write_ros2, topics, names, storage, mode
     yield "wild.bag", READ, write_ros1, {"/s": (JOINT_STATE, wild)}, names
     yield "nan", "not a number throughout", write_ros2, {"/s": (JOINT_STATE, still)}, names
     yield "no [bold]names%20?#'.bag", "names joints", write_ros1, topics, ()
@@ -171,30 +164,6 @@ def bag_makers():
 def test_bags(tmp_path, capsys, maker):
     name, expected, write, *arguments = maker
     assert expected in told(write(tmp_path / name, *arguments), capsys)
-
-
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-@pytest.mark.parametrize("storage", ["bag", *StoragePlugin])
-def test_cut_bags(tmp_path, capsys, storage, share):
-    topics = {"/joint_states": (JOINT_STATE, MOTION)}
-    if storage == "bag":
-        path = write_ros1(tmp_path / "a.bag", topics, ("a", "b"))
-    else:
-        folder = write_ros2(tmp_path / "bag", topics, ("a", "b"), storage)
-        path = next(p for p in folder.iterdir() if p.suffix != ".yaml")
-    whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    said = told(path, capsys)
-    assert READ in said or "damaged or unfinished bag" in said or "cut" in said
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"rosbag2_bagfile_information: 3", b"\xff\xfe", b"{", b"- "]
-)
-def test_a_folder_whose_description_is_damaged(tmp_path, capsys, content):
-    folder = write_ros2(tmp_path / "bag", {"/joint_states": (JOINT_STATE, MOTION)}, ("a", "b"))
-    (folder / "metadata.yaml").write_bytes(content)
-    assert "bag: " in told(folder, capsys)
 
 
 def lerobot(folder, episodes=1, torque=True, names=("shoulder", "elbow")):

@@ -9,11 +9,7 @@ import pytest
 from adapter.errors import SettingsError
 from adapter.model.self_model import Limits
 from adapter.signals.front_end import FrontEnd
-from adapter.signals.records import (
-    LinkMotionKind,
-    StateLayout,
-    stamps_of,
-)
+from adapter.signals.records import LinkMotionKind, StateLayout, stamps_of
 from adapter.signals.settings import FrontEndSettings
 from drivers.interface import DriverError, JointSample, LinkMotion
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, record
@@ -36,8 +32,10 @@ def feed(front_end: FrontEnd, samples: list[JointSample]) -> np.ndarray:
     return np.array(rows).reshape(-1, LAYOUT.size)
 
 
-def run(samples: list[JointSample], **options) -> tuple[np.ndarray, FrontEnd]:
-    front_end = FrontEnd(panda_model(), None, FrontEndSettings(**options))
+def run(samples: list[JointSample], known: bool = True) -> tuple[np.ndarray, FrontEnd]:
+    """What comes out sample by sample, of an arm with or without documented limits."""
+    model = panda_model()
+    front_end = FrontEnd(model if known else replace(model, limits=Limits.unknown(N)))
     states = feed(front_end, samples)
     assert len(samples) == len(states) + sum(front_end.refused.values())
     return states, front_end
@@ -67,7 +65,7 @@ def test_clean_motion_passes() -> None:
     assert not front_end.gaps
     stamps = stamps_of(states)
     assert (np.diff(stamps) == MS).all()
-    assert stamps[-1] == data.stamp_ns[-1] - front_end.filter.delay_ns
+    assert stamps[-1] == data.stamp_ns[-1] - front_end.filter.gains.delay_ns
     assert front_end.delay_s == front_end.filter.delay_s
     first = int(np.argmax((np.abs(data.dq) > 0.02).any(axis=1)))
     assert front_end.first_moving_ns == data.stamp_ns[first]
@@ -112,7 +110,9 @@ def test_degrees_are_refused_throughout() -> None:
 
 def test_unknown_limits_allow_anything() -> None:
     data = moving()
-    states, front_end = run_unknown(replace(data, q=100 * data.q, tau=1e3 * data.tau).samples())
+    states, front_end = run(
+        replace(data, q=100 * data.q, tau=1e3 * data.tau).samples(), known=False
+    )
     assert len(states) > 2600 and front_end.refused["out_of_range"] == 0
 
 
@@ -171,7 +171,7 @@ def test_a_gap_restarts_the_filter() -> None:
     states, front_end = run(before + after)
     assert front_end.gaps == [(samples[1999].stamp_ns, pytest.approx(0.051))]
     settle = front_end.filter.gains.settle_ns
-    stamps = stamps_of(states) + front_end.filter.delay_ns
+    stamps = stamps_of(states) + front_end.filter.gains.delay_ns
     hole = (stamps > samples[1999].stamp_ns) & (stamps < samples[2050].stamp_ns + settle)
     assert not hole.any()
     fresh, _ = run(after)
@@ -207,7 +207,7 @@ def test_saturated_torque_is_kept_out_until_the_filter_has_forgotten_it() -> Non
     wait = front_end.filter.gains.settle_ns / MS
     assert front_end.refused["torque_saturated"] == pytest.approx(wait, abs=4)
     assert front_end.refused["implausible_step"] <= 2
-    stamps = stamps_of(states) + front_end.filter.delay_ns
+    stamps = stamps_of(states) + front_end.filter.gains.delay_ns
     assert not (
         (stamps >= 2000 * MS) & (stamps <= 2002 * MS + front_end.filter.gains.settle_ns)
     ).any()
@@ -225,7 +225,7 @@ def test_measured_link_motion_takes_its_place() -> None:
     data = moving(links=True)
     states, front_end = run(data.samples())
     assert (states[:, 1] == LinkMotionKind.MEASURED).all()
-    k = np.searchsorted(data.stamp_ns, stamps_of(states) + front_end.filter.delay_ns)
+    k = np.searchsorted(data.stamp_ns, stamps_of(states) + front_end.filter.gains.delay_ns)
     motion = states[:, LAYOUT.motion].reshape(-1, N, 12)
     assert np.array_equal(motion[..., :6], data.twists[k])
     assert np.array_equal(motion[..., 6:], data.accels[k])
@@ -256,15 +256,9 @@ def test_a_spike_of_a_link_sensor_is_not_learned_from(value: float) -> None:
 @pytest.mark.parametrize("signal", ["q", "dq", "tau"])
 def test_absurd_readings_are_refused_even_where_limits_are_unknown(signal: str) -> None:
     """1e305 is a finite number, but the filter's products of it are not, ever after."""
-    states, front_end = run_unknown(with_reading(signal, 1e305, at=1000))
+    states, front_end = run(with_reading(signal, 1e305, at=1000), known=False)
     assert np.isfinite(states[:, SIGNALS]).all()
     assert front_end.refused["out_of_range"] == 1
-
-
-def run_unknown(samples: list[JointSample]) -> tuple[np.ndarray, FrontEnd]:
-    """With an arm whose limits nobody documented."""
-    front_end = FrontEnd(replace(panda_model(), limits=Limits.unknown(N)))
-    return feed(front_end, samples), front_end
 
 
 @pytest.mark.parametrize("name", list(FrontEndSettings.__dataclass_fields__))

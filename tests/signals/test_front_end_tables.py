@@ -8,21 +8,10 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from adapter.model.self_model import Limits
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import LinkMotionKind, stamps_of
-from drivers.interface import JointSample
 from tests.helpers.arm_data import ArmData, panda_model
-from tests.signals.test_front_end import LAYOUT, MS, SIGNALS, N, feed, moving
-
-
-def run(samples: list[JointSample], known: bool = True) -> tuple[np.ndarray, FrontEnd]:
-    """What comes out sample by sample, of an arm with or without documented limits."""
-    model = panda_model()
-    front_end = FrontEnd(model if known else replace(model, limits=Limits.unknown(N)))
-    states = feed(front_end, samples)
-    assert len(samples) == len(states) + sum(front_end.refused.values())
-    return states, front_end
+from tests.signals.test_front_end import LAYOUT, MS, SIGNALS, N, moving, run
 
 
 def damaged(links: bool) -> ArmData:

@@ -5,11 +5,10 @@ import re
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from adapter.cli import main
 from adapter.cli.exit_codes import ExitCode
-from adapter.signals.plausible import velocity_doubts
+from adapter.signals.importer import velocity_doubts
 from drivers.files.mcap import McapWriter, read_log, read_position_log
 from drivers.files.mcap.records import McapScan
 from tests.helpers.bags import JOINTS, Motion, write_ros1, write_ros1_mcap, write_ros2
@@ -29,9 +28,6 @@ def packed(path):
 
 MAKERS = {
     "folder": lambda path: write_ros2(path, STATES),
-    "folder of MCAP": lambda path: write_ros2(path, STATES, storage=StoragePlugin.MCAP),
-    "by message": lambda path: write_ros2(path, STATES, compression=CompressionMode.MESSAGE),
-    "by file": lambda path: write_ros2(path, STATES, compression=CompressionMode.FILE),
     "one file": lambda path: next(write_ros2(path, STATES).glob("*.db3")),
     "ros1.bag": lambda path: write_ros1(path, STATES, compression="LZ4"),
     "ros1 without a suffix": lambda path: write_ros1(path, STATES, compression="BZ2"),

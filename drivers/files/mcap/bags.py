@@ -19,7 +19,8 @@ import tempfile
 import weakref
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
+from functools import partial
 from io import BytesIO
 from pathlib import Path, PurePath
 from typing import Any
@@ -33,7 +34,6 @@ from drivers.files import names
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT, read_text
 from drivers.files.mcap.records import MAGIC, McapScan, Region, Scan
 from drivers.files.mcap.series import PARSERS, schema_name
-from drivers.files.ros import JointStateEncoder
 from drivers.files.ros_types import FRANKA_STATE, JOINT_STATE
 from drivers.interface import DriverError
 
@@ -63,8 +63,14 @@ def open_scan(path: Path) -> Scan:
     Raises:
         DriverError: it is none of these, or cannot be read; names what is there.
     """
+    if path.is_dir() and names.is_recording(path):
+        return FolderScan(path)
     if path.is_dir():
-        return _open_folder(path)
+        files = sorted(p for p in path.iterdir() if p.suffix in names.RECORDINGS)
+        if len(files) == 1:
+            return open_scan(files[0])
+        inside = ", ".join(p.name for p in files) or "no recording"
+        raise DriverError(f"{path}: is a folder; name the file in it (has: {inside})")
     try:
         with path.open("rb") as file:
             head = file.read(len(_SQLITE))
@@ -96,16 +102,6 @@ def is_recording(path: Path) -> bool:
     except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError):
         head = b""
     return head.startswith((_SQLITE, _ROS1, MAGIC)) or names.is_recording(path)
-
-
-def _open_folder(path: Path) -> Scan:
-    if names.is_recording(path):
-        return FolderScan(path)
-    files = sorted(p for p in path.iterdir() if p.suffix in names.RECORDINGS)
-    if len(files) == 1:
-        return open_scan(files[0])
-    inside = ", ".join(p.name for p in files) or "no recording"
-    raise DriverError(f"{path}: is a folder; name the file in it (has: {inside})")
 
 
 def _files_of(folder: Path) -> list[Path]:
@@ -176,22 +172,12 @@ def _bounded(stream: Any) -> bytes:
 
 def _unpacked(path: Path, head: bytes) -> Scan:
     """What lies in a compressed file; errors and warnings name the file itself."""
-    folder = tempfile.TemporaryDirectory()
-    try:
-        scan = _scan_unpacked(path, head, Path(folder.name) / "unpacked")
-    except BaseException:
-        folder.cleanup()
-        raise
-    weakref.finalize(scan, folder.cleanup)
-    return scan
-
-
-def _scan_unpacked(path: Path, head: bytes, whole: Path) -> Scan:
     unpack = next(unpack for magic, unpack in _PACKED.items() if head.startswith(magic))
     growth = _Growth(path.stat().st_size)
-    with path.open("rb") as packed, whole.open("wb") as out:
+    with ExitStack() as until:
+        whole = Path(until.enter_context(tempfile.TemporaryDirectory())) / "unpacked"
         try:
-            with unpack(packed) as stream:
+            with path.open("rb") as packed, whole.open("wb") as out, unpack(packed) as stream:
                 while part := stream.read(_STEP):
                     growth.spend(len(part))
                     out.write(part)
@@ -199,14 +185,15 @@ def _scan_unpacked(path: Path, head: bytes, whole: Path) -> Scan:
             raise DriverError(f"{path}: {error}") from error
         except (OSError, EOFError, ValueError, zlib.error, zstandard.ZstdError) as error:
             raise DriverError(f"{path}: cannot be unpacked: {error}") from error
-    with whole.open("rb") as file:
-        if file.read(len(_ZSTD)).startswith(tuple(_PACKED)):
-            raise DriverError(f"{path}: is packed twice; unpack it once")
-    try:
-        scan = open_scan(whole)
-    except DriverError as error:
-        raise DriverError(str(error).replace(str(whole), str(path))) from error
-    scan.path, scan.stored = path, path.stat().st_size
+        with whole.open("rb") as file:
+            if file.read(len(_ZSTD)).startswith(tuple(_PACKED)):
+                raise DriverError(f"{path}: is packed twice; unpack it once")
+        try:
+            scan = open_scan(whole)
+        except DriverError as error:
+            raise DriverError(str(error).replace(str(whole), str(path))) from error
+        scan.path, scan.stored = path, path.stat().st_size
+        weakref.finalize(scan, until.pop_all().close)
     return scan
 
 
@@ -426,23 +413,17 @@ class McapOfAnyRos(McapScan):
         if kind not in PARSERS or schema.encoding != "ros1msg":
             return
         if number not in self._from_ros1:
-            convert = self._converter(kind, schema)
-            if convert is None:
+            try:
+                convert = _to_cdr({kind: schema.data.decode()})
+            except Exception as error:  # of whatever kind rosbags' parser raises
+                said = " ".join(str(error).split())[:200] or type(error).__name__
+                self._warn(f"the definition of {schema.name} cannot be read: {said}")
                 return
-            self._from_ros1[number] = convert
+            self._from_ros1[number] = partial(convert, kind)
         told = JOINT_STATE if kind == FRANKA_STATE else kind
         own = _OWN_SCHEMAS + number
         self.schemas[own] = Schema(own, b"", "ros2msg", told)
         self.channels[number] = Channel(number, channel.topic, "cdr", channel.metadata, own)
-
-    def _converter(self, kind: str, schema: Schema) -> Callable[[bytes], bytes] | None:
-        try:
-            convert = _to_cdr({kind: schema.data.decode()})
-        except Exception as error:  # of whatever kind rosbags' parser raises
-            said = " ".join(str(error).split())[:200] or type(error).__name__
-            self._warn(f"the definition of {schema.name} cannot be read: {said}")
-            return None
-        return lambda raw: convert(kind, raw)
 
     def _told(self, region: Region, packed: NDArray[np.bool_]) -> Iterator[tuple[bytes, bytes]]:
         """Head and content of each message."""
@@ -458,21 +439,19 @@ class McapOfAnyRos(McapScan):
 
 def _regions(messages: Iterator[tuple[bytes, bytes]]) -> Iterator[Region]:
     """Heads and contents, some thousand together."""
-    data, starts, stops = bytearray(), [], []
-    for head, content in messages:
-        data += head
-        starts.append(len(data))
-        data += content
-        stops.append(len(data))
-        if len(starts) == _TOGETHER or len(data) > _REGION_BYTES:
-            yield _region(data, starts, stops)
-            data, starts, stops = bytearray(), [], []
-    if starts:
-        yield _region(data, starts, stops)
-
-
-def _region(data: bytearray, starts: list[int], stops: list[int]) -> Region:
-    return Region(np.frombuffer(data, np.uint8), np.array(starts), np.array(stops))
+    more = True
+    while more:
+        more, data, starts, stops = False, bytearray(), [], []
+        for head, content in messages:
+            data += head
+            starts.append(len(data))
+            data += content
+            stops.append(len(data))
+            if len(starts) == _TOGETHER or len(data) > _REGION_BYTES:
+                more = True
+                break
+        if starts:
+            yield Region(np.frombuffer(data, np.uint8), np.array(starts), np.array(stops))
 
 
 def _empty(types: Mapping[str, Any]) -> set[str]:
@@ -505,20 +484,17 @@ def _to_cdr(definitions: dict[str, str]) -> Callable[[str, bytes], bytes]:
         if empty:  # any number of them fits into a message, and would be walked over
             raise ValueError(f"{sorted(empty)[0]} has no bytes")
         store.register({k: v for k, v in found.items() if k not in store.fielddefs})
-    encoders: dict[int, JointStateEncoder] = {}
 
     def convert(kind: str, raw: bytes) -> bytes:
         try:
             cdr = bytes(store.ros1_to_cdr(raw, kind))
         except Exception:  # of whatever kind; the message is then counted as unreadable
             return b""
-        return _joint_state(store.deserialize_cdr(cdr, kind)) if kind == FRANKA_STATE else cdr
-
-    def _joint_state(state: Any) -> bytes:
-        n = len(state.q)
-        encoder = encoders.setdefault(n, JointStateEncoder([f"joint{i + 1}" for i in range(n)]))
-        stamp = state.header.stamp
-        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
-        return encoder.encode(stamp_ns, state.q, state.dq, state.tau_J)
+        if kind != FRANKA_STATE:
+            return cdr
+        state = store.deserialize_cdr(cdr, kind)
+        names = [f"joint{i + 1}" for i in range(len(state.q))]
+        told = store.types[JOINT_STATE](state.header, names, state.q, state.dq, state.tau_J)
+        return bytes(store.serialize_cdr(told, JOINT_STATE))
 
     return convert

@@ -6,14 +6,15 @@ What is decoded waits in files while a recording is read, so that no length need
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.mcap.log import Commands
-from drivers.files.mcap.series import JOINT_SCHEMAS, Series
+from drivers.files.mcap.series import JOINT_SCHEMAS, Series, in_order
 from drivers.files.ros import Block
 from drivers.files.ros_types import JOINT_STATE
 from drivers.files.rows import AT_ONCE, RowsFile, gathered
@@ -25,52 +26,45 @@ _DEGREE_SHARE = 0.05  # of the samples a joint must spend beyond it to be suspec
 _NEED = "learning needs positions and measured joint torques (effort)"
 _NEED_POSITION = "discovery needs the positions of the joints"
 Q, DQ, TAU = range(3)  # runs of doubles in a message
+_CLOCKS = attrgetter("stamp_ns"), attrgetter("log_ns")  # of a block
+_PLACE = attrgetter("index")
 _Stamps = NDArray[np.int64]
 
 
-class StampsFile(RowsFile):
-    """Stamps (m, 1) ns, and what they tell while they come.
-
-    Attributes:
-        back: how often time runs backwards; first_back: (place, ns) of the first time.
-        silent: whether all are 0.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(1, _IN_MEMORY, np.int64)
-        self.back, self.first_back, self.silent, self._last = 0, (0, 0), True, 0
-
-    def append(self, table: _Stamps) -> None:
-        """Take (k, 1) stamps that follow."""
-        if not len(table):
-            return
-        steps = np.diff(table[:, 0], prepend=self._last if len(self) else table[0, 0])
-        places = np.flatnonzero(steps < 0)
-        if places.size and not self.back:
-            self.first_back = len(self) + int(places[0]), -int(steps[places[0]])
-        self.back += places.size
-        self.silent = self.silent and not table.any()
-        self._last = int(table[-1, 0])
-        super().append(table)
+def stamps_file() -> RowsFile:
+    """Where stamps (m, 1) ns wait."""
+    return RowsFile(1, _IN_MEMORY, np.int64)
 
 
-def in_use(header: StampsFile, log: StampsFile, where: str, warnings: list[str]) -> StampsFile:
+def in_use(header: RowsFile, log: RowsFile, where: str, warnings: list[str]) -> RowsFile:
     """The stamps of the messages' headers; the recorder's where every one of these is 0."""
     clock = header
-    if len(header) > 1 and header.silent:
+    if len(header) > 1 and not any(part.any() for part in header.stretches()):
         clock = log
         warnings.append(f"{where}: header stamps are 0; the recorder's log times are used")
-    if clock.back:
-        place, step_ns = clock.first_back
+    times, place, step_ns = steps_back(clock)
+    if times:
         warnings.append(
-            f"{where}: time runs backwards {clock.back} times, first by {step_ns / 1e6:.3f} ms at "
+            f"{where}: time runs backwards {times} times, first by {step_ns / 1e6:.3f} ms at "
             f"sample {place}"
         )
     return clock
 
 
+def steps_back(clock: RowsFile) -> tuple[int, int, int]:
+    """How often time runs backwards, and place and ns of the first time."""
+    times, first, last = 0, (0, 0), int(clock.rows(0, 1)[0, 0]) if len(clock) else 0
+    for k, part in enumerate(clock.stretches()):
+        steps = np.diff(part[:, 0], prepend=last)
+        places = np.flatnonzero(steps < 0)
+        if places.size and not times:
+            first = AT_ONCE * k + int(places[0]), -int(steps[places[0]])
+        times, last = times + places.size, int(part[-1, 0])
+    return times, *first
+
+
 def _stamps_of(clocks: Sequence[_Stamps], where: str, warnings: list[str]) -> _Stamps:
-    files = StampsFile(), StampsFile()
+    files = stamps_file(), stamps_file()
     for file, stamp_ns in zip(files, clocks, strict=True):
         file.append(stamp_ns[:, None])
     return in_use(*files, where, warnings).table(False)[:, 0]
@@ -78,8 +72,8 @@ def _stamps_of(clocks: Sequence[_Stamps], where: str, warnings: list[str]) -> _S
 
 def stamps(series: Series, where: str, warnings: list[str]) -> _Stamps:
     """(m,) header stamps; log times where every header stamp is 0."""
-    clocks = [block.stamp_ns for block in series.blocks], series.log_ns
-    return _stamps_of([series.in_order(parts) for parts in clocks], where, warnings)
+    clocks = [in_order(series.blocks, clock) for clock in _CLOCKS]
+    return _stamps_of(clocks, where, warnings)
 
 
 def check_type(series: Series, path: Path) -> None:
@@ -100,7 +94,8 @@ def fits(series: Series, effort: bool) -> bool:
     """Whether a topic tells positions (and efforts) of joints."""
     needed = (Q, TAU) if effort else (Q,)
     return _is_of_joints(series) and any(
-        b.layout.names and all(_run(b, run) is not None for run in needed) for b in series.blocks
+        names and all(lengths[run] == len(names) for run in needed)
+        for names, lengths in series.kinds
     )
 
 
@@ -123,8 +118,8 @@ class JointRows:
 
     def __init__(self, names: tuple[str, ...], kept: Sequence[int]) -> None:
         self.names, self.messages = names, 0
-        self.clocks = StampsFile(), StampsFile()
-        self.place = StampsFile()
+        self.clocks = stamps_file(), stamps_file()
+        self.place = stamps_file()
         self.runs = {run: RowsFile(len(names), _IN_MEMORY) for run in kept}
         self.present: set[int] = set()
         self.lengths: dict[int, set[int]] = {Q: set(), DQ: set(), TAU: set()}
@@ -132,40 +127,31 @@ class JointRows:
     def __len__(self) -> int:
         return len(self.place)
 
-    def take(self, series: Series, needed: Sequence[int]) -> None:
+    def take(self, blocks: Sequence[Block], needed: Sequence[int]) -> None:
         """Take messages that follow."""
         kept = []
-        for i, block in enumerate(series.blocks):
+        for block in blocks:
             self.messages += len(block.index)
             runs = {run for run in self.lengths if _run(block, run) is not None}
             self.present |= runs
             for run, lengths in self.lengths.items():
                 lengths.add(block.values[run].shape[1])
             if runs >= set(needed):
-                kept.append(i)
+                kept.append(block)
         if not kept:
             return
-        part = series.at(kept)
-        header_ns = [block.stamp_ns for block in part.blocks]
-        for file, own in zip(
-            (*self.clocks, self.place), (header_ns, part.log_ns, part.places), strict=True
-        ):
-            file.append(part.in_order(own)[:, None])
+        for file, own in zip((*self.clocks, self.place), (*_CLOCKS, _PLACE), strict=True):
+            file.append(in_order(kept, own)[:, None])
         for run, table in self.runs.items():
-            table.append(part.in_order([self._doubles(block, run) for block in part.blocks]))
+            table.append(in_order(kept, partial(self._doubles, run)))
 
-    def _doubles(self, block: Block, run: int) -> Array:
+    def _doubles(self, run: int, block: Block) -> Array:
         values, names = _run(block, run), block.layout.names
         if values is None:
             return np.full((len(block.index), len(names)), np.nan)
         if names == self.names:
             return values
         return values[:, [names.index(name) for name in self.names]]
-
-    def stretches(self, *runs: int) -> Iterator[list[Array]]:
-        """Runs of doubles, so many rows at a time."""
-        for start in range(0, len(self), AT_ONCE):
-            yield [self.runs[run].rows(start, start + AT_ONCE) for run in runs]
 
 
 class Told:
@@ -182,18 +168,17 @@ class Told:
 
     def take(self, series: Series) -> None:
         """Take messages that follow in the file."""
-        found: dict[frozenset[str], list[int]] = {}
-        for i, block in enumerate(series.blocks):
+        found: dict[frozenset[str], list[Block]] = {}
+        for block in series.blocks:
             names = block.layout.names
             self._messages += len(block.index)
             self._names.update(names)
             if names and len(set(names)) == len(names):
-                found.setdefault(frozenset(names), []).append(i)
-        for key, places in found.items():
-            part = series.at(places)
+                found.setdefault(frozenset(names), []).append(block)
+        for key, blocks in found.items():
             if key not in self.sets:
-                self.sets[key] = JointRows(part.blocks[0].layout.names, self._kept)
-            self.sets[key].take(part, self._needed)
+                self.sets[key] = JointRows(blocks[0].layout.names, self._kept)
+            self.sets[key].take(blocks, self._needed)
 
     def chosen(
         self, series: Series, where: str, want: Sequence[str] | None, warnings: list[str]
@@ -226,11 +211,7 @@ class Told:
                 f"{where}: {left_out} messages are of other joints "
                 f"({others or 'a part of these, or twice'}); left out"
             )
-        self._check_complete(sets[chosen], where, warnings)
-        return sets[chosen]
-
-    def _check_complete(self, own: JointRows, where: str, warnings: list[str]) -> None:
-        """Say which messages lack positions (or efforts). Raises DriverError where all do."""
+        own = sets[chosen]
         need = _NEED if TAU in self._needed else _NEED_POSITION
         what_of = {Q: "position", TAU: "effort"}
         for run in self._needed:
@@ -247,40 +228,7 @@ class Told:
                 f"{where}: {own.messages - len(own)} messages lack "
                 f"{' or '.join(what_of[run] for run in self._needed)}; left out"
             )
-
-    def of(self, names: Sequence[str]) -> list[JointRows]:
-        """The messages that tell something of these joints."""
-        return [x for x in self.sets.values() if len(x) and {*x.names} & {*names}]
-
-
-class _Seen(NamedTuple):
-    """What all samples tell: whether positions and velocities vary and torques are known or not
-    0, samples without velocities, the largest position, samples beyond any arm's angle by joint.
-    """
-
-    varied: bool
-    moving: bool
-    torque_known: bool
-    torque: bool
-    silent: int
-    furthest: float
-    beyond: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, rows: JointRows) -> _Seen:
-        varied = moving = known = torque = False
-        silent, furthest, beyond = 0, 0.0, np.zeros(len(rows.names), dtype=np.int64)
-        first = rows.runs[Q].rows(0, 1)
-        for q, dq, tau in rows.stretches(Q, DQ, TAU):
-            varied = varied or bool(np.any(q != first))
-            moving = moving or bool(np.any(dq))
-            known = known or not np.isnan(tau).all()
-            torque = torque or bool(np.any(tau))
-            silent += int(np.isnan(dq).all(axis=1).sum())
-            size = np.abs(q)
-            furthest = float(np.fmax(furthest, np.fmax.reduce(size, axis=None)))
-            beyond += (size > _RAD_MAX).sum(axis=0)
-        return cls(varied, moving, known, torque, silent, furthest, beyond)
+        return own
 
 
 def joints_told(
@@ -297,33 +245,44 @@ def joints_told(
     Raises:
         DriverError: efforts that are needed are not a number throughout.
     """
-    seen, count, velocity = _Seen.of(rows), len(rows), rows.runs[DQ]
-    if effort and not seen.torque_known:
+    count, velocity, first = len(rows), rows.runs[DQ], rows.runs[Q].rows(0, 1)
+    seen = [
+        (
+            *(np.any(q != first), np.any(dq), ~np.isnan(tau).all(), np.any(tau)),
+            np.isnan(dq).all(axis=1).sum(),
+            np.fmax.reduce(np.abs(q), axis=None),
+            (np.abs(q) > _RAD_MAX).sum(axis=0),
+        )
+        for q, dq, tau in zip(*(rows.runs[run].stretches() for run in (Q, DQ, TAU)), strict=True)
+    ]
+    varied, moving, known, torque, silent, furthest, beyond = zip(*seen, strict=True)
+    without = sum(silent)
+    if effort and not any(known):
         raise DriverError(f"{where} has efforts that are not a number throughout; {_NEED}")
     clock = in_use(*rows.clocks, where, warnings)
-    if not seen.torque_known:
+    if not any(known):
         warnings.append(f"{where} has no efforts: nothing is learned from torques")
-    if not effort and seen.varied and (seen.silent == count or not seen.moving):
-        velocity = gathered(velocity.width, (np.full_like(q, np.nan) for (q,) in rows.stretches(Q)))
+    if not effort and any(varied) and (without == count or not any(moving)):
+        nothing = (np.full_like(q, np.nan) for q in rows.runs[Q].stretches())
+        velocity = gathered(velocity.width, nothing)
         warnings.append(f"{where} has no velocities: they are those of the filtered positions")
-    elif seen.silent:
+    elif without:
         velocity = gathered(velocity.width, _velocities(rows, clock))
         warnings.append(
-            f"{where}: {seen.silent} of {count} messages have no velocity; "
-            "derived from the positions"
+            f"{where}: {without} of {count} messages have no velocity; derived from the positions"
         )
-    if count > 1 and not seen.torque:
+    if count > 1 and not any(torque):
         warnings.append(f"{where}: all efforts are 0; does this arm measure torque?")
-    if _are_degrees(seen.beyond, count):
+    if _are_degrees(np.sum(beyond, axis=0), count):
         warnings.append(
-            f"{where}: positions reach {seen.furthest:.0f} rad; are these degrees? "
+            f"{where}: positions reach {np.fmax.reduce(furthest):.0f} rad; are these degrees? "
             "Recordings hold radians (`adapter import` converts)"
         )
     q, dq, tau = (file.table(mapped) for file in (rows.runs[Q], velocity, rows.runs[TAU]))
     return clock.table(mapped)[:, 0], q, dq, tau
 
 
-def _velocities(rows: JointRows, clock: StampsFile) -> Iterator[Array]:
+def _velocities(rows: JointRows, clock: RowsFile) -> Iterator[Array]:
     """Velocities, the positions' slope where a sample has none."""
     begin_ns = int(clock.rows(0, 1)[0, 0])
     for start in range(0, len(rows), AT_ONCE):
@@ -349,16 +308,17 @@ def commands_told(
     if len(sets) == 1:
         (rows,) = sets
         clock = in_use(*rows.clocks, where, warnings)
-        tau = gathered(len(names), (_commanded(rows, names, x) for (x,) in rows.stretches(TAU)))
+        parts = (_commanded(rows, names, x) for x in rows.runs[TAU].stretches())
+        tau = gathered(len(names), parts)
         return Commands(clock.table(mapped)[:, 0], tau.table(mapped))
-    order = np.argsort(_joined([x.place for x in sets]), kind="stable")
-    clocks = [_joined(files)[order] for files in zip(*(x.clocks for x in sets), strict=True)]
+    place, *clocks = (
+        np.concatenate([file.table(False)[:, 0] for file in files])
+        for files in zip(*((x.place, *x.clocks) for x in sets), strict=True)
+    )
+    order = np.argsort(place, kind="stable")
+    clocks = [clock[order] for clock in clocks]
     tables = [_commanded(x, names, x.runs[TAU].table(False)) for x in sets]
     return Commands(_stamps_of(clocks, where, warnings), np.concatenate(tables)[order])
-
-
-def _joined(files: Sequence[StampsFile]) -> _Stamps:
-    return np.concatenate([file.table(False)[:, 0] for file in files])
 
 
 def _commanded(rows: JointRows, names: Sequence[str], tau: Array) -> Array:

@@ -1,17 +1,23 @@
-"""Measured link motion, matched to the joint samples by header stamp, or carried to them.
+"""Motion of links and of frames on them, told by sensors: matched to joint samples or carried.
 
-A sensor with stamps of its own is carried: a message goes to the joint sample nearest in time,
-along the straight line through its neighbours; of several that share a sample their mean does.
-Samples that no message is nearest to stay not a number. So nothing is made up in gaps, and the
-noise of what is there stays that of the sensor, which values interpolated at every sample would
-hide.
+Link motion with the joint samples' header stamps is matched to them. A sensor with stamps of its
+own is carried: a message goes to the joint sample nearest in time, along the straight line through
+its neighbours; of several that share a sample their mean does. Samples that no message is nearest
+to stay not a number. So nothing is made up in gaps, and the noise of what is there stays that of
+the sensor, which values interpolated at every sample would hide.
+
+Of frames tell sensors glued on links, `sensor_msgs/msg/Imu` on whatever topic, and of a floating
+base also `Odometry`, `TwistStamped` and `AccelStamped`. An Imu tells angular velocity and what the
+accelerometer reads (9.81 m/s² up at rest), in the sensor's own frame. A sensor is what one topic
+says of one frame. ROS marks what a sensor does not measure by -1 as the first number of its
+covariance.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,14 +25,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.files.mcap.joints import stamps
-from drivers.files.mcap.series import Series
+from drivers.files.mcap.log import FrameMotion
+from drivers.files.mcap.series import Series, in_order
 from drivers.files.mcap.writer import LINK_ACCELS, LINK_TWISTS
-from drivers.files.ros_types import ACCEL_STAMPED, TWIST_STAMPED
+from drivers.files.ros_types import ACCEL_STAMPED, IMU, ODOMETRY, TWIST_STAMPED
 from drivers.interface import Array
 
 LONGEST_PERIODS = 3.0  # of the sensor; no line is drawn across a longer silence
 MENTIONED = 0.05  # share of messages outside the joint samples' time that is worth a sentence
 _MOST_MATCHED = 0.9  # share of a topic's stamps that joint samples have; below, stamps are its own
+_W, _W_UNKNOWN = slice(13, 16), 16  # of the run of doubles, and where its covariance begins
+_A, _A_UNKNOWN = slice(25, 28), 28
+_TWIST = 43  # where an Odometry's twist begins in its run of doubles
+_MOST_W = 200.0  # rad/s; gyroscopes end at 70 (4000 °/s)
+_MOST_A = 5000.0  # m/s²; accelerometers of robots end at 2000 (200 g)
+_AT_REST = (5.0, 15.0)  # m/s², the median of what an accelerometer reads lies around 9.81
+_RARE = 0.05  # of a topic's messages; a frame named less often comes from damaged ones
 
 
 class Carrier:
@@ -34,10 +48,14 @@ class Carrier:
 
     def __init__(self, stamp_ns: NDArray[np.int64], path: Path, warnings: list[str]) -> None:
         """Take (m,) stamps of the joint samples, ns; sentences go to `warnings`."""
-        self._count = len(stamp_ns)
-        self._onto, self._rows = np.unique(stamp_ns, return_index=True)
-        self._path, self._warnings = path, warnings
+        self.stamp_ns, self.path, self.warnings = stamp_ns, path, warnings
         self._carried: dict[str, list[str]] = {}
+
+    @cached_property
+    def _samples(self) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+        """Stamps of the joint samples, rising, and whose they are; a long log may need none."""
+        stamp_ns, rows = np.unique(self.stamp_ns, return_index=True)
+        return stamp_ns, rows
 
     def carry(self, name: str, own_ns: NDArray[np.int64], values: Array) -> Array | None:
         """(m, 3 h) the values (k, 3 h) of a sensor at the joint samples, each vector by itself.
@@ -48,42 +66,39 @@ class Carrier:
             name: of the sensor, for sentences.
             own_ns: (k,) stamps; values: vectors that are not a number are passed over.
         """
+        onto, rows = self._samples
         own, first = np.unique(own_ns, return_index=True)
-        near, close = _nearest(self._onto, own)
+        near, close = _nearest(onto, own)
         if not close.any():
-            theirs, joints = (_span(stamps, self._onto[0]) for stamps in (own, self._onto))
-            self._warnings.append(
-                f"{self._path}: {name}: its stamps ({theirs}) lie outside those of the joint "
+            theirs, joints = (_span(stamps, onto[0]) for stamps in (own, onto))
+            self.warnings.append(
+                f"{self.path}: {name}: its stamps ({theirs}) lie outside those of the joint "
                 f"samples ({joints}); do they share a clock? Left out"
             )
             return None
         missed = len(own) - int(close.sum())
         if missed > MENTIONED * len(own):
-            self._warnings.append(
-                f"{self._path}: {name}: {missed} of {len(own)} messages are near no joint sample; "
+            self.warnings.append(
+                f"{self.path}: {name}: {missed} of {len(own)} messages are near no joint sample; "
                 "left out"
             )
-        out = np.full((self._count, values.shape[1]), np.nan)
+        out = np.full((len(self.stamp_ns), values.shape[1]), np.nan)
         for k in range(0, values.shape[1], 3):
             x = values[first, k : k + 3]
             use = close & np.isfinite(x).all(axis=1)
-            cells, moved = _moved(self._onto, own[use], near[use], x[use])
-            out[self._rows[cells], k : k + 3] = moved
-        self._carried.setdefault(_rate(own), []).append(name)
+            cells, moved = _moved(onto, own[use], near[use], x[use])
+            out[rows[cells], k : k + 3] = moved
+        hz = 1e9 / float(np.median(np.diff(own))) if len(own) > 1 else None
+        rate = "one message" if hz is None else f"{hz:.0f} Hz"
+        self._carried.setdefault(rate, []).append(name)
         return out
 
     def tell(self) -> None:
         """One sentence for all sensors of a rate."""
         for rate, names in self._carried.items():
-            self._warnings.append(
-                f"{self._path}: {', '.join(names)}: {rate}, carried to the joint samples' stamps"
+            self.warnings.append(
+                f"{self.path}: {', '.join(names)}: {rate}, carried to the joint samples' stamps"
             )
-
-
-def _rate(own_ns: NDArray[np.int64]) -> str:
-    if len(own_ns) < 2:
-        return "one message"
-    return f"{1e9 / float(np.median(np.diff(own_ns))):.0f} Hz"
 
 
 def _span(stamp_ns: NDArray[np.int64], start_ns: int) -> str:
@@ -131,8 +146,7 @@ def _slopes(t_s: Array, x: Array) -> Array:
     return np.asarray(total / np.maximum(sides, 1)[:, None])
 
 
-@dataclass(frozen=True, slots=True)
-class Links:
+class Links(NamedTuple):
     """(m, n, 6) twists and accelerations; not a number where a stamp has no message."""
 
     names: tuple[str, ...]
@@ -140,73 +154,66 @@ class Links:
     accels: Array | None
 
 
-class Onto(NamedTuple):
-    """What link motion is brought onto.
-
-    Attributes:
-        stamp_ns: (m,) stamps of the joint samples.
-        path, warnings: for sentences on what was left out.
-        carrier: for topics with stamps of their own, whose frames may then be of other names;
-            without it such messages are left out.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    path: Path
-    warnings: list[str]
-    carrier: Carrier | None = None
-
-
-def assemble_links(topics: Mapping[str, Series], order: Sequence[str], onto: Onto) -> Links:
+def assemble_links(
+    topics: Mapping[str, Series], order: Sequence[str], carrier: Carrier, sensors: bool
+) -> Links:
     """Link motion at the joint samples' stamps.
 
     Args:
         topics: the file's topics.
         order: link names in their recorded order; links not in it follow in the file's order.
-        onto: the joint samples.
+        carrier: to the joint samples' stamps, with what sentences need.
+        sensors: carry also topics with stamps of their own, whose frames may then be of other
+            names, and behind them all Imu topics. If not, such messages are left out.
     """
+    of_links = {k: s for k, s in topics.items() if not (sensors and s.schema == IMU)}
     found = [
         topic.removeprefix(prefix)
-        for topic, series in topics.items()
+        for topic, series in of_links.items()
         for prefix in (LINK_TWISTS, LINK_ACCELS)
         if topic.startswith(prefix) and series.count
     ]
     names = tuple(dict.fromkeys([n for n in order if n in found] + found))
     frames = dict(zip(names, names, strict=True))
-    if onto.carrier is not None:
-        frames |= _frames_of_their_own(topics, names, onto.path, onto.warnings)
-    twists = _stack(topics, LINK_TWISTS, TWIST_STAMPED, frames, onto)
-    accels = _stack(topics, LINK_ACCELS, ACCEL_STAMPED, frames, onto)
-    return Links(names if twists is not None or accels is not None else (), twists, accels)
+    if sensors:
+        frames |= _frames_of_their_own(of_links, names, carrier)
+    twists = _stack(of_links, TWIST_STAMPED, frames, carrier, sensors)
+    accels = _stack(of_links, ACCEL_STAMPED, frames, carrier, sensors)
+    links = Links(names if twists is not None or accels is not None else (), twists, accels)
+    if sensors:
+        links = _with_imus(links, topics, carrier)
+        carrier.tell()
+    return links
 
 
 def _stack(
     topics: Mapping[str, Series],
-    prefix: str,
     schema: str,
     frames: Mapping[str, str],
-    onto: Onto,
+    carrier: Carrier,
+    sensors: bool,
 ) -> Array | None:
     """(m, links, 6) one kind of motion of all links; None where there is none."""
-    stack = np.full((len(onto.stamp_ns), len(frames), 6), np.nan)
+    stack = np.full((len(carrier.stamp_ns), len(frames), 6), np.nan)
     used = False
     for i, (name, frame) in enumerate(frames.items()):
-        series = topics.get(prefix + name)
+        series = topics.get((LINK_TWISTS if schema == TWIST_STAMPED else LINK_ACCELS) + name)
         if series is None or not series.count:
             continue
-        where = f"{onto.path}: {series.topic}"
-        part = _in_frame(series, schema, frame, where, onto.warnings)
+        where = f"{carrier.path}: {series.topic}"
+        part = _in_frame(series, schema, frame, where, carrier.warnings)
         if part is None:
             continue
         used = True
-        link_ns = stamps(part, where, onto.warnings)
-        values = part.in_order([block.values[0] for block in part.blocks])
-        matched = _match(onto.stamp_ns, link_ns, values, stack[:, i])
+        link_ns = stamps(part, where, carrier.warnings)
+        values = in_order(part.blocks, lambda block: block.values[0])
+        matched = _match(carrier.stamp_ns, link_ns, values, stack[:, i])
         sent = len(np.unique(link_ns))
-        if onto.carrier is not None and matched < _MOST_MATCHED * sent:
-            carried = onto.carrier.carry(part.topic, link_ns, values)
+        if sensors and matched < _MOST_MATCHED * sent:
+            carried = carrier.carry(part.topic, link_ns, values)
             stack[:, i] = np.nan if carried is None else carried
         elif matched < sent:
-            onto.warnings.append(
+            carrier.warnings.append(
                 f"{where}: {sent - matched} of {len(link_ns)} messages carry "
                 "the stamp of no joint sample; left out"
             )
@@ -214,20 +221,17 @@ def _stack(
 
 
 def _frames_of_their_own(
-    topics: Mapping[str, Series], names: tuple[str, ...], path: Path, warnings: list[str]
+    topics: Mapping[str, Series], names: tuple[str, ...], carrier: Carrier
 ) -> dict[str, str]:
     """Frames that can only be the links' own, though they have other names.
 
     Motion told in a frame of the world, of the base or of another link shares that frame with
     others, or with their names. So all links must have a frame each that no other has, or none.
     """
-    frames = {}
+    frames, path, warnings = {}, carrier.path, carrier.warnings
     for name in names:
-        counts: Counter[str] = Counter()
-        for prefix in (LINK_TWISTS, LINK_ACCELS):
-            series = topics.get(prefix + name)
-            for block in series.blocks if series is not None else ():
-                counts[block.layout.frame_id] += len(block.index)
+        both = (topics.get(prefix + name) for prefix in (LINK_TWISTS, LINK_ACCELS))
+        counts = sum((x.frames() for x in both if x is not None), Counter[str]())
         frames[name] = max(counts, key=lambda frame: counts[frame], default="")
     told = set(frames.values())
     if told == {""}:
@@ -250,9 +254,9 @@ def _in_frame(
             "cdr; left out"
         )
         return None
-    part = series.only(lambda block: block.layout.frame_id == link)
+    part = series.in_frame(link)
     if part.count < series.count - len(series.bad):
-        frames = sorted({b.layout.frame_id for b in series.blocks} - {link})
+        frames = sorted(series.frames().keys() - {link})
         warnings.append(
             f"{where}: {series.count - len(series.bad) - part.count} messages are in the frame "
             f"{', '.join(map(repr, frames))}, not in that of the link, {link!r}; left out"
@@ -274,3 +278,135 @@ def _match(
     equal = link_ns[order][place] == stamp_ns
     into[equal] = values[order][place[equal]]
     return len(np.unique(stamp_ns[equal]))
+
+
+def _with_imus(links: Links, topics: Mapping[str, Series], carrier: Carrier) -> Links:
+    """The links' motion, and behind it that of all Imu topics at the joint samples."""
+    found = _distinct(topics, carrier)
+    names, motion = list(links.names), []
+    for imu, name in zip(found, _names(found, links.names), strict=True):
+        values = carrier.carry(name, imu.stamp_ns, np.concatenate([imu.w, imu.a], axis=1))
+        if values is not None:
+            names.append(name)
+            motion.append(values)
+    if not motion:
+        return links
+    own = np.stack(motion, axis=1)
+    nothing = np.full_like(own[..., :3], np.nan)
+    missing = np.full((len(own), len(links.names), 6), np.nan)
+    before = [missing if x is None else x for x in (links.twists, links.accels)]
+    twists = np.concatenate([nothing, own[..., :3]], axis=2)
+    accels = np.concatenate([own[..., 3:], nothing], axis=2)
+    return Links(
+        tuple(names),
+        np.concatenate([before[0], twists], axis=1),
+        np.concatenate([before[1], accels], axis=1),
+    )
+
+
+def frame_motions(
+    topics: Mapping[str, Series], schemas: Collection[str], path: Path, warnings: list[str]
+) -> list[FrameMotion]:
+    """What the topics of these types (of `READERS`) say, one entry for each topic and frame."""
+    found = []
+    for topic, series in topics.items():
+        if series.schema not in schemas or not series.count:
+            continue
+        where = f"{path}: {topic}"
+        if series.encoding != "cdr":
+            held = f"{series.schema} as {series.encoding}"
+            warnings.append(f"{where}: holds {held}, not as cdr; left out")
+        if series.bad:
+            place, reason = series.bad[0]
+            warnings.append(
+                f"{where}: {len(series.bad)} messages are unreadable, first number {place}: "
+                f"{reason}; left out"
+            )
+        counts = series.frames()
+        for frame, count in counts.items():
+            if count < _RARE * counts.total():
+                warnings.append(f"{where}: {count} messages name the frame {frame!r}; left out")
+                continue
+            motion = READERS[series.schema](series.in_frame(frame), frame, where, warnings)
+            if motion is not None:
+                found.append(motion)
+    return found
+
+
+def _imu(series: Series, frame: str, where: str, warnings: list[str]) -> FrameMotion | None:
+    """What an Imu says; None where no angular velocity is among it."""
+    values = in_order(series.blocks, lambda block: block.values[0])
+    w = _measured(values, _W, _W_UNKNOWN, _MOST_W, f"{where}: angular velocities", warnings)
+    a = _measured(values, _A, _A_UNKNOWN, _MOST_A, f"{where}: accelerations", warnings)
+    if np.isnan(w).all():
+        warnings.append(f"{where}: measures no angular velocity; left out")
+        return None
+    heard = np.isfinite(a).all(axis=1)
+    size = float(np.median(np.linalg.norm(a[heard], axis=1))) if heard.any() else np.nan
+    if not np.isnan(size) and not _AT_REST[0] < size < _AT_REST[1]:
+        warnings.append(
+            f"{where}: accelerations are mostly about {size:.2g} m/s², but at rest 9.81 is what "
+            "an accelerometer reads; are they in g, or without gravity?"
+        )
+    stamp_ns = stamps(series, where, warnings)
+    return FrameMotion(series.topic, series.schema, frame, stamp_ns, w, a, np.full_like(w, np.nan))
+
+
+def _other(series: Series, frame: str, where: str, warnings: list[str]) -> FrameMotion | None:
+    """What a TwistStamped, an AccelStamped or an Odometry says."""
+    values = in_order(series.blocks, lambda block: block.values[0])
+    first = _TWIST if series.schema == ODOMETRY else 0
+    linear, angular = values[:, first : first + 3], values[:, first + 3 : first + 6]
+    nothing, stamp_ns = np.full_like(linear, np.nan), stamps(series, where, warnings)
+    about = series.topic, series.schema, frame, stamp_ns
+    if series.schema == ACCEL_STAMPED:  # its angular part is the rate of a velocity that is there
+        return FrameMotion(*about, nothing, linear, nothing)
+    return FrameMotion(*about, angular, nothing, linear)
+
+
+READERS: dict[str, Callable[[Series, str, str, list[str]], FrameMotion | None]] = {
+    IMU: _imu,
+    ODOMETRY: _other,
+    TWIST_STAMPED: _other,
+    ACCEL_STAMPED: _other,
+}
+
+
+def _measured(
+    values: Array, part: slice, unknown: int, most: float, what: str, warnings: list[str]
+) -> Array:
+    """(k, 3) one vector of each message; not a number where not measured, or not possible."""
+    x = values[:, part].copy()
+    x[values[:, unknown] == -1.0] = np.nan
+    wild = (np.isinf(x) | (np.abs(x) > most)).any(axis=1)
+    if wild.any():
+        warnings.append(f"{what} of {int(wild.sum())} messages are impossible; left out")
+    x[wild | np.isnan(x).any(axis=1)] = np.nan
+    return x
+
+
+def _distinct(topics: Mapping[str, Series], carrier: Carrier) -> list[FrameMotion]:
+    """Imus without those that another topic holds too (raw and processed, say)."""
+    kept: list[FrameMotion] = []
+    for imu in frame_motions(topics, (IMU,), carrier.path, carrier.warnings):
+        twin = next((k for k in kept if _same(k, imu)), None)
+        if twin is None:
+            kept.append(imu)
+        else:
+            said = f"{imu.topic} holds the sensor of {twin.topic} again; left out"
+            carrier.warnings.append(f"{carrier.path}: {said}")
+    return kept
+
+
+def _same(one: FrameMotion, other: FrameMotion) -> bool:
+    pairs = ((one.stamp_ns, other.stamp_ns), (one.w, other.w), (one.a, other.a))
+    return bool(np.any(one.w)) and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+
+
+def _names(found: Sequence[FrameMotion], taken: Collection[str]) -> list[str]:
+    """Frames where each sensor has one of its own, else topics."""
+    frames = [imu.frame for imu in found]
+    if all(frames) and len(set(frames)) == len(frames) and not set(frames) & set(taken):
+        return frames
+    topics = Counter(imu.topic for imu in found)
+    return [f"{i.topic}:{i.frame}" if topics[i.topic] > 1 else i.topic for i in found]

@@ -206,18 +206,12 @@ class Log:
         warnings = list(self.warnings)
         if extra:
             warnings.append(f"{self.path}: joints not asked for are ignored: {', '.join(extra)}")
-        log = replace(
-            self,
-            joint_names=tuple(joint_names),
-            q=_columns(self.q, columns),
-            dq=_columns(self.dq, columns),
-            tau=_columns(self.tau, columns),
-            warnings=warnings,
-        )
-        if self.commands is not None:
-            tau, q = self.commands.tau, self.commands.q
-            q = None if q is None else _columns(q, columns)
-            log = replace(log, commands=replace(self.commands, tau=_columns(tau, columns), q=q))
+        q, dq, tau = (_columns(x, columns) for x in (self.q, self.dq, self.tau))
+        log = replace(self, joint_names=tuple(joint_names), q=q, dq=dq, tau=tau, warnings=warnings)
+        if (asked := self.commands) is not None:
+            own = None if asked.q is None else _columns(asked.q, columns)
+            asked = replace(asked, tau=_columns(asked.tau, columns), q=own)
+            log = replace(log, commands=asked)
         if link_names is None:
             link_names = self._links_moved_by(joint_names)
         return log if link_names is None else log._select_links(link_names)
@@ -248,12 +242,9 @@ class Log:
         if not self.link_names:
             return self
         rows = _places_of(self.link_names, link_names, f"{self.path}: has no motion of link")
-        return replace(
-            self,
-            link_names=tuple(link_names),
-            twists=None if self.twists is None else _columns(self.twists, rows),
-            accels=None if self.accels is None else _columns(self.accels, rows),
-        )
+        both = (None if x is None else _columns(x, rows) for x in (self.twists, self.accels))
+        twists, accels = both
+        return replace(self, link_names=tuple(link_names), twists=twists, accels=accels)
 
 
 def mapped(like: Log, pieces: Iterable[Log]) -> Log:

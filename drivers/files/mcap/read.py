@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import choices
 from drivers.files.bounded import parse_json
 from drivers.files.estimates import estimate_values, values_of_json
 from drivers.files.mcap.bags import open_scan
-from drivers.files.mcap.imus import READERS, frame_motions, with_imus
 from drivers.files.mcap.joints import (
     TAU,
     Q,
@@ -23,9 +24,10 @@ from drivers.files.mcap.joints import (
     fits,
     in_use,
     joints_told,
+    steps_back,
 )
-from drivers.files.mcap.links import Carrier, Links, Onto, assemble_links
-from drivers.files.mcap.log import Log, Topic
+from drivers.files.mcap.links import READERS, Carrier, assemble_links, frame_motions
+from drivers.files.mcap.log import Commands, Log, Topic
 from drivers.files.mcap.records import McapScan, Scan
 from drivers.files.mcap.series import JOINT_SCHEMAS, Series, collect, schema_name
 from drivers.files.mcap.writer import (
@@ -39,9 +41,11 @@ from drivers.files.mcap.writer import (
 from drivers.files.messages import Message, decode
 from drivers.files.ros_types import ESTIMATE, IMU
 from drivers.files.rows import AT_ONCE
-from drivers.interface import DriverError
+from drivers.interface import Array, DriverError
 
+Beside = Literal["", "sensors", "frames", "imus"]
 IN_MEMORY = 2**17  # samples; the arrays of a longer recording are mapped
+GLANCE_S = 5.0  # that tell of most recordings that they are of another kind
 
 
 def read_log(
@@ -49,89 +53,82 @@ def read_log(
     joint_names: Sequence[str] | None = None,
     topic: str | None = None,
     *,
-    sensors: bool = False,
-    frames: bool = False,
-    imus: bool = False,
+    beside: Beside = "",
+    within_s: tuple[float, float] | None = None,
 ) -> Log:
     """Read a recording of any length, cut or whole, by whatever recorder.
 
     The arrays of more than `IN_MEMORY` samples are mapped (see `Log`). In memory is, whatever the
-    length, a recording that tells motion of links or what `frames` or `imus` ask for, or whose
-    commands are of several sets of joints or not in the order of time.
+    length, a recording that tells motion of links or what `beside` asks for, or whose commands are
+    of several sets of joints or not in the order of time.
 
     Args:
         path: an MCAP file, chunked or not, uncompressed, zstd or lz4; a rosbag2, folder or SQLite
             file; a bag of ROS 1; any of these compressed (zstd, gzip).
         joint_names: joints that must be there, in the order wanted; all joints where None.
         topic: of the joint states; where None `/joint_states`, else the only one that fits.
-        sensors: read what sensors on links recorded beside the joints, for discovery: also
-            Imu topics and link motion with stamps of its own, carried to the joint samples'
-            stamps; efforts and velocities may be absent.
-        frames: read into `Log.frames` what topics say of frames' motion, whatever frames; `imus`
-            the same for Imu topics alone.
+        beside: what else is read. `sensors`, for discovery: what sensors on links recorded beside
+            the joints, also Imu topics and link motion with stamps of its own, carried to the joint
+            samples' stamps; efforts and velocities may be absent. `frames`: into `Log.frames` what
+            topics say of frames' motion, whatever frames; `imus` the same for Imu topics alone.
+        within_s: the part that is read, log times since the first message, s; all where None.
 
     Raises:
-        DriverError: the file is unreadable or empty, or has no joint states with positions and
-            efforts; the sentence says what the file does have.
-    """
-    return assembled(
-        open_scan(Path(path)), joint_names, topic, sensors=sensors, frames=frames, imus=imus
-    )
-
-
-def read_sensors(
-    path: str | Path, topic: str | None = None, within_s: tuple[float, float] | None = None
-) -> Log:
-    """As `read_log` with `sensors`, of a part of the recording.
-
-    Args:
-        within_s: log times since the first message, s; None: all.
-
-    Raises:
-        DriverError: as `read_log`; the recording ends before that time.
+        DriverError: the file is unreadable or empty, ends before `within_s`, or has no joint
+            states with positions and efforts; the sentence says what the file does have.
     """
     scan = open_scan(Path(path))
     scan.within_s = within_s
-    return assembled(scan, None, topic, sensors=True)
+    return assembled(scan, joint_names, topic, beside)
 
 
 def assembled(
     scan: Scan,
     joint_names: Sequence[str] | None = None,
     topic: str | None = None,
-    *,
-    sensors: bool = False,
-    frames: bool = False,
-    imus: bool = False,
+    beside: Beside = "",
 ) -> Log:
     """What a scan tells, see `read_log`."""
-    tell = tuple(READERS) if frames else (IMU,) if imus else ()
-    kinds = (*tell, IMU) if sensors else tell
-    told = _Told((Q,) if sensors else (Q, TAU))
-    topics = collect(scan, lambda series: _is_wanted(series, topic, kinds), told.take)
+    sensors, tell = beside == "sensors", {"frames": (*READERS,), "imus": (IMU,)}.get(beside, ())
+    kinds, needed = ((IMU,), (Q,)) if sensors else (tell, (Q, TAU))
+    states, commanding = defaultdict[str, Told](lambda: Told(needed)), Told((TAU,), (TAU,))
+
+    def take(series: Series, least: int = AT_ONCE) -> None:
+        """Take what was decoded of joints, once it is so much that it is worth it."""
+        if series.schema not in JOINT_SCHEMAS or not (series.blocks or series.bad):
+            return
+        if sum(len(block.index) for block in series.blocks) >= least:
+            states[series.topic].take(series)
+            if series.topic == JOINT_COMMANDS:
+                commanding.take(series)
+            series.blocks.clear()
+
+    topics = collect(scan, lambda series: _is_wanted(series, topic, kinds), take)
     series = _choose_topic(scan, topics, topic, not sensors)
     check_type(series, scan.path)
     for other in topics.values():
-        told.take(other, least=0)
+        take(other, least=0)
     where, warnings = f"{scan.path}: {series.topic}", list(scan.warnings)
-    rows = told.joints[series.topic].chosen(series, where, joint_names, warnings)
-    orders = told.commands.of(rows.names)
+    rows = states[series.topic].chosen(series, where, joint_names, warnings)
+    asked = [x for x in commanding.sets.values() if len(x) and {*x.names} & {*rows.names}]
     mapped = (
         len(rows) > IN_MEMORY
         and not any(s.count for s in topics.values() if _is_of_links(s) or s.schema in kinds)
-        and not (len(orders) > 1 or any(in_use(*x.clocks, where, []).back for x in orders))
+        and len(asked) <= 1
+        and not any(steps_back(in_use(*x.clocks, where, []))[0] for x in asked)
     )
     metadata = _decoded_metadata(scan)
     with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers are found by their size
         samples = joints_told(rows, where, not sensors, mapped, warnings)
-        onto = Onto(samples[0], scan.path, warnings)
-        links = _links(topics, metadata.get("link_names"), onto, sensors)
+        carrier, order = Carrier(samples[0], scan.path, warnings), metadata.get("link_names")
+        names = order if isinstance(order, list) else []
+        links = assemble_links(topics, names, carrier, sensors)
         found = frame_motions(topics, tell, scan.path, warnings)
     commands = None
     if JOINT_COMMANDS in topics and topics[JOINT_COMMANDS].count:
         check_type(topics[JOINT_COMMANDS], scan.path)
         where = f"{scan.path}: {JOINT_COMMANDS}"
-        commands = commands_told(orders, where, rows.names, mapped, warnings)
+        commands = commands_told(asked, where, rows.names, mapped, warnings)
     log = Log(
         scan.path,
         rows.names,
@@ -151,26 +148,62 @@ def assembled(
     return log if joint_names is None else log.select(joint_names)
 
 
-class _Told:
-    """What the topics of joints tell, while a file is read.
+def read_position_log(path: str | Path, topic: str | None = None) -> Log | None:
+    """The positions of a recording whose `/joint_commands` hold positions, without any efforts.
 
     Args:
-        needed: runs of doubles without which a state is of no use, see `Told`.
+        path: as `read_log` takes it; topic: of the joint states, `/joint_states` where None.
+
+    Returns:
+        Finite positions, stamps of the encoders and of the commands strictly increasing; None for
+        every other recording: those whose joint states have efforts, or whose commands are not
+        positions.
+
+    Raises:
+        DriverError: the file is unreadable, or positions and commands are of other joints.
     """
+    states, glance = topic or JOINT_STATES, open_scan(Path(path))
+    glance.within_s = (0.0, GLANCE_S)  # a long recording is not held in memory for that
+    topics = collect(glance, lambda series: series.topic == states)
+    if states not in topics or JOINT_COMMANDS not in topics or not topics[JOINT_COMMANDS].count:
+        return None
+    if fits(topics[states], effort=True) and _has_effort(topics[states]):
+        return None
+    scan = open_scan(Path(path))
+    topics = collect(scan, lambda series: series.topic in (states, JOINT_COMMANDS))
+    read, commanded = topics.get(states), topics.get(JOINT_COMMANDS)
+    if read is None or commanded is None or not fits(commanded, effort=False):
+        return None
+    if not fits(read, effort=False) or _has_effort(read):
+        return None
+    names, at, rows, said = _positions(read, scan.path, None)
+    _, when, commands, _ = _positions(commanded, scan.path, names)
+    nothing, warnings = np.full_like(rows, np.nan), scan.warnings + said
+    orders = Commands(when, np.full_like(commands, np.nan), commands)
+    log = Log(scan.path, names, at, rows, nothing, nothing, topic=states, warnings=warnings)
+    return replace(log, commands=orders)
 
-    def __init__(self, needed: Sequence[int]) -> None:
-        self.joints = defaultdict[str, Told](lambda: Told(needed))
-        self.commands = Told((TAU,), (TAU,))
 
-    def take(self, series: Series, least: int = AT_ONCE) -> None:
-        """Take what was decoded of joints, once it is so much that it is worth it."""
-        if series.schema not in JOINT_SCHEMAS or not (series.blocks or series.bad):
-            return
-        if sum(len(block.index) for block in series.blocks) >= least:
-            self.joints[series.topic].take(series)
-            if series.topic == JOINT_COMMANDS:
-                self.commands.take(series)
-            series.forget()
+def _positions(
+    series: Series, path: Path, want: Sequence[str] | None
+) -> tuple[tuple[str, ...], NDArray[np.int64], Array, list[str]]:
+    """Joints of a topic, finite positions (k, n) in the order of time, and sentences on its clock.
+
+    With stamps (k,), of each of which it is the first; of `want` in that order where it is given.
+    """
+    told, where, said = Told((Q,), (Q,)), f"{path}: {series.topic}", list[str]()
+    told.take(series)
+    rows = told.chosen(series, where, want, [])
+    stamp_ns = in_use(*rows.clocks, where, said).table(False)[:, 0]
+    q = rows.runs[Q].table(False)[:, [rows.names.index(name) for name in want or rows.names]]
+    finite = np.isfinite(q).all(axis=1)
+    found, first = np.unique(stamp_ns[finite], return_index=True)
+    return rows.names, found, np.ascontiguousarray(q[finite][first]), said
+
+
+def _has_effort(series: Series) -> bool:
+    """Whether any message tells an effort that is a number and not zero."""
+    return any(np.any(np.nan_to_num(block.values[2])) for block in series.blocks)
 
 
 def survey(path: str | Path) -> tuple[dict[str, Topic], list[str], bool]:
@@ -259,18 +292,6 @@ def _is_of_links(series: Series) -> bool:
     return series.topic.startswith((LINK_TWISTS, LINK_ACCELS))
 
 
-def _links(topics: Mapping[str, Series], order: Any, onto: Onto, sensors: bool) -> Links:
-    names = order if isinstance(order, list) else []
-    if not sensors:
-        return assemble_links(topics, names, onto)
-    carrier = Carrier(*onto[:3])
-    others = {name: series for name, series in topics.items() if series.schema != IMU}
-    links = assemble_links(others, names, onto._replace(carrier=carrier))
-    links = with_imus(links, topics, carrier, onto.path, onto.warnings)
-    carrier.tell()
-    return links
-
-
 def _topics_told(topics: Mapping[str, Series]) -> dict[str, Topic]:
     return {k: Topic(s.schema, s.encoding, s.count) for k, s in sorted(topics.items())}
 
@@ -289,15 +310,12 @@ def _nothing_found(scan: Scan, topics: Mapping[str, Series], topic: str) -> str:
 def _decoded_metadata(scan: Scan) -> dict[str, Any]:
     entries: dict[str, Any] = {}
     for record in scan.metadata:
-        if record.name == METADATA:
-            entries.update({key: _decoded(value) for key, value in record.metadata.items()})
-        else:
+        if record.name != METADATA:
             entries[record.name] = dict(record.metadata)
+            continue
+        for key, value in record.metadata.items():
+            try:
+                entries[key] = parse_json(value)
+            except ValueError:
+                entries[key] = value
     return entries
-
-
-def _decoded(text: str) -> Any:
-    try:
-        return parse_json(text)
-    except ValueError:
-        return text

@@ -19,19 +19,30 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Metadata, Schema
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    Header,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
 from numpy.typing import NDArray
 
 from drivers.files.bounded import CHUNK_LIMIT, GROWTH_LIMIT
 from drivers.interface import DriverError
 
-_COMPRESSIONS = ("", "zstd", "lz4")
 _MOST_OTHERS = 2**18  # records of a stretch that are no messages; channel numbers have 16 bits
 _MOST_WARNINGS = 50
 _LOOK = 16  # messages behind which it is looked whether their sizes come again in turn
@@ -44,11 +55,20 @@ MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_HEAD = struct.Struct("<QQQII")  # start, end, size, crc, length of the compression's name
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the index, of its offsets, crc
 _CRC_SIZE = 4
-_CHUNK_PLACE = struct.Struct("<16xQ")  # in a chunk index, behind two times
 _LENGTH = struct.Struct("<Q")
-_NOTED = frozenset(
-    map(int, (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT))
-) | {int(Opcode.CHUNK_INDEX)}
+_NOTED: dict[
+    int, Any
+] = {  # what is kept, each read by its class; all others are messages, or of no use
+    int(Opcode.SCHEMA): Schema,
+    int(Opcode.CHANNEL): Channel,
+    int(Opcode.HEADER): Header,
+    int(Opcode.METADATA): Metadata,
+    int(Opcode.ATTACHMENT): Attachment,
+    int(Opcode.CHUNK_INDEX): ChunkIndex,
+    int(Opcode.METADATA_INDEX): MetadataIndex,
+    int(Opcode.ATTACHMENT_INDEX): AttachmentIndex,
+    int(Opcode.STATISTICS): Statistics,
+}
 _INVALID = 0  # what a file system leaves behind a cut: zeros
 _IN_CHUNK = frozenset({_INVALID})
 _IN_FILE = frozenset({_INVALID, int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)})
@@ -58,45 +78,34 @@ class DamagedChunk(ValueError):
     """A chunk's bytes are not what its head says."""
 
 
-def decompress(name: str, data: memoryview, size: int, cut: bool = False) -> memoryview:
-    """The records of a chunk.
+def decompress(chunk: Chunk, cut: bool = False) -> memoryview:
+    """The records of a chunk, whatever its own head or a frame's claims.
 
     Args:
-        name: how it is compressed.
-        data: the compressed bytes.
-        size: how many bytes they make.
+        chunk: with its compressed bytes.
         cut: the end is missing; give what can be had.
 
     Raises:
         DamagedChunk: the bytes cannot be decompressed, or make another size.
     """
-    if name not in _COMPRESSIONS:
-        raise DamagedChunk(f"it is compressed by {name!r} (known: none, zstd, lz4)")
+    name, size = chunk.compression, chunk.uncompressed_size
     try:
-        content = _DECOMPRESSORS[name](data, size)
+        if name == "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+                content = memoryview(reader.read(size + 1))
+        elif name == "lz4":
+            frame = importlib.import_module("lz4.frame")  # comes with mcap; seldom needed
+            stream = frame.LZ4FrameDecompressor()
+            content = memoryview(stream.decompress(chunk.data, max_length=size + 1))
+        elif name == "":
+            content = memoryview(chunk.data)
+        else:
+            raise DamagedChunk(f"it is compressed by {name!r} (known: none, zstd, lz4)")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
         raise DamagedChunk(f"{name} cannot read it ({error})") from error
     if not cut and len(content) != size:
         raise DamagedChunk(f"it does not make the {size} bytes that it claims")
     return content
-
-
-def _stored(data: memoryview, size: int) -> memoryview:
-    return data
-
-
-def _zstd(data: memoryview, size: int) -> memoryview:
-    """At most `size` bytes and one more, whatever the frame's own head claims."""
-    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-        return memoryview(reader.read(size + 1))
-
-
-def _lz4(data: memoryview, size: int) -> memoryview:
-    frame = importlib.import_module("lz4.frame")  # comes with mcap; imported only where needed
-    return memoryview(frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
-
-
-_DECOMPRESSORS = {"": _stored, "zstd": _zstd, "lz4": _lz4}
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,15 +223,6 @@ def _note_repeated(found: Walk, data: memoryview, at: int, most: int | None) -> 
     return at + times * width
 
 
-@dataclass(frozen=True, slots=True)
-class _ChunkHead:
-    name: str
-    size: int
-    crc: int
-    first: int
-    last: int
-
-
 class Scan:
     """One pass over a recording. Its attributes are complete once `regions` is exhausted.
 
@@ -262,6 +262,7 @@ class McapScan(Scan):
 
     Attributes:
         size: its bytes.
+        others: metadata, attachments, and what a sound end of the file says of it, by opcode.
         lost_bytes: bytes behind the cut that hold no complete record.
     """
 
@@ -270,6 +271,9 @@ class McapScan(Scan):
         super().__init__(path)
         self._data = _open(path)
         self.size = len(self._data)
+        self.others: dict[int, list[Any]] = {opcode: [] for opcode in _NOTED}
+        self.metadata = self.others[Opcode.METADATA]
+        self.attachments = self.others[Opcode.ATTACHMENT]
         self.lost_bytes = 0
         self._rescued = self._made = self._given_back = 0
         self._chunks: list[int] = []
@@ -307,7 +311,7 @@ class McapScan(Scan):
                 at = bound
             else:
                 if is_chunk:
-                    yield from self._cut_chunk(at)
+                    yield from self._chunk(at, stop)
                 break
         self._judge_end(at)
 
@@ -336,15 +340,11 @@ class McapScan(Scan):
             return
         if crc and zlib.crc32(self._data[start : end - _CRC_SIZE]) != crc:
             return
-        index = walk(self._data[:footer], start, _IN_CHUNK)
-        for opcode, first, last in index.others:
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        for opcode, first, last in walk(self._data[:footer], start, _IN_CHUNK).others:
+            if opcode not in (Opcode.HEADER, Opcode.METADATA, Opcode.ATTACHMENT):
                 self._note(opcode, self._data[first:last])
-            elif opcode == Opcode.CHUNK_INDEX and last - first >= _CHUNK_PLACE.size:
-                (place,) = _CHUNK_PLACE.unpack_from(self._data, first)
-                if place < start and self._data[place] == Opcode.CHUNK:
-                    self._chunks.append(place)
-        self._chunks.sort()
+        places = (chunk.chunk_start_offset for chunk in self.others[Opcode.CHUNK_INDEX])
+        self._chunks = sorted(x for x in places if x < start and self._data[x] == Opcode.CHUNK)
 
     def _use(self, found: Walk, data: memoryview) -> Iterator[Region]:
         for opcode, first, last in found.others:
@@ -354,66 +354,55 @@ class McapScan(Scan):
             yield Region(np.frombuffer(data, np.uint8), starts, stops)
 
     def _note(self, opcode: int, content: memoryview) -> None:
-        """Keep a record that isn't a message; summaries and indexes are of no use here."""
-        stream = ReadDataStream(BytesIO(content))
+        """Keep a record that isn't a message."""
         try:
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(stream)
-                self.schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(stream)
-                self.channels[channel.id] = channel
-            elif opcode == Opcode.HEADER:
-                self.header = Header.read(stream)
-            elif opcode == Opcode.METADATA:
-                self.metadata.append(Metadata.read(stream))
-            elif opcode == Opcode.ATTACHMENT:
-                self.attachments.append(Attachment.read(stream))
+            record = _NOTED[opcode].read(ReadDataStream(BytesIO(content)))
         except (McapError, struct.error, UnicodeDecodeError) as error:
             self._warn(f"a record of type {opcode} is damaged and was passed over ({error})")
+            return
+        if opcode == Opcode.SCHEMA:
+            self.schemas[record.id] = record
+        elif opcode == Opcode.CHANNEL:
+            self.channels[record.id] = record
+        elif opcode == Opcode.HEADER:
+            self.header = record
+        else:
+            self.others[opcode].append(record)
 
     def _chunk(self, at: int, stop: int) -> Iterator[Region]:
+        """Its messages; of a cut one what can be had, and no checksum holds it to anything."""
+        cut = stop > self.size
         try:
-            head = self._chunk_head(at)
-            self._spend(head.size)
-            content = self._content(at, head)
+            chunk = self._chunk_at(at)
+            self._spend(chunk.uncompressed_size)
+            content = decompress(chunk, cut=True) if cut else self._content(at, chunk)
             found = walk(content, 0, _IN_CHUNK)
-            if found.end != len(content):
+            if not cut and found.end != len(content):
                 raise DamagedChunk(f"its record at byte {found.end} is broken")
         except (DamagedChunk, struct.error, UnicodeDecodeError) as error:
-            self.lost_bytes += stop - at
-            self._warn(f"the chunk at byte {at} is damaged and was passed over: {error}")
+            if not cut:
+                self.lost_bytes += stop - at
+                self._warn(f"the chunk at byte {at} is damaged and was passed over: {error}")
             return
+        self._rescued = len(found.start) if cut else 0
         yield from self._use(found, content)
 
-    def _content(self, at: int, head: _ChunkHead) -> memoryview:
+    def _content(self, at: int, chunk: Chunk) -> memoryview:
         """Records of the chunk there; a second thread makes those of the next one meanwhile."""
         made, after = self._ahead.pop(at, None), self._next_chunk(at)
         self._ahead.clear()
         if self._second is not None and after < self.size:
             with contextlib.suppress(struct.error, UnicodeDecodeError):
-                coming = self._chunk_head(after)
-                if coming.size <= CHUNK_LIMIT:
+                coming = self._chunk_at(after)
+                if coming.uncompressed_size <= CHUNK_LIMIT:
                     self._ahead[after] = self._second.submit(self._checked, coming)
-        return self._checked(head) if made is None else made.result()
+        return self._checked(chunk) if made is None else made.result()
 
-    def _checked(self, head: _ChunkHead) -> memoryview:
-        content = decompress(head.name, self._data[head.first : head.last], head.size)
-        if head.crc and zlib.crc32(content) != head.crc:
+    def _checked(self, chunk: Chunk) -> memoryview:
+        content = decompress(chunk)
+        if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
             raise DamagedChunk("its checksum is wrong")
         return content
-
-    def _cut_chunk(self, at: int) -> Iterator[Region]:
-        """What can be decompressed of the last chunk; no checksum holds it to anything."""
-        try:
-            head = self._chunk_head(at)
-            self._spend(head.size)
-            content = decompress(head.name, self._data[head.first :], head.size, cut=True)
-        except (DamagedChunk, struct.error, UnicodeDecodeError):
-            return
-        found = walk(content, 0, _IN_CHUNK)
-        self._rescued = len(found.start)
-        yield from self._use(found, content)
 
     def _spend(self, size: int) -> None:
         """Count what chunks make. Raises DamagedChunk where no recording makes so much."""
@@ -423,13 +412,15 @@ class McapScan(Scan):
             raise DamagedChunk(f"the file would grow more than {GROWTH_LIMIT} times")
         self._made += size
 
-    def _chunk_head(self, at: int) -> _ChunkHead:
-        _, _, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
+    def _chunk_at(self, at: int) -> Chunk:
+        """The chunk there, whose bytes are not copied; of a cut one as many as there are."""
+        begin, end, size, crc, length = _CHUNK_HEAD.unpack_from(self._data, at + HEAD)
         name_at = at + HEAD + _CHUNK_HEAD.size
         name = str(self._data[name_at : name_at + length], "utf-8")
         (stored,) = _LENGTH.unpack_from(self._data, name_at + length)
         first = name_at + length + _LENGTH.size
-        return _ChunkHead(name, size, crc, first, first + stored)
+        data: Any = self._data[first : first + stored]
+        return Chunk(name, data, end, begin, crc, size)
 
     def _judge_end(self, at: int) -> None:
         """Say whether the file was cut, and where."""

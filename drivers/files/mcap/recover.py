@@ -10,6 +10,7 @@ import os
 import tempfile
 from collections import Counter
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO
 
@@ -21,7 +22,7 @@ from drivers.files.estimates import FLAGS, EstimateNames, estimate_fields, value
 from drivers.files.mcap.records import McapScan
 from drivers.files.mcap.writer import ESTIMATES, LIBRARY, METADATA
 from drivers.files.messages import encode
-from drivers.files.ros_types import ESTIMATE, SCHEMAS
+from drivers.files.ros_types import ESTIMATE, schemas
 from drivers.interface import DriverError
 
 
@@ -33,7 +34,6 @@ class Recovery:
         path, out: the file read, the file written.
         was_whole: nothing was wrong with it.
         messages: written, by topic.
-        attachments, metadata: records written.
         lost_bytes: of the file that hold no complete record.
         warnings: what was wrong.
     """
@@ -42,8 +42,6 @@ class Recovery:
     out: Path
     was_whole: bool
     messages: dict[str, int]
-    attachments: int
-    metadata: int
     lost_bytes: int
     warnings: list[str]
 
@@ -84,8 +82,6 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
         out=out,
         was_whole=not scan.warnings,
         messages=dict(sorted(counts.items())),
-        attachments=len(scan.attachments),
-        metadata=len(scan.metadata),
         lost_bytes=scan.lost_bytes,
         warnings=scan.warnings,
     )
@@ -94,33 +90,29 @@ def recover(path: str | Path, out: str | Path | None = None) -> Recovery:
 def _copy(scan: McapScan, file: IO[bytes]) -> Counter[str]:
     """Copy all messages, then metadata and attachments; counts by topic."""
     writer = Writer(file)
-    started = False
     numbers: dict[int, int] = {}
     counts: Counter[str] = Counter()
-    schemas: dict[int, int] = {}
+    written: dict[int, int] = {}
     orphans = 0
-    for region in scan.regions():
-        if not started:
-            writer.start(profile=scan.header.profile, library=LIBRARY)
-            started = True
-        spans = zip(region.start.tolist(), region.stop.tolist(), strict=True)
-        facts = zip(region.channel.tolist(), region.sequence, region.times.tolist(), strict=True)
-        for (start, stop), (number, sequence, times) in zip(spans, facts, strict=True):
+    regions = scan.regions()
+    first = next(regions, None)  # the header comes before all messages
+    writer.start(profile=scan.header.profile, library=LIBRARY)
+    for region in regions if first is None else chain([first], regions):
+        facts = region.start, region.stop, region.channel, region.sequence, region.times
+        for start, stop, number, sequence, times in zip(*(x.tolist() for x in facts), strict=True):
             channel = scan.channels.get(number)
             if channel is None:
                 orphans += 1
                 continue
             if number not in numbers:
-                numbers[number] = _register(writer, scan, channel, schemas)
+                numbers[number] = _register(writer, scan, channel, written)
             payload = region.data[start:stop].tobytes()
-            if is_old_estimate(channel):
-                payload = told_anew(scan, payload)
-            writer.add_message(numbers[number], times[0], payload, times[1], int(sequence))
+            if _is_old(channel):
+                payload = _told_anew(scan, payload)
+            writer.add_message(numbers[number], times[0], payload, times[1], sequence)
             counts[channel.topic] += 1
     if orphans:
         scan.warnings.append(f"{scan.path}: {orphans} messages belong to no channel; left out")
-    if not started:
-        writer.start(profile=scan.header.profile, library=LIBRARY)
     for record in scan.metadata:
         writer.add_metadata(record.name, record.metadata)
     for item in scan.attachments:
@@ -131,12 +123,7 @@ def _copy(scan: McapScan, file: IO[bytes]) -> Counter[str]:
     return counts
 
 
-def is_old_estimate(channel: Channel) -> bool:
-    """Whether a channel holds estimates in JSON."""
-    return bool(channel.topic == ESTIMATES and channel.message_encoding == "json")
-
-
-def told_anew(scan: McapScan, payload: bytes) -> bytes:
+def _told_anew(scan: McapScan, payload: bytes) -> bytes:
     """An estimate in JSON as a ROS 2 message; what JSON did not tell is not-a-number.
 
     Raises DriverError where it is none.
@@ -162,14 +149,19 @@ def told_anew(scan: McapScan, payload: bytes) -> bytes:
         ) from error
 
 
-def _register(writer: Writer, scan: McapScan, channel: Channel, schemas: dict[int, int]) -> int:
-    if is_old_estimate(channel):
-        number = writer.register_schema(ESTIMATE, "ros2msg", SCHEMAS[ESTIMATE].encode())
+def _is_old(channel: Channel) -> bool:
+    """Whether a channel holds estimates in JSON."""
+    return bool(channel.topic == ESTIMATES and channel.message_encoding == "json")
+
+
+def _register(writer: Writer, scan: McapScan, channel: Channel, written: dict[int, int]) -> int:
+    if _is_old(channel):
+        number = writer.register_schema(ESTIMATE, "ros2msg", schemas()[ESTIMATE].encode())
         return int(writer.register_channel(channel.topic, "cdr", number))
     schema = scan.schemas.get(channel.schema_id)
-    if schema is not None and schema.id not in schemas:
-        schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-    schema_id = schemas[schema.id] if schema is not None else 0
+    if schema is not None and schema.id not in written:
+        written[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+    schema_id = written[schema.id] if schema is not None else 0
     return int(
         writer.register_channel(
             channel.topic, channel.message_encoding, schema_id, channel.metadata

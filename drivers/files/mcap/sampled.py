@@ -5,37 +5,34 @@ Nothing but the index and some chunks is read, however large the file is.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import make_reader
-from mcap.records import ChunkIndex
-from mcap.summary import Summary
 
 from drivers.files.mcap.log import Log, Topic
-from drivers.files.mcap.read import assembled
-from drivers.files.mcap.records import HEAD, MAGIC, RECORD, McapScan, Region
+from drivers.files.mcap.read import Beside, assembled
+from drivers.files.mcap.records import HEAD, RECORD, McapScan, Region
 from drivers.files.mcap.series import schema_name
 from drivers.interface import DriverError
 
 SAMPLED_FROM = 2**26  # bytes; a smaller file is read whole
-_OTHERS = (Opcode.METADATA, Opcode.ATTACHMENT)
+_INDEXED = {
+    Opcode.METADATA_INDEX: Opcode.METADATA,
+    Opcode.ATTACHMENT_INDEX: Opcode.ATTACHMENT,
+}
 STRETCHES, STRETCH_BYTES = 24, 2**20  # how many, and of what each holds unpacked, about
 
 
 def sample_log(
-    path: str | Path, topic: str | None = None, **read: Any
+    path: str | Path, topic: str | None = None, beside: Beside = ""
 ) -> tuple[list[Log], list[tuple[float, float]]] | None:
     """A sample of a long MCAP file with an index; None of every other recording.
 
     Args:
-        path: of the file; topic: of the joint states; read: as `read_log` takes it.
+        path: of the file; topic: of the joint states; beside: as `read_log` takes it.
 
     Returns:
         Stretches in the order of time, of the same joints and topic, whose topics count the
@@ -45,75 +42,51 @@ def sample_log(
     file = Path(path)
     if not file.is_file() or file.stat().st_size < SAMPLED_FROM:
         return None
-    summary = _summary(file)
-    if summary is None or summary.statistics is None or not summary.chunk_indexes:
+    try:
+        scan = _Part(file)
+    except DriverError:  # the scan that reads all says what is wrong
         return None
-    chunks = sorted(summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
-    stretches = _stretches(chunks)
+    chunks = sorted(scan.others[Opcode.CHUNK_INDEX], key=lambda c: c.chunk_start_offset)
+    if not chunks or not scan.others[Opcode.STATISTICS]:
+        return None
+    # Places of chunks, some in a row, spread evenly from the first to the last.
+    size = float(np.median([c.uncompressed_size for c in chunks]))
+    together = max(round(STRETCH_BYTES / max(size, 1.0)), 1)
+    starts = np.unique(np.linspace(0, max(len(chunks) - together, 0), STRETCHES).astype(int))
+    stretches = [range(i, min(i + together, len(chunks))) for i in starts.tolist()]
     if sum(map(len, stretches)) > len(chunks) // 2:
         return None
-    scan = _Part(file)
-    scan.note_others(summary)
+    scan.note_others()
     found = []
     for stretch in stretches:
         scan.chosen = [chunks[i].chunk_start_offset for i in stretch]
         try:
-            found.append(assembled(scan, topic=topic, **read))
+            found.append(assembled(scan, None, topic, beside))
         except DriverError:  # this stretch has no joint states, others may
             continue
     if not found or not scan.sound:
         return None
     first = found[0]
     warnings = list(dict.fromkeys(text for part in found for text in part.warnings))
-    topics = _topics(scan, summary)
+    topics: dict[str, Topic] = {}
+    counts = scan.others[Opcode.STATISTICS][-1].channel_message_counts
+    for channel in sorted(scan.channels.values(), key=lambda c: str(c.topic)):
+        before = topics[channel.topic].messages if channel.topic in topics else 0
+        messages = before + counts.get(channel.id, 0)
+        about = schema_name(scan, channel), channel.message_encoding
+        topics[channel.topic] = Topic(*about, messages)
     parts = [
         replace(part, topics=topics, warnings=warnings)
         for part in found
         if (part.joint_names, part.topic) == (first.joint_names, first.topic)
     ]
-    return parts, _holes(chunks, stretches)
-
-
-def _summary(path: Path) -> Summary | None:
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                return None
-            file.seek(0)
-            return make_reader(file).get_summary()
-    except (McapError, OSError, ValueError, struct.error, MemoryError):
-        return None  # the scan that reads all says what is wrong
-
-
-def _stretches(chunks: Sequence[ChunkIndex]) -> list[range]:
-    """Places of chunks, some in a row, spread evenly from the first to the last."""
-    size = float(np.median([c.uncompressed_size for c in chunks]))
-    together = max(round(STRETCH_BYTES / max(size, 1.0)), 1)
-    last = max(len(chunks) - together, 0)
-    starts = np.unique(np.linspace(0, last, STRETCHES).astype(int)).tolist()
-    return [range(start, min(start + together, len(chunks))) for start in starts]
-
-
-def _holes(chunks: Sequence[ChunkIndex], stretches: list[range]) -> list[tuple[float, float]]:
     inside = {i for stretch in stretches for i in stretch[1:]}
-    begin = chunks[0].message_start_time
-    found = []
+    begin, holes = chunks[0].message_start_time, []
     for i in range(1, len(chunks)):
         before, behind = chunks[i - 1].message_end_time, chunks[i].message_start_time
         if i not in inside and behind > before:
-            found.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
-    return found
-
-
-def _topics(scan: McapScan, summary: Summary) -> dict[str, Topic]:
-    counts = summary.statistics.channel_message_counts if summary.statistics else {}
-    found: dict[str, Topic] = {}
-    for channel in scan.channels.values():
-        before = found[channel.topic].messages if channel.topic in found else 0
-        kind = schema_name(scan, channel)
-        messages = before + counts.get(channel.id, 0)
-        found[channel.topic] = Topic(kind, channel.message_encoding, messages)
-    return dict(sorted(found.items()))
+            holes.append((1e-9 * (before - begin), 1e-9 * (behind - before)))
+    return parts, holes
 
 
 class _Part(McapScan):
@@ -132,22 +105,22 @@ class _Part(McapScan):
         self._made = 0
         for place in self.chosen:
             self._give_back(place)
-            size = self.size - place
-            if size < HEAD or self._data[place] != Opcode.CHUNK:
-                self.sound = False
-                return
-            stop = place + HEAD + RECORD.unpack_from(self._data, place)[1]
-            if stop > self.size:
+            stop = self._end_of(place, Opcode.CHUNK)
+            if not stop:
                 self.sound = False
                 return
             yield from self._chunk(place, stop)
 
-    def note_others(self, summary: Summary) -> None:
+    def note_others(self) -> None:
         """Read metadata and attachments, which the index has the places of."""
-        for kind in (summary.metadata_indexes, summary.attachment_indexes):
-            for index in kind:
-                if 0 < index.offset <= self.size - HEAD:
-                    opcode, length = RECORD.unpack_from(self._data, index.offset)
-                    first = index.offset + HEAD
-                    if opcode in _OTHERS and first + length <= self.size:
-                        self._note(opcode, self._data[first : first + length])
+        for index, opcode in _INDEXED.items():
+            for place in self.others[index]:
+                if stop := self._end_of(place.offset, opcode):
+                    self._note(opcode, self._data[place.offset + HEAD : stop])
+
+    def _end_of(self, place: int, opcode: Opcode) -> int:
+        """Where a whole record there ends; 0 where there is none of that kind."""
+        if place + HEAD > self.size or self._data[place] != opcode:
+            return 0
+        stop = place + HEAD + int(RECORD.unpack_from(self._data, place)[1])
+        return stop if stop <= self.size else 0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from mcap.records import Channel
@@ -12,17 +13,17 @@ from numpy.typing import NDArray
 
 from drivers.files.mcap.records import Region, Scan
 from drivers.files.ros import (
+    IMU_DOUBLES,
+    ODOMETRY_DOUBLES,
     Block,
     Bytes,
     Layout,
     decode_many,
+    parse_doubles,
     parse_dynamic_joint_state,
     parse_franka_robot_state,
     parse_franka_state,
-    parse_imu,
     parse_joint_state,
-    parse_motion,
-    parse_odometry,
 )
 from drivers.files.ros_types import (
     ACCEL_STAMPED,
@@ -45,10 +46,10 @@ _JOINT_PARSERS: dict[str, Callable[[Bytes], Layout]] = {
 JOINT_SCHEMAS = tuple(_JOINT_PARSERS)  # messages with positions, velocities and efforts of joints
 PARSERS: dict[str, Callable[[Bytes], Layout]] = {
     **_JOINT_PARSERS,
-    TWIST_STAMPED: parse_motion,
-    ACCEL_STAMPED: parse_motion,
-    IMU: parse_imu,
-    ODOMETRY: parse_odometry,
+    TWIST_STAMPED: partial(parse_doubles, number=6),
+    ACCEL_STAMPED: partial(parse_doubles, number=6),
+    IMU: partial(parse_doubles, number=IMU_DOUBLES),
+    ODOMETRY: partial(parse_doubles, number=ODOMETRY_DOUBLES, of_child=True),
 }
 
 
@@ -60,9 +61,8 @@ class Series:
         topic, schema: their names; a schema's name without the older spelling's missing `/msg/`.
         encoding: of the messages; only `cdr` is decoded.
         count: messages in the file.
-        places: for each block the (k,) places of its messages in the topic's order.
-        log_ns: for each block the (k,) log times.
         blocks: the decoded messages, by layout.
+        kinds: joints and lengths of the runs of doubles of all that there were.
         bad: (place, reason) of messages that could not be read.
     """
 
@@ -70,9 +70,8 @@ class Series:
     schema: str
     encoding: str
     count: int = 0
-    places: list[NDArray[np.int64]] = field(default_factory=list)
-    log_ns: list[NDArray[np.int64]] = field(default_factory=list)
     blocks: list[Block] = field(default_factory=list)
+    kinds: set[tuple[tuple[str, ...], tuple[int, ...]]] = field(default_factory=set)
     bad: list[tuple[int, str]] = field(default_factory=list)
 
     def add(self, region: Region, which: NDArray[np.int64], times: NDArray[np.int64]) -> None:
@@ -85,44 +84,32 @@ class Series:
             blocks, bad = decode_many(rows, parse)
             for block in blocks:
                 places = here[block.index]
-                self.places.append(self.count + places)
-                self.log_ns.append(times[which[places]])
-                self.blocks.append(block)
+                index, log_ns = self.count + places, times[which[places]]
+                self.blocks.append(replace(block, index=index, log_ns=log_ns))
+                self.kinds.add((block.layout.names, tuple(x.shape[1] for x in block.values)))
             self.bad += [(self.count + int(here[i]), reason) for i, reason in bad]
         self.count += len(which)
 
-    def in_order(self, arrays: list[NDArray]) -> NDArray:
-        """One array from an array for each block, in the order of the file."""
-        joined = np.concatenate(arrays)
-        places = np.concatenate(self.places)
-        if np.all(places[1:] > places[:-1]):
-            return joined
-        return joined[np.argsort(places, kind="stable")]
-
-    def forget(self) -> None:
-        """Drop messages that were taken; an empty block of each kind stays and tells its layout."""
-        kinds: dict[Any, Block] = {}
+    def frames(self) -> Counter[str]:
+        """How many of the decoded messages name each frame."""
+        counts: Counter[str] = Counter()
         for block in self.blocks:
-            widths = tuple(values.shape[1] for values in block.values)
-            empty = tuple(values[:0].copy() for values in block.values)
-            none = np.zeros(0, dtype=np.int64)
-            kinds[block.layout.names, widths] = Block(none, none, block.layout, empty)
-        self.blocks = list(kinds.values())
-        self.places = [np.zeros(0, dtype=np.int64)] * len(kinds)
-        self.log_ns = list(self.places)
+            counts[block.layout.frame_id] += len(block.index)
+        return counts
 
-    def only(self, keep: Callable[[Block], bool]) -> Series:
-        """The blocks that satisfy `keep`."""
-        return self.at([i for i, block in enumerate(self.blocks) if keep(block)])
+    def in_frame(self, frame: str) -> Series:
+        """The messages that name a frame."""
+        blocks = [block for block in self.blocks if block.layout.frame_id == frame]
+        return replace(self, blocks=blocks, count=sum(len(b.index) for b in blocks), bad=[])
 
-    def at(self, chosen: Sequence[int]) -> Series:
-        """The blocks at these places."""
-        part = Series(self.topic, self.schema, self.encoding)
-        part.places = [self.places[i] for i in chosen]
-        part.log_ns = [self.log_ns[i] for i in chosen]
-        part.blocks = [self.blocks[i] for i in chosen]
-        part.count = sum(len(p) for p in part.places)
-        return part
+
+def in_order(blocks: Sequence[Block], of: Callable[[Block], NDArray]) -> NDArray:
+    """What each block has of its messages, in one array in the order of the file."""
+    joined = np.concatenate([of(block) for block in blocks])
+    places = np.concatenate([block.index for block in blocks])
+    if np.all(places[1:] > places[:-1]):
+        return joined
+    return joined[np.argsort(places, kind="stable")]
 
 
 def schema_name(scan: Scan, channel: Channel) -> str:
@@ -154,7 +141,11 @@ def collect(
         times = region.times[:, 0].astype(np.int64)
         if len(times):
             begin, end = begin or int(times.min()), max(end, int(times.max()))
-        for topic, numbers in _by_topic(scan, np.unique(channels)).items():
+        by_topic: dict[str, list[int]] = {}  # a topic with several publishers has several channels
+        for number in np.unique(channels).tolist():
+            known = scan.channels.get(number)
+            by_topic.setdefault(known.topic if known else "", []).append(number)
+        for topic, numbers in by_topic.items():
             which = np.flatnonzero(np.isin(channels, numbers))
             if not topic:
                 unknown += len(which)
@@ -183,15 +174,6 @@ def collect(
         _series(topics, scan, channel)
     for topic, count in scan.passed.items():
         topics[topic].count += count
-    return topics
-
-
-def _by_topic(scan: Scan, numbers: NDArray[np.int64]) -> dict[str, list[int]]:
-    """Channel numbers by topic; a topic with several publishers has several channels."""
-    topics: dict[str, list[int]] = {}
-    for number in numbers.tolist():
-        channel = scan.channels.get(number)
-        topics.setdefault(channel.topic if channel else "", []).append(number)
     return topics
 
 

@@ -14,21 +14,22 @@ import numpy as np
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from drivers.files.messages import Message, encode
-from drivers.files.ros import (
-    CdrError,
+from drivers.files.messages import (
     ImuEncoder,
     JointStateEncoder,
+    Message,
     MotionEncoder,
-    encode_joint_trajectory,
+    encode,
+    header,
 )
+from drivers.files.ros import SECOND_NS, CdrError
 from drivers.files.ros_types import (
     ACCEL_STAMPED,
     IMU,
     JOINT_STATE,
     JOINT_TRAJECTORY,
-    SCHEMAS,
     TWIST_STAMPED,
+    schemas,
 )
 from drivers.interface import Array, DriverError, JointSample, LinkMotion
 
@@ -138,13 +139,17 @@ class McapWriter:
 
     def write_joint_state(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> None:
         """Record (n,) positions, velocities and torques: rad, rad/s, N m."""
-        data = self._encode(self._states, stamp_ns, q, dq, tau)
-        self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
+        self._write_state(JOINT_STATES, self._states, stamp_ns, (q, dq, tau))
 
     def write_trajectory(self, times_ns: NDArray[np.int64], motion: Array) -> None:
         """Write a planned motion as one trajectory: (m,) from its start, (m, 3, n) q, dq, ddq."""
-        data = encode_joint_trajectory(self.joint_names, times_ns, motion)
-        self._add(self._channel(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY), 0, data)
+        points = []
+        for since_ns, rows in zip(times_ns.tolist(), motion, strict=True):
+            after = dict(zip(("sec", "nanosec"), divmod(since_ns, SECOND_NS), strict=True))
+            point = zip(("positions", "velocities", "accelerations"), rows, strict=True)
+            points.append({**dict(point), "effort": (), "time_from_start": after})
+        fields = {"header": header(0), "joint_names": self.joint_names, "points": points}
+        self.write_message(Message(JOINT_TRAJECTORY_TOPIC, JOINT_TRAJECTORY, 0, fields))
 
     def write_links(self, stamp_ns: int, links: LinkMotion) -> None:
         """Record the measured motion of the links, in the order of `link_names`.
@@ -174,26 +179,22 @@ class McapWriter:
 
     def write_command(self, stamp_ns: int, tau: Array) -> None:
         """Record (n,) commanded joint torques, N m."""
-        data = self._encode(self._commands, stamp_ns, tau, tau, tau)
-        self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
+        self._write_state(JOINT_COMMANDS, self._commands, stamp_ns, (tau, tau, tau))
 
     def write_position(self, stamp_ns: int, q: Array) -> None:
         """Record (n,) positions of an arm that tells nothing else, rad."""
-        data = self._encode(self._positions, stamp_ns, q, q, q)
-        self._add(self._channel(JOINT_STATES, JOINT_STATE), stamp_ns, data)
+        self._write_state(JOINT_STATES, self._positions, stamp_ns, (q, q, q))
 
     def write_position_command(self, stamp_ns: int, q: Array) -> None:
         """Record (n,) commanded joint positions, rad."""
-        data = self._encode(self._positions, stamp_ns, q, q, q)
-        self._add(self._channel(JOINT_COMMANDS, JOINT_STATE), stamp_ns, data)
+        self._write_state(JOINT_COMMANDS, self._positions, stamp_ns, (q, q, q))
 
     def write_external(self, stamp_ns: int, tau: Array) -> None:
         """Record (n,) torques that the surroundings put on the joints, N m."""
-        data = self._encode(self._commands, stamp_ns, tau, tau, tau)
-        self._add(self._channel(EXTERNAL_TORQUES, JOINT_STATE), stamp_ns, data)
+        self._write_state(EXTERNAL_TORQUES, self._commands, stamp_ns, (tau, tau, tau))
 
     def write_message(self, message: Message) -> None:
-        """Record a message of any type that `ros_types.SCHEMAS` defines."""
+        """Record a message of any type that `ros_types.schemas` defines."""
         try:
             data = encode(message.schema, message.fields)
         except CdrError as error:
@@ -236,27 +237,26 @@ class McapWriter:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _encode(
-        self, encoder: JointStateEncoder, stamp_ns: int, q: Array, dq: Array, tau: Array
-    ) -> bytes:
+    def _write_state(
+        self, topic: str, encoder: JointStateEncoder, stamp_ns: int, signals: tuple[Array, ...]
+    ) -> None:
         try:
-            return encoder.encode(stamp_ns, q, dq, tau)
+            data = encoder.encode(stamp_ns, *signals)
         except CdrError as error:
             raise DriverError(f"{self.path}: sample of {stamp_ns} ns: {error}") from error
+        self._add(self._channel(topic, JOINT_STATE), stamp_ns, data)
 
     def _channel(self, topic: str, schema: str, latched: bool = False) -> int:
         number = self._channels.get(topic)
         if number is None:
+            if schema not in self._schemas:
+                text = schemas()[schema].encode()
+                self._schemas[schema] = self._writer.register_schema(schema, "ros2msg", text)
             offered = {"offered_qos_profiles": LATCHED_QOS if latched else STREAM_QOS}
-            number = self._writer.register_channel(topic, "cdr", self._schema(schema), offered)
+            of = self._schemas[schema]
+            number = self._writer.register_channel(topic, "cdr", of, offered)
             self._channels[topic] = number
         return number
-
-    def _schema(self, name: str) -> int:
-        if name not in self._schemas:
-            text = SCHEMAS[name].encode()
-            self._schemas[name] = self._writer.register_schema(name, "ros2msg", text)
-        return self._schemas[name]
 
     def _add(self, channel: int, stamp_ns: int, data: bytes) -> None:
         # Log times cannot be negative; the header stamp keeps what the arm said.
