@@ -1,10 +1,14 @@
-"""When a served arm ends: at SIGTERM or SIGINT, or when its time is over."""
+"""How a served arm ends: at SIGTERM or SIGINT, or when its time is over, with a summary."""
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 
 class Ending:
@@ -33,3 +37,11 @@ class Ending:
     def is_set(self) -> bool:
         """Whether to end."""
         return self._event.is_set() or (self._end is not None and time.monotonic() >= self._end)
+
+
+def sum_up(summary: Mapping[str, Any], lines: str | None, path: Path | None) -> None:
+    """Say what happened, in these lines or one for each number, and write it where wanted."""
+    print(lines or "\n".join(f"{key}: {value}" for key, value in summary.items()), flush=True)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(summary, indent=1) + "\n", "utf-8")

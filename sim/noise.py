@@ -109,7 +109,8 @@ class _JointNoise:
 
     def __init__(self, levels: NoiseLevels, n: int) -> None:
         white, band = _torque_parts(levels)
-        whole = 1 / np.sqrt(_share_above())
+        above = 1.0 - HIGH_HZ / (RATE_HZ / 2)  # share of white noise's power above 50 Hz: 0.9
+        whole = 1 / np.sqrt(above)
         dq, q = (whole * np.asarray(x) for x in (levels.dq_above_50hz, levels.q_above_50hz))
         self._white = np.stack([np.broadcast_to(x, n) for x in (white, dq, q)])
         self._band = _Band(np.broadcast_to(band, n))
@@ -154,11 +155,6 @@ def band_response() -> tuple[Array, NDArray[np.complex128]]:
     normal = (s * s + low * high) / (s * (high - low))
     inner = 1.0 / (normal * normal + np.sqrt(2.0) * normal + 1.0)
     return f, np.concatenate(([0.0], inner, [0.0]))
-
-
-def _share_above() -> float:
-    """Share of white noise's power above 50 Hz: 0.9."""
-    return 1.0 - HIGH_HZ / (RATE_HZ / 2)
 
 
 def _torque_parts(levels: NoiseLevels) -> tuple[Array, Array]:

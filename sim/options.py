@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from drivers.errors import choices
@@ -92,18 +93,31 @@ def options_of(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def add_scenario(
+def add_served(
     parser: argparse.ArgumentParser,
+    faults: str,
     of_set: str = "as in noise=none",
     default: str = DEFAULT_SCENARIO,
 ) -> None:
-    """Declare which arm is simulated: `--scenario`, `--set` (told more of), `--seed`."""
+    """Declare what every served arm is asked for: which one, its faults, how long, a summary.
+
+    Args:
+        parser: of its options.
+        faults: there are, one line each, below what they begin with.
+        of_set: more about `--set`.
+        default: scenario.
+    """
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = f"faults, NAME[=VALUE][@SECONDS]{faults}"
     add = parser.add_argument
     words = f"{', '.join(SCENARIOS)}; {default} by default"
     add("--scenario", default=default, metavar="NAME", help=words)
     words = f"option of the scenario, {of_set}"
     add("--set", action="append", default=[], metavar="KEY=VALUE", help=words)
     add("--seed", type=int, default=0, help="of the arm, noise and faults")
+    add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
+    add("--duration", type=float, metavar="S", help="end after so many seconds")
+    add("--json", type=Path, metavar="FILE", help="write the summary there as well")
 
 
 def _size(name: str, key: str, value: Any) -> float:

@@ -7,7 +7,7 @@ crosstalk, bent curve, gain and offset, deadband, low-pass, and last the delay o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.signal import cont2discrete, lfilter, lfilter_zi
@@ -20,57 +20,37 @@ DIRECTION_WIDTH = 0.01  # rad/s, below it the motor pushes neither way in full
 
 
 def encoded(
-    effects: Sequence[Effect], t: Array | float, q: Array, dq: Array, twisting: tuple[Array, Array]
+    effects: Sequence[Effect], t: float, q: Array, dq: Array, twisting: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """What the encoders read.
 
     Args:
         effects: any; those of encoders count, play aside.
-        t: s, a number or (m, 1).
-        q: (n,) or (m, n) link angle plus play, rad.
-        dq: its velocity, rad/s.
-        twisting: joint torque and its rate, like q, N m and N m/s.
+        t: s.
+        q: (n,) link angle plus play, rad.
+        dq: (n,) its velocity, rad/s.
+        twisting: joint torque and its rate, (n,) each, N m and N m/s.
 
     Returns:
         Measured q and dq.
     """
-    q, dq = q + _twist(effects, t, twisting[0]), dq + _twist(effects, t, twisting[1])
-    add_q, add_dq = np.zeros_like(q), np.zeros_like(q)
-    for effect, j, on in _encoder_terms(effects, t, q.shape[-1]):
-        if effect.name == "encoder_offset":
-            add_q[..., j] += on * effect.number("o")
-        else:
-            angle = q[..., j] + effect.number("phase")
-            add_q[..., j] += on * effect.number("a") * np.sin(angle)
-            add_dq[..., j] += on * effect.number("a") * np.cos(angle) * dq[..., j]
-    return q + add_q, dq + add_dq
-
-
-def _twist(effects: Sequence[Effect], t: Array | float, tau: Array) -> Array:
-    """tau / k of the elastic joints, zero on the others."""
-    out = np.zeros_like(tau)
-    for effect in effects:
+    told_q, told_dq = q.copy(), dq.copy()
+    acting = [effect for effect in effects if effect.acts(t)]
+    for effect in acting:
         if effect.name == "joint_elasticity":
-            for j in effect.columns(tau.shape[-1]):
-                out[..., j] += _on(effect, t) * tau[..., j] / effect.number("k")
-    return out
-
-
-def _encoder_terms(
-    effects: Sequence[Effect], t: Array | float, n: int
-) -> Iterator[tuple[Effect, int, Array | float]]:
-    """Offsets and ripples: effect, joint from 0, where in time it acts (0 or 1)."""
-    for effect in effects:
-        if effect.name in ("encoder_offset", "encoder_ripple"):
-            for j in effect.columns(n):
-                yield effect, j, _on(effect, t)
-
-
-def _on(effect: Effect, t: Array | float) -> Array | float:
-    """1 where an effect acts, else 0; (m,) for t (m, 1)."""
-    if np.ndim(t):
-        return np.asarray(effect.acts(np.ravel(np.asarray(t))), float)
-    return float(effect.acts(t))
+            columns = effect.columns(len(q))
+            told_q[columns] += twisting[0][columns] / effect.number("k")
+            told_dq[columns] += twisting[1][columns] / effect.number("k")
+    twisted_q, twisted_dq = told_q.copy(), told_dq.copy()
+    for effect in acting:
+        columns, size = effect.columns(len(q)), effect.number("a")
+        if effect.name == "encoder_offset":
+            told_q[columns] += effect.number("o")
+        elif effect.name == "encoder_ripple":
+            angle = twisted_q[columns] + effect.number("phase")
+            told_q[columns] += size * np.sin(angle)
+            told_dq[columns] += size * np.cos(angle) * twisted_dq[columns]
+    return told_q, told_dq
 
 
 class Play:

@@ -1,4 +1,4 @@
-"""A truth written as URDF text, in the form that PyBullet reads without loss.
+"""A truth written as URDF text, without loss.
 
 PyBullet keeps only the diagonal of an inertia tensor, so every inertial frame is turned into
 the principal axes of its body. Joints are `continuous`: PyBullet's own joint stops would push
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim.truth import Array, Truth, body_of, to_rpy
+from sim.truth import Array, Limits, Truth, body_of, to_rpy
 
 
 def urdf(truth: Truth) -> str:
@@ -18,7 +18,8 @@ def urdf(truth: Truth) -> str:
     parent = "base"
     for j, name in enumerate(truth.link_names):
         parts.append(link_text(name, *body_of(truth.theta[j])))
-        parts.append(joint_text(truth.joint_names[j], parent, name, truth.p[j], truth.R[j]))
+        place = truth.p[j], truth.R[j]
+        parts.append(joint_text(truth.joint_names[j], (parent, name), place))
         parent = name
     return "\n".join([*parts, "</robot>"])
 
@@ -31,12 +32,9 @@ def principal(inertia: Array) -> tuple[Array, Array]:
     return moments, axes
 
 
-def _numbers(values: Array | tuple[float, ...]) -> str:
-    return " ".join(repr(float(v)) for v in values)
-
-
 def _origin(p: Array, R: Array) -> str:
-    return f'<origin xyz="{_numbers(p)}" rpy="{_numbers(to_rpy(R))}"/>'
+    place, turned = (" ".join(repr(float(x)) for x in part) for part in (p, to_rpy(R)))
+    return f'<origin xyz="{place}" rpy="{turned}"/>'
 
 
 def link_text(name: str, m: float, com: Array, inertia: Array) -> str:
@@ -49,9 +47,25 @@ def link_text(name: str, m: float, com: Array, inertia: Array) -> str:
     )
 
 
-def joint_text(name: str, parent: str, child: str, p: Array, R: Array) -> str:
-    """A joint at p (3,) m, turned by R (3, 3), about its own z."""
+def joint_text(
+    name: str, links: tuple[str, str], place: tuple[Array, Array], more: str | None = None
+) -> str:
+    """A joint about its own z, between a parent and a child.
+
+    Args:
+        name: of the joint; links: of the two.
+        place: (3,) m and turn (3, 3) of the joint in its parent.
+        more: elements of a joint with limits; it turns without end where None.
+    """
+    kind = "continuous" if more is None else "revolute"
     return (
-        f'<joint name="{name}" type="continuous">{_origin(p, R)}<parent link="{parent}"/>'
-        f'<child link="{child}"/><axis xyz="0 0 1"/></joint>'
+        f'<joint name="{name}" type="{kind}">{_origin(*place)}<parent link="{links[0]}"/>'
+        f'<child link="{links[1]}"/><axis xyz="0 0 1"/>{more or ""}</joint>'
     )
+
+
+def limit_text(limits: Limits, j: int) -> str:
+    """The limits of joint j, from 0."""
+    keys = "lower", "upper", "velocity", "effort"
+    said = " ".join(f'{key}="{float(getattr(limits, key)[j])!r}"' for key in keys)
+    return f"<limit {said}/>"

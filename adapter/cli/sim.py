@@ -25,17 +25,17 @@ ARMS = {
     "fci": Served(
         "a Franka robot: FCI protocol 5 (Panda, FER) or 10 (FR3), on 127.0.0.1",
         "sim.fci.options",
-        "sim.fci.command",
+        "sim.fci.server",
     ),
     "can": Served(
         "an arm of Damiao motors in MIT mode, on a python-can bus",
         "sim.damiao.options",
-        "sim.damiao.command",
+        "sim.damiao.server",
     ),
     "ros2": Served(
         "an arm behind ros2_control: joint states and an effort controller, over DDS on loopback",
         "sim.ros2.options",
-        "sim.ros2.command",
+        "sim.ros2.arm",
     ),
 }
 

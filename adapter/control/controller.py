@@ -348,17 +348,12 @@ class ExcitationController:
             if model.ready:
                 self._fade_s = min(self._fade_s + dt_s, FADE_S)
                 share = smooth_step(self._fade_s / FADE_S)[0]
-                tau += share * self._of_model(model, ref)
+                whole = model(ref.q, ref.dq, ref.ddq)
+                tau += share * (whole - model.unbent(ref.q) if self._adds_gravity else whole)
         if share < 1.0:
             tau += (1.0 - share) * self._bias
         if ref.time_s >= self.motion.start_s and share in (0.0, 1.0):
             (self._with_model if share else self._feedback_only).add(error)
-        return tau
-
-    def _of_model(self, model: Feedforward, ref: PathMotion) -> Array:
-        tau = model(ref.q, ref.dq, ref.ddq)
-        if self._adds_gravity:
-            tau = tau - model.unbent(ref.q)
         return tau
 
     def tracking(self) -> dict[str, Any]:

@@ -161,48 +161,31 @@ def plan_lines(
     fastest = limits.speed_between(lower, upper)
     width = max(len(name) for name in joint_names)
     moving = int(np.count_nonzero(speed))
-    lines = [f"This moves {moving} joints, {_until(duration_s, settings.stop_s)}."]
+    until = f"until somebody stops it (it comes to rest within {settings.stop_s:g} s)"
+    if duration_s is not None:
+        until = f"for {duration_s:g} s and {settings.stop_s:g} s of coming to rest"
+    lines = [f"This moves {moving} joints, {until}."]
     if settings.slow_s:
         lines.append(
             f"The first {settings.slow_s:g} s go at {settings.slow_share:.0%} of the speed, "
             f"then within {settings.start_s:g} s to all of it."
         )
     for j, name in enumerate(joint_names):
+        low, high = limits.lower[j], limits.upper[j]
+        room = "its limits are not documented"
+        if np.isfinite(low) and np.isfinite(high):
+            margin = min(lower[j] - low, high - upper[j])
+            room = f"limits {low:+.3f} .. {high:+.3f}, margin {margin:.3f} rad"
+        fast = f"up to {speed[j]:.3f}"
+        if settings.slow_s:
+            fast = f"at first {settings.slow_share * speed[j]:.3f}, then {speed[j]:.3f}"
         lines.append(
             f"{name:{width}}  {lower[j]:+.3f} .. {upper[j]:+.3f} rad "
             f"({math.degrees(lower[j]):+.1f} .. {math.degrees(upper[j]):+.1f} deg; "
-            f"{_range_of(limits.lower[j], limits.upper[j], lower[j], upper[j])}), "
-            f"{_speeds(speed[j], settings.slow_s, settings.slow_share)} rad/s "
-            f"({_share(speed[j], fastest[j])} of {fastest[j]:.4g})"
+            f"{room}), {fast} rad/s ({speed[j] / fastest[j]:.0%} of {fastest[j]:.4g})"
         )
     lines.append(
-        f"At most {_worst(acceleration, limits.acceleration)} of the documented acceleration and "
-        f"{_worst(jerk, limits.jerk)} of the jerk of any joint."
+        f"At most {np.max(acceleration / limits.acceleration):.0%} of the documented acceleration "
+        f"and {np.max(jerk / limits.jerk):.0%} of the jerk of any joint."
     )
     return [*lines, HOW_TO_STOP]
-
-
-def _until(duration_s: float | None, stop_s: float) -> str:
-    if duration_s is None:
-        return f"until somebody stops it (it comes to rest within {stop_s:g} s)"
-    return f"for {duration_s:g} s and {stop_s:g} s of coming to rest"
-
-
-def _range_of(low: float, high: float, lower: float, upper: float) -> str:
-    if not (np.isfinite(low) and np.isfinite(high)):
-        return "its limits are not documented"
-    return f"limits {low:+.3f} .. {high:+.3f}, margin {min(lower - low, high - upper):.3f} rad"
-
-
-def _speeds(speed: float, slow_s: float, slow_share: float) -> str:
-    return (
-        f"at first {slow_share * speed:.3f}, then {speed:.3f}" if slow_s else f"up to {speed:.3f}"
-    )
-
-
-def _share(value: float, limit: float) -> str:
-    return f"{value / limit:.0%}"
-
-
-def _worst(values: Array, limits: Array) -> str:
-    return f"{np.max(values / limits):.0%}"

@@ -115,7 +115,10 @@ class ArmInCell:
         self._shapes = [self._shape(body) for body in self.bodies]
         self._request = self._coal.DistanceRequest()
         self._pairs = [*self._own_pairs(), *self._cell_pairs()]
-        self._check_allowed()
+        names = {name for pair in self._pairs for name in pair.names}
+        for name in (name for pair in cell.allowed for name in pair):
+            if name not in names:
+                raise SettingsError(f"cell.allowed: no '{name}'; have: {', '.join(sorted(names))}")
         self.ignored = self._joined()
         allowed = {frozenset(pair) for pair in (*cell.allowed, *self.ignored)}
         self._pairs = [pair for pair in self._pairs if frozenset(pair.names) not in allowed]
@@ -207,18 +210,6 @@ class ArmInCell:
         triangles.extend([self._coal.Triangle(*row) for row in mesh.triangles.tolist()])
         return points, triangles
 
-    def _surface(self, file: str, scale: float) -> Any:
-        """A tree of bounding volumes over the triangles of a file."""
-        try:
-            mesh = read_mesh(file, (scale,))
-        except ValueError as error:
-            raise SettingsError(f"cell.mesh: {error}") from None
-        tree = self._coal.BVHModelOBBRSS()
-        tree.beginModel(len(mesh.triangles), len(mesh.corners))
-        tree.addSubModel(*self._listed(mesh))
-        tree.endModel()
-        return tree
-
     def _placed(self, k: int) -> Any:
         _, turn, place = self._shapes[k]
         link = self.bodies[k].link
@@ -291,8 +282,16 @@ class ArmInCell:
             place = coal.Transform3s(matrix_from_rpy(pillar.rpy), np.array(pillar.xyz))
             things.append((pillar.name, coal.Cylinder(pillar.radius, pillar.length), place))
         for mesh in cell.mesh:
+            try:
+                surface = read_mesh(mesh.file, (mesh.scale,))
+            except ValueError as error:
+                raise SettingsError(f"cell.mesh: {error}") from None
+            tree = coal.BVHModelOBBRSS()  # of bounding volumes over its triangles
+            tree.beginModel(len(surface.triangles), len(surface.corners))
+            tree.addSubModel(*self._listed(surface))
+            tree.endModel()
             place = coal.Transform3s(matrix_from_rpy(mesh.rpy), np.array(mesh.xyz))
-            things.append((mesh.name, self._surface(mesh.file, mesh.scale), place))
+            things.append((mesh.name, tree, place))
         for wall in cell.plane:
             length = float(np.linalg.norm(wall.normal))
             normal = np.array(wall.normal) / length
@@ -326,12 +325,6 @@ class ArmInCell:
             link = self.model.tree.parent[link]
             levers[link] = far
         return levers
-
-    def _check_allowed(self) -> None:
-        names = {name for pair in self._pairs for name in pair.names}
-        for name in (name for pair in self.cell.allowed for name in pair):
-            if name not in names:
-                raise SettingsError(f"cell.allowed: no '{name}'; have: {', '.join(sorted(names))}")
 
     def _joined(self) -> list[tuple[str, str]]:
         """Pairs of links that are near in nearly every pose, whatever the joints do."""

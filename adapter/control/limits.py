@@ -42,8 +42,15 @@ class MotionLimits:
 
         Of an arm that is known by name the vendor's limits hold, too.
         """
-        n, known = model.tree.n, facts_of(model)
-        limits = model.limits if known is None else _tighter(model.limits, known.model.limits)
+        n, known, limits = model.tree.n, facts_of(model), model.limits
+        if known is not None:
+            vendor = known.model.limits  # fmax and fmin: one's number where the other has none
+            limits = Limits(
+                np.fmax(limits.lower, vendor.lower),
+                np.fmin(limits.upper, vendor.upper),
+                np.fmin(limits.velocity, vendor.velocity),
+                np.fmin(limits.effort, vendor.effort),
+            )
         return cls(
             limits.lower,
             limits.upper,
@@ -68,16 +75,6 @@ class MotionLimits:
             return self.velocity
         speed: Array = np.minimum(self.velocity, by_position.between(low, high))
         return speed
-
-
-def _tighter(one: Limits, other: Limits) -> Limits:
-    """What keeps both; one's number where the other has none."""
-    return Limits(
-        np.fmax(one.lower, other.lower),
-        np.fmin(one.upper, other.upper),
-        np.fmin(one.velocity, other.velocity),
-        np.fmin(one.effort, other.effort),
-    )
 
 
 def need_complete(model: SelfModel) -> None:

@@ -93,7 +93,8 @@ def file_of(name: str, folder: str) -> Path:
         above = [here, *here.parents][:LEVELS]
         places = [at for at in above if at.name == package] + [at / package for at in above]
         listed = os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)
-        places += [at for part in filter(None, listed) for at in _of_listed(Path(part), package)]
+        for at in map(Path, filter(None, listed)):  # a package, or the folder of packages
+            places += [at, at / package] if at.name == package else [at / package]
         for root in places:
             if (found := root / rest).is_file():
                 return _inside(found, root, name)
@@ -107,11 +108,6 @@ def file_of(name: str, folder: str) -> Path:
     if not found.is_file():
         raise ValueError(f"{name}: no such file beside the URDF")
     return found
-
-
-def _of_listed(at: Path, package: str) -> list[Path]:
-    """Where a package may be that ROS_PACKAGE_PATH lists, or whose folder it lists."""
-    return [at, at / package] if at.name == package else [at / package]
 
 
 def _inside(found: Path, root: Path, name: str) -> Path:

@@ -45,11 +45,14 @@ class PushBound:
 
     def lines(self) -> list[str]:
         """For the person beside the arm."""
+        worst = f"{self.most:.0f} N for the worst"
+        if not self.most < NO_PUSH_N:
+            worst = "no push does in the worst"
         each, left = (", ".join(f"{x:.3g}" for x in row) for row in (self.joints, self.left))
         return [
             f"A push ends it within 0.05 s from {each} N m on a joint that the model does not "
             f"expect: at the hand from {self.middle:.0f} N for half of all directions and poses on "
-            f"the way, {_worst(self.most)}.",
+            f"the way, {worst}.",
             f"Once stopped the joints push with at most {left} N m.",
         ]
 
@@ -61,7 +64,9 @@ def push_bound(
     joints = safety.external_share * limits.effort
     frames, n = frames_of(model.tree.parent, model.lam), model.tree.n
     R, o = np.empty((n, 3, 3)), np.empty((n, 3))
-    ways, forces = _directions(), []
+    z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
+    angle, radius, forces = GOLDEN_ANGLE * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2), []
+    ways = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
     for s in np.linspace(0.0, LOOKED_S, POSES):
         place_frames(frames, motion.path(s)[0], R, o)
         felt, j = np.zeros((n, len(ways))), n - 1
@@ -73,14 +78,3 @@ def push_bound(
     force = np.concatenate(forces)
     left = left_at_most(limits.effort)
     return PushBound(joints, float(np.median(force)), float(force.max()), left)
-
-
-def _directions() -> Array:
-    """(k, 3) unit vectors, spread evenly."""
-    z = 1.0 - (2.0 * np.arange(DIRECTIONS) + 1.0) / DIRECTIONS
-    angle, radius = GOLDEN_ANGLE * np.arange(DIRECTIONS), np.sqrt(1.0 - z**2)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
-
-
-def _worst(force: float) -> str:
-    return f"{force:.0f} N for the worst" if force < NO_PUSH_N else "no push does in the worst"

@@ -73,7 +73,10 @@ class CarriedWeight:
     def begin(self, q: Array, tau: Array) -> None:
         """Find the load of an arm that holds tau (n,) N m at rest at q (n,) rad."""
         said = self._plain.unbent(q)
-        hands, columns = _load_columns(self._model, q)
+        n, still = len(q), np.zeros((1, len(q)))
+        Y = RigidArm.of(self._model).regressor(q[None], still, still)[0].reshape(n, n, 10)
+        hands = [link for link in range(n) if link not in self._model.tree.parent]
+        columns = Y[:, hands, :4].reshape(n, -1)  # per kg and kg m of a load on each hand
         load = _best_load(tau - said, columns, self._band, self._heaviest)
         theta = self._model.theta.copy()
         theta[hands, :4] += load.reshape(-1, 4)
@@ -103,14 +106,6 @@ class CarriedWeight:
             "lean on something, is it another robot (--robot), mounted otherwise (--gravity X Y Z) "
             "or carrying more ([tool] in --config)? --trust-model moves it all the same"
         )
-
-
-def _load_columns(model: SelfModel, q: Array) -> tuple[list[int], Array]:
-    """Links that carry no other, and torque (n, 4 hands) per kg and kg m of a load on each."""
-    n, still = model.tree.n, np.zeros((1, model.tree.n))
-    Y = RigidArm.of(model).regressor(q[None], still, still)[0].reshape(n, n, 10)
-    hands = [link for link in range(n) if link not in model.tree.parent]
-    return hands, Y[:, hands, :4].reshape(n, -1)
 
 
 def _best_load(wanted: Array, loads: Array, band: Array, heaviest: float) -> Array:

@@ -240,15 +240,11 @@ class ArmWatch:
         if cause >= 0:
             raise ControlError(self._said(Cause(cause), j))
         if calm and self._agreed_s <= self._settings.rise_s:
-            self._rise(dt_s)
+            self._agreed_s += dt_s  # more effort after so long as expected; in the end, all of it
+            share = min(self._agreed_s / max(self._settings.rise_s, dt_s), 1.0)
+            self._bounds[0] = (1.0 - share) * self._start + 2.0 * share * self._bounds[1]
         out: Array = self.now[Now.COMMAND].copy()
         return out
-
-    def _rise(self, dt_s: float) -> None:
-        """More effort after so long a motion as expected; in the end, all of it."""
-        self._agreed_s += dt_s
-        share = min(self._agreed_s / max(self._settings.rise_s, dt_s), 1.0)
-        self._bounds[0] = (1.0 - share) * self._start + 2.0 * share * self._bounds[1]
 
     def _said(self, cause: Cause, j: int) -> str:
         now = self.now[:, j]

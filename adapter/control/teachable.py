@@ -74,7 +74,8 @@ def teachable(log: Log, model: SelfModel) -> Teachable:
 
 def _missing(names: tuple[str, ...], dq: Array, moved: Array, std: Array) -> list[str]:
     fastest = np.abs(dq).max(axis=0)
-    turns = [_reversals(dq[:, j]) for j in range(len(names))]
+    ways = [np.sign(speed[np.abs(speed) > RESTS]) for speed in dq.T]
+    turns = [int((way[1:] != way[:-1]).sum()) for way in ways]
     resting = [name for name, speed in zip(names, fastest, strict=True) if speed < RESTS]
     one_way = [n for n, k in zip(names, turns, strict=True) if k < REVERSALS and n not in resting]
     slow = [
@@ -95,11 +96,6 @@ def _missing(names: tuple[str, ...], dq: Array, moved: Array, std: Array) -> lis
             f"too slow, torque of motion below the noise: {', '.join(slow)}; inertias hardly show"
         )
     return said
-
-
-def _reversals(dq: Array) -> int:
-    way = np.sign(dq[np.abs(dq) > RESTS])
-    return int((way[1:] != way[:-1]).sum())
 
 
 def _smoothed(log: Log) -> tuple[list[Array], float]:

@@ -1,4 +1,4 @@
-"""The contact observer beside a live learner: it follows the estimate that is published."""
+"""Whoever in the loop goes on with the estimate that a live learner publishes."""
 
 from __future__ import annotations
 
@@ -6,11 +6,39 @@ from collections.abc import Sequence
 
 from adapter.control.observer import ContactObserver
 from adapter.model.spatial import Array
-from adapter.realtime.estimates import EstimateFollower
-from adapter.realtime.snapshot import ExternalTorque, SnapshotWriter
+from adapter.realtime.snapshot import ExternalTorque, Snapshot, SnapshotReader, SnapshotWriter
 from drivers.interface import JointSample
 
 REFRESH_TICKS = 500  # an estimate taken over costs some 0.2 ms
+
+
+class EstimateFollower:
+    """Follows the estimate that a learner publishes; attach it when the snapshot exists."""
+
+    def __init__(self) -> None:
+        self._reader: SnapshotReader | None = None
+        self._version = 0
+
+    def attach(self, name: str) -> None:
+        """Follow the estimate of this name from now on. Raises SnapshotError."""
+        self.detach()
+        self._reader = SnapshotReader(name)
+
+    def detach(self) -> None:
+        """Follow no longer; what was read last stays."""
+        if self._reader is not None:
+            self._reader.close()
+        self._reader = None
+
+    def new_estimate(self) -> Snapshot | None:
+        """An estimate that has converged and was not handed out before; None without one."""
+        if self._reader is None:
+            return None
+        found = self._reader.read()
+        if found.version == self._version or not (found.lam_converged and found.theta_converged):
+            return None
+        self._version = found.version
+        return found
 
 
 class FollowingObserver(EstimateFollower):

@@ -17,7 +17,7 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of, regressors
-from adapter.realtime.estimates import EstimateFollower
+from adapter.realtime.following import EstimateFollower
 
 LOAD_SHARE, LOAD_OFF_M = 0.25, 0.15  # of the arm's own mass, at the last link; off its origin
 FRICTION_SHARE = 0.1  # of the effort limit

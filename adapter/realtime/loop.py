@@ -186,7 +186,11 @@ def run_live(
     options, jobs = options or LiveOptions(), jobs or Jobs()
     if controller is not None and not driver.can_move:
         raise DriverError("this source cannot move; run it in passive mode")
-    tell = _without_fail(say)
+
+    def tell(line: str) -> None:
+        with suppress(OSError):  # a terminal that is gone is no reason to drop an arm
+            say(line)
+
     deadman = Deadman() if options.deadman else None
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignals())
@@ -228,21 +232,11 @@ def run_live(
                 controller.detach()
             if options.observer is not None:
                 options.observer.detach()
-            if session is not None:
-                supervisor.note_end(session.ended, session.fault)
+            if session is not None and supervisor.loop_board is not None:
+                supervisor.loop_board.write_end(session.ended, session.fault)
             collected = supervisor.finish(hurry=lambda: stop.count > 2)
         tracking = None if controller is None else controller.tracking()
         return loop.result(real_time.grants, collected, tracking)
-
-
-def _without_fail(say: Callable[[str], None]) -> Callable[[str], None]:
-    """The same, but for a terminal that is gone: no reason to drop an arm."""
-
-    def tell(line: str) -> None:
-        with suppress(OSError):
-            say(line)
-
-    return tell
 
 
 def _prepare(
@@ -261,19 +255,15 @@ def _prepare(
             controller.prepare(sample)
 
     sample = session.get_ready(prepare)
-    _warm_up(copy.deepcopy(front_end), sample, driver.period_ns)
-    if driver.paced:  # time went by; what was read first may be far behind
-        session.get_ready(prepare)
-
-
-def _warm_up(front_end: FrontEndLike, sample: JointSample, period_ns: int) -> None:
-    """Show a copy of the front end some motion around this sample, so that all is compiled."""
+    shown = copy.deepcopy(front_end)  # some motion around this sample, so that all is compiled
     for k in range(1, WARM_UP_TICKS):
-        angle = WARM_UP_RATE * 1e-9 * period_ns * k
+        angle = WARM_UP_RATE * 1e-9 * driver.period_ns * k
         q = sample.q + WARM_UP_REACH * np.sin(angle)
         dq = np.full(q.shape, WARM_UP_REACH * WARM_UP_RATE * np.cos(angle))
-        stamp_ns = sample.stamp_ns + k * period_ns
-        front_end.step(replace(sample, stamp_ns=stamp_ns, q=q, dq=dq))
+        stamp_ns = sample.stamp_ns + k * driver.period_ns
+        shown.step(replace(sample, stamp_ns=stamp_ns, q=q, dq=dq))
+    if driver.paced:  # time went by; what was read first may be far behind
+        session.get_ready(prepare)
 
 
 class _Loop:
@@ -311,7 +301,9 @@ class _Loop:
                 session.begin_stop(Ended.INTERRUPTED)
             if ticks % LOOK_EVERY == 0:
                 self._supervisor.look_after()
-                self._supervisor.note_missed(self._clock.missed, self._clock.missed_own)
+                if self._supervisor.loop_board is not None:
+                    missed = self._clock.missed, self._clock.missed_own
+                    self._supervisor.loop_board.count_missed(*missed)
                 if self._deadman is not None and self._deadman.gone():
                     session.begin_stop(Ended.OPERATOR_GONE)
                 if wall_s is not None and time.monotonic() - begin > wall_s:

@@ -68,11 +68,6 @@ def _compile(size: int) -> None:
     set_after(header, TAIL, 1)
 
 
-def ring_bytes(size: int, rows: int) -> int:
-    """Shared memory of a ring, bytes."""
-    return HEADER_BYTES + 8 * size * rows
-
-
 def affordable_rows(sizes: tuple[int, ...], rows: int) -> int:
     """Rows that rings of these record sizes can have in the shared memory that is free."""
     free = free_bytes()
@@ -102,7 +97,7 @@ class Ring:
         """An empty ring of `rows` records of `size` float64. Raises SharedMemoryError."""
         if size < 1 or rows < 1:
             raise ValueError(f"a ring needs records and rows of at least 1, got {size}, {rows}")
-        ring = cls(SharedBlock.create(ring_bytes(size, rows)), size, rows)
+        ring = cls(SharedBlock.create(HEADER_BYTES + 8 * size * rows), size, rows)
         ring._header[ROWS], ring._header[SIZE] = rows, size
         _compile(size)
         return ring

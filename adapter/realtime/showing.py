@@ -97,8 +97,10 @@ class DisplayTask:
         try:
             show = self.job.make()
             port.ready()
-            if self.job.idle:
-                yield_to_all()  # threads that begin later inherit it
+            if self.job.idle:  # threads that begin later inherit it
+                with suppress(OSError, AttributeError):  # as far as the system lets
+                    os.nice(19)
+                    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
             looker = Looker(ring, reader, board)
             done = False
             while not done:
@@ -159,10 +161,3 @@ def newer(before: T, read: Callable[[], T]) -> T:
     with suppress(SnapshotError):
         return read()
     return before
-
-
-def yield_to_all() -> None:
-    """Run only where nobody else wants the processor, as far as the system lets."""
-    with suppress(OSError, AttributeError):
-        os.nice(19)
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

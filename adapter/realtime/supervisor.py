@@ -255,26 +255,12 @@ class Supervisor:
             self.view.look_after()
 
     def _tell(self, line: str) -> None:
+        """Say a line, or let the display do so where it is there and says lines itself."""
         self.troubles.append(line)
-        if not self._display_says(line):
-            self._say(line)
-
-    def _display_says(self, line: str) -> bool:
-        """Whether the display has the line said, where it is there and says lines itself."""
         job, shown, board = self._jobs.display, self.display, self.loop_board
-        if job is None or not job.says or shown is None or board is None:
-            return False
-        return shown.alive and board.write_line(line)
-
-    def note_missed(self, missed: int, own: int) -> None:
-        """Let who looks know of deadlines missed so far; never waits."""
-        if self.loop_board is not None:
-            self.loop_board.count_missed(missed, own)
-
-    def note_end(self, ended: str, fault: str | None) -> None:
-        """Let who looks know why the loop came to its end."""
-        if self.loop_board is not None:
-            self.loop_board.write_end(ended, fault)
+        says = job is not None and job.says and shown is not None and shown.alive
+        if not (says and board is not None and board.write_line(line)):
+            self._say(line)
 
     def _abandon(self, ring: Ring) -> None:
         """Empty the ring that nobody reads any more, which a display may be waiting for."""

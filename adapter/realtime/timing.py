@@ -67,11 +67,6 @@ class Histogram:
         out["max"] = self.max_ns * 1e-3 if self.count else None
         return out
 
-    @property
-    def mean_us(self) -> float | None:
-        """The mean, µs; None if empty."""
-        return 1e-3 * self.total_ns / self.count if self.count else None
-
 
 def upper_ns(index: int) -> int:
     """The longest duration that a bin counts."""
@@ -168,7 +163,8 @@ class Timing:
     def report(self, missed: int = 0, missed_own: int = 0) -> TimingReport:
         """What was collected so far."""
         period = self._period.summary_us()
-        period["mean"] = self._period.mean_us
+        count = self._period.count
+        period["mean"] = 1e-3 * self._period.total_ns / count if count else None
         return TimingReport(
             self._loop.count,
             missed,

@@ -232,7 +232,12 @@ class WorkerStarter:
     """
 
     def __init__(self, cores: set[int]) -> None:
-        self._pool = ThreadPoolExecutor(1, "worker starter", _keep_to, (cores,))
+
+        def stay() -> None:
+            with suppress(OSError):
+                os.sched_setaffinity(0, cores)
+
+        self._pool = ThreadPoolExecutor(1, "worker starter", stay)
         self._pool.submit(int).result()  # the thread exists from here on
 
     def start_worker(self, build: Callable[[], Worker]) -> Future[Worker]:
@@ -242,11 +247,6 @@ class WorkerStarter:
     def close(self) -> None:
         """Let the thread end; may be called more than once."""
         self._pool.shutdown()
-
-
-def _keep_to(cores: set[int]) -> None:
-    with suppress(OSError):
-        os.sched_setaffinity(0, cores)
 
 
 @dataclass(frozen=True)

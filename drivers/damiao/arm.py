@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -11,12 +12,11 @@ import numpy as np
 from drivers.damiao import codec
 from drivers.damiao.answered import AnsweredCommands
 from drivers.damiao.bus import MulticastWire, Wire, open_bus, wire_of
-from drivers.damiao.codec import MIT_MODE, TIMEOUT_UNIT_S, Scales
+from drivers.damiao.codec import CODES, MIT_MODE, TIMEOUT_UNIT_S, Scales, mit_command
 from drivers.damiao.connect import Dialogue
 from drivers.damiao.guardian import GuardianMode
 from drivers.damiao.guardian_client import GuardianClient, former_guardian
 from drivers.damiao.holding import Braker, brake, settle
-from drivers.damiao.limits import torque_frames
 from drivers.damiao.settings import VIRTUAL, BusSettings
 from drivers.damiao.speed_check import SpeedCheck
 from drivers.damiao.stream import MotorStream, ReplyIntake
@@ -27,6 +27,10 @@ WATCHDOG_S = 0.5  # without a command for so long a motor lets go: a last resort
 FIRST_ROUNDS, ROUND_TIMEOUT_S = 2, 0.1  # replies that the first sample lies between
 CARRIED_SHARE = 0.02  # of each tick's torque in the mean that carries a braked arm: 50 ms
 DELAY_PERIODS = 5  # halves of one: a sample is one old, a command on the bus most of one, held one
+# The torque command of each code, with nothing else: q, dq, kp, kd zero. The same for all types.
+TORQUE_FRAMES = [
+    mit_command(Scales(1.0, 1.0, 1.0))[:6] + code.to_bytes(2, "big") for code in range(CODES + 1)
+]
 
 
 class DamiaoArm:
@@ -132,7 +136,13 @@ class DamiaoArm:
         if isinstance(self._wire, MulticastWire):
             self._wire.ignore(self.settings.ids[-1] + 1)
         replies.others_ask = self._guardian is not None
-        self._say_what_is_unusual()
+        strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
+        if strange:
+            replies.note(
+                "type",
+                f"motors {', '.join(map(str, strange))} scale as no known type does (motor "
+                f"{strange[0]}: {self.limits[strange[0] - 1]}); their own registers are used",
+            )
         self._say_who_holds()
         self._stream.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
         if self.can_move:
@@ -176,15 +186,6 @@ class DamiaoArm:
             self._guardian.memory.put(*self._stream.motion(), self._carried)
             self._guardian.memory.hold(hold)
             self._replies.others_ask = True
-
-    def _say_what_is_unusual(self) -> None:
-        strange = [j + 1 for j, x in enumerate(self.limits) if type_of(x) == "unknown type"]
-        if strange:
-            self._replies.note(
-                "type",
-                f"motors {', '.join(map(str, strange))} scale as no known type does (motor "
-                f"{strange[0]}: {self.limits[strange[0] - 1]}); their own registers are used",
-            )
 
     def _say_who_holds(self) -> None:
         say = self._replies.note
@@ -256,8 +257,13 @@ class DamiaoArm:
         frames, cut = torque_frames(tau, self._tau_max)
         if cut:
             self._replies.note("cut", "a torque beyond a motor's TMAX was cut")
-        if not self._driving:
-            self._start_driving()
+        if not self._driving:  # from holding to driving: the guardian's replies are not ours
+            if self._guardian is not None:
+                self._replies.discard()
+                self._beat()
+                self._guardian.memory.mode = GuardianMode.DRIVE
+            self._answered.pause()
+            self._driving, self._replies.others_ask = True, False
         self._beat()
         self._commanded = True
         whole = self._stream.command(frames)
@@ -329,15 +335,6 @@ class DamiaoArm:
                 "taken", "no command came for 50 ms; the guardian braked the arm until the next one"
             )
 
-    def _start_driving(self) -> None:
-        """From holding to driving: the guardian's replies are not ours."""
-        if self._guardian is not None:
-            self._replies.discard()
-            self._beat()
-            self._guardian.memory.mode = GuardianMode.DRIVE
-        self._answered.pause()
-        self._driving, self._replies.others_ask = True, False
-
     def _report(self, values: list[float]) -> None:
         """Keep what the arm must be carried with, here and with the guardian."""
         n = self._joints
@@ -348,3 +345,21 @@ class DamiaoArm:
         if self._guardian is not None:
             parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
             self._guardian.memory.put(*parts)
+
+
+def torque_frames(tau: Array, tau_max: Sequence[float]) -> tuple[list[bytes], bool]:
+    """The MIT commands of (n,) torques, N m, and whether one was cut at its motor's TMAX.
+
+    Raises DriverError for anything but n finite numbers.
+    """
+    wanted = np.asarray(tau, dtype=np.float64).tolist()
+    if not isinstance(wanted, list) or len(wanted) != len(tau_max):
+        raise DriverError(f"a command is {len(tau_max)} torques, N m")
+    frames, cut = [], False
+    for value, most in zip(wanted, tau_max, strict=True):
+        if not -most <= value <= most:
+            if not math.isfinite(value):
+                raise DriverError("a torque to be commanded is not a finite number")
+            value, cut = math.copysign(most, value), True
+        frames.append(TORQUE_FRAMES[int((value + most) / (most + most) * CODES)])
+    return frames, cut

@@ -23,13 +23,12 @@ It sends the commands of `drivers.damiao.holding` at 200 Hz, until
 
 from __future__ import annotations
 
+import ctypes
 import fcntl
 import json
-import mmap
 import os
 import signal
 import stat
-import struct
 import sys
 import tempfile
 import time
@@ -37,7 +36,6 @@ from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
 from types import FrameType
-from typing import IO
 
 import can
 
@@ -47,15 +45,12 @@ from drivers.damiao.codec import Scales, WireError
 from drivers.damiao.holding import SINK_S, Braker, Push, PushWatch
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
+from drivers.process import Block
 
 MOST_JOINTS = 15
-HEAD_BYTES = 64
-ROWS = 5  # held angle, angle, speed, torque that carries the arm, torque measured
-BLOCK_BYTES = HEAD_BYTES + 8 * ROWS * MOST_JOINTS
 WATCH_S, HOLD_S = 0.002, 0.005
 SILENCE_NS = 50_000_000  # a quarter of the motors' time-out
 GO_ON_BEATS = 2  # commands seen after driving was forbidden; one may have been under way
-MILLI = 1000  # the block's whole numbers are mN m
 GONE_S = 10.0
 READY = "ready"
 
@@ -70,63 +65,36 @@ class GuardianMode(IntEnum):
     BRAKE = 4  # as DRIVE, while the loop settles or brakes the arm
 
 
-class GuardianMemory:
+class GuardianMemory(Block):
     """The shared block.
 
-    The loop writes, the guardian reads, except for `taken` and `forbidden`. Each number is written
-    as a whole; numbers of one tick may be mixed with the next one's, which is 1 ms later.
+    The loop writes, the guardian reads, except for `taken` and what it forbids. Numbers of one
+    tick may be mixed with the next one's, which is 1 ms later.
 
-    Args:
-        file: of `BLOCK_BYTES`, open for reading and writing.
-        joints: of the arm.
+    Attributes:
+        mode: what the guardian is to do, a `GuardianMode`.
+        beat_ns: CLOCK_MONOTONIC instant of the last command.
+        taken: how often the guardian has taken a driven arm over.
+        held: angles to hold, rad.
+        q, dq: where the arm is, rad, and how fast, rad/s.
+        carried, tau: what carries it and what was measured, N m.
     """
 
-    def __init__(self, file: IO[bytes] | int, joints: int) -> None:
-        fileno = file if isinstance(file, int) else file.fileno()
-        self._map = mmap.mmap(fileno, BLOCK_BYTES)
-        self._head = memoryview(self._map)[:HEAD_BYTES].cast("q")
-        self._joints = joints
-        self._row = struct.Struct(f"{joints}d")
-        self._rows = struct.Struct(f"{4 * joints}d")
-
-    @property
-    def mode(self) -> GuardianMode:
-        """What the guardian is to do."""
-        return GuardianMode(self._head[0])
-
-    @mode.setter
-    def mode(self, mode: GuardianMode) -> None:
-        self._head[0] = mode
-
-    @property
-    def beat_ns(self) -> int:
-        """CLOCK_MONOTONIC instant of the last command."""
-        return self._head[1]
-
-    @beat_ns.setter
-    def beat_ns(self, now_ns: int) -> None:
-        self._head[1] = now_ns
-
-    @property
-    def taken(self) -> int:
-        """How often the guardian has taken a driven arm over."""
-        return self._head[2]
-
-    def count_taken(self) -> None:
-        """The guardian takes over."""
-        self._head[2] += 1
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("mode", "beat_ns", "taken", "_pushed")),
+        *((name, ctypes.c_double) for name in ("_torque", "_limit")),
+        *((name, ctypes.c_double * MOST_JOINTS) for name in ("held", "q", "dq", "carried", "tau")),
+    )
 
     @property
     def forbidden(self) -> Push | None:
         """What is pushed, so that the arm may not be driven on; None for nothing."""
-        if not self._head[3]:
-            return None
-        return Push(self._head[3] - 1, self._head[4] / MILLI, self._head[5] / MILLI)
+        return Push(self._pushed - 1, self._torque, self._limit) if self._pushed else None
 
     def forbid(self, push: Push) -> None:
         """The arm may not be driven on."""
-        self._head[4], self._head[5] = round(MILLI * push.torque), round(MILLI * push.limit)
-        self._head[3] = push.joint + 1  # last: whoever reads it finds the others
+        self._torque, self._limit = push.torque, push.limit
+        self._pushed = push.joint + 1  # last: whoever reads it finds the others
 
     def put(
         self,
@@ -135,29 +103,15 @@ class GuardianMemory:
         carried: Sequence[float],
         tau: Sequence[float] | None = None,
     ) -> None:
-        """Where the arm is, rad, how fast, rad/s, what carries it and what was measured, N m."""
-        values = *q, *dq, *carried, *(carried if tau is None else tau)
-        self._rows.pack_into(self._map, HEAD_BYTES + self._row.size, *values)
-
-    def motion(self) -> tuple[list[float], list[float], list[float], list[float]]:
-        """(q, dq, carried, tau) as `put` wrote them."""
-        values = list(self._rows.unpack_from(self._map, HEAD_BYTES + self._row.size))
-        n = self._joints
-        return values[:n], values[n : 2 * n], values[2 * n : 3 * n], values[3 * n :]
+        """Where the arm is, how fast, what carries it and what was measured; (n) each."""
+        n = len(q)
+        self.q[:n], self.dq[:n], self.carried[:n] = q, dq, carried
+        self.tau[:n] = carried if tau is None else tau
 
     def hold(self, q: Sequence[float]) -> None:
-        """Hold these angles from now on, rad."""
-        self._row.pack_into(self._map, HEAD_BYTES, *q)
+        """Hold these angles from now on, (n) rad."""
+        self.held[: len(q)] = q
         self.mode = GuardianMode.HOLD
-
-    def held(self) -> list[float]:
-        """Angles to hold, rad."""
-        return list(self._row.unpack_from(self._map, HEAD_BYTES))
-
-    def close(self) -> None:
-        """Unmap; may be called more than once."""
-        self._head.release()
-        self._map.close()
 
 
 class Guardian:
@@ -189,7 +143,7 @@ class Guardian:
         self._pushes = PushWatch(limits)
         self._longest_ns = max(round(1e9 * HOLD_S), 1_000_000_000 // settings.rate_hz)
         self._beat_ns = self._gone_on = 0
-        self._mode = GuardianMode.IDLE
+        self._mode: int = GuardianMode.IDLE
         self._q: list[float] = []
         self._dq: list[float] = []
         self._heard_s = 0.0
@@ -213,13 +167,14 @@ class Guardian:
                 time.sleep(WATCH_S)
                 continue
             if self._braker is None or mode != self._mode:
-                self._begin(mode, alive)
+                self._braker = self._begin(mode, alive)
             if not alive:
                 leave_pipe()
             if self.ended:
-                self._let_down()
+                self._let_down(self._braker)
                 return
-            self._step()
+            self._listen()
+            self._send(self._braker.commands(HOLD_S, self._q, self._dq))
             if time.monotonic() - self._heard_s > GONE_S:
                 self._say("no motor answers any more; nothing is left to hold")
                 return
@@ -230,7 +185,7 @@ class Guardian:
         self._wire.close()
         self._bus.shutdown()
 
-    def _look(self, mode: GuardianMode) -> None:
+    def _look(self, mode: int) -> None:
         """At each command of a driven arm: forbid to drive on where it is pushed although it
         stands still, and end a loop that drives on all the same."""
         memory = self._memory
@@ -244,30 +199,25 @@ class Guardian:
                 self._say(f"process {self._parent} goes on driving; it is ended")
                 os.kill(self._parent, signal.SIGKILL)
         elif beat_ns != before_ns:
-            _, dq, carried, tau = memory.motion()
             dt_s = 1e-9 * min(beat_ns - before_ns, self._longest_ns)
-            push = self._pushes.step(dt_s, dq, carried, tau)
+            rows = (row[:] for row in (memory.dq, memory.carried, memory.tau))
+            push = self._pushes.step(dt_s, *rows)
             if push is not None:
                 memory.forbid(push)
                 self._say(f"{push.said(self._names[push.joint])}; the arm is stopped")
         self._beat_ns = beat_ns
 
-    def _begin(self, mode: GuardianMode, alive: bool) -> None:
+    def _begin(self, mode: int, alive: bool) -> Braker:
         self._wire.waiting()  # old replies
-        self._q, self._dq, tau, _ = self._memory.motion()
+        memory, n = self._memory, len(self._limits)
+        self._q, self._dq = memory.q[:n], memory.dq[:n]
         self._mode, self._heard_s = mode, time.monotonic()
-        self._braker = Braker(
-            self._limits, tau, self._memory.held() if mode == GuardianMode.HOLD else None
-        )
+        hold = memory.held[:n] if mode == GuardianMode.HOLD else None
         if mode in (GuardianMode.DRIVE, GuardianMode.BRAKE):
-            self._memory.count_taken()
+            memory.taken += 1
             why = "the loop has sent nothing for 50 ms" if alive else "the loop's process is gone"
             self._say(f"{why}; the arm is braked and held. Support it, then: kill {os.getpid()}")
-
-    def _step(self) -> None:
-        assert self._braker is not None
-        self._listen()
-        self._send(self._braker.commands(HOLD_S, self._q, self._dq))
+        return Braker(self._limits, memory.carried[:n], hold)
 
     def _listen(self) -> None:
         try:
@@ -294,14 +244,13 @@ class Guardian:
             except (can.CanError, OSError):
                 continue  # buffer full or bus down: the next one follows in 5 ms
 
-    def _let_down(self) -> None:
-        assert self._braker is not None
+    def _let_down(self, braker: Braker) -> None:
         self._say(f"the arm sinks over {SINK_S:g} s, then its motors are switched off")
         steps = round(SINK_S / HOLD_S)
         for k in range(steps):
             if self.relieved:
                 return
-            self._send(self._braker.sinking(1.0 - k / steps))
+            self._send(braker.sinking(1.0 - k / steps))
             time.sleep(HOLD_S)
         for _ in range(3):  # a lost frame must not leave a motor on
             self._send([codec.DISABLE] * len(self._messages))
@@ -352,7 +301,7 @@ def main() -> None:
     settings = BusSettings(**said["settings"])
     limits = [Scales(*values) for values in said["limits"]]
     try:
-        memory = GuardianMemory(said["block"], settings.joints)
+        memory = GuardianMemory.of(said["block"])
         guardian = Guardian(settings, limits, memory, said["parent"], said["names"])
     except DriverError as error:
         print(error, flush=True)

@@ -9,18 +9,15 @@ import os
 import select
 import signal
 import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from pathlib import Path
 
-import drivers
 from drivers.damiao.codec import Scales
-from drivers.damiao.guardian import BLOCK_BYTES, READY, GuardianMemory, GuardianMode, open_lock
+from drivers.damiao.guardian import READY, GuardianMemory, GuardianMode, open_lock
 from drivers.damiao.settings import BusSettings
 from drivers.interface import DriverError
+from drivers.process import start_module
 
 START_TIMEOUT_S, RELIEF_TIMEOUT_S = 30.0, 2.0
 
@@ -45,43 +42,36 @@ class GuardianClient:
         self, settings: BusSettings, limits: Sequence[Scales], names: Sequence[str]
     ) -> None:
         self._settings = settings
-        with tempfile.TemporaryFile() as block:
-            block.truncate(BLOCK_BYTES)
-            self.memory = GuardianMemory(block, settings.joints)
-            said = {
-                "settings": dataclasses.asdict(settings),
-                "limits": [dataclasses.astuple(limit) for limit in limits],
-                "block": block.fileno(),
-                "parent": os.getpid(),
-                "names": list(names),
-            }
-            root = str(Path(drivers.__file__).resolve().parents[1])
-            path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "drivers.damiao.guardian", json.dumps(said)],
+        block, self.memory = GuardianMemory.create()
+        said = {
+            "settings": dataclasses.asdict(settings),
+            "limits": [dataclasses.astuple(limit) for limit in limits],
+            "block": block,
+            "parent": os.getpid(),
+            "names": list(names),
+        }
+        try:
+            self._process = start_module(
+                "drivers.damiao.guardian",
+                json.dumps(said),
+                (block,),
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                pass_fds=(block.fileno(),),
                 start_new_session=True,  # Ctrl-C and a closing terminal are not for it
-                env={**os.environ, "PYTHONPATH": path},
             )
+        finally:
+            os.close(block)
         self.pid = self._process.pid
-        answer = self._answer()
+        assert self._process.stdout is not None
+        with self._process.stdout as said_there:
+            ready, _, _ = select.select([said_there], [], [], START_TIMEOUT_S)
+            answer = said_there.readline().decode(errors="replace").strip() if ready else ""
         if answer != READY:
             self._process.kill()
             self._process.wait()
-            self.memory.close()
             raise DriverError(
                 "the process that holds the arm when the loop dies did not start: "
                 f"{answer or 'no answer'}; without it (?guardian=0) a crash drops the arm"
             )
-
-    def _answer(self) -> str:
-        stdout = self._process.stdout
-        assert stdout is not None
-        with stdout:
-            ready, _, _ = select.select([stdout], [], [], START_TIMEOUT_S)
-            return stdout.readline().decode(errors="replace").strip() if ready else ""
 
     @property
     def alive(self) -> bool:
@@ -118,7 +108,6 @@ class GuardianClient:
         """Let it go on alone with what it was told last; away with it where that was nothing."""
         if self.memory.mode == GuardianMode.IDLE:
             self.release()
-        self.memory.close()
         if self.alive:
             self._process.returncode = 0  # it is meant to outlive us: nobody waits for it
 

@@ -81,7 +81,12 @@ class Braker:
         if self.hold is not None:
             self.holding_s += dt_s
             if self.yields:
-                self._yield(self.hold, q, YIELD_SPEED * dt_s)
+                step = YIELD_SPEED * dt_s
+                for j, limit in enumerate(self._limits):
+                    most = YIELD_SHARE * limit.tau_max / self._gains[j][0]
+                    away = self.hold[j] - q[j]
+                    if abs(away) > most:
+                        self.hold[j] -= math.copysign(min(abs(away) - most, step), away)
         else:
             self._braking_s += dt_s
             slow = all(abs(speed) < SLOW for speed in dq if speed == speed)
@@ -89,14 +94,6 @@ class Braker:
                 self.hold, self.holding_s = list(q), 0.0
         share = min(self.holding_s / FADE_S, 1.0) if self.hold is not None else 0.0
         return [self._command(j, share, q[j]) for j in range(len(self._limits))]
-
-    def _yield(self, hold: list[float], q: Sequence[float], step: float) -> None:
-        """Let held angles come after joints that are kept away from them, by `step` rad at most."""
-        for j, limit in enumerate(self._limits):
-            most = YIELD_SHARE * limit.tau_max / self._gains[j][0]
-            away = hold[j] - q[j]
-            if abs(away) > most:
-                hold[j] -= math.copysign(min(abs(away) - most, step), away)
 
     def _command(self, j: int, share: float, q_now: float) -> bytes:
         kp, kd = self._gains[j]

@@ -165,7 +165,11 @@ class ReplyIntake:
             if data[6] >= WARM_DEGC or data[7] >= WARM_DEGC:
                 self._look_at_temperatures(j, data[6], data[7])
             if not (0 < code_tau < CODES and 0 < code_dq < CODES):
-                self._end_of_scale(j, code_tau in (0, CODES))
+                what = "torque" if code_tau in (0, CODES) else "speed"
+                self.note(
+                    f"end of scale {what} {j}",
+                    f"motor {j + 1}: {what} at the end of its scale; the true value may lie beyond",
+                )
             if arrived_ns > last_ns:
                 last_ns = arrived_ns
             used += 1
@@ -292,13 +296,6 @@ class ReplyIntake:
                     f"warm {part} {j}",
                     f"{who} are at {degc} deg C; the run ends at {HOT_DEGC}: move less or slower",
                 )
-
-    def _end_of_scale(self, j: int, torque: bool) -> None:
-        what = "torque" if torque else "speed"
-        self.note(
-            f"end of scale {what} {j}",
-            f"motor {j + 1}: {what} at the end of its scale; the true value may lie beyond",
-        )
 
     def _need_signs_of_life(self, missing: Sequence[int], stamp_ns: int) -> None:
         silent = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -32,8 +33,8 @@ def corrupt(sample: JointSample, rng: np.random.Generator) -> JointSample:
     at = int(rng.integers(numbers))
     if at < 3 * n:
         name = SIGNALS[at // n]
-        changed = flip_bits(getattr(sample, name), at % n, rng)
-        return _with(sample, name, changed)
+        changed: dict[str, Any] = {name: flip_bits(getattr(sample, name), at % n, rng)}
+        return replace(sample, **changed)
     assert sample.links is not None
     at -= 3 * n
     twist, accel = sample.links.twist, sample.links.accel
@@ -57,7 +58,7 @@ def blank(sample: JointSample, rng: np.random.Generator) -> JointSample:
     for name in SIGNALS if which == len(SIGNALS) else SIGNALS[which : which + 1]:
         values = getattr(sample, name).copy()
         values[joint] = np.nan
-        sample = _with(sample, name, values)
+        sample = replace(sample, **{name: values})
     return sample
 
 
@@ -67,7 +68,7 @@ def spike(sample: JointSample, rng: np.random.Generator, factor: float) -> Joint
     values = getattr(sample, name).copy()
     size = rng.uniform(LEAST_SPIKE, 1.0) * rng.choice([-1.0, 1.0])
     values[rng.integers(len(values))] += factor * SPIKE_SIZE[name] * size
-    return _with(sample, name, values)
+    return replace(sample, **{name: values})
 
 
 def frozen(sample: JointSample, joint: int, held: tuple[float, float, float]) -> JointSample:
@@ -75,7 +76,7 @@ def frozen(sample: JointSample, joint: int, held: tuple[float, float, float]) ->
     for name, value in zip(SIGNALS, held, strict=True):
         values = getattr(sample, name).copy()
         values[joint] = value
-        sample = _with(sample, name, values)
+        sample = replace(sample, **{name: values})
     return sample
 
 
@@ -84,9 +85,3 @@ def shifted(sample: JointSample, joint: int, offset: float) -> JointSample:
     q = sample.q.copy()
     q[joint] += offset
     return replace(sample, q=q)
-
-
-def _with(sample: JointSample, name: str, values: Array) -> JointSample:
-    """The sample with another q, dq or tau."""
-    signals = {key: getattr(sample, key) for key in SIGNALS} | {name: values}
-    return JointSample(sample.stamp_ns, **signals, links=sample.links)

@@ -80,10 +80,13 @@ class FaultyDriver:
     arrived_ns = _of_driver("arrived_ns")  # when the newest sample taken had arrived
 
     def __init__(self, driver: Driver, faults: Faults, seed: int = 0) -> None:
-        faults.check_joints(len(driver.joint_names))
+        n = len(driver.joint_names)
+        for item in faults.items:
+            if item.joint is not None and not 1 <= item.joint <= n:
+                raise DriverError(f"fault '{item}': the arm has joints 1 to {n}")
         self.driver, self.faults, self.seed = driver, faults, seed
         self.plant_time_ns = 0
-        self._shares = faults.by_share()
+        self._shares = {item.name: item for item in faults.items if item.share is not None}
         self._lasting = faults.timed("stuck", "jump", "clock")
         self._ends = faults.timed("silence", "died")
         self._start()

@@ -104,19 +104,9 @@ class Faults:
     def __str__(self) -> str:
         return ",".join(map(str, self.items))
 
-    def by_share(self) -> dict[str, Fault]:
-        """Those that hit a share of the samples, by name."""
-        return {item.name: item for item in self.items if item.share is not None}
-
     def timed(self, *names: str) -> Sequence[Fault]:
         """Those of these names that begin at a time."""
         return [item for item in self.items if item.at_s is not None and item.name in names]
-
-    def check_joints(self, n: int) -> None:
-        """Raises DriverError where a fault names a joint that an arm with n joints lacks."""
-        for item in self.items:
-            if item.joint is not None and not 1 <= item.joint <= n:
-                raise DriverError(f"fault '{item}': the arm has joints 1 to {n}")
 
 
 def _fault(text: str) -> Fault:

@@ -213,8 +213,9 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
                 f"the robot at {target.host} answers Connect with status {status}, which is not "
                 "defined: check its system version"
             )
-        if status == 0 and target.version is None and _sends(connection, tables.FR3):
-            server = tables.FR3
+        if status == 0 and target.version is None:
+            length = connection.reader.next_length(FIRST_STATE_S)
+            server = tables.FR3 if length == STATE_DTYPE[tables.FR3].itemsize else server
     except BaseException:
         connection.close()
         raise
@@ -222,11 +223,6 @@ def _try(target: Target, version: int) -> tuple[Connection | None, int]:
         connection.close()
         return None, server
     return connection, server
-
-
-def _sends(connection: Connection, version: int) -> bool:
-    """Whether the robot's first state has the length of this version."""
-    return connection.reader.next_length(FIRST_STATE_S) == STATE_DTYPE[version].itemsize
 
 
 def _ask(connection: Connection) -> tuple[int, int]:

@@ -60,8 +60,11 @@ class Safeguards(NamedTuple):
 
 def parse(address: str, options: Mapping[str, str]) -> Safeguards:
     """What the options of an address ask for. Raises DriverError with the choices."""
+    text, collision = options.get("collision", "1"), None
     try:
-        collision = read_collision(options.get("collision", "1"))
+        collision = None if text == KEEP else float(text)
+        if collision is not None and not LEAST <= collision <= MOST:
+            raise ValueError
     except ValueError as error:
         raise DriverError(
             f"'{address}': collision is a factor from {LEAST:g} to {MOST:g}, or {KEEP}"
@@ -73,16 +76,6 @@ def parse(address: str, options: Mapping[str, str]) -> Safeguards:
             f"'{address}': load is KG or KG,X,Y,Z (m from the flange) up to {HEAVIEST_KG:g} kg, "
             f"or {KEEP}"
         ) from error
-
-
-def read_collision(text: str) -> float | None:
-    """Of `?collision=FACTOR|keep`. Raises ValueError with the choices."""
-    if text == KEEP:
-        return None
-    factor = float(text)
-    if not LEAST <= factor <= MOST:
-        raise ValueError
-    return factor
 
 
 def read_load(text: str) -> Load | None:

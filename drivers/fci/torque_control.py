@@ -106,17 +106,13 @@ class TorqueControl:
         allowed = tau if finished else self.limiter.limit(tau, accepted.tolist())
         if allowed is not None:
             self._send(self._encoder.encode(message_id, allowed, finished))
-            self._note_sent(message_id)
+            ticks, count = message_id - self._sent_id, self.count
+            if self._sent_id >= 0 and ticks > 1:  # the last one answered no neighbouring tick
+                count.holes += 1
+                count.longest_hole_ms = max(count.longest_hole_ms, float(ticks))
+            self._sent_id = message_id
+            count.sent += 1
         self.count.cut = self.limiter.cut
-
-    def _note_sent(self, message_id: int) -> None:
-        """Count a command; it ends a hole where the last one answered no neighbouring tick."""
-        ticks, count = message_id - self._sent_id, self.count
-        if self._sent_id >= 0 and ticks > 1:
-            count.holes += 1
-            count.longest_hole_ms = max(count.longest_hole_ms, float(ticks))
-        self._sent_id = message_id
-        count.sent += 1
 
     def _note_rate(self, rate: float) -> None:
         """Count the robot's success rate, once it is about commands of this motion alone."""

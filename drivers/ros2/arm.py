@@ -15,42 +15,22 @@ import math
 import os
 import select
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-import drivers
 from drivers.interface import Array, CommandCount, DriverError, Intake, JointSample
+from drivers.process import start_module
 from drivers.ros2.bridge import BRAKES, Start
-from drivers.ros2.memory import (
-    ASKED,
-    HEAD,
-    REFUSED,
-    SLOTS,
-    Asked,
-    Doing,
-    Memory,
-    Refusal,
-)
+from drivers.ros2.memory import SLOTS, Asked, Doing, Memory, Refusal
 from drivers.ros2.settings import EXAMPLE, parse
 
 READY_S, STOP_S, END_S = 60.0, 3.0, 2.0
 POLL_S = 0.002
 TRANSPORT_NS = 1_000_000  # of a command, from here to the controller
-WORDS_OF = {
-    Refusal.UNREADABLE: "unreadable",
-    Refusal.OTHER_JOINTS: "other_joints",
-    Refusal.INCOMPLETE: "incomplete",
-    Refusal.NOT_FINITE: "not_finite",
-    Refusal.JUMP: "jump",
-    Refusal.OLD: "old",
-    Refusal.OVERTAKEN: "overtaken",
-}
 NOTES = {
     Refusal.UNREADABLE: "joint states come that cannot be read; is it another type that is sent?",
     Refusal.OTHER_JOINTS: "joint states of other joints come on the same topic; they are left out",
@@ -136,7 +116,7 @@ class Ros2Arm:
         """The next joint state; waits for it. Raises DriverError."""
         bridge = self._open()
         deadline = time.monotonic() + self._settings.timeout_s
-        while int(bridge.memory.words[HEAD]) <= self._next:
+        while bridge.memory.words.head <= self._next:
             self._listen(bridge)
             left_s = deadline - time.monotonic()
             if left_s <= 0.0:
@@ -146,7 +126,7 @@ class Ros2Arm:
                 )
             bridge.wait(left_s)
         self._listen(bridge)
-        behind = int(bridge.memory.words[HEAD]) - self._next - (SLOTS - 8)
+        behind = bridge.memory.words.head - self._next - (SLOTS - 8)
         if behind > 0:
             self._next += behind
             self._refused(Refusal.OVERTAKEN, behind)
@@ -173,7 +153,7 @@ class Ros2Arm:
         count.sent += 1
         if not self._driving:
             self._driving = True
-            bridge.memory.words[ASKED] = Asked.DRIVE
+            bridge.memory.words.asked = Asked.DRIVE
         bridge.memory.put_command(cut, time.monotonic_ns())
         bridge.nudge()
 
@@ -185,10 +165,12 @@ class Ros2Arm:
         if not bridge.alive:
             with contextlib.suppress(DriverError):
                 bridge = self._bridge = self._rescued(bridge)
-        bridge.memory.words[ASKED] = Asked.BRAKE
+        bridge.memory.words.asked = Asked.BRAKE
         end = time.monotonic() + STOP_S
-        while bridge.alive and bridge.memory.doing != Doing.HOLDING and time.monotonic() < end:
-            if bridge.memory.doing not in (*BRAKES, Doing.DRIVING):
+        while (
+            bridge.alive and bridge.memory.words.doing != Doing.HOLDING and time.monotonic() < end
+        ):
+            if bridge.memory.words.doing not in (*BRAKES, Doing.DRIVING):
                 break  # no command of ours was sent yet
             time.sleep(POLL_S)
         self._driving, self._fault = False, ""
@@ -202,8 +184,8 @@ class Ros2Arm:
 
     def _begin_with(self, bridge: _Process) -> None:
         """Samples and counts begin with what a new bridge hears from now on."""
-        self._next = int(bridge.memory.words[HEAD])
-        self._ignored = bridge.memory.words[REFUSED : REFUSED + len(Refusal)].copy()
+        self._next = bridge.memory.words.head
+        self._ignored = bridge.memory.words.refused[:]
 
     def close(self) -> None:
         """Stop, then end the bridge. The controller goes on with the torques that hold the arm."""
@@ -215,7 +197,7 @@ class Ros2Arm:
         finally:
             bridge, self._bridge = self._bridge, None
             assert bridge is not None
-            bridge.memory.words[ASKED] = Asked.LISTEN
+            bridge.memory.words.asked = Asked.LISTEN
             bridge.end(END_S)
 
     def _open(self) -> _Process:
@@ -236,11 +218,11 @@ class Ros2Arm:
     def _count(self, bridge: _Process, stamp_ns: int) -> None:
         intake = self.intake
         intake.used += 1
-        refused = bridge.memory.words[REFUSED : REFUSED + len(Refusal)] - self._ignored
         for why in Refusal:
-            if why != Refusal.OVERTAKEN and refused[why]:
+            refused = bridge.memory.words.refused[why] - self._ignored[why]
+            if why != Refusal.OVERTAKEN and refused:
                 self._note(why)
-                intake.refused[WORDS_OF[why]] = int(refused[why])
+                intake.refused[why.name.lower()] = refused
         intake.received = intake.used + sum(intake.refused.values())
         if self._stamp_ns:
             periods = (stamp_ns - self._stamp_ns) / self.period_ns
@@ -248,7 +230,7 @@ class Ros2Arm:
         self._stamp_ns = stamp_ns
 
     def _refused(self, why: Refusal, count: int) -> None:
-        self.intake.refused[WORDS_OF[why]] += count
+        self.intake.refused[why.name.lower()] += count
         if self._driving:  # before that it only says that somebody took a while to begin
             self._note(why)
 
@@ -261,22 +243,19 @@ class _Process:
     """The bridge from the driver's side."""
 
     def __init__(self, settings: Any, joints: tuple[str, ...], leave: tuple[bool, bool]) -> None:
-        fileno, self.memory = Memory.create(len(joints))
+        self.memory = Memory(len(joints))
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._nudge = os.eventfd(0, os.EFD_CLOEXEC)
-        start = Start(settings, joints, *leave, fileno, self._wake, self._nudge)
-        root = str(Path(drivers.__file__).resolve().parents[1])
-        path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+        filenos = self.memory.fileno, self._wake, self._nudge
         self._complaints: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "drivers.ros2.bridge", start.as_text()],
+        self._process = start_module(
+            "drivers.ros2.bridge",
+            Start(settings, joints, *leave, *filenos).as_text(),
+            filenos,
             stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
             stderr=self._complaints,
-            pass_fds=(fileno, self._wake, self._nudge),
-            env={**os.environ, "PYTHONPATH": path},
         )
-        os.close(fileno)
+        os.close(self.memory.fileno)
         assert self._process.stdout is not None
         self._out = self._process.stdout.fileno()
         os.set_blocking(self._out, False)

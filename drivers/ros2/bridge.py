@@ -30,17 +30,7 @@ from drivers.files.ros import CdrError, Layout, parse_joint_state
 from drivers.files.ros_types import FLOAT64_MULTI_ARRAY, JOINT_STATE, STRING
 from drivers.interface import Array, DriverError
 from drivers.ros2.holding import Braker
-from drivers.ros2.memory import (
-    ASKED,
-    BEAT,
-    RECEIVED,
-    SEQUENCE,
-    STATE,
-    Asked,
-    Doing,
-    Memory,
-    Refusal,
-)
+from drivers.ros2.memory import Asked, Doing, Memory, Refusal
 from drivers.ros2.settings import Ros2Settings
 from drivers.ros2.wire import Found, Network, Publication, described
 
@@ -121,10 +111,9 @@ class States:
 
     def take(self, data: bytes) -> tuple[int, Array] | None:
         """Stamp and (3, n) of a message; None where it is refused."""
-        self._memory.words[RECEIVED] += 1
         found = self._values(data)
         if isinstance(found, Refusal):
-            self._memory.count_refused(found)
+            self._memory.words.refused[found] += 1
             return None
         return found
 
@@ -166,7 +155,7 @@ class Bridge:
 
     def __init__(self, start: Start) -> None:
         self._start, where = start, start.settings
-        self._memory = Memory(start.memory, len(start.joints))
+        self._memory = Memory(len(start.joints), start.memory)
         self._network = Network(where.domain, where.local)
         self._states = self._network.subscribe(where.states, JOINT_STATE)
         self._texts = self._network.subscribe(DESCRIPTION, STRING, latched=True)
@@ -177,7 +166,7 @@ class Bridge:
         order = where.joints or start.joints
         self._order = [start.joints.index(name) for name in order]
         self._lock, self._gone = threading.Lock(), threading.Event()
-        self._sent = int(self._memory.words[SEQUENCE])
+        self._sent = self._memory.words.sequence
         self._taken = False  # from the driver, which has to stop before it drives again
         self._heard = time.monotonic()
         self._look_at = self._idle_at = 0.0
@@ -206,7 +195,7 @@ class Bridge:
         self._braker = Braker(self._effort(), 1.0 / where.hz, where.gravity)
         if self._commands is not None and not self._start.rescue:
             self._check_command(self._commands)
-        self._memory.words[STATE] = Doing.BRAKING if self._start.rescue else Doing.LISTENING
+        self._memory.words.doing = Doing.BRAKING if self._start.rescue else Doing.LISTENING
         say(ready=list(names), effort=self._braker.effort.tolist())
 
     def _first_states(self) -> list[bytes]:
@@ -285,7 +274,13 @@ class Bridge:
 
     def run(self) -> None:
         """Until the driver is gone and the arm stands."""
-        threading.Thread(target=self._wait_for_end, daemon=True).start()
+
+        def wait_for_end() -> None:
+            while sys.stdin.buffer.read(4096):
+                pass
+            self._gone.set()
+
+        threading.Thread(target=wait_for_end, daemon=True).start()
         threading.Thread(target=self._pass_on, daemon=True).start()
         waiter = self._waiter()
         while not self._done():
@@ -294,7 +289,7 @@ class Bridge:
             for data in self._states.take():
                 self._take_state(data)
             with self._lock:
-                if self._answer is not None and self._memory.doing in BRAKES:
+                if self._answer is not None and self._memory.words.doing in BRAKES:
                     self._send(self._answer)
                 self._supervise()
 
@@ -307,18 +302,13 @@ class Bridge:
         waiter.attach(self._condition)
         return waiter
 
-    def _wait_for_end(self) -> None:
-        while sys.stdin.buffer.read(4096):
-            pass
-        self._gone.set()
-
     def _done(self) -> bool:
         if not self._gone.is_set():
             return False
         memory, now = self._memory, time.monotonic()
-        if memory.doing == Doing.HOLDING and not self._idle_at:
+        if memory.words.doing == Doing.HOLDING and not self._idle_at:
             self._idle_at = now
-        released = memory.asked == Asked.LISTEN or memory.doing == Doing.LISTENING
+        released = memory.words.asked == Asked.LISTEN or memory.words.doing == Doing.LISTENING
         held = self._idle_at > 0.0 and now > self._idle_at + HELD_S
         return released or held or now > self._heard + HELD_S
 
@@ -331,12 +321,12 @@ class Bridge:
 
     def _send_newest(self) -> None:
         memory = self._memory
-        sequence = int(memory.words[SEQUENCE])
-        if sequence == self._sent or memory.asked != Asked.DRIVE or self._taken:
+        sequence = memory.words.sequence
+        if sequence == self._sent or memory.words.asked != Asked.DRIVE or self._taken:
             return
-        if memory.doing != Doing.DRIVING:
+        if memory.words.doing != Doing.DRIVING:
             self._braker.release()
-        memory.words[STATE] = Doing.DRIVING
+        memory.words.doing = Doing.DRIVING
         self._sent = sequence
         self._send(memory.command())
 
@@ -358,32 +348,32 @@ class Bridge:
         self._memory.put_state(stamp_ns, time.monotonic_ns(), values)
         os.eventfd_write(self._start.wake, 1)
         with self._lock:
-            doing = self._memory.doing
+            doing = self._memory.words.doing
             if doing not in BRAKES:
                 self._braker.listen(values[1], values[2])
                 return
             self._answer = self._braker.torques(*values)  # of several at once the last one is sent
             if self._braker.standing:
-                self._memory.words[STATE] = Doing.HOLDING
+                self._memory.words.doing = Doing.HOLDING
 
     def _supervise(self) -> None:
         """Brake where it is asked for, where commands stay away, or somebody else commands."""
         memory, now = self._memory, time.monotonic()
-        if self._gone.is_set() and memory.asked == Asked.DRIVE:
-            memory.words[ASKED] = Asked.BRAKE  # nobody else is there to ask
-        doing, asked = memory.doing, memory.asked
+        if self._gone.is_set() and memory.words.asked == Asked.DRIVE:
+            memory.words.asked = Asked.BRAKE  # nobody else is there to ask
+        doing, asked = memory.words.doing, memory.words.asked
         if asked == Asked.BRAKE:
             self._taken = False
             if doing == Doing.DRIVING:
-                memory.words[STATE] = Doing.BRAKING
+                memory.words.doing = Doing.BRAKING
         elif doing == Doing.DRIVING:
-            unheard_s, silent_s = now - self._heard, now - 1e-9 * int(memory.words[BEAT])
+            unheard_s, silent_s = now - self._heard, now - 1e-9 * memory.words.beat_ns
             if silent_s > SILENCE_S and unheard_s > 0.5 * silent_s:  # a command answers a state
                 topic = self._start.settings.states
                 self._take_over(f"{topic} has been silent for {1e3 * unheard_s:.0f} ms")
             elif silent_s > SILENCE_S:
                 self._take_over(f"no command came for {1e3 * silent_s:.0f} ms")
-        if memory.doing in BRAKES and now - self._heard > BLIND_S:
+        if memory.words.doing in BRAKES and now - self._heard > BLIND_S:
             self._send(self._braker.blind())
         if self._commands is not None and now > self._look_at:
             self._look_at = now + LOOK_S
@@ -392,9 +382,9 @@ class Bridge:
                 self._take_over(f"somebody else began to publish on {topic}")
 
     def _take_over(self, why: str) -> None:
-        if self._memory.doing == Doing.DRIVING:
+        if self._memory.words.doing == Doing.DRIVING:
             self._taken = True
-            self._memory.words[STATE] = Doing.BRAKING
+            self._memory.words.doing = Doing.BRAKING
             why = f"{why}; the arm is braked and held"
         say(fault=why)
 

@@ -1,24 +1,21 @@
 """What the driver and the bridge share: a ring of states, the newest command, who does what.
 
-Each side writes words of its own; each is aligned and written as a whole. The ring's head moves on
-when a state is complete. A command is complete when its sequence number is written behind it.
+Each side writes words of its own; the ring's head moves on when a state is complete. A command is
+complete when its sequence number is written behind it.
 """
 
 from __future__ import annotations
 
+import ctypes
 import mmap
-import os
 from enum import IntEnum
 
 import numpy as np
 
 from drivers.interface import Array
+from drivers.process import Block
 
 SLOTS = 1024
-HEAD, RECEIVED, STATE = range(3)  # words that the bridge writes
-REFUSED = 8  # the first of its counters of refused messages
-ASKED, SEQUENCE, BEAT = range(32, 35)  # words that the driver writes
-WORDS = 64
 
 
 class Asked(IntEnum):
@@ -51,51 +48,52 @@ class Refusal(IntEnum):
     OVERTAKEN = 6
 
 
-class Memory:
-    """The shared block.
+class Words(Block):
+    """What is counted and asked for.
 
-    Args:
-        fileno: of a file of `bytes_of(n)`.
-        n: joints.
+    Attributes:
+        head: states ever put into the ring.
+        refused: (len(Refusal)) messages, by reason.
+        doing: what the bridge does, a `Doing`; the bridge writes it and all before.
+        asked: what the driver asks for, an `Asked`; the driver writes it and all that follows.
+        sequence: of the newest command; beat_ns: its instant, CLOCK_MONOTONIC.
     """
 
-    def __init__(self, fileno: int, n: int) -> None:
-        self._map = mmap.mmap(fileno, self.bytes_of(n))
-        self.words = np.frombuffer(self._map, np.int64, WORDS)
-        self._command = np.frombuffer(self._map, np.float64, n, 8 * WORDS)
-        rows = np.frombuffer(self._map, np.float64, SLOTS * (2 + 3 * n), 8 * (WORDS + n))
-        self._rows = rows.reshape(SLOTS, 2 + 3 * n)
-        self._n = n
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in ("head", "doing")),
+        ("refused", ctypes.c_int64 * len(Refusal)),
+        ("_apart", ctypes.c_int64 * 8),  # a cache line
+        *((name, ctypes.c_int64) for name in ("asked", "sequence", "beat_ns")),
+    )
 
-    @staticmethod
-    def bytes_of(n: int) -> int:
-        """Size for n joints."""
-        return 8 * (WORDS + n + SLOTS * (2 + 3 * n))
 
-    @classmethod
-    def create(cls, n: int) -> tuple[int, Memory]:
-        """A new one and its file descriptor, which a child inherits by number."""
-        fileno = os.memfd_create("ros2-bridge")
-        os.truncate(fileno, cls.bytes_of(n))
-        return fileno, cls(fileno, n)
+class Memory:
+    """The shared block, and its descriptor, which a child inherits by number.
 
-    @property
-    def asked(self) -> Asked:
-        """What the driver asks."""
-        return Asked(int(self.words[ASKED]))
+    Args:
+        n: joints.
+        fileno: of one that is there; None makes one.
 
-    @property
-    def doing(self) -> Doing:
-        """What the bridge does."""
-        return Doing(int(self.words[STATE]))
+    Attributes:
+        words: see `Words`.
+    """
+
+    def __init__(self, n: int, fileno: int | None = None) -> None:
+        more = 8 * (n + SLOTS * (2 + 3 * n))
+        if fileno is None:
+            fileno, self.words = Words.create(more)
+        else:
+            self.words = Words.of(fileno)
+        self.fileno, self._n = fileno, n
+        numbers = np.frombuffer(mmap.mmap(fileno, 0), np.float64, more // 8, ctypes.sizeof(Words))
+        self._command, self._rows = numbers[:n], numbers[n:].reshape(SLOTS, 2 + 3 * n)
 
     def put_state(self, stamp_ns: int, arrived_ns: int, values: Array) -> None:
         """Bridge: a state (3, n) q, dq, tau."""
-        head = int(self.words[HEAD])
-        row = self._rows[head % SLOTS]
+        row = self._rows[self.words.head % SLOTS]
         row[:2].view(np.int64)[:] = stamp_ns, arrived_ns
         row[2:] = values.reshape(-1)
-        self.words[HEAD] = head + 1
+        self.words.head += 1
 
     def state(self, index: int) -> tuple[int, int, Array]:
         """Driver: stamp, arrival and a copy (3, n) of the state of this number."""
@@ -106,13 +104,9 @@ class Memory:
     def put_command(self, tau: Array, now_ns: int) -> None:
         """Driver: torques (n,)."""
         self._command[:] = tau
-        self.words[BEAT] = now_ns
-        self.words[SEQUENCE] += 1
+        self.words.beat_ns = now_ns
+        self.words.sequence += 1
 
     def command(self) -> Array:
         """Bridge: a copy of the torques (n,) asked for last."""
         return self._command.copy()
-
-    def count_refused(self, why: Refusal) -> None:
-        """Bridge: one message more that is no sample."""
-        self.words[REFUSED + why] += 1

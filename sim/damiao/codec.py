@@ -98,17 +98,12 @@ def register_value(register: int, data: bytes) -> float | int:
     return struct.unpack("<I" if register in INTEGER_REGISTERS else "<f", data)[0]
 
 
-def register_bytes(register: int, value: float) -> bytes:
-    """Four bytes of a register's value."""
-    if register in INTEGER_REGISTERS:
-        return struct.pack("<I", int(value))
-    return struct.pack("<f", value)
-
-
 def encode_register_reply(motor_id: int, what: int, register: int, value: float) -> bytes:
     """The reply to a read (`what` is READ) or the echo of a write (WRITE)."""
     head = bytes([motor_id & 0xFF, motor_id >> 8, what, register])
-    return head + register_bytes(register, value)
+    if register in INTEGER_REGISTERS:
+        return head + struct.pack("<I", int(value))
+    return head + struct.pack("<f", value)
 
 
 def encode_save_reply(motor_id: int) -> bytes:

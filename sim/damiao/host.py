@@ -22,11 +22,18 @@ class Serviceable(Protocol):
         """Handle the frames that have arrived."""
 
 
-class WrappedBus(can.BusABC):
-    """Any bus, everything going straight through; closing closes the bus inside as well."""
+class ServedBus(can.BusABC):
+    """A host's bus whose boards live in the same process: whoever receives lets them work.
 
-    def __init__(self, bus: can.BusABC) -> None:
-        self._bus = bus
+    Everything else goes straight through; closing closes the bus inside as well.
+
+    Attributes:
+        serving: whether to do so; without it the boards' owner calls `Boards.service`.
+    """
+
+    def __init__(self, bus: can.BusABC, boards: Serviceable) -> None:
+        """Wrap the host's end of a bus."""
+        self._bus, self._boards, self.serving = bus, boards, True
         self._can_protocol = bus.protocol
         self.channel_info = bus.channel_info
         super().__init__(channel=0)
@@ -36,7 +43,9 @@ class WrappedBus(can.BusABC):
         self._bus.send(msg, timeout)
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Receive."""
+        """Let the boards work, then receive."""
+        if self.serving:
+            self._boards.service()
         return self._bus.recv(timeout)
 
     def fileno(self) -> int:
@@ -47,25 +56,6 @@ class WrappedBus(can.BusABC):
         """Close."""
         super().shutdown()
         self._bus.shutdown()
-
-
-class ServedBus(WrappedBus):
-    """A host's bus whose boards live in the same process: whoever receives lets them work.
-
-    Attributes:
-        serving: whether to do so; without it the boards' owner calls `Boards.service`.
-    """
-
-    def __init__(self, bus: can.BusABC, boards: Serviceable) -> None:
-        """Wrap the host's end of a bus."""
-        super().__init__(bus)
-        self._boards, self.serving = boards, True
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        """Let the boards work, then receive."""
-        if self.serving:
-            self._boards.service()
-        return self._bus.recv(timeout)
 
 
 class WrappedDriver:

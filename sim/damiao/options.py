@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from sim.damiao.bus import INTERFACES, MULTICAST_GROUP, MULTICAST_PORT
 from sim.damiao.faults import KINDS, OF_HOSTS
 from sim.damiao.motor import SETS
 from sim.faults import describe, read_fault
-from sim.options import add_scenario, options_of
+from sim.options import add_served, options_of
 from sim.options import check as check_scenario
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS], seconds from the first frame on:\n" + describe(
-        KINDS
-    )
-    parser.add_argument(
-        "--interface", choices=INTERFACES, default=INTERFACES[0], help=f"default {INTERFACES[0]}"
-    )
-    parser.add_argument(
-        "--channel",
-        default=MULTICAST_GROUP,
-        metavar="WHERE",
-        help=f"multicast group (default {MULTICAST_GROUP}) or CAN interface, as in vcan0",
-    )
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=MULTICAST_PORT,
-        help=f"of the multicast group, default {MULTICAST_PORT}",
-    )
-    parser.add_argument("--fd", type=int, choices=(0, 1), default=1, help="CAN FD, default 1")
-    parser.add_argument("--motors", choices=tuple(SETS), default="panda", help="default panda")
-    add_scenario(parser, "as in noise=real: a Panda's sensor noise beside the quantisation")
-    parser.add_argument(
-        "--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable"
-    )
-    parser.add_argument("--duration", type=float, metavar="S", help="end after so many seconds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    add = parser.add_argument
+    words = f"default {INTERFACES[0]}"
+    add("--interface", choices=INTERFACES, default=INTERFACES[0], help=words)
+    words = f"multicast group (default {MULTICAST_GROUP}) or CAN interface, as in vcan0"
+    add("--channel", default=MULTICAST_GROUP, metavar="WHERE", help=words)
+    words = f"of the multicast group, default {MULTICAST_PORT}"
+    add("--port", type=int, default=MULTICAST_PORT, help=words)
+    add("--fd", type=int, choices=(0, 1), default=1, help="CAN FD, default 1")
+    add("--motors", choices=tuple(SETS), default="panda", help="default panda")
+    faults = ", seconds from the first frame on:\n" + describe(KINDS)
+    of_set = "as in noise=real: a Panda's sensor noise beside the quantisation"
+    add_served(parser, faults, of_set)
 
 
 def check(args: argparse.Namespace) -> None:

@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import os
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import can
 
 from sim.damiao.arm import World
+from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
 from sim.damiao.faults import Faults, Outbox
 from sim.damiao.motor import motor_set
+from sim.damiao.options import check
 from sim.damiao.robot import MotorBank
 from sim.effects import ENCODER, TORQUE
+from sim.ending import Ending, sum_up
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
-from sim.scenarios import Scenario
+from sim.options import options_of
+from sim.scenarios import Scenario, build
 from sim.truth import Array
 
 IDLE_S = 5e-3  # longest wait without frames: the arm goes on in steps of this
 ACTIVE_NS = 10_000_000  # so long after a frame the ticks keep their rhythm
 FIFO_PRIORITY = 40
 MOST_UNREADABLE = 1000  # failures to receive in a row, then the bus counts as gone
-
-
-class Stop(Protocol):
-    """Says when to end, like `threading.Event`."""
-
-    def is_set(self) -> bool:
-        """Whether to end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,14 +123,14 @@ class Boards:
         self.compute_ns += time.perf_counter_ns() - begun
         return count
 
-    def serve(self, stop: Stop) -> None:
-        """Handle frames as they come until told to stop; for a process of its own.
+    def serve(self, stop: Callable[[], bool]) -> None:
+        """Handle frames as they come until `stop()` is true; for a process of its own.
 
         Asks for SCHED_FIFO and goes on without where that is not permitted.
         """
         with contextlib.suppress(OSError, AttributeError):
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
-        while not stop.is_set():
+        while not stop():
             message = self._receive(self._patience_s())
             begun = time.perf_counter_ns()
             if message is not None:
@@ -238,3 +236,43 @@ class Boards:
         if reply is not None:
             frame = data_frame(self.motors[j].reply_id, reply, message.is_fd)
             self._outbox.put(frame, now, now_s)
+
+
+def run(args: argparse.Namespace) -> int:
+    """`adapter sim can`: serve until a signal comes or the time is over. Raises ValueError."""
+    check(args)
+    options = options_of(args.set)
+    scenario = build(args.scenario, args.seed, **options)
+    noise = scenario.noise if options.keys() & {"noise", "levels"} else None
+    fd = bool(args.fd)
+    with Ending(args.duration) as ending, contextlib.ExitStack() as stack:
+        bus = open_bus(args.interface, args.channel, args.port, fd)
+        stack.callback(bus.shutdown)
+        boards = Boards(bus, scenario, BoardOptions(args.motors, noise), args.fault)
+        stack.callback(boards.close)
+        check_alone(bus, boards.motors[0].motor_id, boards.motors[0].reply_id, fd)
+        address = address_of(args.interface, args.channel, args.port, fd)
+        print(f"ready: a simulated arm on {address}", flush=True)
+        boards.serve(ending.is_set)
+        report = boards.report()
+    sum_up({"address": address, **report}, summary(report), args.json)
+    return 0
+
+
+def summary(report: dict[str, Any]) -> str:
+    """What happened, in a few lines."""
+    frames, faults = report["frames"], report["faults"]
+    lines = [
+        f"simulated {report['ticks'] / 1000:.1f} s, slipped {report['slipped_ms']:.0f} ms",
+        f"frames: {_counts(frames)}; replies {report['replies']}",
+        f"status of motors 1 to 7: {' '.join(f'{status:X}' for status in report['status'])}; "
+        f"fastest joint {report['fastest_rad_s']:.2f} rad/s; limp {report['limp_ticks']} ms, "
+        f"on an end stop {report['stop_ticks']} ms",
+    ]
+    if faults:
+        lines.append(f"faults struck: {_counts(faults)}")
+    return "\n".join(lines)
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{key} {count}" for key, count in counts.items()) or "none"

@@ -233,5 +233,5 @@ def _urdf(truth: TreeTruth) -> str:
     ]
     for j, (joint, link) in enumerate(zip(truth.joint_names, truth.link_names, strict=True)):
         parent = names[truth.parent[j] + 1]
-        parts.append(joint_text(joint, parent, link, truth.p[j], truth.R[j]))
+        parts.append(joint_text(joint, (parent, link), (truth.p[j], truth.R[j])))
     return "\n".join([f'<robot name="{truth.name}">', *parts, "</robot>"])

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from sim.faults import describe, read_fault
 from sim.fci.codec import HOST, PORT, VERSIONS
 from sim.fci.faults import KINDS
 from sim.fci.gripper import WIDEST
-from sim.options import add_scenario, options_of
+from sim.options import add_served, options_of
 from sim.options import check as check_scenario
 
 ROBOT = {5: "panda", 10: "fr3"}  # by protocol
@@ -18,8 +17,6 @@ ROBOT = {5: "panda", 10: "fr3"}  # by protocol
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS]:\n" + describe(KINDS)
     add = parser.add_argument
     add("--port", type=int, default=PORT, help=f"TCP port on {HOST}; clients know only {PORT}")
     words = "TCP port of the gripper; 1338, which clients know, where --port is 1337, else none"
@@ -27,13 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     words = "width of what lies between the gripper's fingers; 0 is nothing"
     add("--object", type=float, default=0.0, metavar="M", help=words)
     add("--protocol", type=int, choices=VERSIONS, default=5, help="5 Panda (FER), 10 FR3")
-    add_scenario(parser, default="real_drives")
-    add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
     add("--core", type=int, default=None, help="processor to stay on")
     words = "wait so long for a late command while the world stands still; no robot does"
     add("--patience", type=float, default=0.0, metavar="S", help=words)
-    add("--duration", type=float, default=None, metavar="S", help="stop after so many seconds")
-    add("--json", type=Path, default=None, metavar="FILE", help="write the summary there as well")
+    add_served(parser, ":\n" + describe(KINDS), default="real_drives")
 
 
 def chosen(args: argparse.Namespace) -> dict[str, Any]:

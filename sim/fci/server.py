@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import select
 import socket
 import time
@@ -9,6 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
+from sim.ending import Ending, sum_up
 from sim.faults import read_fault
 from sim.fci.clock import Ticks, undisturbed
 from sim.fci.codec import (
@@ -27,11 +29,13 @@ from sim.fci.codec import (
     reply,
 )
 from sim.fci.faults import KINDS, Spoiler
+from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
 from sim.fci.model import model_library
+from sim.fci.options import chosen
 from sim.fci.robot import Reporter, Robot
 from sim.fci.urdf import robot_urdf
-from sim.scenarios import Scenario
+from sim.scenarios import Scenario, build
 
 CHUNK = 4096  # bytes at a time; the longest request has 428
 MOST_HELD = 16 << 20  # bytes of replies that a client does not fetch, then it is dropped
@@ -213,7 +217,9 @@ class FciServer:
         except BaseException:
             self._listener.close()
             raise
-        self._model = self._model_reply()
+        truth = self.robot.arm.truth
+        # What a client gets as a model: a library for x64 Linux, or URDF.
+        self._model = model_library(truth) if protocol == 5 else robot_urdf(truth).encode()
         self._reporter = Reporter(self.robot)
         self._reporter.refresh()
         self._reporter.fill(0)  # what is compiled on first use is compiled before a client comes
@@ -242,7 +248,11 @@ class FciServer:
                     continue
                 self._ticks.wait()
                 self._one_tick()
-                self._talk()
+                if self._session is not None:
+                    self._session.requests(self._answer)
+                    if not self._session.open:
+                        self._drop()
+                self._accept()
                 if self.hand is not None and self._tick % HAND_TICKS == 0:
                     self.hand.poll()
 
@@ -327,14 +337,6 @@ class FciServer:
             else:
                 self._drop()
 
-    def _talk(self) -> None:
-        """Whatever came in over TCP."""
-        if self._session is not None:
-            self._session.requests(self._answer)
-            if not self._session.open:
-                self._drop()
-        self._accept()
-
     def _accept(self) -> None:
         """Let a client in; one that comes while another is there finds its connection closed."""
         try:
@@ -374,19 +376,50 @@ class FciServer:
         if request.name == "GetCartesianLimit":
             return limit_reply(request, version)
         if request.name in ("LoadModelLibrary", "GetRobotModel"):
-            return self._send_model(request)
+            strange = request.name == "LoadModelLibrary" and request.payload != b"\0\0"
+            if self._model is None or strange:
+                return reply(request, Status.ERROR, version)
+            return reply(request, Status.OK, version, self._model)
         said = self.robot.request(request)
         self._reporter.refresh()
         return said
 
-    def _send_model(self, request: Request) -> bytes:
-        if self._model is None or (
-            request.name == "LoadModelLibrary" and request.payload != b"\0\0"
-        ):
-            return reply(request, Status.ERROR, self._version)
-        return reply(request, Status.OK, self._version, self._model)
 
-    def _model_reply(self) -> bytes | None:
-        """What a client gets as a model: a library for x64 Linux, or URDF."""
-        truth = self.robot.arm.truth
-        return model_library(truth) if self._version == 5 else robot_urdf(truth).encode()
+def run(args: argparse.Namespace) -> int:
+    """`adapter sim fci`: serve until a signal comes or the time is over. Raises ValueError."""
+    scenario = build(args.scenario, args.seed, **chosen(args))
+    hand = _hand(args)
+    try:
+        server = FciServer(scenario, args.port, args.protocol, args.fault, args.core, args.patience)
+    except OSError as error:
+        raise ValueError(_taken(args.port, error)) from error
+    server.hand = hand
+    try:
+        with Ending(args.duration) as ending:
+            address = f"fci://{HOST}" + (f":{server.port}" if server.port != PORT else "")
+            protocol = f"(protocol {server.protocol})"
+            print(f"ready: a simulated arm on {address} {protocol}", flush=True)
+            if hand is not None:
+                print(f"the gripper on {HOST}:{hand.port}", flush=True)
+            server.serve(ending.is_set)
+    finally:
+        server.close()
+    sum_up(server.summary(), None, args.json)
+    return 0
+
+
+def _hand(args: argparse.Namespace) -> GripperServer | None:
+    """The gripper: on its port where the robot is on its own, or where one is named."""
+    port = args.gripper_port
+    if port is None:
+        if args.port != PORT:
+            return None
+        port = GRIPPER_PORT
+    try:
+        return GripperServer(port, args.object)
+    except OSError as error:
+        raise ValueError(_taken(port, error)) from error
+
+
+def _taken(port: int, error: OSError) -> str:
+    return f"port {port} of {HOST} cannot be used ({error.strerror}); stop what uses it"

@@ -9,6 +9,7 @@ unless it is 0.
 
 from __future__ import annotations
 
+import argparse
 import os
 import time
 from collections import Counter
@@ -20,17 +21,21 @@ from typing import Any
 import numpy as np
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import make_idl_struct, types
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from drivers.interface import DriverError
-from sim.faults import Fault
+from sim.ending import Ending, sum_up
+from sim.faults import Fault, read_fault
 from sim.fci.clock import PRIORITY, Ticks, undisturbed
-from sim.ros2.messages import Float64MultiArray, Header, JointState, String, Time
-from sim.scenarios import Scenario
-from sim.truth import Truth, to_rpy
+from sim.options import options_of
+from sim.ros2.options import KINDS, check
+from sim.scenarios import Scenario, build
+from sim.truth import Truth
+from sim.urdf_writer import joint_text, limit_text
 
 LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces>
 <NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
@@ -41,6 +46,41 @@ FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02}
 SUBSTEPS = 2
 OFF_RAD = 0.5  # by which a joint is wrong where faults say so
 SECOND_NS = 1_000_000_000
+
+# The four messages that the arm speaks; names and layout are ROS 2's.
+Time = make_idl_struct(
+    "Time_",
+    "builtin_interfaces.msg.dds_.Time_",
+    {"sec": types.int32, "nanosec": types.uint32},
+)
+Header = make_idl_struct("Header_", "std_msgs.msg.dds_.Header_", {"stamp": Time, "frame_id": str})
+JointState = make_idl_struct(
+    "JointState_",
+    "sensor_msgs.msg.dds_.JointState_",
+    {
+        "header": Header,
+        "name": types.sequence[str],
+        "position": types.sequence[types.float64],
+        "velocity": types.sequence[types.float64],
+        "effort": types.sequence[types.float64],
+    },
+)
+Dimension = make_idl_struct(
+    "MultiArrayDimension_",
+    "std_msgs.msg.dds_.MultiArrayDimension_",
+    {"label": str, "size": types.uint32, "stride": types.uint32},
+)
+Layout = make_idl_struct(
+    "MultiArrayLayout_",
+    "std_msgs.msg.dds_.MultiArrayLayout_",
+    {"dim": types.sequence[Dimension], "data_offset": types.uint32},
+)
+Float64MultiArray = make_idl_struct(
+    "Float64MultiArray_",
+    "std_msgs.msg.dds_.Float64MultiArray_",
+    {"layout": Layout, "data": types.sequence[types.float64]},
+)
+String = make_idl_struct("String_", "std_msgs.msg.dds_.String_", {"data": str})
 
 
 @dataclass(frozen=True)
@@ -191,19 +231,30 @@ def quality(latched: bool, depth: int) -> Qos:
 
 def description(truth: Truth) -> str:
     """URDF of the joints with their limits; of the links their names."""
-    limits, parts = truth.limits, ['<robot name="arm"><link name="base"/>']
-    parent = "base"
+    parts, parent = ['<robot name="arm"><link name="base"/>'], "base"
     for j, (name, link) in enumerate(zip(truth.joint_names, truth.link_names, strict=True)):
-        place = f'xyz="{_row(truth.p[j])}" rpy="{_row(to_rpy(truth.R[j]))}"'
-        parts.append(
-            f'<link name="{link}"/><joint name="{name}" type="revolute"><origin {place}/>'
-            f'<parent link="{parent}"/><child link="{link}"/><axis xyz="0 0 1"/>'
-            f'<limit lower="{limits.lower[j]}" upper="{limits.upper[j]}" '
-            f'velocity="{limits.velocity[j]}" effort="{limits.effort[j]}"/></joint>'
-        )
+        place = truth.p[j], truth.R[j]
+        parts.append(f'<link name="{link}"/>')
+        parts.append(joint_text(name, (parent, link), place, limit_text(truth.limits, j)))
         parent = link
     return "\n".join([*parts, "</robot>"])
 
 
-def _row(values: Any) -> str:
-    return " ".join(repr(float(x)) for x in values)
+def run(args: argparse.Namespace) -> int:
+    """`adapter sim ros2`: serve until a signal comes or the time is over. Raises ValueError."""
+    check(args)
+    scenario = build(args.scenario, args.seed, **options_of(args.set))
+    place = Place(
+        args.domain, args.states, args.commands, args.every, args.watch, not args.no_description
+    )
+    arm = ServedArm(scenario, place, [read_fault(text, KINDS) for text in args.fault])
+    try:
+        with Ending(args.duration) as ending:
+            hz = "" if args.every == 1 else f"&hz={1000 // args.every}"
+            address = f"ros2://{args.states}?command={args.commands}&domain={args.domain}&local=1"
+            print(f"ready: a simulated arm on {address}{hz}", flush=True)
+            arm.serve(ending.is_set)
+    finally:
+        arm.close()
+    sum_up(arm.summary(), None, args.json)
+    return 0

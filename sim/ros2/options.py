@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 
 from sim.faults import NOTHING, Kind, describe, read_fault
-from sim.options import add_scenario, options_of
+from sim.options import add_served, options_of
 from sim.options import check as check_scenario
 
 DOMAIN, STATES, COMMANDS = "0", "/joint_states", "/effort_controller/commands"
@@ -22,8 +21,6 @@ KINDS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = "faults, NAME[=VALUE][@SECONDS], from the first command on:\n" + describe(KINDS)
     add = parser.add_argument
     domain = int(os.environ.get("ROS_DOMAIN_ID") or DOMAIN)
     add("--domain", type=int, default=domain, metavar="N", help="of DDS; ROS_DOMAIN_ID, else 0")
@@ -34,10 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     words = "the drives brake when no command is new for so long; 0 never, as without a watch"
     add("--watch", type=float, default=0.1, metavar="S", help=words)
     add("--no-description", action="store_true", help="nobody publishes /robot_description")
-    add_scenario(parser)
-    add("--fault", action="append", default=[], metavar="FAULT", help="see below; repeatable")
-    add("--duration", type=float, metavar="S", help="end after so many seconds")
-    add("--json", type=Path, metavar="FILE", help="write the summary there as well")
+    add_served(parser, ", from the first command on:\n" + describe(KINDS))
 
 
 def check(args: argparse.Namespace) -> None:

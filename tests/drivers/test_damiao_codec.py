@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.damiao import codec
+from drivers.damiao.arm import TORQUE_FRAMES
 from drivers.damiao.bus_time import budget, classic_bits, fd_bits, frame_times
 from drivers.damiao.codec import Scales, WireError
-from drivers.damiao.limits import TORQUE_FRAMES
 from drivers.damiao.settings import BusSettings
 from drivers.damiao.tables import FAULTS, MOTOR_TYPES, OPENARM, fault_of, type_of
 from drivers.interface import DriverError

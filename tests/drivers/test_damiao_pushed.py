@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 import os
-import tempfile
 from contextlib import ExitStack
 
 import numpy as np
@@ -21,7 +20,7 @@ from adapter.signals.front_end import FrontEnd
 from drivers.damiao import holding
 from drivers.damiao.arm import DamiaoArm
 from drivers.damiao.codec import Scales
-from drivers.damiao.guardian import BLOCK_BYTES, Guardian, GuardianMemory, GuardianMode
+from drivers.damiao.guardian import Guardian, GuardianMemory, GuardianMode
 from drivers.damiao.holding import Braker, Push, PushWatch
 from drivers.damiao.settings import BusSettings
 from sim.damiao.host import Lockstep
@@ -136,48 +135,45 @@ def test_a_loop_that_a_busy_machine_stops_in_a_push_is_not_held_to_have_pushed_m
     limits = [Scales(12.5, 25.0, 100.0)] * settings.joints
     names = [f"joint{j + 1}" for j in range(settings.joints)]
     n = settings.joints
-    with tempfile.TemporaryFile() as block:
-        block.truncate(BLOCK_BYTES)
-        memory = GuardianMemory(block, n)
-        guardian = Guardian(settings, limits, memory, os.getpid(), names)
-        guardian._say = lambda sentence: None
-        try:
-            memory.put([0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n)
-            beats = itertools.count(10**9, 5_000_000)
-            for _ in range(10):
-                memory.beat_ns = next(beats)
-                guardian._look(GuardianMode.DRIVE)
-            memory.put([0.0] * n, [0.0] * n, [0.0] * n, [90.0] * n)
+    block, memory = GuardianMemory.create()
+    os.close(block)
+    guardian = Guardian(settings, limits, memory, os.getpid(), names)
+    guardian._say = lambda sentence: None
+    try:
+        memory.put([0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n)
+        beats = itertools.count(10**9, 5_000_000)
+        for _ in range(10):
             memory.beat_ns = next(beats)
-            for _ in range(20):
-                guardian._look(GuardianMode.DRIVE)
-            assert memory.forbidden is None
+            guardian._look(GuardianMode.DRIVE)
+        memory.put([0.0] * n, [0.0] * n, [0.0] * n, [90.0] * n)
+        memory.beat_ns = next(beats)
+        for _ in range(20):
+            guardian._look(GuardianMode.DRIVE)
+        assert memory.forbidden is None
+        memory.beat_ns = next(beats) + 40_000_000
+        guardian._look(GuardianMode.DRIVE)
+        assert memory.forbidden is None
+        for _ in range(2):
             memory.beat_ns = next(beats) + 40_000_000
             guardian._look(GuardianMode.DRIVE)
-            assert memory.forbidden is None
-            for _ in range(2):
-                memory.beat_ns = next(beats) + 40_000_000
-                guardian._look(GuardianMode.DRIVE)
-            assert memory.forbidden is not None and memory.forbidden.joint == 0
-            for _ in range(20):  # it heeds that: no command, however long it takes
-                guardian._look(GuardianMode.DRIVE)
-            assert guardian._gone_on == 0
-        finally:
-            guardian.close()
-            memory.close()
+        assert memory.forbidden is not None and memory.forbidden.joint == 0
+        for _ in range(20):  # it heeds that: no command, however long it takes
+            guardian._look(GuardianMode.DRIVE)
+        assert guardian._gone_on == 0
+    finally:
+        guardian.close()
 
 
 def test_a_forbidden_joint_is_read_by_the_loop() -> None:
-    with tempfile.TemporaryFile() as block:
-        block.truncate(BLOCK_BYTES)
-        guardian, loop = GuardianMemory(block, 2), GuardianMemory(block, 2)
-        assert loop.forbidden is None
-        loop.put([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
-        assert guardian.motion() == ([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
-        guardian.forbid(Push(1, -80.25, 75.0))
-        assert loop.forbidden == Push(1, -80.25, 75.0)
-        assert loop.forbidden.said("elbow") == (
-            "joint 2 (elbow) is pushed with -80.2 N m (limit 75.0 N m) although it stands still"
-        )
-        guardian.close()
-        loop.close()
+    block, loop = GuardianMemory.create()
+    guardian = GuardianMemory.of(block)
+    os.close(block)
+    assert loop.forbidden is None
+    loop.put([1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0])
+    rows = guardian.q, guardian.dq, guardian.carried, guardian.tau
+    assert [row[:2] for row in rows] == [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0], [7.0, 8.0]]
+    guardian.forbid(Push(1, -80.25, 75.0))
+    assert loop.forbidden == Push(1, -80.25, 75.0)
+    assert loop.forbidden.said("elbow") == (
+        "joint 2 (elbow) is pushed with -80.2 N m (limit 75.0 N m) although it stands still"
+    )

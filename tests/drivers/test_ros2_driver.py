@@ -19,9 +19,9 @@ from drivers.interface import DriverError  # noqa: E402
 from drivers.ros2.arm import Ros2Arm  # noqa: E402
 from drivers.ros2.bridge import JUMPS, States, encode_command  # noqa: E402
 from drivers.ros2.holding import Braker  # noqa: E402
-from drivers.ros2.memory import REFUSED, Doing, Memory, Refusal  # noqa: E402
+from drivers.ros2.memory import Doing, Memory, Refusal  # noqa: E402
 from drivers.ros2.settings import parse  # noqa: E402
-from sim.ros2.messages import Float64MultiArray, Header, JointState, Layout, Time  # noqa: E402
+from sim.ros2.arm import Float64MultiArray, Header, JointState, Layout, Time  # noqa: E402
 from sim.scenarios import build  # noqa: E402
 from tests.helpers.hardware_rigs import PANDA_JOINTS, free_domain, ros2_arm  # noqa: E402
 from tests.helpers.patience import patient_read, patiently  # noqa: E402
@@ -76,7 +76,7 @@ def test_the_domain_is_that_of_ros(monkeypatch):
 
 
 def test_what_cannot_be_is_refused_and_counted():
-    _, memory = Memory.create(2)
+    memory = Memory(2)
     states = States(("b", "a"), memory)
     encoder = JointStateEncoder(("a", "x", "b"))
 
@@ -98,7 +98,7 @@ def test_what_cannot_be_is_refused_and_counted():
     }
     for data in bad.values():
         assert states.take(data) is None
-    counts = memory.words[REFUSED : REFUSED + len(Refusal)].tolist()
+    counts = memory.words.refused[:]
     assert all(counts[why] == 1 for why in bad) and sum(counts) == len(bad)
     assert states.take(message(10**9 + 10**7, (1.2, 2.1))) is not None  # in 10 ms it may have gone
     far = [states.take(message(2 * 10**9 + k, (40.0, 2.1))) for k in range(JUMPS + 1)]
@@ -213,7 +213,7 @@ def _moves_and_stops(address):
         assert moving.q[0] - before.q[0] > 0.0
         after = [arm.read() for _ in range(1500)]
         assert np.abs(np.median([s.dq for s in after[-100:]], axis=0)).max() < 0.05
-        assert arm._bridge.memory.doing == Doing.HOLDING
+        assert arm._bridge.memory.words.doing == Doing.HOLDING
         assert arm.intake.commands.sent >= 50 and arm.intake.commands.cut == 0
         assert arm.intake.received == arm.intake.used
 
@@ -244,7 +244,7 @@ def _silence_of_the_loop_brakes(address):
             for _ in range(2000):
                 arm.read()
         arm.stop()  # by a new bridge
-        assert arm._bridge.memory.doing in (Doing.BRAKING, Doing.HOLDING)
+        assert arm._bridge.memory.words.doing in (Doing.BRAKING, Doing.HOLDING)
 
 
 LOOP = """

@@ -61,7 +61,8 @@ def robot(
         summary = Path(folder) / "summary.json"
         options = [word for fault in faults for word in ("--fault", fault)]
         command = [
-            sys.executable, "-m", "sim.fci", "--protocol", str(protocol), "--seed", str(seed),
+            sys.executable, "-m", "adapter", "sim", "fci", "--protocol", str(protocol),
+            "--seed", str(seed),
             "--json", str(summary), "--patience", str(patience_s), *options, *more,
         ]  # fmt: skip
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=HERE.parents[2])

@@ -22,13 +22,7 @@ from sim.scenarios import build
 from tests.helpers.board_tools import free_port
 from tests.helpers.contract_suite import Start
 
-SERVE_CAN = (
-    "import argparse, sys; from sim.damiao.command import run; "
-    "from sim.damiao.options import add_arguments; "
-    "p = argparse.ArgumentParser(); add_arguments(p); sys.exit(run(p.parse_args()))"
-)
-
-SERVE_ROS2 = SERVE_CAN.replace("sim.damiao", "sim.ros2")
+SERVE = "-m", "adapter", "sim"
 PANDA_JOINTS = tuple(f"panda_joint{j}" for j in range(1, 8))
 
 # Of a simulated robot with a process that this machine holds up; less than the second after which
@@ -91,7 +85,7 @@ def fci(protocol: int, allow_motion: bool):
     @contextmanager
     def start() -> Iterator[Start]:
         options = ["--port", "0", "--protocol", str(protocol), "--patience", PATIENCE_S]
-        server = process("-m", "sim.fci", *options)
+        server = process(*SERVE, "fci", *options)
         with server as line, closing() as arms:
             address = fci_address(line)
 
@@ -110,7 +104,7 @@ def fci(protocol: int, allow_motion: bool):
 def can_multicast() -> Iterator[Start]:
     """Boards in a process of their own, on UDP multicast."""
     options = ["--interface", "udp_multicast", "--port", str(free_port())]
-    with process("-c", SERVE_CAN, *options) as line, closing() as arms:
+    with process(*SERVE, "can", *options) as line, closing() as arms:
         address = line.split()[-1]
         yield _maker(arms, address)
 
@@ -155,7 +149,7 @@ def ros2(allow_motion: bool, *options: str):
 @contextmanager
 def ros2_arm(*options: str) -> Iterator[str]:
     """`adapter sim ros2` with these options in a domain of its own; gives its address."""
-    with process("-c", SERVE_ROS2, "--domain", str(free_domain()), *options) as line:
+    with process(*SERVE, "ros2", "--domain", str(free_domain()), *options) as line:
         yield line.split()[-1]
 
 

@@ -40,19 +40,11 @@ def _killed_in_motion(folder: Path) -> str:
     """Kill the loop of a moving robot, which has to come to rest; why it ended before, or ""."""
     folder.mkdir()
     figures = folder / "run.json"
-    with rigs.process("-m", "sim.fci", "--port", "0", "--patience", rigs.PATIENCE_S) as line:
+    served = *rigs.SERVE, "fci", "--port", "0", "--patience", rigs.PATIENCE_S
+    with rigs.process(*served) as line:
         address = rigs.fci_address(line)
         command = [sys.executable, "-m", "adapter", "run", "--driver", address, "--allow-motion"]
-        command += [
-            "--yes",
-            "--duration",
-            "60",
-            "--quiet",
-            "--out",
-            str(folder),
-            "--json",
-            str(figures),
-        ]
+        command += ["--yes", "--duration=60", "--quiet", f"--out={folder}", f"--json={figures}"]
         recording = folder / "recording.mcap"
         loop = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
         try:

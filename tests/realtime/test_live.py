@@ -23,7 +23,7 @@ from drivers.files.mcap import read_estimates, read_log
 from drivers.interface import DriverError
 from tests.helpers import live_tools as tools
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
 
 SCRIPT = """
 if __name__ == "__main__":  # the workers load this file as well, and need none of it
@@ -40,14 +40,6 @@ if __name__ == "__main__":  # the workers load this file as well, and need none 
         options=tools.live_options(None),
     )
 """
-
-
-@pytest.fixture(autouse=True)
-def no_leftovers(monkeypatch):
-    monkeypatch.setattr("adapter.realtime.loop.WALL_EXTRA_S", 60.0)  # a busy machine is no end
-    blocks = tools.created_blocks(monkeypatch)
-    yield
-    assert tools.wait_for(lambda: not tools.left_behind(blocks))
 
 
 def _wait_for_display(diary: Path, stopped=None) -> None:

@@ -24,19 +24,10 @@ from adapter.realtime.loop import run_live
 from drivers.files.mcap import read_log
 from tests.helpers import live_tools as tools
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
 
 ROOM = 49 * 4096  # bytes, for a second or so of samples
 RUN_S = 2.5
-
-
-@pytest.fixture(autouse=True)
-def no_leftovers(tmp_path, monkeypatch):
-    monkeypatch.setenv("TEST_GRAVES", str(tmp_path))
-    monkeypatch.setattr("adapter.realtime.loop.WALL_EXTRA_S", 60.0)  # a busy machine is no end
-    blocks = tools.created_blocks(monkeypatch)
-    yield
-    assert not tools.left_behind(blocks)
 
 
 class Shaky(tools.Swinging):

@@ -25,6 +25,7 @@ from drivers.interface import DriverError
 from tests.helpers import live_tools as tools
 from tests.helpers.stalls import Stalls
 
+pytestmark = pytest.mark.usefixtures("no_leftovers")
 alone = pytest.mark.alone  # what kills processes of a live run, in real time
 
 SCRIPT = """
@@ -58,15 +59,6 @@ if __name__ == "__main__":  # the workers load this file as well, and need none 
 """
 ROOT = str(Path(__file__).parents[2])
 RUNNING = 60_000  # bytes of a recording that is well under way
-
-
-@pytest.fixture(autouse=True)
-def no_leftovers(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    blocks = tools.created_blocks(monkeypatch)
-    yield
-    assert tools.wait_for(lambda: not tools.left_behind(blocks))
-    assert tools.wait_for(lambda: not list(tmp_path.glob("adapter-learner-*")))
 
 
 @pytest.fixture

@@ -22,15 +22,7 @@ from adapter.realtime.snapshot import NEWS_BYTES
 from adapter.realtime.timing import COUNTED, Timing
 from tests.helpers import live_tools as tools
 
-pytestmark = pytest.mark.alone
-
-
-@pytest.fixture(autouse=True)
-def no_leftovers(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("adapter.realtime.loop.WALL_EXTRA_S", 60.0)  # a busy machine is no end
-    blocks = tools.created_blocks(monkeypatch)
-    yield
-    assert tools.wait_for(lambda: not tools.left_behind(blocks))
+pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
 
 
 def test_a_spectator_sees_the_newest_and_takes_nothing() -> None:

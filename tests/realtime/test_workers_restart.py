@@ -18,22 +18,10 @@ from adapter.runs.live import learner_job, single_thread_learner
 from adapter.runs.outcome import collect
 from tests.helpers import live_tools as tools
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.usefixtures("no_leftovers")]
 
 # Some seconds, so that successors, who take seconds to start, take over while the arm moves.
 RUN_S = 3.5
-
-
-@pytest.fixture(autouse=True)
-def no_leftovers(tmp_path, monkeypatch):
-    monkeypatch.setenv("TEST_GRAVES", str(tmp_path))
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr("adapter.realtime.loop.WALL_EXTRA_S", 60.0)  # a busy machine is no end
-    blocks = tools.created_blocks(monkeypatch)
-    yield
-    assert not tools.left_behind(blocks)
-    assert not list(tmp_path.glob("adapter-learner-*"))
 
 
 def _whole(duration_s: float):

@@ -22,11 +22,10 @@ import pytest
 
 from sim.damiao import codec as wire
 from sim.damiao.bus import open_bus
-from sim.damiao.command import run
 from sim.damiao.host import ServedBus
 from sim.damiao.motor import SETS
 from sim.damiao.options import add_arguments
-from sim.damiao.server import BoardOptions, Boards
+from sim.damiao.server import BoardOptions, Boards, run
 from sim.effects import Effect
 from sim.noise import levels_of
 from sim.scenarios import build
@@ -49,7 +48,7 @@ from tests.helpers.board_tools import (
     two_buses,
     write_register,
 )
-from tests.helpers.hardware_rigs import SERVE_CAN
+from tests.helpers.hardware_rigs import SERVE
 
 READY = build("nominal").truth.ready
 LIMP = BoardOptions(stand=False)
@@ -408,7 +407,7 @@ def receive(bus: can.BusABC, identifier: int, patience_s: float = 20.0) -> can.M
 def serving(boards: Boards):
     """Boards served in a thread, which ends when it is told to."""
     stop = threading.Event()
-    thread = threading.Thread(target=boards.serve, args=(stop,))
+    thread = threading.Thread(target=boards.serve, args=(stop.is_set,))
     thread.start()
     try:
         yield
@@ -465,7 +464,7 @@ def test_across_processes_until_sigterm(tmp_path) -> None:
     port, figures = free_port(), tmp_path / "figures.json"
     with multicast_or_skip(GROUP, port) as bus:
         server = subprocess.Popen(
-            [sys.executable, "-c", SERVE_CAN, "--port", str(port), "--json", str(figures)],
+            [sys.executable, *SERVE, "can", "--port", str(port), "--json", str(figures)],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         try:
@@ -524,7 +523,7 @@ def test_wrong_options_are_refused_in_a_sentence(options, says) -> None:
 
 @pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare for a bare network")
 def test_a_machine_without_route_is_told_which_one_it_needs() -> None:
-    bare = ["unshare", "--net", sys.executable, "-c", SERVE_CAN]
+    bare = ["unshare", "--net", sys.executable, *SERVE, "can"]
     if subprocess.run(["unshare", "--net", "true"], capture_output=True).returncode:
         pytest.skip("this user may not open a network namespace")
     done = subprocess.run(bare, capture_output=True, text=True, timeout=60)
