@@ -95,17 +95,22 @@ class Telling:
         """Independent samples of a joint."""
         return min(MOST_SAMPLES, self.span_s / CORRELATED_S)
 
-    def explained(self, rows: Rows) -> Explained:
-        """How well the model explains rows, after corrections of a plausible size."""
-        return self.explaining(rows)(rows.tau)
+    def explained(self, rows: Rows, changed: int | None = None) -> Explained:
+        """How well the model explains rows, after corrections of a plausible size.
 
-    def explaining(self, rows: Rows) -> Callable[[Array], Explained]:
+        Args:
+            changed: the row from which on the hand holds something else; None for never.
+        """
+        return self.explaining(rows, changed)(rows.tau)
+
+    def explaining(self, rows: Rows, changed: int | None = None) -> Callable[[Array], Explained]:
         """The same of any torques (m, n) of these instants."""
-        columns, model = self._columns(rows)
+        columns, model = self._columns(rows, changed)
         m, beyond = len(model), self._beyond(rows.q)
         usual = np.sqrt(np.mean(model**2, axis=0))
         floor = SENSOR_NM + SENSOR_SHARE * usual
         squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
+        gains = slice(13 * len(usual), 14 * len(usual))
 
         def of(tau: Array) -> Explained:
             apart, sigma = tau - model, FLOOR_NM + FLOOR_SHARE * usual
@@ -114,15 +119,15 @@ class Telling:
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
                 normal = np.eye(columns.shape[2]) + np.tensordot(weight, squares, 1)
                 x = np.linalg.solve(normal, weight @ products)
-                x[-len(usual) :] = np.clip(x[-len(usual) :], -HELD, HELD)
+                x[gains] = np.clip(x[gains], -HELD, HELD)
                 left = np.mean((apart - columns @ x) ** 2, axis=0)
                 total = self.samples + SENSOR_WEIGHT
                 sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
             noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
             cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
             share = 1.0 - left / np.maximum(tau.var(axis=0), floor**2)
-            size = 1.0 + FRICTION[-1] * x[-len(share) :]
-            return Explained(cost + beyond, share, size, x)
+            size = 1.0 + FRICTION[-1] * x[gains]
+            return Explained(cost + beyond, share, size, x[: gains.stop])
 
         return of
 
@@ -144,7 +149,7 @@ class Telling:
         apart = np.mean((rows.tau - self.torque(rows)) ** 2, axis=0)[self.alive]
         return float(np.log(apart + SENSOR_NM**2).sum()) + rows.scaled
 
-    def _columns(self, rows: Rows) -> tuple[Array, Array]:
+    def _columns(self, rows: Rows, changed: int | None) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
         model = self.torque(rows)
@@ -153,8 +158,11 @@ class Telling:
         joint = np.zeros((m, n, len(FRICTION), n))
         for k, column in enumerate((np.ones_like(model), step, rows.dq, model)):
             joint[:, range(n), k, range(n)] = FRICTION[k] * column
-        inertial = regressor * inertial_std(self.arm).ravel()
-        return np.concatenate([inertial, joint.reshape(m, n, -1)], axis=2), model
+        parts = [regressor * inertial_std(self.arm).ravel(), joint.reshape(m, n, -1)]
+        if changed is not None:
+            later = (np.arange(m) >= changed)[:, None, None]
+            parts.append(later * regressor[:, :, -10:] * np.repeat(PAYLOAD, (1, 3, 6)))
+        return np.concatenate(parts, axis=2), model
 
     def _beyond(self, q: Array) -> float:
         """What positions (m, n) outside the model's limits cost."""

@@ -31,6 +31,9 @@ from adapter.screening.likelihood import (
 )
 
 MOST = 3  # readings in one recording
+DATES = tuple(
+    np.linspace(0.1, 0.9, 9)
+)  # shares of it at which the hand may take or leave something
 NUMBER = 4.0  # what a number costs that a reading takes from the recording: it was one of some ten
 SEEN_NM = 0.3  # rms of a joint's model torque below which nothing is read from it
 CLEAR = 4.0  # standard deviations of a joint's share, from which on it tells anything
@@ -314,7 +317,7 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
 
     Returns:
         At most `MOST` readings, one after the other; and how well the model explains the torques
-        with them.
+        with them. None where what the hand takes or leaves half way explains more.
     """
     now = telling.explained(rows)
     found: list[Reading] = []
@@ -325,6 +328,10 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:
             break
+        dates = (np.array(DATES) * len(rows.q)).astype(int).tolist()
+        held = min((telling.explained(rows, date) for date in dates), key=lambda x: x.cost)
+        if held.cost + NUMBER < min(costs):  # the hand takes or leaves something
+            return found, held
         best = int(np.argmin(costs))
         found.append(nearer[best])
         now, rows = explained[best], nearer[best].rows
