@@ -201,3 +201,10 @@ def test_a_few_poses_are_no_other_order(tmp_path: Path) -> None:
     trial = draw(10098)
     log, model, _ = write(trial, tmp_path, pinocchio_recording(trial), "pinocchio")
     taken(read_log(log), documented(model))
+
+
+def test_what_the_hand_takes_half_way_is_no_other_arm(tmp_path: Path) -> None:
+    """5 kg from some time on, which no load that is there from the start explains."""
+    trial = replace(draw(31019), seconds=15.0)
+    log, model, _ = write(trial, tmp_path, pinocchio_recording(trial), "pinocchio")
+    taken(read_log(log), documented(model))

@@ -219,17 +219,6 @@ def test_a_namespace_and_joints_of_a_gripper_are_no_other_robot() -> None:
     assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 0.3
 
 
-@pytest.mark.parametrize("from_s", [2.0, 4.0, 6.0])
-def test_what_the_hand_takes_half_way_is_no_other_arm(from_s: float) -> None:
-    """5 kg, which no correction of a load that is there from the start explains."""
-    held = payload(5.0, np.array([0.02, -0.03, 0.16]), 5e-3 * np.eye(3))
-    bare, loaded = (
-        record(x, Motion(8.0, 5)).log() for x in (arm(), arm().with_changes(effects=[held]))
-    )
-    taken = (1e-9 * (bare.stamp_ns - bare.stamp_ns[0]) > from_s)[:, None]
-    check_torque(replace(bare, tau=np.where(taken, loaded.tau, bare.tau)), panda_model())
-
-
 def written(log: Log, path: Path) -> Path:
     with McapWriter(path, log.joint_names) as writer:
         for stamp_ns, *signals in zip(log.stamp_ns.tolist(), log.q, log.dq, log.tau, strict=True):
