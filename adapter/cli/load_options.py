@@ -36,8 +36,8 @@ def declare(parser: argparse.ArgumentParser) -> None:
         "--inertia-prior",
         type=float,
         metavar="SHARE",
-        help="standard deviation of the model's inertial numbers, of their size (default 0.02 to "
-        "0.16, as far as the log does not speak against it; 0.2 with --empty)",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.05; "
+        "0.2 with --empty)",
     )
     add_json(parser, or_output=True)
     parser.set_defaults(check=_check)
