@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from adapter.gap.monitor_judge import sentence
+from adapter.model.numbers import plus_minus
 from adapter.realtime.showing import View
 from adapter.runs.live import disagreement
 from adapter.runs.terminal import console
@@ -99,7 +100,7 @@ def _learning(now: Now) -> Text:
     for name, state in (("λ", now.lam_state), ("θ", now.theta_state)):
         text.append(f"{name} ").append(state, GOOD if state == CONVERGED else LOUD).append(" · ")
     load = now.load
-    carried = "none noticed" if load is None else f"{load['m']:.3f} ± {load['m_std']:.3f} kg"
+    carried = "none noticed" if load is None else f"{plus_minus(load['m'], load['m_std'])} kg"
     text.append(f"load {carried} · contact ")
     contact = "none" if now.contact is None else f"joint {now.contact + 1}"
     return text.append(contact, "" if now.contact is None else LOUD)

@@ -18,6 +18,7 @@ from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
+from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
 from adapter.report.headline import Worth, headline
@@ -124,7 +125,7 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     table.add_row("θ", _reached(figures, "theta") + fit)
     for change in theta["changes"]:
         load = change.get("payload")
-        what = f"{load['m']:.3f} ± {load['m_std']:.3f} kg" if load else "superseded"
+        what = f"{plus_minus(load['m'], load['m_std'])} kg" if load else "superseded"
         table.add_row("change at the hand", f"at {change['stamp_s'] - start_s:.2f} s: {what}")
     for line in disagreement_lines(figures.get("disagreements", []), start_s):
         table.add_row("new disagreement", line)

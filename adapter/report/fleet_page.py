@@ -21,7 +21,7 @@ from adapter.report.fleet_words import (
 from adapter.report.html import fill, write_whole
 from adapter.report.style import MUTED, Drawing, Panel, joint_color
 from adapter.report.tables import Table
-from adapter.report.words import plus_minus
+from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
@@ -74,8 +74,8 @@ def _parameters(arm: FleetArm) -> Table:
     for j, name in enumerate(arm.model.tree.joint_names):
         shown = arm.model.theta_std[links + j, 0] > LEAST_STD
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
-        values = [plus_minus(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
-        rows.append([name, plus_minus(*mass), *values])
+        values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
+        rows.append([name, with_doubt(*mass), *values])
     note = (
         "A mass without a standard deviation is the documentation's: torques show it in sums only."
     )

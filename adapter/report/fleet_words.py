@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
+from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array
 from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift, StandsOut
@@ -28,7 +29,7 @@ def log_cells(log: OfLog) -> tuple[str, ...]:
         Path(log.moments.path).name,
         begin_words(log.moments.begin_s),
         f"{log.moments.span_s:.0f}",
-        "" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
+        "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
         " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
@@ -51,6 +52,10 @@ def begin_words(begin_s: float) -> str:
     return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
 
 
+def _signed(value: float, std: float) -> str:
+    return "+" * (value > 0.0) + plus_minus(value, std)
+
+
 def _joints(numbers: tuple[int, ...]) -> str:
     return f"joint {', '.join(map(str, numbers))}"
 
@@ -65,7 +70,7 @@ def drift_words(drift: Drift) -> str:
     doubt = "; these recordings cannot tell which" if drift.rivals else ""
     return (
         f"{effect.title.capitalize()} of joint {drift.joint} follows {drift.follows}{or_}: "
-        f"{drift.slope:+.3g} ± {drift.std:.2g} {unit} {per}, {drift.span:.3g} {unit} over all"
+        f"{_signed(drift.slope, drift.std)} {unit} {per}, {drift.span:.3g} {unit} over all"
         f"{share}{doubt}"
     )
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.gap.phrases import DASH, listed, plain
+from adapter.gap.phrases import listed
 from adapter.gap.result import GapResult, Leftover
 from adapter.gap.words import (
     by_kind,
@@ -18,6 +18,7 @@ from adapter.gap.words import (
     signal_words,
     worst_joint,
 )
+from adapter.model.numbers import DASH, plain
 from adapter.model.spatial import Array
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adapter.gap.phrases import plain
 from adapter.gap.result import Curves, GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
+from adapter.model.numbers import plain
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,

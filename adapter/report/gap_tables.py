@@ -8,18 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.gap.phrases import (
-    DASH,
-    THETA,
-    THETA_UNITS,
-    parameter_lines,
-    plain,
-    plus_minus,
-    shown_unit,
-    who,
-)
+from adapter.gap.phrases import parameter_lines, shown_unit, who
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
+from adapter.model.inertia import PARAMETERS, UNITS
+from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
 from adapter.report.tables import Table
 from adapter.report.words import NARROW
@@ -229,9 +222,9 @@ def correction_table(result: GapResult) -> Table | None:
         rows.append(
             [
                 f"link {link + 1}",
-                THETA[part],
-                tied(f"{result.corrections[link, part]:+.2g} {THETA_UNITS[part]}"),
-                f"± {plain(result.corrections_prior[link, part], 2)} {THETA_UNITS[part]}",
+                PARAMETERS[part],
+                tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}"),
+                f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}",
                 tied(f"{ratio[link, part]:+.1f}"),
             ]
         )

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from adapter.gap.phrases import plain, who
+from adapter.gap.phrases import who
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.words import left_above_noise, noise_times, percent, stopped, worse
+from adapter.model.numbers import plain
 from adapter.model.robots import names as robot_names
 from adapter.report.gap_tables import rival_rows, tied
 from adapter.report.next_steps import Step

@@ -12,7 +12,7 @@ import numpy as np
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.torque_panels import refusal, theta_started
-from adapter.report.words import NARROW, is_live, missed_words, not_learned, plus_minus, quantity
+from adapter.report.words import NARROW, is_live, missed_words, not_learned, quantity, with_doubt
 from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
 from adapter.runs.run_folder import RunData
 
@@ -105,7 +105,7 @@ def _all_joints(values: Any, std: Any) -> str:
     """All joints together, ± one standard deviation where it is known."""
     size = together(values)
     spread = None if std is None else float(np.sqrt(np.sum((values * std) ** 2))) / max(size, 1e-12)
-    return f"{plus_minus(size, spread)} N m".replace(" ", NARROW)
+    return f"{with_doubt(size, spread)} N m".replace(" ", NARROW)
 
 
 def _fall_words(fall: Fall, j: int) -> str:
@@ -115,7 +115,7 @@ def _fall_words(fall: Fall, j: int) -> str:
 
 def _loads(worth: Worth) -> list[str]:
     said = [
-        f"A load of {plus_minus(mass, std)} kg was noticed at the hand "
+        f"A load of {with_doubt(mass, std)} kg was noticed at the hand "
         f"{quantity(at_s, 's')} after the first motion.".replace(" kg", f"{NARROW}kg")
         for at_s, mass, std in worth.loads
     ]

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from adapter.model.numbers import DASH
 from adapter.report.gap_panels import fall_drawing
 from adapter.report.headline import Worth
 from adapter.report.style import Panel
 from adapter.report.tables import Table
-from adapter.report.words import NOTHING, number, plus_minus
+from adapter.report.words import number, with_doubt
 from adapter.report.worth import Fall
 from adapter.runs.run_folder import RunData
 
@@ -43,13 +44,13 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
 
 def _values(values: Any, std: Any = None) -> list[str]:
     doubts = [None] * len(values) if std is None else std
-    return [plus_minus(x, s) for x, s in zip(values, doubts, strict=True)]
+    return [with_doubt(x, s) for x, s in zip(values, doubts, strict=True)]
 
 
 def _changes(fall: Fall) -> list[str]:
     assert fall.before is not None
     shares = 100.0 * (fall.after / np.maximum(fall.before, 1e-12) - 1.0)
-    return [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else NOTHING for x in shares]
+    return [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
 
 
 def worth_panels(data: RunData, worth: Worth) -> list[Panel]:

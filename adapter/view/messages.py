@@ -21,6 +21,7 @@ import numpy as np
 
 from adapter.effects.base import with_squares
 from adapter.effects.catalogue import CATALOGUE, effects_by_name
+from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.runs.terminal import json_ready
@@ -29,10 +30,6 @@ from adapter.view.now import Now, Onlooker, Skeleton, skeleton
 
 DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
 ESTIMATE_S = 0.5
-THETA = (
-    *(("m", "kg"), ("mX", "kg m"), ("mY", "kg m"), ("mZ", "kg m")),
-    *((f"{a}{b}", "kg m²") for a, b in ("XX", "XY", "XZ", "YY", "YZ", "ZZ")),
-)
 LAMBDA = (
     *((f"turn about {axis}", "mrad") for axis in "xyz"),
     *((f"shift along {axis}", "mm") for axis in "xyz"),
@@ -86,7 +83,7 @@ class Messages:
             "links": list(arm.tree.link_names),
             "parents": list(arm.tree.parent),
             "lambda": [list(entry) for entry in LAMBDA],
-            "theta": [list(entry) for entry in THETA],
+            "theta": [list(entry) for entry in zip(PARAMETERS, UNITS, strict=True)],
             "theta_documented": numbers(arm.theta),
             "theta_alone": self._onlooker.shown_alone.tolist(),
             "effects": [

@@ -180,24 +180,6 @@ def _broken(data: TreeData, name: str, value: float) -> TreeData:
     return replace(data, **{first: replace(holder, **{second: table}) if second else table})
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("constant", 1.5, "0 to 1"),
-        ("constant", np.nan, "0 to 1"),
-        ("gain", 0.0, "above 0 and at most 1"),
-        ("gain", 2.0, "above 0 and at most 1"),
-        ("longest_step", -1.0, "above 0 and finite"),
-        ("position_span", np.inf, "above 0 and finite"),
-        ("minibatch", 0, "at least 1"),
-        ("snapshots", (-1,), "from 0 on"),
-    ],
-)
-def test_settings_out_of_range_are_named(name: str, value: Any, said: str) -> None:
-    with pytest.raises(ModelError, match=f"{name}.*{said}"):
-        NetworkSettings(**{name: value})
-
-
 @pytest.mark.parametrize("constant", [0.0, 1.0])
 def test_the_gain_may_fall_at_once_or_never(constant: float) -> None:
     truth = random_tree(5, 7)

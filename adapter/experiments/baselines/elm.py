@@ -15,13 +15,7 @@ from scipy import linalg
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import gram, solve_positive
-from adapter.experiments.baselines.learner import (
-    Progress,
-    ScaledBaseline,
-    Told,
-    at_least,
-    positive,
-)
+from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 MEMBERS, UNITS, POINTS = 50, 4000, 10_000  # the paper's
@@ -65,12 +59,7 @@ class ElmCommittee(ScaledBaseline):
                 the units close to their linear part, so that their sums are low polynomials.
             ridge: added to the mean Gram matrix of the units.
             seed: of weights and parts.
-
-        Raises:
-            ModelError: sizes below 1, or a spread or ridge that is not positive.
         """
-        at_least(1, members=members, units=units, points=points)
-        positive(spread=spread, ridge=ridge)
         self.members, self.units, self.points = members, units, points
         self.spread, self.ridge, self.seed = spread, ridge, seed
         self._machines: list[_Machine] = []
@@ -108,12 +97,7 @@ class ElmCommittee(ScaledBaseline):
         return mean
 
     def _told(self, points: int, inputs: int) -> Told:
-        sizes = {
-            "members": self.members,
-            "units": self.units,
-            "points": points,
-            "inputs": inputs,
-        }
+        sizes = {"members": self.members, "units": self.units, "points": points, "inputs": inputs}
         tuning = (
             f"Random input weights with deviation {self.spread:g} / sqrt({inputs}) on standardised "
             "inputs, biases uniform in -1 to 1.",

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.page.figure4 import KINDS
-from adapter.experiments.page.words import grouped, listed, scientific, with_unit
+from adapter.experiments.page.words import grouped, scientific, with_unit
 from adapter.experiments.results import AtlasResults, PandaResults
+from adapter.gap.phrases import listed
+from adapter.model.numbers import DASH
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -24,7 +26,6 @@ from adapter.report.style import (
     time_axis,
 )
 from adapter.report.tables import Table
-from adapter.report.words import NOTHING
 from adapter.runs.score import TORQUE_GOAL
 
 DECADE = 10.0  # largest over smallest value from which a plot is logarithmic
@@ -106,7 +107,7 @@ def _time(us: float | None) -> str:
 
 def _ranks(rank: int | None, joints: int | None) -> str:
     if rank is None or joints is None:
-        return NOTHING
+        return DASH
     return f"{grouped(rank)} of {grouped(6 * joints)}"
 
 

@@ -24,7 +24,6 @@ from adapter.experiments.page.words import (
     headline,
     last_ratio,
     letter,
-    listed,
     measured,
     ours_text,
     percent,
@@ -33,11 +32,13 @@ from adapter.experiments.page.words import (
     with_unit,
 )
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
+from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
+from adapter.model.numbers import DASH
 from adapter.report.html import fill, write_whole
 from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
-from adapter.report.words import JOIN, NARROW, NOTHING
+from adapter.report.words import JOIN, NARROW
 
 TEMPLATE = "experiment.html"
 NOT_STATED = "not stated"
@@ -231,7 +232,7 @@ def learner_table(atlas: AtlasResults) -> Table | None:
     units = ["", "", "", "", "eq. 20", "eq. 20", "by joint, N m"]
     rows = []
     for learner in atlas.learners:
-        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [NOTHING]
+        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [DASH]
         for name in known:
             first = name == known[0]
             row = [learner.name, _joints(learner), with_unit(learner.train_s, "s", 3)]
@@ -254,7 +255,7 @@ def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
 
 def _joints(learner: LearnerScores) -> str:
     known = {len(x) for x in (*learner.rmse.values(), *learner.boxes.values())}
-    return str(max(known)) if known else NOTHING
+    return str(max(known)) if known else DASH
 
 
 def _spread(values: np.ndarray | None) -> str:
@@ -262,6 +263,6 @@ def _spread(values: np.ndarray | None) -> str:
     finite = np.asarray([] if values is None else values, dtype=float)
     finite = finite[np.isfinite(finite)]
     if not len(finite):
-        return NOTHING
+        return DASH
     low, high = scientific(float(finite.min())), scientific(float(finite.max()))
     return low if low == high else f"{low}{NARROW}–{JOIN}{NARROW}{high}"
