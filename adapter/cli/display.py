@@ -19,7 +19,7 @@ from adapter.model.numbers import plus_minus
 from adapter.realtime.showing import View
 from adapter.runs.live import disagreement
 from adapter.runs.terminal import console
-from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker
+from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker, untold
 
 GOOD, LOUD, DIM = "green", "yellow", "dim"
 
@@ -64,11 +64,8 @@ class LiveTable:
         """What is new since the last look, above the table."""
         lines = now.view.lines[self._lines :]
         self._lines = len(now.view.lines)
-        for found in now.findings:
-            key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
-            if key not in self._told:
-                self._told.add(key)
-                lines.append(disagreement(sentence(found, 0.0)))
+        for found in untold(now.findings, self._told):
+            lines.append(disagreement(sentence(found, 0.0)))
         for note in now.view.news.get("notes", []):
             if note not in self._told:
                 self._told.add(note)

@@ -21,9 +21,10 @@ from adapter.model.model_file import load_model
 from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
-from adapter.report.headline import Worth, headline
+from adapter.report.headline import headline
 from adapter.report.next_steps import next_steps
 from adapter.report.words import is_live, missed_words, small
+from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import RunData, load_run, run_data, save_run
 from adapter.runs.score import Reference, counted_from
@@ -68,10 +69,7 @@ def conclude(
     page, other = folder / "report.html", folder / "model.urdf"
     for stale in (page, other):  # of an earlier model, which they alone describe
         stale.unlink(missing_ok=True)
-    try:
-        other.write_bytes(robot_urdf(data.model).text.encode())
-    except ModelError as error:
-        warn([f"no URDF: {error}"])
+    write_urdf(data.model, other)
     save_run(folder, data)
     if not args.no_report:
         figures["report"] = str(write_report(page, data))
@@ -159,6 +157,24 @@ def _reached(figures: dict[str, Any], which: str) -> str:
     if not at and figures["slow_s"]:
         return "converged in the slow phase"
     return f"converged {at:.2f} s after {counted_from(figures)}"
+
+
+def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False) -> bool:
+    """Write a model as URDF, or warn where a body of it cannot exist; whether it was written.
+
+    Args:
+        whose: said before the warning; told: warn as well of what the file lacks.
+    """
+    try:
+        written = robot_urdf(model)
+    except ModelError as error:
+        warn([f"{whose}no URDF: {error}"])
+        return False
+    if told:
+        write_robot(path, written)
+    else:
+        path.write_bytes(written.text.encode())
+    return True
 
 
 def write_robot(path: Path, written: RobotText) -> None:

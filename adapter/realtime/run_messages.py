@@ -167,14 +167,8 @@ class RunMessages:
         if not (np.isfinite(push.wrench).all() and np.isfinite(q).all()):
             return []
         frames = self._frames[LEARNED if push.learned and self._version else DOCUMENTED]
-        into = frames.orientation_of_last(q).T
-        fields = {
-            "header": header(push.stamp_ns, frames.last),
-            "wrench": {
-                "force": _xyz(into @ push.wrench[:3]),
-                "torque": _xyz(into @ push.wrench[3:]),
-            },
-        }
+        own = push.wrench.reshape(2, 3) @ frames.orientation_of_last(q)
+        fields = wrench_fields(push.stamp_ns, frames.last, own)
         return [Message(WRENCH, WRENCH_STAMPED, push.stamp_ns, fields)]
 
     def news(self, stamp_ns: int, told: Mapping[str, Any]) -> list[Message]:
@@ -244,7 +238,23 @@ def _shares(found: Mapping[str, float | None]) -> dict[str, float]:
     return dict(zip(SHARE_FIELDS, values, strict=True))
 
 
-def _xyz(vector: Array) -> dict[str, float]:
+def wrench_fields(stamp_ns: int, frame: str, wrench: Array) -> dict[str, Any]:
+    """Of a WrenchStamped: (2, 3) force and torque, N and N m, in a frame's axes."""
+    both = zip(("force", "torque"), map(xyz, wrench), strict=True)
+    return {"header": header(stamp_ns, frame), "wrench": dict(both)}
+
+
+def table_fields(labels: Sequence[str], table: Array) -> dict[str, Any]:
+    """Of a Float64MultiArray of any shape, a label for each dimension."""
+    dim = [
+        {"label": label, "size": size, "stride": int(np.prod(table.shape[k:]))}
+        for k, (label, size) in enumerate(zip(labels, table.shape, strict=True))
+    ]
+    return {"layout": {"dim": dim, "data_offset": 0}, "data": table.ravel()}
+
+
+def xyz(vector: Array) -> dict[str, float]:
+    """Of a Vector3."""
     return dict(zip("xyz", vector.tolist(), strict=True))
 
 

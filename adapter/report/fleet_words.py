@@ -56,10 +56,6 @@ def _signed(value: float, std: float) -> str:
     return "+" * (value > 0.0) + plus_minus(value, std)
 
 
-def _joints(numbers: tuple[int, ...]) -> str:
-    return f"joint {', '.join(map(str, numbers))}"
-
-
 def drift_words(drift: Drift) -> str:
     """A sentence."""
     effect, per = CATALOGUE[drift.effect], f"per unit of {drift.follows}"
@@ -97,9 +93,9 @@ def sentences(arm: FleetArm) -> list[str]:
             worst = int(np.argmax(log.rmse / log.own_rmse))
             found.append(
                 f"{Path(log.moments.path).name} disagrees with the others on "
-                f"{_joints(log.disagrees)}: {log.rmse[worst]:.2g} N m on joint {worst + 1} where "
-                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change"
-                f"{'' if log.used else '; the model is learned without it'}"
+                f"joint {', '.join(map(str, log.disagrees))}: {log.rmse[worst]:.2g} N m on joint "
+                f"{worst + 1} where a model of its own leaves {log.own_rmse[worst]:.2g}; another "
+                f"arm, or a change{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
     used = [x for x in arm.logs if x.used]
@@ -150,33 +146,30 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
             for k, name in enumerate(arm.effects)
         },
         "drifts": [asdict(x) for x in arm.drifts],
-        "standing_out": [_standing_out_json(arm, x) for x in arm.standing_out],
-        "logs": [_log_json(log) for log in arm.logs],
+        "standing_out": [
+            {**x._asdict(), "path": arm.logs[x.number].moments.path} for x in arm.standing_out
+        ],
+        "logs": [
+            {
+                "path": log.moments.path,
+                "content": log.moments.content,
+                "begin_s": log.moments.begin_s,
+                "span_s": log.moments.span_s,
+                "samples": log.moments.samples,
+                "load": None if log.load is None else log.load._asdict(),
+                "rmse_nm": log.rmse,
+                "own_rmse_nm": log.own_rmse,
+                "used": log.used,
+                "disagrees": list(log.disagrees),
+                "worth_nats": log.worth,
+            }
+            for log in arm.logs
+        ],
         "notes": sentences(arm),
     }
-
-
-def _standing_out_json(arm: FleetArm, one: StandsOut) -> dict[str, Any]:
-    return {**one._asdict(), "path": arm.logs[one.number].moments.path}
 
 
 def effect_std(arm: FleetArm) -> Array:
     """(e, n) standard deviations of what is learned beside θ."""
     effects = arm.outcome.effects
     return np.asarray(arm.std[len(arm.std) - effects.size :].reshape(effects.shape))
-
-
-def _log_json(log: OfLog) -> dict[str, Any]:
-    return {
-        "path": log.moments.path,
-        "content": log.moments.content,
-        "begin_s": log.moments.begin_s,
-        "span_s": log.moments.span_s,
-        "samples": log.moments.samples,
-        "load": None if log.load is None else log.load._asdict(),
-        "rmse_nm": log.rmse,
-        "own_rmse_nm": log.own_rmse,
-        "used": log.used,
-        "disagrees": list(log.disagrees),
-        "worth_nats": log.worth,
-    }

@@ -35,7 +35,7 @@ from adapter.report.gap_tables import (
 from adapter.report.gap_trust import gap_checks, gap_steps
 from adapter.report.html import fill, write_whole
 from adapter.report.tables import Tile
-from adapter.report.words import NARROW
+from adapter.report.words import NARROW, capital
 
 TEMPLATE = "gap.html"
 WORTH = "torque error"  # how the clause begins that says what findings are worth
@@ -87,7 +87,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "findings": finding_rows(result),
         "matrix": joint_matrix(result),
         "carried": carried_table(result),
-        "contradictions": [_first_capital(text) for text in result.contradictions],
+        "contradictions": [capital(text) for text in result.contradictions],
         "told": told,
         "error_table": error_table(result) if told else None,
         "after_words": _after_words(result),
@@ -115,12 +115,8 @@ def _headline(result: GapResult) -> list[str]:
         parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
-    said = [_first_capital(text) if text.startswith(OURS) else text for text in parts]
+    said = [capital(text) if text.startswith(OURS) else text for text in parts]
     return [f"{tied(text.replace(' -> ', ' → '))}." for text in said]
-
-
-def _first_capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _leftover(item: Leftover) -> str:

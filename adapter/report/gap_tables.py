@@ -15,7 +15,7 @@ from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
 from adapter.report.tables import Table
-from adapter.report.words import NARROW
+from adapter.report.words import NARROW, capital
 
 MOST_CORRECTIONS = 6
 
@@ -60,7 +60,7 @@ def _row(findings: Sequence[Finding]) -> FindingRow:
     else:
         when = span(first) or "throughout"
     return FindingRow(
-        what=_first_capital(first.title),
+        what=capital(first.title),
         where=who(first.effect, joints),
         when=when,
         values=[RANGES.format(_ranges(ordered))]
@@ -110,7 +110,7 @@ def joint_matrix(result: GapResult) -> Table | None:
         of = {f.joints[0]: f for f in findings}
         for key in findings[0].parameters:
             factor, unit = _unit(findings, key)
-            heads.append(_first_capital(findings[0].title))
+            heads.append(capital(findings[0].title))
             units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
             columns.append({j: _scaled_value(f, key, factor) for j, f in of.items()})
     if not columns:
@@ -145,10 +145,6 @@ def _worth(findings: Sequence[Finding]) -> str:
     return tied(f"{low} N m" if low == high else f"{low} to {high} N m")
 
 
-def _first_capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
     """(findings, what else they could be and how much of them that explains, how to tell)."""
     rows = []
@@ -156,7 +152,7 @@ def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
         shares = shares_of(findings)
         if shares:
             joints = sorted(j for f in findings for j in f.joints)
-            where = f"{_first_capital(findings[0].title)}, {who(findings[0].effect, joints)}"
+            where = f"{capital(findings[0].title)}, {who(findings[0].effect, joints)}"
             said = ", ".join(f"{title_of(name)} {share}" for name, share in shares)
             rows.append((where, said, findings[0].split_by))
     return rows

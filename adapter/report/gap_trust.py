@@ -16,6 +16,7 @@ from adapter.model.robots import names as robot_names
 from adapter.report.gap_tables import rival_rows, tied
 from adapter.report.next_steps import Step
 from adapter.report.trust import BAD, GOOD, LOOK, Check
+from adapter.report.words import capital
 
 SURE = 0.99  # evidence from which a finding is called well known
 FIGURES = "gap.json"  # beside the page
@@ -113,7 +114,7 @@ def _asked(texts: Sequence[str]) -> list[str]:
     found = []
     for motion, clauses in told.items():
         signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
-        found.append(_first_capital(f"{motion}: the {signs}" if signs else motion))
+        found.append(tied(capital(f"{motion}: the {signs}" if signs else motion)))
     return found
 
 
@@ -125,7 +126,3 @@ def _robot(result: GapResult) -> tuple[str, ...]:
 
 def _command(*words: str) -> str:
     return shlex.join(["adapter", *words])
-
-
-def _first_capital(text: str) -> str:
-    return tied(text[:1].upper() + text[1:])

@@ -3,38 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.torque_panels import refusal, theta_started
-from adapter.report.words import NARROW, is_live, missed_words, not_learned, quantity, with_doubt
-from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
+from adapter.report.words import (
+    NARROW,
+    capital,
+    is_live,
+    missed_words,
+    not_learned,
+    quantity,
+    with_doubt,
+)
+from adapter.report.worth import Fall, Worth, together
 from adapter.runs.run_folder import RunData
 
 MOVED_M = 1e-4  # of the hand, from which a measured λ is said to differ from the documentation
 MANY_LOADS = 3
-
-
-@dataclass(frozen=True)
-class Worth:
-    """What a run brought, in numbers; see `adapter.report.worth`."""
-
-    torque: Fall | None
-    tracking: Fall | None
-    hand_m: float | None
-    loads: list[tuple[float, float, float | None]]
-
-    @classmethod
-    def of(cls, data: RunData) -> Worth:
-        """Of a run."""
-        measured = data.figures["lambda"].get("source") == LAMBDA_MEASURED
-        hand_m = hand_off_m(data) if measured else None
-        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads(data))
 
 
 def headline(data: RunData, worth: Worth) -> list[str]:
@@ -56,8 +45,7 @@ def _late(figures: Mapping[str, Any]) -> list[str]:
     """Whether deadlines were missed, and by whose fault."""
     if not is_live(figures):
         return []
-    said = missed_words(figures)
-    return [f"{said[:1].upper()}{said[1:]}."]
+    return [f"{capital(missed_words(figures))}."]
 
 
 def against(figures: Mapping[str, Any]) -> str:

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from adapter.model.self_model import MJCF
-from adapter.report.headline import Worth
 from adapter.report.torque_panels import refusal, theta_started
 from adapter.report.words import is_live, not_learned
-from adapter.report.worth import SLOW, slow_share
+from adapter.report.worth import SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData
 
 MOST = 4

@@ -95,10 +95,11 @@ def joint_tables(data: RunData) -> list[Table]:
     if theta.get("validation_torque_rmse_nm"):
         columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
     effects = _effect_columns(data)
-    return [_table(columns), *([_table([names, *effects])] if effects else [])]
+    return [by_column(columns), *([by_column([names, *effects])] if effects else [])]
 
 
-def _table(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
+def by_column(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
+    """Columns (head, unit, cells)."""
     heads, units, cells = zip(*columns, strict=True)
     return Table(heads, list(zip(*cells, strict=True)), units)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
-from adapter.report.headline import Worth, against
+from adapter.report.headline import against
 from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
@@ -23,7 +23,7 @@ from adapter.report.words import (
     small,
     spread,
 )
-from adapter.report.worth import BLOCK_S, SLOW, slow_share
+from adapter.report.worth import BLOCK_S, SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
 from adapter.signals.validation import rms_of

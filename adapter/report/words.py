@@ -48,6 +48,11 @@ def with_doubt(value: Any, std: Any) -> str:
     return plus_minus(value, std).replace("-", "−")
 
 
+def capital(text: str) -> str:
+    """As a sentence begins."""
+    return text[:1].upper() + text[1:]
+
+
 def count(value: int) -> str:
     """A whole number in groups of three."""
     return f"{int(value):,}".replace(",", NARROW)

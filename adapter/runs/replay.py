@@ -208,35 +208,26 @@ def replay(
 
 
 def _exact(
-    log: Log,
-    stop: int,
-    pipeline: Pipeline,
-    progress: Progress,
-    observer: ReplayObserver | None,
+    log: Log, stop: int, pipeline: Pipeline, progress: Progress, observer: ReplayObserver | None
 ) -> TickTimes:
     ticks = TickTimes()
     for start in range(0, stop, AT_ONCE):
         progress(start)
         piece = log.piece(start, min(start + AT_ONCE, stop))
-        _exact_piece(piece, pipeline, observer, ticks)
+        signals = np.stack([piece.q, piece.dq, piece.tau], axis=1)
+        tick_ns = np.zeros(len(piece), np.int64)
+        # the observer goes on with what is learned behind every so-many samples
+        for begin in range(0, len(piece), ADOPT_EVERY):
+            own = slice(begin, min(begin + ADOPT_EVERY, len(piece)))
+            part, before = piece.piece(own.start, own.stop), time.perf_counter_ns()
+            states = _filtered(part, pipeline.front_end)
+            tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
+            if len(states):
+                pipeline.learner.step_each(states)
+            if observer is not None:
+                observer.step_each(part.stamp_ns, signals[own])
+        ticks.add(tick_ns)
     return ticks
-
-
-def _exact_piece(
-    log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
-) -> None:
-    signals, tick_ns = np.stack([log.q, log.dq, log.tau], axis=1), np.zeros(len(log), np.int64)
-    # the observer goes on with what is learned behind every so-many samples
-    for begin in range(0, len(log), ADOPT_EVERY):
-        own = slice(begin, min(begin + ADOPT_EVERY, len(log)))
-        part, before = log.piece(own.start, own.stop), time.perf_counter_ns()
-        states = _filtered(part, pipeline.front_end)
-        tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
-        if len(states):
-            pipeline.learner.step_each(states)
-        if observer is not None:
-            observer.step_each(part.stamp_ns, signals[own])
-    ticks.add(tick_ns)
 
 
 def filtered_tables(log: Log, stop: int, front_end: FrontEnd) -> Iterator[Array]:

@@ -52,7 +52,7 @@ def test_a_finite_motion_costs_no_torque_and_counts_as_no_error() -> None:
     far[1, :3] = zxz_from_matrix(rot_z(1.5) @ matrix_from_zxz(far[1:2, :3]))[0]
     far[1, 5] += 0.3
     elsewhere = replace(documented, lam=far)
-    lam = completed_lambda(outcome, elsewhere).lam
+    lam = completed_lambda(outcome, elsewhere)[0]
     np.testing.assert_allclose(lam, far, atol=1e-7)
     motion = random_motion(documented.tree, 20, 2)
     before, after = (
@@ -68,7 +68,7 @@ def test_a_finite_motion_costs_no_torque_and_counts_as_no_error() -> None:
 def test_measured_frames_keep_what_the_data_show(seed: int) -> None:
     documented, learner = panda_model(), taught("measured", seed)
     outcome = collect(learner)
-    lam = completed_lambda(outcome, documented).lam
+    lam = completed_lambda(outcome, documented)[0]
     np.testing.assert_allclose(lam[0, 3:], documented.lam[0, 3:], atol=1e-9)
     seen = build("bent_link", seed).truth.lam
     hidden = np.einsum("jaa->j", np.eye(6) - outcome.lam_identifiable)

@@ -84,6 +84,10 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
     if not online:
         return None
     settled = online.get("lambda_settled_s")
+    rank, joints = online.get("lambda_rank"), online.get("joints")
+    shown = DASH
+    if rank is not None and joints is not None:
+        shown = f"{grouped(rank)} of {grouped(6 * joints)}"
     steps = [_time(online.get(key)) for key in ("step_p50_us", "step_p99_us")]
     rows = [
         ["samples a second, on one core", with_unit(online.get("samples_per_second"), "1/s", 3)],
@@ -93,7 +97,7 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
             "λ settled, θ begins after",
             "not reached" if settled is None else with_unit(settled, "s", 3),
         ],
-        ["directions of λ shown", _ranks(online.get("lambda_rank"), online.get("joints"))],
+        ["directions of λ shown", shown],
     ]
     return Table(["", "ATLAS"], rows)
 
@@ -103,12 +107,6 @@ def _time(us: float | None) -> str:
     if us is not None and us >= 1000.0:
         return with_unit(1e-3 * us, "ms", 3)
     return with_unit(us, "µs", 3)
-
-
-def _ranks(rank: int | None, joints: int | None) -> str:
-    if rank is None or joints is None:
-        return DASH
-    return f"{grouped(rank)} of {grouped(6 * joints)}"
 
 
 def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:

@@ -80,7 +80,10 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
     """What the template shows."""
     shown = [*(atlas_tiles(atlas) if atlas else []), *(panda_tiles(panda) if panda else [])]
     reasons = [ATLAS_LEFT_OUT] if atlas is None else _atlas_reasons(atlas)
-    reasons += [PANDA_LEFT_OUT] if panda is None else _panda_reasons(panda)
+    if panda is None:
+        reasons.append(PANDA_LEFT_OUT)
+    elif not math.isfinite(panda.theta_start_s):
+        reasons.append("Fig. 6b: θ was not learned, it waits until λ has converged.")
     return {
         "headline": headline(atlas, panda),
         "tiles": shown,
@@ -105,13 +108,8 @@ def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
         value = percent(best.median["control"])
         found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
     if times is not None:
-        found.append(
-            Tile(
-                "Advantage",
-                scientific(times),
-                f"times smaller on the arm, joints {arm_joints(atlas)}",
-            )
-        )
+        note = f"times smaller on the arm, joints {arm_joints(atlas)}"
+        found.append(Tile("Advantage", scientific(times), note))
     return found
 
 
@@ -133,7 +131,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     summary = figure5.side_by_side(atlas)
     return {
         "n": atlas.tree.n,
-        "limbs": figure4.limb_key(atlas.tree),
+        "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figure4.limbs(atlas.tree)],
         "schema": [*figure4.epoch_panels(atlas), *([histogram] if histogram else [])],
         "schema_more": [*([moments] if moments else []), *figure4.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
@@ -147,7 +145,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
         "full": atlas.full,
         "stated": stated_table(atlas.stated),
         "learners": learner_table(atlas),
-        "tuning": tuning_rows(atlas),
+        "tuning": [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners],
     }
 
 
@@ -211,13 +209,6 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
     return reasons
 
 
-def _panda_reasons(panda: PandaResults) -> list[str]:
-    """What of Fig. 6 is missing, and why."""
-    if math.isfinite(panda.theta_start_s):
-        return []
-    return ["Fig. 6b: θ was not learned, it waits until λ has converged."]
-
-
 def stated_table(items: Sequence[Stated]) -> Table | None:
     """What the paper states, what we measured, what differs; None without any."""
     rows = [[item.what, item.paper or NOT_STATED, ours_text(item), item.note] for item in items]
@@ -246,11 +237,6 @@ def learner_table(atlas: AtlasResults) -> Table | None:
                 ]
             )
     return Table(heads, rows, units)
-
-
-def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
-    """Name, title and how it was tuned, of each learner."""
-    return [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners]
 
 
 def _joints(learner: LearnerScores) -> str:

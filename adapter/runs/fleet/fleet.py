@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import glob
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeVar
@@ -147,7 +148,8 @@ def read_manifest(path: Path) -> Manifest:
         arms: dict[str, str] = {}
         told: dict[str, dict[str, float]] = {}
         for number, row in enumerate(reader, start=2):
-            log = _resolved((row[key] or "").strip(), path.parent)
+            log = (row[key] or "").strip()
+            log = log if _is_address(log) else str((path.parent / log).resolve())
             if log in told:
                 raise SettingsError(f"{path}, line {number}: tells of {log} a second time")
             told[log] = {}
@@ -157,20 +159,10 @@ def read_manifest(path: Path) -> Manifest:
                 if name.strip().lower() == ARM_COLUMN:
                     arms[log] = text.strip()
                 else:
-                    _number(told[log], name.strip(), text)
+                    # words (an operator's name) say nothing that can be fitted
+                    with suppress(ValueError):
+                        told[log][name.strip()] = float(text)
     return Manifest(arms, told)
-
-
-def _number(into: dict[str, float], name: str, text: str) -> None:
-    """Keep it where it is one; words (an operator's name) say nothing that can be fitted."""
-    try:
-        into[name] = float(text)
-    except ValueError:
-        return
-
-
-def _resolved(text: str, folder: Path) -> str:
-    return text if "://" in text else str((folder / text).resolve())
 
 
 def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings) -> Fleet:
