@@ -95,9 +95,7 @@ def _rollouts(args: argparse.Namespace) -> Rollouts | None:
         return None
 
 
-def _opened(
-    args: argparse.Namespace,
-) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
+def _opened(args: argparse.Namespace) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
     """The recordings and those held out; read here where a topic was named. Raises DriverError."""
     if args.topic is None:
         return args.logs, tuple(args.hold_out)

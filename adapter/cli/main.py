@@ -225,11 +225,8 @@ def _carry_out(command: Command, args: argparse.Namespace) -> int:
 def _told(value: Any) -> Any:
     """An argument in a sentence: files by their names, of many the first."""
     if isinstance(value, list | tuple):
-        return (
-            f"{_told(value[0])}" + f" and {len(value) - 1} more" * (len(value) > 1)
-            if value
-            else "-"
-        )
+        more = f" and {len(value) - 1} more" * (len(value) > 1)
+        return f"{_told(value[0])}{more}" if value else "-"
     if value is None:
         return "the documented arm"
     return value.name if isinstance(value, Path) else value

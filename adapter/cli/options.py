@@ -133,9 +133,8 @@ def check_robot(name: str | None) -> None:
 
 def add_topic(parser: argparse.ArgumentParser) -> None:
     """Which topic of a bag tells the joints."""
-    parser.add_argument(
-        "--topic", metavar="NAME", help="of the joint states, where a bag has several"
-    )
+    said = "of the joint states, where a bag has several"
+    parser.add_argument("--topic", metavar="NAME", help=said)
 
 
 def add_told(parser: argparse.ArgumentParser) -> None:

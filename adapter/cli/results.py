@@ -192,10 +192,7 @@ def run_export(args: argparse.Namespace) -> int:
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    for kind, path, text_of in (
-        ("urdf", args.urdf, robot_urdf),
-        ("mjcf", args.mjcf, robot_mjcf),
-    ):
+    for kind, path, text_of in (("urdf", args.urdf, robot_urdf), ("mjcf", args.mjcf, robot_mjcf)):
         if path is None:
             continue
         fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")

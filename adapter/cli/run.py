@@ -357,12 +357,7 @@ def _recording(
     path = _recording_path(args, folder)
     for earlier in _parts(path):  # --overwrite, or it would have been refused
         earlier.unlink()
-    return RecordingJob(
-        path,
-        metadata,
-        attachments,
-        arm=ShownArm.of(plan.robot),
-    )
+    return RecordingJob(path, metadata, attachments, arm=ShownArm.of(plan.robot))
 
 
 def _conclude(

@@ -373,7 +373,8 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
     resting = [joints[s] for s in pair if bodies.resting[s]]
     if resting:
         return f"joint {' and '.join(dict.fromkeys(resting))} did not move: move it, by itself"
-    if len(pair) == 2 and pair[0] != pair[1] and _alike(bodies, *pair):
+    dq, two = bodies.log.dq[:, pair], len(pair) == 2 and pair[0] != pair[1]
+    if two and abs(float(np.corrcoef(dq[:, 0], dq[:, 1])[0, 1])) > ALIKE:
         return (
             f"joints {joints[pair[0]]} and {joints[pair[1]]} moved alike: move one without the "
             "other"
@@ -388,8 +389,3 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
     return (
         "what is left unexplained is no smaller than the difference: record longer or faster motion"
     )
-
-
-def _alike(bodies: Bodies, first: int, second: int) -> bool:
-    dq = bodies.log.dq
-    return abs(float(np.corrcoef(dq[:, first], dq[:, second])[0, 1])) > ALIKE

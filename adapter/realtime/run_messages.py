@@ -125,15 +125,9 @@ class RunMessages:
         """Where the links are at joint angles q (n,) rad; of the learned arm once there is one."""
         if self._arm is None or not np.isfinite(q).all():
             return []
-        encoder, shown = (
-            (self._both, self._frames.values())
-            if self._version
-            else (
-                self._one,
-                [self._frames[DOCUMENTED]],
-            )
-        )
-        rows = np.concatenate([frames.rows(q) for frames in shown])
+        encoder = self._both if self._version else self._one
+        shown = (DOCUMENTED, LEARNED) if self._version else (DOCUMENTED,)
+        rows = np.concatenate([self._frames[name].rows(q) for name in shown])
         return [Message(TF_MOVING, TF, stamp_ns, encoder.encode(stamp_ns, rows))]
 
     def estimate(self, snapshot: Snapshot) -> list[Message]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +29,6 @@ MOST_ROWS = 300  # of recordings; of more those that there is something to say o
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
 
 
-@dataclass(frozen=True)
-class ArmOnPage:
-    """An arm's part of the page."""
-
-    name: str
-    lines: list[str]
-    parameters: Table
-    panels: list[Panel]
-    logs: Table
-
-
 def write_fleet_page(found: Fleet, path: str | Path) -> Path:
     """Write the page. Raises RunFolderError."""
     context: dict[str, Any] = {
@@ -52,16 +40,16 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
     return write_whole(path, fill(TEMPLATE, context))
 
 
-def _arm(arm: FleetArm) -> ArmOnPage:
+def _arm(arm: FleetArm) -> dict[str, Any]:
+    """An arm's part of the page."""
     numbers = to_be_shown(arm, MOST_ROWS)
     left = len(arm.logs) - len(numbers)
-    note = f"{left} more in the table file; here are those there is something to say of" * (
-        left > 0
-    )
-    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note)
+    note = f"{left} more in the table file; here are those there is something to say of"
+    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note * (left > 0))
     used = [x for x in arm.logs if x.used]
     panels = _courses(arm, used) if len(used) > 1 else []
-    return ArmOnPage(arm.name, sentences(arm), _parameters(arm), panels, logs)
+    told = {"name": arm.name, "lines": sentences(arm), "parameters": _parameters(arm)}
+    return {**told, "panels": panels, "logs": logs}
 
 
 def _parameters(arm: FleetArm) -> Table:

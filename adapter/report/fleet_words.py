@@ -24,10 +24,13 @@ EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 
 def log_cells(log: OfLog) -> tuple[str, ...]:
     """A recording's row under `HEADS`."""
-    worst = int(np.argmax(log.rmse))
+    worst, begin_s = int(np.argmax(log.rmse)), log.moments.begin_s
+    begins = f"{begin_s:.1f} s"
+    if begin_s >= EPOCH_S:
+        begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
     return (
         Path(log.moments.path).name,
-        begin_words(log.moments.begin_s),
+        begins,
         f"{log.moments.span_s:.0f}",
         "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
@@ -43,13 +46,6 @@ def to_be_shown(arm: FleetArm, most: int) -> list[int]:
     out = {x.number for x in arm.standing_out}
     out |= {k for k, x in enumerate(arm.logs) if x.load is not None or x.disagrees}
     return sorted(out)[:most]
-
-
-def begin_words(begin_s: float) -> str:
-    """A date, or s where a clock counts from something else."""
-    if begin_s < EPOCH_S:
-        return f"{begin_s:.1f} s"
-    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
 
 
 def _signed(value: float, std: float) -> str:

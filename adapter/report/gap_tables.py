@@ -63,15 +63,12 @@ def _row(findings: Sequence[Finding]) -> FindingRow:
         what=capital(first.title),
         where=who(first.effect, joints),
         when=when,
-        values=[RANGES.format(_ranges(ordered))]
+        values=[f"{_ranges(ordered)}; joint by joint below"]
         if in_matrix(ordered)
         else [line for f in ordered for line in _values(f, alone)],
         evidence=sure if alone or least >= 0.999 else f"{sure} and more",
         worth=_worth(ordered),
     )
-
-
-RANGES = "{}; joint by joint below"
 
 
 def in_matrix(findings: Sequence[Finding]) -> bool:
@@ -112,7 +109,10 @@ def joint_matrix(result: GapResult) -> Table | None:
             factor, unit = _unit(findings, key)
             heads.append(capital(findings[0].title))
             units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
-            columns.append({j: _scaled_value(f, key, factor) for j, f in of.items()})
+            std = {j: factor * np.asarray(f.std.get(key, np.nan), float) for j, f in of.items()}
+            columns.append(
+                {j: tied(plus_minus(factor * f.parameters[key], std[j])) for j, f in of.items()}
+            )
     if not columns:
         return None
     rows = [
@@ -120,11 +120,6 @@ def joint_matrix(result: GapResult) -> Table | None:
         for j, name in enumerate(result.joint_names, start=1)
     ]
     return Table(heads, rows, units)
-
-
-def _scaled_value(finding: Finding, key: str, factor: float) -> str:
-    value, std = finding.parameters[key], finding.std.get(key)
-    return tied(plus_minus(factor * value, None if std is None else factor * std))
 
 
 def _values(finding: Finding, alone: bool) -> list[str]:
@@ -186,23 +181,22 @@ def error_table(result: GapResult) -> Table:
         pair = getattr(before, key), getattr(after, key)
         if all(x is None or not np.isfinite(x).any() for x in pair):
             continue
-        columns += [_scaled(x, factor, len(noise)) for x in pair]
+        nothing = np.full(len(noise), np.nan)
+        columns += [nothing if x is None else factor * np.asarray(x, dtype=float) for x in pair]
         heads += ["Before", "After"]
         units += [unit, unit]
         decimals += [digits, digits]
     rows = [
-        [name, *(_fixed(x[j], digits) for x, digits in zip(columns, decimals, strict=True))]
+        [
+            name,
+            *(
+                f"{x[j]:.{digits}f}" if np.isfinite(x[j]) else DASH
+                for x, digits in zip(columns, decimals, strict=True)
+            ),
+        ]
         for j, name in enumerate(result.joint_names)
     ]
     return Table(heads, rows, units)
-
-
-def _fixed(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else DASH
-
-
-def _scaled(values: Array | None, factor: float, n: int) -> Array:
-    return np.full(n, np.nan) if values is None else factor * np.asarray(values, dtype=float)
 
 
 def correction_table(result: GapResult) -> Table | None:

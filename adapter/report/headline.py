@@ -19,7 +19,7 @@ from adapter.report.words import (
     quantity,
     with_doubt,
 )
-from adapter.report.worth import Fall, Worth, together
+from adapter.report.worth import Worth, together
 from adapter.runs.run_folder import RunData
 
 MOVED_M = 1e-4  # of the hand, from which a measured λ is said to differ from the documentation
@@ -81,7 +81,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
         ]
     more = np.square(fall.after) - np.square(fall.before)
     j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
-    worst = f"joint {j + 1} {_fall_words(fall, j)}"
+    first, last = (quantity(x[j], "N m", 2) for x in (fall.before, fall.after))
+    worst = f"joint {j + 1} {first} → {last}"
     verb = "fell" if fall.better else "rose"
     return [
         f"The torque error of all joints {verb} from {before} with the documented model to "
@@ -94,11 +95,6 @@ def _all_joints(values: Any, std: Any) -> str:
     size = together(values)
     spread = None if std is None else float(np.sqrt(np.sum((values * std) ** 2))) / max(size, 1e-12)
     return f"{with_doubt(size, spread)} N m".replace(" ", NARROW)
-
-
-def _fall_words(fall: Fall, j: int) -> str:
-    assert fall.before is not None
-    return f"{quantity(fall.before[j], 'N m', 2)} → {quantity(fall.after[j], 'N m', 2)}"
 
 
 def _loads(worth: Worth) -> list[str]:

@@ -137,14 +137,15 @@ def _view(
         tick = AXIS_SHARE * size * axis
         ax.plot(*project(np.stack([p - tick, p + tick])).T, color=joint_color(j), linewidth=1.3)
         ax.plot(*project(p), color=joint_color(j), marker="o", markersize=3.6)
-    _ground(ax, project, size)
+    ground(ax, project, 0.15 * size)
     return drawing.panel(title, "", note)
 
 
-def _ground(ax: Axes, project: Projection, size: float) -> None:
-    """A square on the ground around the base, and a scale."""
-    square = 0.15 * size * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
+def ground(ax: Axes, project: Projection, half: float) -> None:
+    """A square on the ground around the base, `half` (m) to either side, none of 0; a scale."""
+    if half:
+        square = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+        ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
     left, foot = ax.get_xlim()[0], ax.get_ylim()[0]
     ax.plot([left, left + SCALE_M], [foot, foot], color=MUTED, linewidth=1.2)
     ax.text(left + 1.1 * SCALE_M, foot, f"{SCALE_M:g} m", color=MUTED, va="center", fontsize=7.6)

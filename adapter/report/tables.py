@@ -21,7 +21,6 @@ from adapter.runs.run_folder import RunData
 LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
 HIDDEN = 1e-6  # a share below it is none
-DOCUMENTED = "taken from the documentation"
 
 TIMES = {
     "tick_us": "Compute: driver, filter, synthesis",
@@ -141,7 +140,7 @@ def schema_matrix(data: RunData) -> Matrix:
     std, names = data.model.lam_std, data.documented.tree.joint_names
     rank = data.figures["lambda"].get("identifiable_rank")
     rows = [
-        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k], DOCUMENTED) for k in range(6)])
+        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k]) for k in range(6)])
         for name, shown, spread in zip(names, data.lam_shown, std, strict=True)
     ]
     summary = f"{rank} of {6 * data.n} directions"
@@ -156,7 +155,7 @@ def theta_matrix(data: RunData) -> Matrix:
     rows = []
     for j, name in enumerate(names):
         shares = data.theta_shown[j] if started else np.zeros(10)
-        cells = [_cell(shares[k], std[j, k], UNITS[k], DOCUMENTED) for k in range(10)]
+        cells = [_cell(shares[k], std[j, k], UNITS[k]) for k in range(10)]
         rows.append((name, cells))
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
@@ -164,12 +163,12 @@ def theta_matrix(data: RunData) -> Matrix:
     return Matrix("Dynamics θ", summary, PARAMETERS, rows)
 
 
-def _cell(share: float, std: float, unit: str, instead: str) -> Cell:
+def _cell(share: float, std: float, unit: str) -> Cell:
     if share > SHARE_ALONE:
         return Cell("alone", f"identifiable, standard deviation {number(std, 2)} {unit}")
     if share > HIDDEN:
         return Cell("mixed", "identifiable only in combination with others")
-    return Cell("hidden", f"not identifiable, {instead}")
+    return Cell("hidden", "not identifiable, taken from the documentation")
 
 
 def timing_table(figures: Mapping[str, Any]) -> Table | None:

@@ -330,10 +330,7 @@ def changes_at(
     found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in stamps_ns]
     if found and payload is not None:
         theta, covariance = payload
-        found[-1]["payload"] = {
-            "m": float(theta[0]),
-            "m_std": float(np.sqrt(covariance[0, 0])),
-        }
+        found[-1]["payload"] = {"m": float(theta[0]), "m_std": float(np.sqrt(covariance[0, 0]))}
         if theta[0] > 0.0:
             _, centre, _ = body_from_theta(theta)
             found[-1]["payload"].update(zip(("cx", "cy", "cz"), map(float, centre), strict=True))

@@ -280,18 +280,13 @@ def noise_levels(log: Log) -> dict[str, Array]:
     Not numbers where there are too few samples, or too few that are not the one before. Of a
     mapped recording it is that of stretches, see `Log.spread`.
     """
-    found = [_noise_levels(part) for part in log.spread()]
-    with np.errstate(invalid="ignore"):
-        return {
-            name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))
-            for name in ("q", "dq", "tau")
-        }
-
-
-def _known(levels: list[Array]) -> Array:
-    """(k, n) those of (n,) that are numbers; where none are, one that is not."""
-    known = [x for x in levels if np.isfinite(x).all()]
-    return np.stack(known or levels[:1])
+    found, told = [_noise_levels(part) for part in log.spread()], {}
+    for name in ("q", "dq", "tau"):
+        levels = [x[name] for x in found]
+        known = [x for x in levels if np.isfinite(x).all()]
+        with np.errstate(invalid="ignore"):
+            told[name] = np.sqrt(np.mean(np.stack(known or levels[:1]) ** 2, axis=0))
+    return told
 
 
 def _noise_levels(log: Log) -> dict[str, Array]:

@@ -286,11 +286,7 @@ class Course(NamedTuple):
 
 
 def figures(
-    outcome: Outcome,
-    documented: SelfModel,
-    reference: Reference,
-    course: Course,
-    **more: Any,
+    outcome: Outcome, documented: SelfModel, reference: Reference, course: Course, **more: Any
 ) -> dict[str, Any]:
     """The figures of `run` and `replay`.
 

@@ -326,15 +326,11 @@ def headline(view: View, states: tuple[str, str], tree: Tree) -> str:
     if view.news.get("refusal"):
         return "The torques are not those of this arm: nothing is called converged"
     late = f"; the learner is {view.waiting} samples behind" if view.waiting > BEHIND else ""
-    return progress(*states) + late
-
-
-def progress(lam: str, theta: str) -> str:
-    """How far learning is, in a sentence."""
+    lam, theta = states
     if lam == WAITING:
-        return "Waiting for the first motion"
+        return f"Waiting for the first motion{late}"
     if lam == LEARNING:
-        return "Learning where the joints sit (λ)"
+        return f"Learning where the joints sit (λ){late}"
     if theta == CONVERGED:
-        return "Learned: λ and θ have converged"
-    return "Learning what the links weigh (θ); λ has converged"
+        return f"Learned: λ and θ have converged{late}"
+    return f"Learning what the links weigh (θ); λ has converged{late}"

@@ -20,7 +20,7 @@ from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.config import PipelineSettings
 from adapter.runs.fleet import engine
-from adapter.runs.fleet.arm import FleetArm, learn_arm
+from adapter.runs.fleet.arm import FleetArm, Information, learn_arm
 from adapter.runs.fleet.engine import AT_HAND, here, on_cluster
 from adapter.runs.fleet.fleet import (
     Fleet,
@@ -31,7 +31,6 @@ from adapter.runs.fleet.fleet import (
     read_manifest,
     recall,
 )
-from adapter.runs.fleet.information import Information
 from adapter.runs.fleet.moments import Broken, LogMoments, Task, learner_of, moments_of
 from adapter.runs.pipeline import make_front_end
 from drivers.files.mcap import read_log, write_log

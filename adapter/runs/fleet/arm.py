@@ -7,7 +7,7 @@ all else and taken off its moments. λ is the documented one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
@@ -182,7 +182,8 @@ def _learned(
 
 def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array]) -> None:
     """Put the sum of all moments in place, loads taken off, and solve for (θ, effects)."""
-    A = _sum(_without(theta, log.A, loads.get(log.content)) for log in found)
+    # one after the other, so that no more than two are made at once
+    A = reduce(np.add, (_without(theta, log.A, loads.get(log.content)) for log in found))
     count = sum(log.count for log in found)
     theta.replace_moments(Moments(A, theta.moments.C, *theta.moments[2:]), count)
     for _ in range(FITS):
@@ -277,7 +278,7 @@ def _solved(
     when all others have said what the arm is (Schur complement).
     """
     hand = theta.hand
-    H, rhs = information(_sum(x.A for x in found))
+    H, rhs = information(reduce(np.add, (x.A for x in found)))
     H, rhs = H + theta.prior, rhs + theta.prior_rhs
     for k in loaded:
         own, side = information(found[k].A)
@@ -297,11 +298,6 @@ def _solved(
         body: Array = alone @ (side[hand] - own[hand] @ common)
         bodies.append(Body(body, alone, _gain(own, hand), inverse))
     return bodies
-
-
-def _sum(parts: Iterable[Array]) -> Array:
-    """One after the other, so that no more than two are made at once."""
-    return reduce(np.add, parts)
 
 
 def _gain(information: Array, hand: slice) -> Array:
