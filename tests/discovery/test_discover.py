@@ -18,11 +18,16 @@ from adapter.errors import ModelError, SettingsError
 from adapter.model.model_file import load_model
 from adapter.model.spatial import log_rotation, matrix_from_zxz
 from drivers.files.mcap import write_log
-from tests.helpers.discovery_data import Case, Motion, record, robot
-
-TRUSTED = 0.9
-RATE_HZ = 250.0
-SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
+from tests.helpers.discovery_data import (
+    RATE_HZ,
+    SHORT,
+    TRUSTED,
+    Case,
+    Motion,
+    confidences,
+    record,
+    robot,
+)
 
 
 @cache
@@ -30,12 +35,8 @@ def _case(name: str, motion: Motion, seed: int, noise: float = 1.0, parts: str =
     return record(robot(name), motion, seed, noise=noise, parts=parts)
 
 
-def _named(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
-    return {(e.joint, e.link, e.parent): e.confidence for e in found.edges if e.joint}
-
-
 def _worst_wrong(case: Case, found: Discovery) -> float:
-    return max((c for edge, c in _named(found).items() if edge not in case.edges), default=0.0)
+    return max((c for edge, c in confidences(found).items() if edge not in case.edges), default=0.0)
 
 
 @pytest.mark.parametrize("parts", ["ta", "t"])
@@ -44,9 +45,9 @@ def test_tree_comes_back(name: str, parts: str, seed: int) -> None:
     whole = _case(name, SHORT, seed)
     log = whole.log if parts == "ta" else replace(whole.log, accels=None)
     found = discover(log)
-    assert set(_named(found)) == whole.edges
+    assert set(confidences(found)) == whole.edges
     assert found.root == whole.root
-    assert min(_named(found).values()) > 0.99 and found.root_confidence > 0.99
+    assert min(confidences(found).values()) > 0.99 and found.root_confidence > 0.99
     assert found.undecided == ()
 
 
@@ -65,7 +66,7 @@ def test_a_second_of_motion_is_enough_with_real_parts() -> None:
     case = _case("atlas", Motion(seconds=1.0, rate_hz=RATE_HZ), 4)
     found = discover(case.log)
     assert _worst_wrong(case, found) < TRUSTED
-    assert len(case.edges & set(_named(found))) >= 28
+    assert len(case.edges & set(confidences(found))) >= 28
 
 
 @pytest.mark.parametrize("still", [(2,), (1, 4)])
@@ -101,7 +102,6 @@ def test_a_missing_link_leaves_its_child_open() -> None:
     gone = next(link for _, link, _ in case.edges if _is_link(case, link, 3))
     keep = [k for k, name in enumerate(case.log.link_names) if name != gone]
     log = case.log
-    assert log.twists is not None and log.accels is not None
     found = discover(
         replace(
             log,
@@ -120,18 +120,17 @@ def test_base_at_rest_in_the_recording_is_the_root() -> None:
     case = record(robot("panda"), SHORT, 7, base=True)
     found = discover(case.log)
     assert found.root == case.root != "base"
-    assert set(_named(found)) == case.edges and found.root_confidence > 0.99
+    assert set(confidences(found)) == case.edges and found.root_confidence > 0.99
 
 
 def test_gaps_and_slow_sensors_are_bridged() -> None:
     case = _case("panda", SHORT, 1)
     log = case.log
-    assert log.twists is not None and log.accels is not None
     twists, accels = log.twists.copy(), log.accels.copy()
     twists[np.arange(len(log)) % 5 != 0] = np.nan
     accels[300:360, 2] = np.nan
     found = discover(replace(log, twists=twists, accels=accels))
-    assert set(_named(found)) == case.edges
+    assert set(confidences(found)) == case.edges
 
 
 def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
@@ -204,7 +203,6 @@ def _by_all_combinations(options: list[tuple[Option, ...]]) -> float:
 def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     case = _case("panda", Motion(seconds=2.0, rate_hz=RATE_HZ), 8)
     log = case.log
-    assert log.twists is not None and log.accels is not None
     write_log(log, tmp_path / "log.mcap", {})
     names = {key: str(tmp_path / key) for key in ("model.json", "figures.json")}
     arguments = ["--model", names["model.json"], "--json", names["figures.json"]]

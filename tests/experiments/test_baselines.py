@@ -44,22 +44,17 @@ def robot(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return lam, theta_from_log_cholesky(rng.normal(size=(TREE.bodies, 10)) * 0.3)
 
 
-def samples(seed: int, count: int, links: bool = True) -> TreeData:
+def samples(seed: int, count: int) -> TreeData:
     """Independent random states of the robot, torques from Pinocchio."""
     lam, theta = robot(seed)
     rng = np.random.default_rng([seed, count])
     q, dq, ddq = (rng.uniform(-s, s, (count, TREE.n)) for s in (1.0, 1.0, 3.0))
     base = BodyMotion(*(rng.normal(size=(count, 3)) for _ in range(4)))
     tau = _pinocchio(lam, theta, q, dq, ddq, base)
-    moving = None
-    if links:
-        signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
-        v, w, a, dw = (
-            x[:, 1:].numpy()
-            for x in link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
-        )
-        moving = BodyMotion(w, a, dw, v)
-    return TreeData(TREE, q, dq, ddq, tau, base, moving)
+    signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
+    found = link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
+    v, w, a, dw = (x[:, 1:].numpy() for x in found)
+    return TreeData(TREE, q, dq, ddq, tau, base, BodyMotion(w, a, dw, v))
 
 
 def _pinocchio(
@@ -121,7 +116,7 @@ def least_squares(seed: int) -> RegressorLeastSquares:
 
 
 def test_what_is_no_sub_chain_is_refused() -> None:
-    data = samples(0, 5, links=False)
+    data = samples(0, 5)
     for joints, carrier, words in (
         (("joint3", "joint4"), CARRIER, "all that hangs on it"),
         (("joint3", "joint5", "joint4", "joint1"), CARRIER, "all that hangs on it"),
@@ -134,7 +129,7 @@ def test_what_is_no_sub_chain_is_refused() -> None:
 
 def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
     """Against Pinocchio's torques on a moving base; v is free to choose (Galilei)."""
-    data = samples(0, 30, links=False)
+    data = samples(0, 30)
     lam, theta = (torch.from_numpy(x) for x in robot(0))
 
     def mass(q: torch.Tensor) -> torch.Tensor:
@@ -299,8 +294,7 @@ def test_the_experiments_learners_have_the_papers_sizes() -> None:
         found = {choice.key: choice.make() for choice in learners(*schema, full=full)}
         assert list(found) == ["FFNN", "ELM", "GPR", "DeLaN", "WLS"]
         elm, gpr, net = found["ELM"], found["GPR"], found["FFNN"]
-        assert isinstance(elm, ElmCommittee) and isinstance(gpr, GaussianProcess)
-        assert isinstance(net, FeedForward) and net.units == 1000
+        assert net.units == 1000
         assert (elm.members, elm.units, elm.points, gpr.points) == (members, 4000, 10_000, 10_000)
 
 

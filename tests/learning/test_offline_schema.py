@@ -36,7 +36,6 @@ def samples(text: str, floating: bool, count: int, seed: int) -> tuple[SelfModel
 
 
 def without_speed(data: TreeData) -> TreeData:
-    assert data.links is not None
     return replace(data, links=replace(data.links, v=None), base=replace(data.base, v=None))
 
 
