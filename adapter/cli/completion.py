@@ -40,7 +40,8 @@ def complete(parser: argparse.ArgumentParser) -> None:
     """Answer a shell that asks for completions, and end; else do nothing at all."""
     if ASKED not in os.environ:
         return
-    for part in _parsers(parser):
+    subparsers = (x for x in parser._actions if isinstance(x, argparse._SubParsersAction))
+    for part in (parser, *(part for action in subparsers for part in action.choices.values())):
         for action in part._actions:
             if action.dest in ("robot", "model", "first", "second"):
                 _complete_with(action, robot_names(), files=True)
@@ -48,15 +49,6 @@ def complete(parser: argparse.ArgumentParser) -> None:
                 module, name = NAMES_OF[action.dest]
                 _complete_with(action, tuple(getattr(import_module(own_name(module)), name)))
     import_module("argcomplete").autocomplete(parser, always_complete_options=False)
-
-
-def _parsers(parser: argparse.ArgumentParser) -> list[argparse.ArgumentParser]:
-    """The parser and those of its commands."""
-    found = [parser]
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            found += action.choices.values()
-    return found
 
 
 def _complete_with(action: Any, names: tuple[str, ...], files: bool = False) -> None:

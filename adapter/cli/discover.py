@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -46,8 +47,17 @@ def run(args: argparse.Namespace) -> int:
             raise
         warn([f"λ is not learned: {error}"])
     else:
-        figures["lambda"] = _lambda_figures(learned)
-        _print_lambda(learned)
+        tree, schema = learned.data.tree, learned.schema
+        known = np.where(schema.observable, schema.std, np.nan)
+        figures["lambda"] = {
+            "joint_names": list(tree.joint_names),
+            "link_names": list(tree.link_names),
+            "lam": schema.lam,
+            "std": known,
+            "shown": list(schema.ranks),
+            "arbitrary": schema.freedom.words(tree),
+        }
+        _print_lambda(learned, known)
         _print_mountings(found)
         if args.model is not None:
             figures.update(_write_model(args, found, learned))
@@ -90,56 +100,39 @@ def _shown(confidence: float) -> str:
     return f"{min(confidence, 0.9999):.4f}" if confidence >= DECIDED else f"{confidence:.2f}"
 
 
-def _print_lambda(learned: LearnedTree) -> None:
+def _print_lambda(learned: LearnedTree, known: np.ndarray) -> None:
+    """`known`: (n, 6) standard deviations, NaN where a single turn or shift is not shown."""
     tree, schema = learned.data.tree, learned.schema
-    table = Table(box=None, pad_edge=False)
-    for heading in ("joint", "α β γ rad", "p m", "shown", "± rad, m"):
-        table.add_column(heading, no_wrap=True)
+    rows = []
     for j, name in enumerate(tree.joint_names):
-        turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in _halves(schema.lam[j]))
-        spread = " ".join(_worst(part) for part in _halves(_known(learned)[j]))
-        table.add_row(name, turn, place, f"{schema.ranks[j]}/6", spread)
-    output.print(table)
+        turn, place = (" ".join(f"{x:6.3f}" for x in part) for part in np.split(schema.lam[j], 2))
+        spread = " ".join(
+            f"{np.nanmax(part):.1g}" if np.isfinite(part).any() else "-"
+            for part in np.split(known[j], 2)
+        )
+        rows.append((name, turn, place, f"{schema.ranks[j]}/6", spread))
+    _print_table(("joint", "α β γ rad", "p m", "shown", "± rad, m"), rows)
     for sentence in schema.freedom.words(tree):
         show(f"arbitrary, as no motion shows it: {sentence}")
 
 
 def _print_mountings(found: Discovery) -> None:
     """Where sensors that do not turn about their z sit in their joints' frames."""
-    if not found.mountings:
-        return
-    table = Table(box=None, pad_edge=False)
-    for heading in ("sensor of", "axis in its frame", "x y z in the joint's frame, m"):
-        table.add_column(heading, no_wrap=True)
+    rows = []
     for name, mounting in found.mountings.items():
-        rows = (mounting.axis, mounting.as_dict()["position"])
-        table.add_row(name, *(" ".join(f"{x:6.3f}" for x in row) for row in rows))
+        numbers = (mounting.axis, mounting.as_dict()["position"])
+        rows.append((name, *(" ".join(f"{x:6.3f}" for x in row) for row in numbers)))
+    if rows:
+        _print_table(("sensor of", "axis in its frame", "x y z in the joint's frame, m"), rows)
+
+
+def _print_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in heads:
+        table.add_column(heading, no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
     output.print(table)
-
-
-def _halves(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return row[:3], row[3:]
-
-
-def _known(learned: LearnedTree) -> np.ndarray:
-    """Standard deviations (n, 6), NaN where a single turn or shift is not shown."""
-    return np.where(learned.schema.observable, learned.schema.std, np.nan)
-
-
-def _worst(part: np.ndarray) -> str:
-    return f"{np.nanmax(part):.1g}" if np.isfinite(part).any() else "-"
-
-
-def _lambda_figures(learned: LearnedTree) -> dict[str, Any]:
-    tree, schema = learned.data.tree, learned.schema
-    return {
-        "joint_names": list(tree.joint_names),
-        "link_names": list(tree.link_names),
-        "lam": schema.lam,
-        "std": _known(learned),
-        "shown": list(schema.ranks),
-        "arbitrary": schema.freedom.words(tree),
-    }
 
 
 def _write_model(

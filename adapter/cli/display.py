@@ -15,10 +15,11 @@ from rich.table import Table
 from rich.text import Text
 
 from adapter.gap.monitor_judge import sentence
+from adapter.model.numbers import plus_minus
 from adapter.realtime.showing import View
 from adapter.runs.live import disagreement
 from adapter.runs.terminal import console
-from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker
+from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker, untold
 
 GOOD, LOUD, DIM = "green", "yellow", "dim"
 
@@ -63,11 +64,8 @@ class LiveTable:
         """What is new since the last look, above the table."""
         lines = now.view.lines[self._lines :]
         self._lines = len(now.view.lines)
-        for found in now.findings:
-            key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
-            if key not in self._told:
-                self._told.add(key)
-                lines.append(disagreement(sentence(found, 0.0)))
+        for found in untold(now.findings, self._told):
+            lines.append(disagreement(sentence(found, 0.0)))
         for note in now.view.news.get("notes", []):
             if note not in self._told:
                 self._told.add(note)
@@ -99,7 +97,7 @@ def _learning(now: Now) -> Text:
     for name, state in (("λ", now.lam_state), ("θ", now.theta_state)):
         text.append(f"{name} ").append(state, GOOD if state == CONVERGED else LOUD).append(" · ")
     load = now.load
-    carried = "none noticed" if load is None else f"{load['m']:.3f} ± {load['m_std']:.3f} kg"
+    carried = "none noticed" if load is None else f"{plus_minus(load['m'], load['m_std'])} kg"
     text.append(f"load {carried} · contact ")
     contact = "none" if now.contact is None else f"joint {now.contact + 1}"
     return text.append(contact, "" if now.contact is None else LOUD)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 from importlib import import_module
-from typing import Any
 
 import numpy as np
 
@@ -65,7 +64,15 @@ def run_info(args: argparse.Namespace) -> int:
     """Carry `info` out."""
     if args.file.suffix == ".json":
         model = check_effects(load_model(args.file), args.file)
-        facts, lines = _model_facts(model), _model_lines(model)
+        lines = _model_lines(model)
+        facts = {
+            "name": model.name,
+            "joints": list(model.tree.joint_names),
+            "lambda_source": model.lambda_source,
+            "gravity": model.gravity.tolist(),
+            "effects": sorted({str(entry["effect"]) for entry in model.effects}),
+            "provenance": dict(model.provenance),
+        }
     else:
         log = opened(args)
         facts = describe(args.file if log is None else log, args.topic)
@@ -92,17 +99,6 @@ def opened(args: argparse.Namespace) -> Log | None:
         return None
     spec = ImportSpec.from_options([str(path)], args.columns, args.units, topic=args.topic, **more)
     return recording_log(spec)
-
-
-def _model_facts(model: SelfModel) -> dict[str, Any]:
-    return {
-        "name": model.name,
-        "joints": list(model.tree.joint_names),
-        "lambda_source": model.lambda_source,
-        "gravity": model.gravity.tolist(),
-        "effects": sorted({str(entry["effect"]) for entry in model.effects}),
-        "provenance": dict(model.provenance),
-    }
 
 
 def _model_lines(model: SelfModel) -> list[str]:

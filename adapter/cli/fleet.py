@@ -11,8 +11,8 @@ from rich.table import Table
 
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
-from adapter.effects.export import robot_urdf
-from adapter.errors import MeansError, ModelError
+from adapter.cli.results import write_urdf
+from adapter.errors import MeansError
 from adapter.model.model_file import save_model
 from adapter.report.fleet_page import write_fleet_page
 from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
@@ -55,11 +55,8 @@ def run(args: argparse.Namespace) -> int:
     say(f"{len(given)} recordings; moments are kept in {folder}")
     with Progress(console=console, transient=True, disable=args.quiet) as bar:
         task = bar.add_task("reading", total=len(given))
-
-        def progress(done: int, whole: int) -> None:
-            bar.update(task, completed=done, total=whole)
-
-        found = learn_fleet(given, robot, settings._replace(progress=progress))
+        settings = settings._replace(progress=lambda n, m: bar.update(task, completed=n, total=m))
+        found = learn_fleet(given, robot, settings)
     warn([f"{x.path}: left out: {x.why}" for x in found.broken])
     told = {*manifest.arms, *manifest.told}
     if told and not told & {*given, *(x.moments.path for a in found.arms for x in a.logs)}:
@@ -86,10 +83,7 @@ def _write_model(arm: FleetArm, folder: Path) -> Path:
     """Model file and URDF under the arm's name."""
     name = re.sub(r"[^\w.-]+", "_", arm.name).strip("._") or "arm"
     path = save_model(arm.model, folder / f"{name}.json")
-    try:
-        path.with_suffix(".urdf").write_bytes(robot_urdf(arm.model).text.encode())
-    except ModelError as error:
-        warn([f"{arm.name}: no URDF: {error}"])
+    write_urdf(arm.model, path.with_suffix(".urdf"), f"{arm.name}: ")
     return path
 
 

@@ -1,9 +1,12 @@
-"""`adapter gap`: where model and data disagree, which effect is missing, the gap with it."""
+"""`adapter gap`: where model and data disagree, which effect is missing, the gap with it.
+
+Of a position-controlled arm, whose recordings have commands and encoders but no torque, the servos.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,17 +15,17 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from adapter.cli import servo_gap
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
-from adapter.cli.results import write_robot
-from adapter.effects.export import robot_urdf
-from adapter.errors import MeansError, ModelError, UsageError
+from adapter.cli.results import write_urdf
+from adapter.errors import MeansError, UsageError
+from adapter.gap import servo_words
 from adapter.gap.result import GapResult, Shortfall
+from adapter.gap.servo import explain
+from adapter.gap.servo_model import read_servos
 from adapter.gap.words import as_json, console_summary
 from adapter.gap.workflow import GapSettings, find_gap, names_of
 from adapter.model.model_file import load_model
-from adapter.model.self_model import SelfModel
 from adapter.report.gap_page import write_gap_page
 from adapter.runs.compiling import announce_compiling
 from adapter.runs.terminal import (
@@ -37,14 +40,19 @@ from adapter.runs.terminal import (
 )
 from adapter.screening.screen import RecordingRefused
 from adapter.simulate import Rollouts
-from drivers.files.mcap import Log, read_log
+from drivers.files.mcap import Log, read_log, read_position_log
+
+WITH_TORQUE = (  # options
+    *("validate_from", "rounds", "turn_or_zero", "tau", "trust_log"),
+    *("tau_gain", "gear", "known_load"),
+)
 
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
-    positions = servo_gap.position_logs(args)
+    positions = _position_logs(args)
     if positions is not None:
-        return servo_gap.run(args, *positions)
+        return _explain_positions(args, *positions)
     logs, hold_out = _opened(args)
     told = told_of(args)
     settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, told=told)
@@ -63,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     except RecordingRefused as refusal:
         names, called = nominal.tree.joint_names, names_of([*args.logs, *args.hold_out])
         nothing = GapResult.untold(names, nominal.name, called, args.model, str(refusal))
-        _write(args, folder, nothing, {"refused": refusal.kind})
+        _write(args, folder, {**as_json(nothing), "refused": refusal.kind})
         complain(refusal)
         return ExitCode.WRONG_USE
     result = replace(result, model_in=args.model)
@@ -87,9 +95,7 @@ def _rollouts(args: argparse.Namespace) -> Rollouts | None:
         return None
 
 
-def _opened(
-    args: argparse.Namespace,
-) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
+def _opened(args: argparse.Namespace) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
     """The recordings and those held out; read here where a topic was named. Raises DriverError."""
     if args.topic is None:
         return args.logs, tuple(args.hold_out)
@@ -135,27 +141,73 @@ def _conclude(args: argparse.Namespace, folder: Path, result: GapResult) -> None
     for stale in ("report.html", "model.urdf"):  # of an earlier model
         (folder / stale).unlink(missing_ok=True)
     if result.model_out is not None:
-        more["urdf_out"] = _write_urdf(load_model(result.model_out), folder / "model.urdf")
+        urdf = folder / "model.urdf"
+        written = write_urdf(load_model(result.model_out), urdf, told=True)
+        more["urdf_out"] = str(urdf) if written else None
     if not args.no_report:
         more["report"] = str(write_gap_page(result, folder / "report.html"))
-    _write(args, folder, result, more)
+    _write(args, folder, {**as_json(result), **more})
     for line in console_summary(result):
         output.print(Text.from_markup(line), soft_wrap=True)
     if "report" in more:
         show(f"report {more['report']}")
 
 
-def _write_urdf(model: SelfModel, path: Path) -> str | None:
-    """The new model as URDF; None where a body of it cannot exist."""
-    try:
-        write_robot(path, robot_urdf(model))
-    except ModelError as error:
-        warn([f"no URDF: {error}"])
-        return None
-    return str(path)
-
-
-def _write(args: argparse.Namespace, folder: Path, result: GapResult, more: dict[str, Any]) -> None:
-    figures = {**as_json(result), **more}
+def _write(args: argparse.Namespace, folder: Path, figures: Mapping[str, object]) -> None:
     write_json(folder / "gap.json", figures)
     write_json(args.json, figures)
+
+
+def _position_logs(args: argparse.Namespace) -> tuple[list[Log], list[Log]] | None:
+    """The recordings and those held out; None where they are not of such an arm.
+
+    Raises:
+        DriverError: a file is unreadable. UsageError: some have torques and others have not.
+    """
+    paths = [*args.logs, *args.hold_out]
+    read = {path: read_position_log(path, args.topic) for path in dict.fromkeys(paths)}
+    without = [path for path, log in read.items() if log is None]
+    if len(without) == len(read):
+        if args.servo is not None:
+            raise UsageError(
+                f"--servo: {without[0]} holds no position commands beside positions without "
+                "efforts (/joint_commands and /joint_states)"
+            )
+        return None
+    if without:
+        raise UsageError(
+            f"{', '.join(map(str, without))}: not commands and positions alone, as the others are; "
+            "give recordings of one kind"
+        )
+    found = {path: log for path, log in read.items() if log is not None}
+    return [found[path] for path in args.logs], [found[path] for path in args.hold_out]
+
+
+def _explain_positions(args: argparse.Namespace, logs: list[Log], hold_out: list[Log]) -> int:
+    """What commands and encoders alone tell of the servos; returns the exit code."""
+    unusable = [name for name in WITH_TORQUE if getattr(args, name)]
+    if unusable:
+        options = ", ".join("--" + name.replace("_", "-") for name in unusable)
+        raise UsageError(f"{options}: for recordings with torques; these have commands alone")
+    model = robot_of(args, args.model)
+    names = model.tree.joint_names
+    documented = None if args.servo is None else read_servos(args.servo, names)
+    announce_compiling(say)
+    folder = results_folder(args.out, "gap")
+    target = folder / "servo.toml"
+    if args.servo is not None and target.exists() and target.samefile(args.servo):
+        raise UsageError(f"--out {folder} would overwrite {args.servo}; give another folder")
+    more = {} if args.inertia_prior is None else {"inertia_prior": args.inertia_prior}
+    try:
+        with _progress(args.quiet) as tell:
+            gap = explain(logs, model, documented, hold_out, progress=tell, **more)
+    except RecordingRefused as refusal:
+        _write(args, folder, {"headline": str(refusal), "problem": str(refusal), "findings": []})
+        complain(refusal)
+        return ExitCode.DONE if refusal.kind.is_an_answer else ExitCode.WRONG_USE
+    gap.servos.save(target)
+    _write(args, folder, {**servo_words.as_json(gap), "servos_out": str(target)})
+    for line in servo_words.lines(gap):
+        output.print(Text.from_markup(line), soft_wrap=True)
+    say(f"servos {target}")
+    return 0

@@ -11,20 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adapter import optional
-from adapter.cli import (
-    completion,
-    diff_options,
-    discover_options,
-    excite_options,
-    files_options,
-    fleet_options,
-    gap_options,
-    load_options,
-    replay_options,
-    results_options,
-    run_options,
-    sim,
-)
+from adapter.cli import completion, files_options, model_options, run_options, sim
 from adapter.cli.exit_codes import ExitCode, listed
 from adapter.cli.parser import Parser
 from adapter.errors import MeansError, ModelWarning
@@ -65,45 +52,45 @@ COMMANDS = {  # in the order of --help
         "planning a motion for {driver}",
     ),
     "excite": Command(
-        excite_options.declare,
+        run_options.declare_excite,
         "design a motion that teaches most, or that tells effects apart",
         "adapter.cli.excite:run",
         begins="designing a motion for {robot}",
     ),
     "replay": Command(
-        replay_options.declare,
+        run_options.declare_replay,
         "learn from a recording",
         "adapter.cli.replay:run",
         (ExitCode.NOTHING_LEARNED, ExitCode.NOT_CONVERGED),
         "learning from {logs}",
     ),
     "gap": Command(
-        gap_options.declare,
+        model_options.declare_gap,
         "find what a model lacks",
         "adapter.cli.gap:run",
         begins="comparing {model} with {logs}",
     ),
     "fleet": Command(
-        fleet_options.declare,
+        model_options.declare_fleet,
         "one model per arm from many recordings",
         "adapter.cli.fleet:run",
         (ExitCode.NOTHING_LEARNED,),
         "learning one model per arm from {logs}",
     ),
     "load": Command(
-        load_options.declare,
+        model_options.declare_load,
         "what the hand carries, to type into the robot",
         "adapter.cli.load:run",
         begins="weighing what the hand carries in {log}",
     ),
     "diff": Command(
-        diff_options.declare,
+        model_options.declare_diff,
         "two models of one arm, joint by joint",
         "adapter.cli.diff:run",
         begins="comparing {first} with {second}",
     ),
     "discover": Command(
-        discover_options.declare,
+        model_options.declare_discover,
         "find the tree of a robot from the motion of its links",
         "adapter.cli.discover:run",
         begins="looking for the tree of the robot in {log}",
@@ -122,13 +109,13 @@ COMMANDS = {  # in the order of --help
         begins="reading {sources}",
     ),
     "export": Command(
-        results_options.declare_export,
+        files_options.declare_export,
         "write a model file as URDF",
         "adapter.cli.results:run_export",
         begins="reading {model}",
     ),
     "report": Command(
-        results_options.declare_report,
+        files_options.declare_report,
         "make the HTML page of a run again",
         "adapter.cli.results:run_report",
         begins="making the page of {folder}",
@@ -238,11 +225,8 @@ def _carry_out(command: Command, args: argparse.Namespace) -> int:
 def _told(value: Any) -> Any:
     """An argument in a sentence: files by their names, of many the first."""
     if isinstance(value, list | tuple):
-        return (
-            f"{_told(value[0])}" + f" and {len(value) - 1} more" * (len(value) > 1)
-            if value
-            else "-"
-        )
+        more = f" and {len(value) - 1} more" * (len(value) > 1)
+        return f"{_told(value[0])}{more}" if value else "-"
     if value is None:
         return "the documented arm"
     return value.name if isinstance(value, Path) else value

@@ -26,8 +26,7 @@ MODEL_FILES = (".urdf", ".xml", ".json")
 def add_learning(parser: argparse.ArgumentParser) -> None:
     """Options of everything that learns."""
     add = parser.add_argument
-    add("--robot", metavar="NAME|FILE", help="panda (default), fr3, .urdf, .xml (MJCF) or .json")
-    add_joints(parser)
+    add_robot(parser)
     add("--config", type=Path, metavar="FILE", help="settings in TOML")
     add("--mode", choices=MODES, help="moments (default) or the paper's sample")
     add(
@@ -40,6 +39,13 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
     add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")
     add_results(parser)
     add("--resume", type=Path, metavar="FILE", help="go on from a checkpoint")
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Which arm, and how it is mounted."""
+    said = "panda (default), fr3, .urdf, .xml (MJCF) or .json"
+    parser.add_argument("--robot", metavar="NAME|FILE", help=said)
+    add_joints(parser)
 
 
 def add_joints(parser: argparse.ArgumentParser) -> None:
@@ -107,24 +113,19 @@ def add_json(parser: argparse.ArgumentParser, or_output: bool = False) -> None:
 
 def check_learning(args: argparse.Namespace) -> None:
     """What is wrong with options of everything that learns. Raises UsageError, SettingsError."""
-    if args.robot is not None:
-        check_robot(args.robot)
+    check_robot(args.robot)
     check_files(args.config, args.truth, args.resume)
     if args.effects is not None or args.config is not None:
         import_module(NAMES).check_learning(args)
 
 
-def expanded_by(name: str) -> str:
-    """The command that makes a URDF of xacro."""
-    return f"xacro {name} > {name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
-
-
-def check_robot(name: str) -> None:
+def check_robot(name: str | None) -> None:
     """Refuse what is neither a known robot nor a file of one. Raises UsageError."""
-    if name in robot_names():
+    if name is None or name in robot_names():
         return
     if Path(name).suffix.lower() == ".xacro":
-        raise UsageError(f"{name}: is xacro; make a URDF of it: {expanded_by(name)}")
+        urdf = f"{name.removesuffix('.xacro').removesuffix('.urdf')}.urdf"
+        raise UsageError(f"{name}: is xacro; make a URDF of it: xacro {name} > {urdf}")
     if Path(name).suffix.lower() not in MODEL_FILES:
         raise UsageError(f"no robot '{name}'; {choices(name, robot_names(), ROBOT_FILES)}")
     check_files(Path(name))
@@ -132,9 +133,8 @@ def check_robot(name: str) -> None:
 
 def add_topic(parser: argparse.ArgumentParser) -> None:
     """Which topic of a bag tells the joints."""
-    parser.add_argument(
-        "--topic", metavar="NAME", help="of the joint states, where a bag has several"
-    )
+    said = "of the joint states, where a bag has several"
+    parser.add_argument("--topic", metavar="NAME", help=said)
 
 
 def add_told(parser: argparse.ArgumentParser) -> None:

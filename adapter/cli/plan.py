@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,7 +14,7 @@ from adapter.control.excitation import plan_lines
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
-from adapter.report.next_steps import Step, without
+from adapter.report.next_steps import Step, command, without
 from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import results_folder, say, show
 from drivers.interface import Driver, JointSample
@@ -48,7 +46,10 @@ def run(args: argparse.Namespace) -> int:
         *push_bound(robot, motion, limits, plan.config.safety).lines(),
     ]
     page = results_folder(args.out, "plan") / PLAN_PAGE
-    steps = _steps(sys.argv[2:], plan.maybe_real)
+    # the run of this plan: the same words, but where the plan goes
+    kept = without(sys.argv[2:], ["--out"])
+    kept += ["--allow-motion"] if plan.maybe_real and "--allow-motion" not in kept else []
+    steps = [Step("Move the arm so", command("run", *kept))]
     write_plan(page, draw.arm, motion, limits, draw.least, PlanWords(lines, steps))
     for line in lines:
         show(line)
@@ -58,13 +59,6 @@ def run(args: argparse.Namespace) -> int:
     if not args.trust_model:
         check_resting_torque(robot, sample.q, sample.tau)
     return ExitCode.DONE
-
-
-def _steps(words: Sequence[str], maybe_real: bool) -> list[Step]:
-    """The run of this plan: the same words, but where the plan goes."""
-    kept = without(words, ["--out"])
-    leave = ["--allow-motion"] if maybe_real and "--allow-motion" not in kept else []
-    return [Step("Move the arm so", shlex.join(["adapter", "run", *kept, *leave]))]
 
 
 def _measured(driver: Driver) -> JointSample:

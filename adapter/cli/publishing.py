@@ -22,7 +22,7 @@ import numpy as np
 
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.realtime.run_messages import TF_FIXED, TF_MOVING, RunMessages, ShownArm
+from adapter.realtime.run_messages import TF_FIXED, TF_MOVING, RunMessages, ShownArm, table_fields
 from adapter.realtime.showing import DisplayJob, View
 from adapter.signals.records import StateLayout, stamp_of
 from drivers.files.estimates import EstimateNames
@@ -107,35 +107,20 @@ class Publisher:
 
     def _tables(self, stamp_ns: int, lam: Array, theta: Array) -> list[Message]:
         return [
-            labelled(name, stamp_ns, (rows, columns), table)
-            for name, rows, columns, table in (
-                ("/lambda", self._names.joints, LAMBDA_FIELDS, lam),
-                ("/theta", self._names.bodies, THETA_FIELDS, theta),
+            Message(name, FLOAT64_MULTI_ARRAY, stamp_ns, table_fields((",".join(rows), columns), x))
+            for name, rows, columns, x in (
+                ("/lambda", self._names.joints, ",".join(LAMBDA_FIELDS), lam),
+                ("/theta", self._names.bodies, ",".join(THETA_FIELDS), theta),
             )
         ]
 
     def _send(self, message: Message) -> None:
         if message.schema == LOAD:  # a public type, so that everybody reads it
-            load = message.fields["mass"], message.fields["mass_std"]
-            columns = ("mass", "standard deviation")
-            table = np.array([load])
-            message = labelled(message.topic, message.stamp_ns, (("load",), columns), table)
+            load = np.array([[message.fields["mass"], message.fields["mass_std"]]])
+            fields = table_fields(("load", "mass,standard deviation"), load)
+            message = message._replace(schema=FLOAT64_MULTI_ARRAY, fields=fields)
         topic = message.topic if message.topic in GLOBAL else PREFIX + message.topic
         if topic not in self._publications:
             publish = self._network.publish(topic, message.schema, message.latched)
             self._publications[topic] = publish
         self._publications[topic].write(encode(message.schema, message.fields))
-
-
-def labelled(
-    topic: str, stamp_ns: int, names: tuple[Sequence[str], Sequence[str]], table: Array
-) -> Message:
-    """A table (rows, columns) as std_msgs/Float64MultiArray; the labels name rows and columns."""
-    rows, columns = table.shape
-    strides = rows * columns, columns
-    dim = [
-        {"label": ",".join(labels), "size": size, "stride": stride}
-        for labels, size, stride in zip(names, table.shape, strides, strict=True)
-    ]
-    fields = {"layout": {"dim": dim, "data_offset": 0}, "data": table.ravel()}
-    return Message(topic, FLOAT64_MULTI_ARRAY, stamp_ns, fields)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -96,7 +95,9 @@ def _figures(
         front_end.refused,
         front_end.first_moving_ns,
         front_end.delay_s,
-        _percentiles(result),
+        dict.fromkeys(PERCENTILES)
+        if not result.ticks.count
+        else {k: 1e-3 * result.ticks.percentile_ns(share) for k, share in PERCENTILES.items()},
     )
     return figures(
         result.outcome,
@@ -162,26 +163,16 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
             f"--validate-from {args.validate_from} is outside the recording "
             f"(0 to {last_s(log):.1f} s)"
         )
-    shown = nullcontext() if args.quiet else Progress(console=console, transient=True)
-    with shown as bar:
-        task = None if bar is None else bar.add_task("learning", total=len(log))
-
-        def progress(done: int) -> None:
-            if bar is not None and task is not None:
-                bar.update(task, completed=done)
-
-        return learn_from(
-            log,
-            robot,
-            config.pipeline,
-            ReplayOptions(
-                every=args.every,
-                until_s=args.validate_from,
-                progress=progress,
-                resume=args.resume,
-                say=None if args.quiet else tell,
-            ),
+    with Progress(console=console, transient=True, disable=args.quiet) as bar:
+        task = bar.add_task("learning", total=len(log))
+        options = ReplayOptions(
+            every=args.every,
+            until_s=args.validate_from,
+            progress=lambda done: bar.update(task, completed=done),
+            resume=args.resume,
+            say=None if args.quiet else tell,
         )
+        return learn_from(log, robot, config.pipeline, options)
 
 
 def tell(line: str) -> None:
@@ -199,9 +190,3 @@ def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | Non
         )
         return _joined(args, other, robot)
     return None
-
-
-def _percentiles(result: Replay) -> dict[str, float | None]:
-    if not result.ticks.count:
-        return dict.fromkeys(PERCENTILES)
-    return {k: 1e-3 * result.ticks.percentile_ns(share) for k, share in PERCENTILES.items()}

@@ -18,11 +18,13 @@ from adapter.effects.export import RobotText, robot_mjcf, robot_urdf
 from adapter.errors import ModelError
 from adapter.gap.monitor_judge import sentence
 from adapter.model.model_file import load_model
+from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
-from adapter.report.headline import Worth, headline
+from adapter.report.headline import headline
 from adapter.report.next_steps import next_steps
 from adapter.report.words import is_live, missed_words, small
+from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import RunData, load_run, run_data, save_run
 from adapter.runs.score import Reference, counted_from
@@ -67,10 +69,7 @@ def conclude(
     page, other = folder / "report.html", folder / "model.urdf"
     for stale in (page, other):  # of an earlier model, which they alone describe
         stale.unlink(missing_ok=True)
-    try:
-        other.write_bytes(robot_urdf(data.model).text.encode())
-    except ModelError as error:
-        warn([f"no URDF: {error}"])
+    write_urdf(data.model, other)
     save_run(folder, data)
     if not args.no_report:
         figures["report"] = str(write_report(page, data))
@@ -124,7 +123,7 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     table.add_row("θ", _reached(figures, "theta") + fit)
     for change in theta["changes"]:
         load = change.get("payload")
-        what = f"{load['m']:.3f} ± {load['m_std']:.3f} kg" if load else "superseded"
+        what = f"{plus_minus(load['m'], load['m_std'])} kg" if load else "superseded"
         table.add_row("change at the hand", f"at {change['stamp_s'] - start_s:.2f} s: {what}")
     for line in disagreement_lines(figures.get("disagreements", []), start_s):
         table.add_row("new disagreement", line)
@@ -160,6 +159,24 @@ def _reached(figures: dict[str, Any], which: str) -> str:
     return f"converged {at:.2f} s after {counted_from(figures)}"
 
 
+def write_urdf(model: SelfModel, path: Path, whose: str = "", told: bool = False) -> bool:
+    """Write a model as URDF, or warn where a body of it cannot exist; whether it was written.
+
+    Args:
+        whose: said before the warning; told: warn as well of what the file lacks.
+    """
+    try:
+        written = robot_urdf(model)
+    except ModelError as error:
+        warn([f"{whose}no URDF: {error}"])
+        return False
+    if told:
+        write_robot(path, written)
+    else:
+        path.write_bytes(written.text.encode())
+    return True
+
+
 def write_robot(path: Path, written: RobotText) -> None:
     """Write a robot's file; warns of what it lacks."""
     path.write_bytes(written.text.encode())
@@ -175,10 +192,7 @@ def run_export(args: argparse.Namespace) -> int:
     facts: dict[str, Any] = {"model": str(args.model), "lambda_source": model.lambda_source}
     for key in ("lambda_filled", "theta_filled"):
         facts[key] = list(model.provenance.get(key, ()))
-    for kind, path, text_of in (
-        ("urdf", args.urdf, robot_urdf),
-        ("mjcf", args.mjcf, robot_mjcf),
-    ):
+    for kind, path, text_of in (("urdf", args.urdf, robot_urdf), ("mjcf", args.mjcf, robot_mjcf)):
         if path is None:
             continue
         fits = args.onto is not None and (args.onto.suffix == ".urdf") == (kind == "urdf")

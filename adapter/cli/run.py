@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import secrets
 import shlex
+import socket
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -20,8 +22,7 @@ from adapter.cli.display import make_display
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.publishing import publisher_job, together
 from adapter.cli.results import Learned, code_of, conclude
-from adapter.cli.run_options import simulated
-from adapter.cli.watching import known_run, view_job
+from adapter.cli.run_options import ANY, simulated
 from adapter.control.controller import ControlSettings, ExcitationController
 from adapter.control.designed import Designer
 from adapter.control.excitation import RandomMotion
@@ -61,6 +62,10 @@ from adapter.runs.terminal import (
 )
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.matching import counted, present
+from adapter.view.foxglove_view import free_port, need_foxglove
+from adapter.view.now import KnownRun
+from adapter.view.page import PERIOD_S, make_view
+from adapter.view.server import HOST, address, bind
 from drivers.faults.driver import FaultyDriver, with_faults
 from drivers.files.mcap import read_log
 from drivers.interface import Driver
@@ -118,15 +123,17 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
         UsageError, SettingsError, ModelError, ValueError: what is asked for does not exist.
     """
     robot = robot_of(args, args.robot)
-    scheme, _ = split_address(args.driver)
+    scheme, rest = split_address(args.driver)
     world = None
     if simulated(args.driver):
         optional.load("pybullet")
         builder = import_module(SIMULATED_BY)
         world = builder.simulation(args.driver, args.scenario, args.set, args.seed or 0)
-    names = _joints_of_arm(args.driver, world) or counted(
-        robot, args.driver, joint_count(args.driver)
-    )
+    names = counted(robot, args.driver, joint_count(args.driver))
+    if world is not None:
+        names = tuple(world.scenario.truth.joint_names)
+    elif scheme == "log":
+        names = read_log(rest).joint_names
     robot, locked = present(robot, names, args.driver)
     warn(locked)
     config = with_motion(args, configure(args, None, robot))
@@ -140,14 +147,6 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     usual = "documented" if config.excitation.kind == DESIGNED else "none"
     forward = args.feedforward or usual
     return RunPlan(config.apply(robot), config, world, real, forward)
-
-
-def _joints_of_arm(address: str, world: SimulationLike | None) -> tuple[str, ...]:
-    """Names of the arm's joints; () where it has none of its own and takes those of the model."""
-    scheme, rest = split_address(address)
-    if world is not None:
-        return tuple(world.scenario.truth.joint_names)
-    return read_log(rest).joint_names if scheme == "log" else ()
 
 
 def open_arm(args: argparse.Namespace, plan: RunPlan) -> Driver:
@@ -264,7 +263,7 @@ def _go(
     duration_s = args.duration + (config.excitation.slow_s if controller is not None else 0.0)
     recording = None if args.no_record else _recording(args, plan, driver, folder, truth)
     effects = config.pipeline.learner.effects
-    known = known_run(args, robot, effects, duration_s)
+    known = KnownRun(robot, effects, args.driver, duration_s, secrets.token_hex(8))
     # without a terminal (a pipe, CI) there is no table, and who has something to say says it
     publisher = publisher_job(args.driver, robot, effects)
     display = None
@@ -296,7 +295,7 @@ def _go(
         driver,
         front_end,
         controller,
-        Jobs(learner, recording, display, together([view_job(args, known), publisher])),
+        Jobs(learner, recording, display, together([_view_job(args, known), publisher])),
         LiveOptions(duration_s, deadman=deadman, before_motion=before_motion, observer=watching),
         say=say,
     )
@@ -305,6 +304,27 @@ def _go(
     if watching is None:
         return result
     return dataclasses.replace(result, contacts=contacts_of(watching.observer, robot))
+
+
+def _view_job(args: argparse.Namespace, known: KnownRun) -> DisplayJob | None:
+    """The view process of a run, and a line for each address; None where nobody asked.
+
+    Raises:
+        UsageError: a port is taken. MeansError: Foxglove's library is missing.
+    """
+    listening: socket.socket | None = None
+    port: int | None = None
+    if args.foxglove is not None:
+        need_foxglove()
+        port = free_port(args.foxglove)
+        say(f"Foxglove, PlotJuggler: ws://{HOST}:{port}")
+    if args.view is not None:
+        listening = bind(None if args.view == ANY else args.view)
+        say(f"watch it: {address(listening)}")
+    if listening is None and port is None:
+        return None
+    make = partial(make_view, known, listening, port)
+    return DisplayJob(make, period_s=PERIOD_S, idle=True)
 
 
 def _recording_path(args: argparse.Namespace, folder: Path) -> Path:
@@ -345,12 +365,7 @@ def _recording(
     path = _recording_path(args, folder)
     for earlier in _parts(path):  # --overwrite, or it would have been refused
         earlier.unlink()
-    return RecordingJob(
-        path,
-        metadata,
-        attachments,
-        arm=ShownArm.of(plan.robot),
-    )
+    return RecordingJob(path, metadata, attachments, arm=ShownArm.of(plan.robot))
 
 
 def _conclude(

@@ -1,4 +1,4 @@
-"""Options of `adapter run`."""
+"""Options of the commands that move an arm or learn: `adapter run`, `plan`, `excite`, `replay`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,22 @@ import argparse
 from importlib import import_module
 from pathlib import Path
 
-from adapter.cli.options import NAMES, add_learning, add_motion, check_files, check_learning
-from adapter.control.settings import KINDS
+from adapter.cli.options import (
+    NAMES,
+    add_json,
+    add_learning,
+    add_motion,
+    add_robot,
+    add_told,
+    add_topic,
+    check_files,
+    check_learning,
+    check_logs,
+    check_robot,
+    check_told,
+    numbers,
+)
+from adapter.control.settings import DESIGNED, KINDS
 from adapter.errors import UsageError
 from adapter.model.robot_names import robot_names
 from drivers.errors import choices
@@ -17,6 +31,7 @@ FEEDFORWARD = ("none", "documented", "learned")
 SIMULATED = ("panda",)
 ANY = -1  # the usual port, or any other where that is taken
 DEFAULT_PORT, MOST_PORT = 8765, 65535  # of Foxglove; of all
+SHARE, LONGEST_S, RATE_HZ = 0.2, 300.0, 200.0  # of `excite`
 
 
 def declare(parser: argparse.ArgumentParser) -> None:
@@ -168,3 +183,116 @@ def simulated(address: str) -> bool:
         return scheme == "pybullet"
     _, _, query = address.partition("?")
     return "interface=virtual" in query.split("&")
+
+
+def declare_excite(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Design a motion inside all limits, clear of the cell and of the arm itself, that brings "
+        "every parameter which torques show to a wanted standard deviation in the shortest time, "
+        "going on from what LOGs tell already; or, with --gap, the motion that a gap report asks "
+        "to be measured next. Writes it as CSV, as MCAP (trajectory_msgs/JointTrajectory) and as a "
+        "page; nothing moves. `adapter run --excitation designed` moves an arm so."
+    )
+    add = parser.add_argument
+    add("logs", nargs="*", type=Path, metavar="LOG", help="recordings of the arm that are there")
+    add_robot(parser)
+    add("--config", type=Path, metavar="FILE", help="settings in TOML: [cell], [excitation], ...")
+    add(
+        "--at", metavar="Q1,Q2,...", help="where it starts, rad (default: where the first LOG does)"
+    )
+    add(
+        "--std",
+        type=float,
+        default=SHARE,
+        metavar="SHARE",
+        help="wanted, of the parameters of a body of 1 kg, 10 cm across, and of an effect's usual "
+        f"size (default {SHARE:g}: 0.2 kg, 0.02 kg m, 0.002 kg m², 0.2 N m of friction)",
+    )
+    add(
+        "--noise",
+        metavar="S1,S2,...",
+        help="standard deviation of each joint's torque, N m (default: of the LOGs, else 0.3 %% of "
+        "the effort limits)",
+    )
+    add("--gap", type=Path, metavar="FILE", help="JSON of `adapter gap`: what to measure next")
+    add_motion(parser)
+    add("--seed", type=int, help="of the motion")
+    add("--longest", type=float, default=LONGEST_S, metavar="S", help=f"default {LONGEST_S:g}")
+    said = f"of points (default {RATE_HZ:g})"
+    add("--rate", type=float, default=RATE_HZ, metavar="HZ", help=said)
+    add_json(parser)
+    add("--out", type=Path, metavar="FOLDER", help="where results go")
+    parser.set_defaults(check=_check_excite, excitation=DESIGNED)
+
+
+def _check_excite(args: argparse.Namespace) -> None:
+    check_robot(args.robot)
+    check_files(args.config, args.gap)
+    args.logs = check_logs(*args.logs)
+    args.at = numbers("--at", args.at, what="numbers")
+    args.noise = numbers("--noise", args.noise)
+    for name, least in (("std", 0.0), ("longest", 1.0), ("rate", 1.0)):
+        if not getattr(args, name) > least:
+            raise UsageError(f"--{name} must be above {least:g}, got {getattr(args, name)}")
+
+
+def declare_replay(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Learn λ and θ from an MCAP recording, sample by sample as the live process does (the "
+        "result is the same), or in batches."
+    )
+    add = parser.add_argument
+    add(
+        "logs",
+        nargs="+",
+        type=Path,
+        metavar="LOG",
+        help="recording (MCAP, rosbag2, ROS 1), or a folder of such; several of one arm are "
+        "learned from in order",
+    )
+    add_topic(parser)
+    add_learning(parser)
+    add_told(parser)
+    add("--every", type=int, default=1, metavar="N", help="one update per N samples (batch)")
+    add(
+        "--base",
+        metavar="LINK",
+        help="the base floats, and this is its link (or one fixed to it); its motion is in the "
+        "recording: Imu, or AccelStamped with TwistStamped or Odometry, on any topic",
+    )
+    add(
+        "--base-wrench",
+        choices=("zero", "unknown"),
+        default="unknown",
+        help="what pushes a floating base: zero in free motion; unknown (default), as where it "
+        "stands or hangs: only the joints' torques are learned from",
+    )
+    add(
+        "--imu",
+        action="append",
+        default=[],
+        metavar="TOPIC=LINK",
+        help="an Imu glued on a link, anyhow; may be repeated. Needed where the messages' frame "
+        "does not name the link; none: take no notice of any",
+    )
+    held_out = parser.add_mutually_exclusive_group()
+    held_out.add_argument("--validate", type=Path, metavar="LOG", help="score on this recording")
+    held_out.add_argument(
+        "--validate-from", type=float, metavar="S", help="learn before this second, score after it"
+    )
+    parser.set_defaults(check=_check_replay)
+
+
+def _check_replay(args: argparse.Namespace) -> None:
+    if args.every > 1 and args.mode == "sample":
+        raise UsageError("--every needs mode moments; have: --mode moments, or --every 1")
+    alone = {"--base": args.base, "--imu": args.imu, "--validate-from": args.validate_from}
+    given = [option for option, value in alone.items() if value]
+    args.logs = check_logs(*args.logs)
+    if given and len(args.logs) > 1:
+        raise UsageError(f"{', '.join(given)} go with one LOG, not with several")
+    check_told(args)
+    check_learning(args)
+    check_logs(args.validate)

@@ -4,7 +4,7 @@
 """
 
 from adapter.discovery.learned import LearnedTree, learn, self_model
-from adapter.discovery.prepare import CUTOFF_HZ, log_from_arrays
+from adapter.discovery.prepare import CUTOFF_HZ
 from adapter.discovery.verdict import DECIDED, UNSEEN_BASE, Discovery, Edge, discover
 
 __all__ = [
@@ -16,6 +16,5 @@ __all__ = [
     "LearnedTree",
     "discover",
     "learn",
-    "log_from_arrays",
     "self_model",
 ]

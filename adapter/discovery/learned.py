@@ -206,12 +206,9 @@ def theta_of(data: TreeData, lam: Array) -> tuple[Array, Array, list[str]]:
         std = np.array([max(row.residual(theta), LEAST_TORQUE) for row in rows])
     shown = numerical_rank(system(rows, std, bodies)[0])[1]
     arbitrary = filled_words(shown, data.tree.body_names[first:])
-    r, b = _with_prior(*system(rows, std, bodies), np.tile(neutral_body(), (len(bodies), 1)))
-    theta[first:] = consistent_theta(r, b).theta
+    # below, rows that hold θ to a neutral body, by how far links differ from one another
+    r, b = system(rows, std, bodies)
+    weight = np.diag(np.tile(1.0 / PRIOR_STD, len(bodies)))
+    centre = weight @ np.tile(neutral_body(), len(bodies))
+    theta[first:] = consistent_theta(np.vstack([r, weight]), np.r_[b, centre]).theta
     return theta, np.array([row.residual(theta) for row in rows]), arbitrary
-
-
-def _with_prior(r: Array, b: Array, centre: Array) -> tuple[Array, Array]:
-    """Rows below that hold θ (bodies, 10) to a centre, by how far links differ from one another."""
-    weight = np.diag(np.tile(1.0 / PRIOR_STD, r.shape[1] // 10))
-    return np.vstack([r, weight]), np.r_[b, weight @ centre.ravel()]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
@@ -88,37 +87,6 @@ class PreparedLog:
     def noise_samples(self) -> float:
         """How many independent samples of noise the filter leaves, at least two."""
         return max(2.0, 2.0 * self.duration_s * self.cutoff_hz)
-
-
-def log_from_arrays(
-    t_s: Array,
-    q: Array,
-    twists: Array | None = None,
-    accels: Array | None = None,
-    dq: Array | None = None,
-    tau: Array | None = None,
-) -> Log:
-    """Signals in memory as a recording, joints and links numbered from 1 in the order given.
-
-    Args:
-        t_s: (m,) s; q (m, n) rad; dq (m, n) rad/s and tau (m, n) N m where there are any.
-        twists: (m, links, 6) [v; w] of links in their own frames, m/s and rad/s.
-        accels: (m, links, 6) [a; dw], m/s² as an accelerometer reads them and rad/s². What was
-            not measured is not a number.
-    """
-    nothing: Array = np.full_like(q, np.nan, dtype=np.float64)
-    links = next((x.shape[1] for x in (twists, accels) if x is not None), 0)
-    return Log(
-        Path("arrays"),
-        tuple(f"joint{k + 1}" for k in range(nothing.shape[1])),
-        np.round(1e9 * np.asarray(t_s)).astype(np.int64),
-        np.asarray(q, dtype=np.float64),
-        nothing if dq is None else dq,
-        nothing if tau is None else tau,
-        tuple(f"link{k + 1}" for k in range(links)),
-        twists,
-        accels,
-    )
 
 
 def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:

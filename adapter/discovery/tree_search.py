@@ -77,13 +77,9 @@ class TreeSearch:
         structure, _ = self._search(None, MOST_SPLITS)
         return structure or self._greedy()
 
-    def rooted_at(self, link: int) -> Structure | None:
-        """The best structure in which nothing carries a link."""
-        return self._search(self._free(link), MOST_RIVAL_SPLITS)[0]
-
-    def score_of_root(self, link: int) -> float:
-        """The score of that structure, or a bound on it."""
-        return self._search(self._free(link), MOST_RIVAL_SPLITS)[1]
+    def rooted_at(self, link: int) -> tuple[Structure | None, float]:
+        """The best structure in which nothing carries a link, and its score or a bound on it."""
+        return self._search(self._free(link), MOST_RIVAL_SPLITS)
 
     def _free(self, link: int) -> Option:
         return next(o for o in self._options[link] if o.parent == FREE)
@@ -211,7 +207,7 @@ def floating_roots(bodies: Bodies, structure: Structure) -> list[int]:
 def rootings(search: TreeSearch, structure: Structure, root: int) -> dict[int, float]:
     """Probability that each link of the part of the tree that hangs on `root` carries it."""
     members = component(structure, root)
-    scores = {link: search.score_of_root(link) for link in members}
+    scores = {link: search.rooted_at(link)[1] for link in members}
     top = max(scores.values())
     weight = {link: float(np.exp(score - top)) for link, score in scores.items()}
     total = sum(weight.values())
@@ -229,7 +225,7 @@ def central(search: TreeSearch, bodies: Bodies, structure: Structure) -> Structu
         return structure
     distance = _distances(structure)
     best = min(tied, key=lambda k: (sum(distance[k, i] for i in shares), k))
-    return search.rooted_at(best) or structure
+    return search.rooted_at(best)[0] or structure
 
 
 def component(structure: Structure, root: int) -> list[int]:

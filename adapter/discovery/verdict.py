@@ -207,7 +207,6 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         for root in floating_roots(bodies, structure):
             shares[root] = rootings(search, structure, root)
     posterior = search.posterior(structure, shares)
-    names = body_names(bodies)
     edges, roots, confidence = _judged(bodies, structure, shares, posterior)
     order = {name: k for k, name in enumerate(bodies.log.joint_names)}
     edges.sort(key=lambda edge: order.get(edge.joint or "", len(order)))
@@ -217,8 +216,12 @@ def _discovery(hypotheses: Hypotheses, structure: Structure) -> Discovery:
         root=next(iter(roots)) if single else None,
         root_confidence=next(iter(roots.values())) if single else 0.0,
         edges=kept,
-        undecided=tuple(
-            doubts_of(bodies, structure, posterior, Verdicts(names, confidence, shares, DECIDED))
+        undecided=(
+            *_resting(bodies),
+            *_idle(bodies, structure),
+            *_roots(bodies, structure),
+            *_either_way(bodies, shares),
+            *_undecided(bodies, structure, posterior, shares, confidence),
         ),
         bodies=bodies,
         structure=structure,
@@ -279,35 +282,6 @@ def _edge(bodies: Bodies, option: Option, share: float, rival: Edge | None = Non
 # --- sentences on what is left open, why, and which motion would decide it ---------------------
 
 
-@dataclass(frozen=True)
-class Verdicts:
-    """What was made of the beliefs.
-
-    Attributes:
-        names: of bodies; confidence: by link, of what was chosen.
-        roots: where a root is any link that moves, by it: which others it may be, how probably.
-        decided: confidence from which something counts as decided.
-    """
-
-    names: Sequence[str]
-    confidence: Sequence[float]
-    roots: Mapping[int, Mapping[int, float]]
-    decided: float
-
-
-def doubts_of(
-    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
-) -> list[str]:
-    """All that is undecided, one sentence each."""
-    return [
-        *_resting(bodies),
-        *_idle(bodies, structure),
-        *_roots(bodies, structure, verdicts.names),
-        *_either_way(verdicts),
-        *_undecided(bodies, structure, posterior, verdicts),
-    ]
-
-
 def _resting(bodies: Bodies) -> Iterator[str]:
     log = bodies.log
     for s in np.flatnonzero(bodies.resting):
@@ -330,7 +304,8 @@ def _idle(bodies: Bodies, structure: Structure) -> Iterator[str]:
             )
 
 
-def _roots(bodies: Bodies, structure: Structure, names: Sequence[str]) -> Iterator[str]:
+def _roots(bodies: Bodies, structure: Structure) -> Iterator[str]:
+    names = body_names(bodies)
     free = [names[option.link] for option in structure.chosen if option.parent == FREE]
     carried = [option for option in structure.chosen if option.parent == bodies.unseen_base]
     if len(free) + bool(carried) > 1:
@@ -347,10 +322,11 @@ def _roots(bodies: Bodies, structure: Structure, names: Sequence[str]) -> Iterat
             )
 
 
-def _either_way(verdicts: Verdicts) -> Iterator[str]:
-    names = verdicts.names
-    for root, shares in verdicts.roots.items():
-        if shares[root] >= verdicts.decided:
+def _either_way(bodies: Bodies, roots: Mapping[int, Mapping[int, float]]) -> Iterator[str]:
+    """`roots`: where a root is any link that moves, by it: which others it may be, how probably."""
+    names = body_names(bodies)
+    for root, shares in roots.items():
+        if shares[root] >= DECIDED:
             continue
         likely = sorted(shares.items(), key=lambda item: (-item[1], item[0] != root))
         told = " or ".join(f"{names[k]} ({p:.2f})" for k, p in likely[:MOST_TOLD] if p >= TOLD)
@@ -363,11 +339,16 @@ def _either_way(verdicts: Verdicts) -> Iterator[str]:
 
 
 def _undecided(
-    bodies: Bodies, structure: Structure, posterior: Sequence[Ranked], verdicts: Verdicts
+    bodies: Bodies,
+    structure: Structure,
+    posterior: Sequence[Ranked],
+    roots: Mapping[int, Mapping[int, float]],
+    confidence: Sequence[float],
 ) -> Iterator[str]:
-    joints, names = bodies.log.joint_names, verdicts.names
-    for own, ranked, sure in zip(structure.chosen, posterior, verdicts.confidence, strict=True):
-        if sure >= verdicts.decided or own.link in verdicts.roots:
+    """`confidence`: by link, of what was chosen."""
+    joints, names = bodies.log.joint_names, body_names(bodies)
+    for own, ranked, sure in zip(structure.chosen, posterior, confidence, strict=True):
+        if sure >= DECIDED or own.link in roots:
             continue
         told = [(o, p) for o, p in ranked if p >= TOLD or o == own][:MOST_TOLD]
         listed = " or ".join(f"{_said(o, joints, names)} ({p:.2f})" for o, p in told)
@@ -392,7 +373,8 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
     resting = [joints[s] for s in pair if bodies.resting[s]]
     if resting:
         return f"joint {' and '.join(dict.fromkeys(resting))} did not move: move it, by itself"
-    if len(pair) == 2 and pair[0] != pair[1] and _alike(bodies, *pair):
+    dq, two = bodies.log.dq[:, pair], len(pair) == 2 and pair[0] != pair[1]
+    if two and abs(float(np.corrcoef(dq[:, 0], dq[:, 1])[0, 1])) > ALIKE:
         return (
             f"joints {joints[pair[0]]} and {joints[pair[1]]} moved alike: move one without the "
             "other"
@@ -407,8 +389,3 @@ def _remedy(bodies: Bodies, own: Option, rival: Option, names: Sequence[str]) ->
     return (
         "what is left unexplained is no smaller than the difference: record longer or faster motion"
     )
-
-
-def _alike(bodies: Bodies, first: int, second: int) -> bool:
-    dq = bodies.log.dq
-    return abs(float(np.corrcoef(dq[:, first], dq[:, second])[0, 1])) > ALIKE

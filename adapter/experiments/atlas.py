@@ -225,13 +225,19 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
     if not args.no_baselines:
         learners += _baselines(args, source, parts, say)
     say("learning online, sample by sample")
-    online = _online(source, parts.control)
+    used = [k for k in range(count) if k not in parts.control][:ONLINE_FALLS]
+    motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
+    online, _ = online_trial(motions, source.exact(parts.control[0]), truth.lam)
     say(f"finding the tree of {min(args.seeds, count)} falls, shuffled and renamed")
     found = topology_trials(fall_logs(source.noisy, args.seeds), tree, args.seed)
     numbers = {
         "joints": tree.n,
         "arm_joints": [j + 1 for j in ARM],
-        **_sizes(parts, len(data)),
+        "trajectories": count,
+        "control_trajectories": len(parts.control),
+        "train_samples": len(parts.train),
+        "test_samples": len(parts.test),
+        "learned_samples": len(data),
         **_learning(networks, by_networks, by_moments, tree),
         **_comparison(learners, [by_networks.arm, by_moments.arm]),
         "noise": noise,
@@ -241,11 +247,15 @@ def run_atlas(args: argparse.Namespace) -> AtlasResults:
         "simulated_s": simulated_s,
         "wall_s": time.perf_counter() - began,
     }
+    last = max(networks.snapshots)
     return AtlasResults(
         tree=tree,
         true_lam=truth.lam,
         arm=ARM,
-        snapshots=snapshots(networks.snapshots),
+        snapshots=[
+            ("final" if epoch == last else f"epoch {epoch}", lam)
+            for epoch, lam in sorted(networks.snapshots.items())
+        ],
         cost=networks.loss,
         error_edges=np.log10(by_moments.training.edges),
         error_counts=by_networks.training.histogram,
@@ -270,30 +280,7 @@ def _baselines(
     return compare(sets, chosen, args.seed, say)
 
 
-def _online(source: Falls, control: Sequence[int]) -> dict[str, Any]:
-    """The online learner on falls with noise, judged on one that it never sees."""
-    used = [k for k in range(len(source)) if k not in control][:ONLINE_FALLS]
-    motions = [noisy(without_velocity(source.exact(k)), k) for k in used]
-    return online_trial(motions, source.exact(control[0]), source.truth.lam)[0]
-
-
-def snapshots(kept: dict[int, np.ndarray]) -> list[tuple[str, np.ndarray]]:
-    """λ by label, the last one called final."""
-    last = max(kept)
-    return [("final" if epoch == last else f"epoch {epoch}", kept[epoch]) for epoch in sorted(kept)]
-
-
 # --- every number of the experiment under a key of its own --------------------------------------
-
-
-def _sizes(parts: Split, learned: int) -> dict[str, Any]:
-    return {
-        "trajectories": len(parts.lengths) + len(parts.control),
-        "control_trajectories": len(parts.control),
-        "train_samples": len(parts.train),
-        "test_samples": len(parts.test),
-        "learned_samples": learned,
-    }
 
 
 def _learning(

@@ -53,20 +53,15 @@ def run(args: argparse.Namespace) -> int:
         shown = ("-", "-") if p50 is None else (f"{p50:.1f}", f"{p99:.1f}")
         table.add_row(row["what"], *shown, row["note"])
     output.print(table)
-    unseen = _held_out(args)
+    unseen = [stated()]  # what figaroh is known to leave
+    if args.log is not None:
+        unseen = held_out(read_log(args.log), read_robot(args.robot), args.validate_from)
     table = Table("unseen torque", "rmse by joint, N m", "note", box=None, pad_edge=False)
     for row in unseen:
         table.add_row(row["what"], " ".join(f"{x:.3f}" for x in row["rmse_nm"]), row["note"])
     output.print(table)
     write_json(args.json, {"rows": rows, "held_out": unseen})
     return 0
-
-
-def _held_out(args: argparse.Namespace) -> list[dict[str, Any]]:
-    """What ours and figaroh leave on a log; without one what figaroh is known to leave."""
-    if args.log is None:
-        return [stated()]
-    return held_out(read_log(args.log), read_robot(args.robot), args.validate_from)
 
 
 def motion(robot: SelfModel, samples: int) -> tuple[Array, Array, Array, Array]:
@@ -186,14 +181,10 @@ def _pinocchio(robot: SelfModel, repeats: int) -> dict[str, Any]:
 
 
 def _peer(repeats: int) -> dict[str, Any]:
+    """ADAM on one sample, the link masses being learned."""
     what = "differentiable-robot-model, ADAM"
     if importlib.util.find_spec("differentiable_robot_model") is None:
         return _row(what, None, MISSING)
-    return _row(what, _time_peer(repeats), "one sample, link masses alone")
-
-
-def _time_peer(repeats: int) -> list[int]:
-    """Nanoseconds of each ADAM step on one sample, the link masses being learned."""
     from differentiable_robot_model.rigid_body_params import UnconstrainedTensor
     from differentiable_robot_model.robot_model import DifferentiableRobotModel
 
@@ -207,12 +198,11 @@ def _time_peer(repeats: int) -> list[int]:
         )
     adam = torch.optim.Adam(model.parameters(), lr=1e-3)
     q, dq, ddq, tau = torch.rand(4, 1, 7)
-    times = []
-    for _ in range(repeats):
-        before = time.perf_counter_ns()
+
+    def step(k: int) -> None:
         adam.zero_grad()
         hat = model.compute_inverse_dynamics(q, dq, ddq, include_gravity=True)
         ((hat - tau) ** 2).sum().backward()
         adam.step()
-        times.append(time.perf_counter_ns() - before)
-    return times
+
+    return _row(what, _timed(step, repeats), "one sample, link masses alone")

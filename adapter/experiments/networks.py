@@ -15,7 +15,7 @@ shift, take a few products of tensors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,9 +27,6 @@ from adapter.learning.tree_data import BodyMotion, TreeData, check_motion
 from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import BASE
 from adapter.physics.networks import turn_z
-
-# Called after every iteration with its number and the mean cost of the batch.
-Callback = Callable[[int, float], None]
 
 # A cost below this share of the signal's is rounding: motion right to 1e-8 of its size.
 ROUNDING = 1e-16
@@ -56,8 +53,6 @@ class NetworkSettings:
             later batches count alike, which averages noise out.
         longest_step: of an iteration, rad and m.
         position_span: starting positions are uniform within ± this, m; angles within ±π.
-        accelerations: whether accelerations are compared beside the twist. None: only where
-            twists can't show every frame (no measured v, or a base at rest).
         snapshots: iterations ("epochs") at which λ is kept, beside the last.
     """
 
@@ -68,22 +63,7 @@ class NetworkSettings:
     constant: float = 0.5
     longest_step: float = 0.05
     position_span: float = 0.5
-    accelerations: bool | None = None
     snapshots: tuple[int, ...] = (0, 50, 100)
-
-    def __post_init__(self) -> None:
-        for name in ("minibatch", "cycles", "starts"):
-            if getattr(self, name) < 1:
-                raise ModelError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if not 0.0 < self.gain <= 1.0:
-            raise ModelError(f"gain must be above 0 and at most 1, got {self.gain}")
-        if not 0.0 <= self.constant <= 1.0:
-            raise ModelError(f"constant must be a share, 0 to 1, got {self.constant}")
-        for name in ("longest_step", "position_span"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ModelError(f"{name} must be above 0 and finite, got {getattr(self, name)}")
-        if any(epoch < 0 for epoch in self.snapshots):
-            raise ModelError(f"snapshots are iterations from 0 on, got {self.snapshots}")
 
 
 @dataclass
@@ -107,10 +87,7 @@ class NetworkResult:
 
 
 def schema_by_networks(
-    data: TreeData,
-    seed: int = 0,
-    settings: NetworkSettings | None = None,
-    callback: Callback | None = None,
+    data: TreeData, seed: int = 0, settings: NetworkSettings | None = None
 ) -> NetworkResult:
     """λ by stochastic descent of eq. 18, all joints at once.
 
@@ -118,7 +95,6 @@ def schema_by_networks(
         data: with measured motion of the links.
         seed: of the starts and of the order of the samples.
         settings: see `NetworkSettings`.
-        callback: told of every iteration.
 
     Raises:
         ModelError: no link motion, fewer samples than a mini-batch, numbers that are not finite.
@@ -131,7 +107,7 @@ def schema_by_networks(
             f"{len(data)} samples don't fill a mini-batch of {settings.minibatch}; give more"
         )
     check_motion(data)
-    signals = network_signals(data, _channels(data, settings))
+    signals = network_signals(data, _channels(data))
     rng = np.random.default_rng(seed)
     frames = _random_starts(data.tree.n, settings, rng)
     total = settings.cycles * (len(data) // settings.minibatch)
@@ -145,8 +121,6 @@ def schema_by_networks(
         curvature = (1.0 - gain) * curvature + gain * own
         frames = frames.moved(_shortened(gain * newton_step(slope, curvature), settings))
         losses[epoch] = cost.numpy()
-        if callback is not None:
-            callback(epoch, float(losses[epoch].min(axis=1).mean()))
     kept[total] = _lam(frames)
     final = costs(frames, signals).numpy()
     joints, best = np.arange(data.tree.n), final.argmin(axis=1)
@@ -156,14 +130,13 @@ def schema_by_networks(
     return NetworkResult(chosen[total], chosen, loss, final, _converged(found, signals))
 
 
-def _channels(data: TreeData, settings: NetworkSettings) -> list[str]:
-    """What is compared of w, v and a."""
+def _channels(data: TreeData) -> list[str]:
+    """What is compared of w, v and a: the latter only where twists can't show every frame (no
+    measured v, or a base at rest)."""
     assert data.links is not None
     with_speed = data.links.v is not None and data.base.v is not None
-    accelerations = settings.accelerations
-    if accelerations is None:
-        accelerations = not (with_speed and data.tree.floating)
-    return ["w", *(["v"] if with_speed else []), *(["a"] if accelerations else [])]
+    by_twist = with_speed and data.tree.floating
+    return ["w", *(["v"] if with_speed else []), *([] if by_twist else ["a"])]
 
 
 def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> StartFrames:

@@ -111,12 +111,7 @@ def atlas_stated(numbers: dict[str, Any]) -> list[Stated]:
 
 def panda_stated(numbers: dict[str, Any]) -> list[Stated]:
     """The figures that the paper's text gives, beside ours."""
-
-    def ours(key: str) -> float | int | str | None:
-        value = numbers[key]
-        assert value is None or isinstance(value, float | int | str)
-        return value
-
+    ours = numbers.__getitem__
     return [
         Stated("rate_hz", "rate of the online learning", "1 kHz", ours("rate_hz"), "Hz"),
         Stated("joints", "joints of the arm", "7", ours("joints")),

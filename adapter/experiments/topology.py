@@ -5,7 +5,7 @@ Every recording is shuffled and renamed first, so that nothing but the signals c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -149,22 +149,19 @@ def panda_logs(count: int, seed: int) -> Iterator[Log]:
             run_lockstep(arm, front_end, controller=controller, duration_s=MOTION_S, each=keep)
         finally:
             arm.close()
-        yield _first(_log_of(arm, samples))
-
-
-def _log_of(arm: PyBulletArm, samples: Sequence[JointSample]) -> Log:
-    links = [sample.links for sample in samples if sample.links is not None]
-    return Log(
-        Path("simulated Panda"),
-        arm.joint_names,
-        np.array([sample.stamp_ns for sample in samples]),
-        np.array([sample.q for sample in samples]),
-        np.array([sample.dq for sample in samples]),
-        np.array([sample.tau for sample in samples]),
-        arm.link_names,
-        np.array([motion.twist for motion in links]),
-        np.array([motion.accel for motion in links]),
-    )
+        links = [sample.links for sample in samples if sample.links is not None]
+        log = Log(
+            Path("simulated Panda"),
+            arm.joint_names,
+            np.array([sample.stamp_ns for sample in samples]),
+            np.array([sample.q for sample in samples]),
+            np.array([sample.dq for sample in samples]),
+            np.array([sample.tau for sample in samples]),
+            arm.link_names,
+            np.array([motion.twist for motion in links]),
+            np.array([motion.accel for motion in links]),
+        )
+        yield _first(log)
 
 
 def _first(log: Log) -> Log:

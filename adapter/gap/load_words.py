@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from adapter.gap.load import HandLoad
-from adapter.gap.phrases import plus_minus
 from adapter.model.inertia import six_from_tensor
+from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array
 
 _SIX = ("XX", "XY", "XZ", "YY", "YZ", "ZZ")

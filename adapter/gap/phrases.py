@@ -12,9 +12,9 @@ from adapter.effects.base import ALL, BASE, FLANGE, LINK
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.phrases import Length, Phrase
 from adapter.gap.result import Finding
+from adapter.model.inertia import PARAMETERS, UNITS
+from adapter.model.numbers import plain, plus_minus
 
-DASH = "–"
-MOST_DIGITS = 5  # of a value, however small its standard deviation
 SMALL_RAD = 0.1  # angles below it are shown in mrad
 SHOWN_UNITS = {
     "1": (100.0, "%"),
@@ -23,36 +23,6 @@ SHOWN_UNITS = {
     "m": (1e3, "mm"),
     "kg m2": (1.0, "kg m²"),
 }
-
-
-def plain(value: Any, digits: int = 3) -> str:
-    """A number with that many significant digits and no exponent; a dash where there is none.
-
-    >>> plain(0.012345), plain(12345.6), plain(None), plain(-2.0)
-    ('0.0123', '12346', '–', '-2.00')
-    """
-    value = _number(value)
-    if not math.isfinite(value):
-        return DASH
-    if abs(value) < 1e-9:
-        return "0"
-    return f"{value:.{max(0, digits - 1 - _order(value))}f}"
-
-
-def plus_minus(value: Any, std: Any) -> str:
-    """Value ± standard deviation, both to the second digit of the latter.
-
-    >>> plus_minus(2.0, 0.03), plus_minus(12345.0, 340.0), plus_minus(1.5, None)
-    ('2.000 ± 0.030', '12340 ± 340', '1.50')
-    """
-    value, std = _number(value), _number(std)
-    if not math.isfinite(value) or not _is_size(std):
-        return plain(value)
-    decimals = 1 - _order(std)
-    if value and decimals > MOST_DIGITS - 1 - _order(value):
-        return plain(value, MOST_DIGITS)
-    shown, doubt = round(value, decimals) + 0.0, round(std, decimals)  # no minus before 0.00
-    return f"{shown:.{max(decimals, 0)}f} ± {doubt:.{max(decimals, 0)}f}"
 
 
 def measured(value: Any, std: Any, unit: str) -> str:
@@ -95,8 +65,6 @@ def parameter_lines(finding: Finding) -> list[str]:
     return lines
 
 
-THETA = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
-THETA_UNITS = ("kg", *["kg m"] * 3, *["kg m²"] * 6)
 MOST_PARTS = 4
 
 
@@ -109,9 +77,7 @@ def inertia_lines(dtheta: Sequence[float], std: Any) -> list[str]:
     if not usable.any():
         surety = np.abs(value)
     best = [k for k in np.argsort(-surety)[:MOST_PARTS] if surety[k] > 0.0]
-    return [
-        f"Δ{THETA[k]} = {plus_minus(value[k], doubt[k])} {THETA_UNITS[k]}" for k in sorted(best)
-    ]
+    return [f"Δ{PARAMETERS[k]} = {plus_minus(value[k], doubt[k])} {UNITS[k]}" for k in sorted(best)]
 
 
 def norm(finding: Finding, length: Length) -> str:
@@ -199,10 +165,6 @@ def _two_readings(finding: Finding) -> str:
 def _worth(finding: Finding) -> str:
     worth = np.asarray(finding.torque_rms_nm, dtype=float)
     return f"{plain(np.max(worth), 2)} N m of torque" if worth.size else "its torque differs"
-
-
-def _order(value: float) -> int:
-    return math.floor(math.log10(abs(value)))
 
 
 def _is_size(value: float) -> bool:

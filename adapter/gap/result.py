@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array
-from drivers.files.html_table import html_table, plus_minus
+from drivers.files.html_table import html_table
 
 UNEXPLAINED = "unexplained"  # the name of what no effect of the catalogue explains
 WORSE = 0.05  # share by which an error of a joint may grow on data not seen, and unsaid

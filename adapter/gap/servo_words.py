@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
-from adapter.gap.phrases import listed, numbered, plain, plus_minus, shown_unit
+from adapter.gap.phrases import listed, numbered, shown_unit
 from adapter.gap.servo import TITLES, UNITS, ServoFinding, ServoGap
+from adapter.model.numbers import plain, plus_minus
 from adapter.model.spatial import Array
 
 WORSE = 0.05  # share by which an error of a joint may grow, and unsaid

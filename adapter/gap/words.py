@@ -16,12 +16,11 @@ from adapter.gap.phrases import (
     parameter_lines,
     phrase,
     phrase_of,
-    plain,
-    plus_minus,
     shown_unit,
     who,
 )
 from adapter.gap.result import WORSE, Finding, GapResult, Leftover, LogLoad
+from adapter.model.numbers import plain, plus_minus
 from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from adapter.model.spatial import Array, skew
 
 PARAMETERS = ("m", "mX", "mY", "mZ", "XX", "XY", "XZ", "YY", "YZ", "ZZ")
+UNITS = ("kg", *["kg m"] * 3, *["kg m²"] * 6)  # of these
 # The place of XX XY XZ YY YZ ZZ in a symmetric 3x3 matrix.
 _ROWS = (0, 0, 0, 1, 1, 2)
 _COLS = (0, 1, 2, 1, 2, 2)

@@ -10,9 +10,10 @@ import numpy as np
 
 from adapter.errors import ModelError
 from adapter.model.inertia import move_theta, theta_from_body
+from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import Tree
-from drivers.files.html_table import html_table, plus_minus
+from drivers.files.html_table import html_table
 
 STANDARD_GRAVITY = 9.81  # m/s², the value simulators and Pinocchio use
 LAMBDA_DOCUMENTATION = "documentation"
@@ -48,7 +49,7 @@ def effects_html(effects: Sequence[Mapping[str, Any]]) -> str:
                 continue
             std = entry.get("std", {}).get(key)
             unit = entry.get("units", {}).get(key, "")
-            cell = plus_minus(float(value), np.nan if std is None else float(std))
+            cell = plus_minus(float(value), std)
             joints = ", ".join(map(str, entry["joints"])) or "all"
             rows.setdefault((entry["effect"], f"{key}, {unit}".rstrip(", ")), []).append(
                 f"{joints}: {cell}"

@@ -124,15 +124,9 @@ class RunMessages:
         """Where the links are at joint angles q (n,) rad; of the learned arm once there is one."""
         if self._arm is None or not np.isfinite(q).all():
             return []
-        encoder, shown = (
-            (self._both, self._frames.values())
-            if self._version
-            else (
-                self._one,
-                [self._frames[DOCUMENTED]],
-            )
-        )
-        rows = np.concatenate([frames.rows(q) for frames in shown])
+        encoder = self._both if self._version else self._one
+        shown = (DOCUMENTED, LEARNED) if self._version else (DOCUMENTED,)
+        rows = np.concatenate([self._frames[name].rows(q) for name in shown])
         return [Message(TF_MOVING, TF, stamp_ns, encoder.encode(stamp_ns, rows))]
 
     def estimate(self, snapshot: Snapshot) -> list[Message]:
@@ -166,14 +160,8 @@ class RunMessages:
         if not (np.isfinite(push.wrench).all() and np.isfinite(q).all()):
             return []
         frames = self._frames[LEARNED if push.learned and self._version else DOCUMENTED]
-        into = frames.orientation_of_last(q).T
-        fields = {
-            "header": header(push.stamp_ns, frames.last),
-            "wrench": {
-                "force": _xyz(into @ push.wrench[:3]),
-                "torque": _xyz(into @ push.wrench[3:]),
-            },
-        }
+        own = push.wrench.reshape(2, 3) @ frames.orientation_of_last(q)
+        fields = wrench_fields(push.stamp_ns, frames.last, own)
         return [Message(WRENCH, WRENCH_STAMPED, push.stamp_ns, fields)]
 
     def news(self, stamp_ns: int, told: Mapping[str, Any]) -> list[Message]:
@@ -243,7 +231,23 @@ def _shares(found: Mapping[str, float | None]) -> dict[str, float]:
     return dict(zip(SHARE_FIELDS, values, strict=True))
 
 
-def _xyz(vector: Array) -> dict[str, float]:
+def wrench_fields(stamp_ns: int, frame: str, wrench: Array) -> dict[str, Any]:
+    """Of a WrenchStamped: (2, 3) force and torque, N and N m, in a frame's axes."""
+    both = zip(("force", "torque"), map(xyz, wrench), strict=True)
+    return {"header": header(stamp_ns, frame), "wrench": dict(both)}
+
+
+def table_fields(labels: Sequence[str], table: Array) -> dict[str, Any]:
+    """Of a Float64MultiArray of any shape, a label for each dimension."""
+    dim = [
+        {"label": label, "size": size, "stride": int(np.prod(table.shape[k:]))}
+        for k, (label, size) in enumerate(zip(labels, table.shape, strict=True))
+    ]
+    return {"layout": {"dim": dim, "data_offset": 0}, "data": table.ravel()}
+
+
+def xyz(vector: Array) -> dict[str, float]:
+    """Of a Vector3."""
     return dict(zip("xyz", vector.tolist(), strict=True))
 
 

@@ -18,7 +18,6 @@ from adapter.runs.compare import (
     ModelDifference,
 )
 
-HEADS = ("what", "from A to B", "z", "N m", "mm")
 MATRIX_HEADS = ("joint", "its frame in the one before", "the link behind it")
 EFFECT_HEADS = ("effect", "from A to B, joint by joint", "z", "N m")
 LEGEND = "z: standard deviations; N m, mm: what it alone does to torque and to the hand, rms"
@@ -68,21 +67,6 @@ def _from_to(values: list[float]) -> str:
         return "-"
     low, high = (f"{x:.0f}" if x >= 10.0 else f"{x:.2g}" for x in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
-
-
-def difference_rows(found: ModelDifference) -> list[tuple[str, ...]]:
-    """Rows of a table under `HEADS`, what does most first; what is noise or nothing is left out."""
-    return [
-        (
-            _name(change),
-            _change_words(change),
-            "-" if change.z is None else f"{change.z:.1f}",
-            f"{change.torque_nm:.2g} ({change.torque_joint})" if change.torque_nm > 0.0 else "0",
-            f"{1e3 * change.hand_m:.2g}",
-        )
-        for change in found.changes
-        if _listed(change)
-    ]
 
 
 def difference_summary(found: ModelDifference) -> list[str]:

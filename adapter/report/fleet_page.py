@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,24 +20,13 @@ from adapter.report.fleet_words import (
 from adapter.report.html import fill, write_whole
 from adapter.report.style import MUTED, Drawing, Panel, joint_color
 from adapter.report.tables import Table
-from adapter.report.words import plus_minus
+from adapter.report.words import with_doubt
 from adapter.runs.fleet.arm import DAY_S, FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
 TEMPLATE = "fleet.html"
 MOST_ROWS = 300  # of recordings; of more those that there is something to say of
 LEAST_STD = 1e-9  # below it nothing was learned, it is rounding
-
-
-@dataclass(frozen=True)
-class ArmOnPage:
-    """An arm's part of the page."""
-
-    name: str
-    lines: list[str]
-    parameters: Table
-    panels: list[Panel]
-    logs: Table
 
 
 def write_fleet_page(found: Fleet, path: str | Path) -> Path:
@@ -52,16 +40,16 @@ def write_fleet_page(found: Fleet, path: str | Path) -> Path:
     return write_whole(path, fill(TEMPLATE, context))
 
 
-def _arm(arm: FleetArm) -> ArmOnPage:
+def _arm(arm: FleetArm) -> dict[str, Any]:
+    """An arm's part of the page."""
     numbers = to_be_shown(arm, MOST_ROWS)
     left = len(arm.logs) - len(numbers)
-    note = f"{left} more in the table file; here are those there is something to say of" * (
-        left > 0
-    )
-    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note)
+    note = f"{left} more in the table file; here are those there is something to say of"
+    logs = Table(HEADS, [log_cells(arm.logs[k]) for k in numbers], note=note * (left > 0))
     used = [x for x in arm.logs if x.used]
     panels = _courses(arm, used) if len(used) > 1 else []
-    return ArmOnPage(arm.name, sentences(arm), _parameters(arm), panels, logs)
+    told = {"name": arm.name, "lines": sentences(arm), "parameters": _parameters(arm)}
+    return {**told, "panels": panels, "logs": logs}
 
 
 def _parameters(arm: FleetArm) -> Table:
@@ -74,8 +62,8 @@ def _parameters(arm: FleetArm) -> Table:
     for j, name in enumerate(arm.model.tree.joint_names):
         shown = arm.model.theta_std[links + j, 0] > LEAST_STD
         mass = arm.model.theta[links + j, 0], arm.model.theta_std[links + j, 0] if shown else None
-        values = [plus_minus(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
-        rows.append([name, plus_minus(*mass), *values])
+        values = [with_doubt(arm.outcome.effects[k, j], std[k, j]) for k in range(len(std))]
+        rows.append([name, with_doubt(*mass), *values])
     note = (
         "A mass without a standard deviation is the documentation's: torques show it in sums only."
     )

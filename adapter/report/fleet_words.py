@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
+from adapter.model.numbers import plus_minus
 from adapter.model.spatial import Array
 from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift, StandsOut
@@ -23,12 +24,15 @@ EPOCH_S = 1e9  # stamps below are no dates: a robot that counts from its start
 
 def log_cells(log: OfLog) -> tuple[str, ...]:
     """A recording's row under `HEADS`."""
-    worst = int(np.argmax(log.rmse))
+    worst, begin_s = int(np.argmax(log.rmse)), log.moments.begin_s
+    begins = f"{begin_s:.1f} s"
+    if begin_s >= EPOCH_S:
+        begins = f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
     return (
         Path(log.moments.path).name,
-        begin_words(log.moments.begin_s),
+        begins,
         f"{log.moments.span_s:.0f}",
-        "" if log.load is None else f"{log.load.mass:+.3f} ± {log.load.std:.3f}",
+        "" if log.load is None else _signed(*log.load),
         f"{log.rmse[worst]:.3f} ({worst + 1})",
         _less(log.worth),
         " ".join(map(str, log.disagrees)) if len(log.disagrees) < FEW else "everywhere",
@@ -44,15 +48,8 @@ def to_be_shown(arm: FleetArm, most: int) -> list[int]:
     return sorted(out)[:most]
 
 
-def begin_words(begin_s: float) -> str:
-    """A date, or s where a clock counts from something else."""
-    if begin_s < EPOCH_S:
-        return f"{begin_s:.1f} s"
-    return f"{datetime.fromtimestamp(begin_s, UTC):%Y-%m-%d %H:%M}"
-
-
-def _joints(numbers: tuple[int, ...]) -> str:
-    return f"joint {', '.join(map(str, numbers))}"
+def _signed(value: float, std: float) -> str:
+    return "+" * (value > 0.0) + plus_minus(value, std)
 
 
 def drift_words(drift: Drift) -> str:
@@ -65,7 +62,7 @@ def drift_words(drift: Drift) -> str:
     doubt = "; these recordings cannot tell which" if drift.rivals else ""
     return (
         f"{effect.title.capitalize()} of joint {drift.joint} follows {drift.follows}{or_}: "
-        f"{drift.slope:+.3g} ± {drift.std:.2g} {unit} {per}, {drift.span:.3g} {unit} over all"
+        f"{_signed(drift.slope, drift.std)} {unit} {per}, {drift.span:.3g} {unit} over all"
         f"{share}{doubt}"
     )
 
@@ -92,9 +89,9 @@ def sentences(arm: FleetArm) -> list[str]:
             worst = int(np.argmax(log.rmse / log.own_rmse))
             found.append(
                 f"{Path(log.moments.path).name} disagrees with the others on "
-                f"{_joints(log.disagrees)}: {log.rmse[worst]:.2g} N m on joint {worst + 1} where "
-                f"a model of its own leaves {log.own_rmse[worst]:.2g}; another arm, or a change"
-                f"{'' if log.used else '; the model is learned without it'}"
+                f"joint {', '.join(map(str, log.disagrees))}: {log.rmse[worst]:.2g} N m on joint "
+                f"{worst + 1} where a model of its own leaves {log.own_rmse[worst]:.2g}; another "
+                f"arm, or a change{'' if log.used else '; the model is learned without it'}"
             )
     found += standing_out_words(arm)
     used = [x for x in arm.logs if x.used]
@@ -145,33 +142,30 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
             for k, name in enumerate(arm.effects)
         },
         "drifts": [asdict(x) for x in arm.drifts],
-        "standing_out": [_standing_out_json(arm, x) for x in arm.standing_out],
-        "logs": [_log_json(log) for log in arm.logs],
+        "standing_out": [
+            {**x._asdict(), "path": arm.logs[x.number].moments.path} for x in arm.standing_out
+        ],
+        "logs": [
+            {
+                "path": log.moments.path,
+                "content": log.moments.content,
+                "begin_s": log.moments.begin_s,
+                "span_s": log.moments.span_s,
+                "samples": log.moments.samples,
+                "load": None if log.load is None else log.load._asdict(),
+                "rmse_nm": log.rmse,
+                "own_rmse_nm": log.own_rmse,
+                "used": log.used,
+                "disagrees": list(log.disagrees),
+                "worth_nats": log.worth,
+            }
+            for log in arm.logs
+        ],
         "notes": sentences(arm),
     }
-
-
-def _standing_out_json(arm: FleetArm, one: StandsOut) -> dict[str, Any]:
-    return {**one._asdict(), "path": arm.logs[one.number].moments.path}
 
 
 def effect_std(arm: FleetArm) -> Array:
     """(e, n) standard deviations of what is learned beside θ."""
     effects = arm.outcome.effects
     return np.asarray(arm.std[len(arm.std) - effects.size :].reshape(effects.shape))
-
-
-def _log_json(log: OfLog) -> dict[str, Any]:
-    return {
-        "path": log.moments.path,
-        "content": log.moments.content,
-        "begin_s": log.moments.begin_s,
-        "span_s": log.moments.span_s,
-        "samples": log.moments.samples,
-        "load": None if log.load is None else log.load._asdict(),
-        "rmse_nm": log.rmse,
-        "own_rmse_nm": log.own_rmse,
-        "used": log.used,
-        "disagrees": list(log.disagrees),
-        "worth_nats": log.worth,
-    }

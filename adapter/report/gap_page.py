@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.gap.phrases import DASH, listed, plain
+from adapter.gap.phrases import listed
 from adapter.gap.result import GapResult, Leftover
 from adapter.gap.words import (
     by_kind,
@@ -18,7 +18,7 @@ from adapter.gap.words import (
     signal_words,
     worst_joint,
 )
-from adapter.model.spatial import Array
+from adapter.model.numbers import DASH, plain
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
 from adapter.report.gap_tables import (
@@ -34,7 +34,7 @@ from adapter.report.gap_tables import (
 from adapter.report.gap_trust import gap_checks, gap_steps
 from adapter.report.html import fill, write_whole
 from adapter.report.tables import Tile
-from adapter.report.words import NARROW
+from adapter.report.words import NARROW, capital
 
 TEMPLATE = "gap.html"
 WORTH = "torque error"  # how the clause begins that says what findings are worth
@@ -75,6 +75,11 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     """What the template shows."""
     told = result.problem is None
     shown = _tiles(result) if told else []
+    correction, ratio = correction_table(result), correction_ratio(result)
+    found = "what was found" if result.findings else ""
+    corrected = "the small correction of the inertias" if correction else ""
+    largest = 0.0 if ratio is None or not ratio.size else float(np.abs(ratio).max())
+    took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
     return {
         "robot": result.model_name,
         "headline": _headline(result),
@@ -86,10 +91,11 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "findings": finding_rows(result),
         "matrix": joint_matrix(result),
         "carried": carried_table(result),
-        "contradictions": [_first_capital(text) for text in result.contradictions],
+        "contradictions": [capital(text) for text in result.contradictions],
         "told": told,
         "error_table": error_table(result) if told else None,
-        "after_words": _after_words(result),
+        "after_words": "with "
+        + (" and ".join(filter(None, (found, corrected))) or "nothing added"),
         "errors": error_panels(result) if told else [],
         "signatures": signature_panels(result),
         "marked": any(f.interval_s[0] > 0.0 or not f.lasting for f in result.findings),
@@ -97,12 +103,19 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "rivals": rival_rows(result),
         "unexplained": [_leftover(item) for item in result.unexplained],
         "unexplained_panels": unexplained_panels(result),
-        "correction": correction_table(result) if told else None,
-        "correction_words": _correction_words(result),
+        "correction": correction if told else None,
+        "correction_words": ""
+        if ratio is None or not told
+        else f"The largest part is {largest:.1f} times the deviation that was expected beforehand.",
         "checks": gap_checks(result),
         "steps": gap_steps(result, folder),
         "notes": result.notes,
-        "provenance": _provenance(result),
+        "provenance": [
+            ("Recordings", ", ".join(result.recordings) or DASH),
+            ("Model", result.model_in),
+            ("New model", result.model_out or "none was written"),
+            ("Time taken", took),
+        ],
     }
 
 
@@ -114,12 +127,8 @@ def _headline(result: GapResult) -> list[str]:
         parts.insert(1, parts.pop(worth[0]))
     if result.problem is not None:
         return parts
-    said = [_first_capital(text) if text.startswith(OURS) else text for text in parts]
+    said = [capital(text) if text.startswith(OURS) else text for text in parts]
     return [f"{tied(text.replace(' -> ', ' → '))}." for text in said]
-
-
-def _first_capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _leftover(item: Leftover) -> str:
@@ -138,12 +147,6 @@ def _named(recordings: Sequence[str]) -> list[str]:
     return [*recordings[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])]
 
 
-def _after_words(result: GapResult) -> str:
-    corrected = "the small correction of the inertias" if correction_table(result) else ""
-    found = "what was found" if result.findings else ""
-    return "with " + (" and ".join(filter(None, (found, corrected))) or "nothing added")
-
-
 def _tiles(result: GapResult) -> list[Tile]:
     before, after = result.before, result.after
     noise = np.asarray(result.noise_floor_nm, dtype=float)
@@ -151,7 +154,8 @@ def _tiles(result: GapResult) -> list[Tile]:
     worst = worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
-        tiles.append(Tile("Torque error", _fall(first, last), f"joint {worst + 1}, the worst; rms"))
+        fell = f"{fall(first, last)} N m".replace("->", "→").replace(" ", NARROW)
+        tiles.append(Tile("Torque error", fell, f"joint {worst + 1}, the worst; rms"))
     if worst is not None and noise[worst] > 0.0:
         tiles.append(
             Tile(
@@ -160,7 +164,13 @@ def _tiles(result: GapResult) -> list[Tile]:
                 tied(f"joint {worst + 1}, noise {plain(noise[worst], 2)} N m"),
             )
         )
-    return [*tiles, *_rollout_tile(result)]
+    off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
+    if off is not None and np.isfinite(off).any():
+        j = int(np.nanargmax(off))
+        left = np.nan if off_after is None else off_after[j]
+        value, note = _arrow(1e3 * off[j], 1e3 * left, "mrad"), f"joint {j + 1}, rms within 0.5 s"
+        tiles.append(Tile("Forward simulation off by", value, tied(note)))
+    return tiles
 
 
 def _left_words(result: GapResult) -> str:
@@ -171,39 +181,5 @@ def _left_words(result: GapResult) -> str:
     return left_above_noise(result) or "nothing above the noise left"
 
 
-def _rollout_tile(result: GapResult) -> list[Tile]:
-    before, after = result.before.rollout_rmse_rad, result.after.rollout_rmse_rad
-    worst = None if before is None else _worst(before)
-    if worst is None or before is None:
-        return []
-    last = np.nan if after is None else after[worst]
-    value = _arrow(1e3 * before[worst], 1e3 * last, "mrad")
-    return [Tile("Forward simulation off by", value, tied(f"joint {worst + 1}, rms within 0.5 s"))]
-
-
-def _worst(values: Array) -> int | None:
-    values = np.asarray(values, dtype=float)
-    return int(np.nanargmax(values)) if np.isfinite(values).any() else None
-
-
-def _fall(before: float, after: float) -> str:
-    return f"{fall(before, after)} N m".replace("->", "→").replace(" ", NARROW)
-
-
 def _arrow(before: float, after: float, unit: str) -> str:
     return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
-
-
-def _correction_words(result: GapResult) -> str:
-    ratio = correction_ratio(result)
-    if ratio is None or result.problem is not None:
-        return ""
-    largest = float(np.abs(ratio).max()) if ratio.size else 0.0
-    return f"The largest part is {largest:.1f} times the deviation that was expected beforehand."
-
-
-def _provenance(result: GapResult) -> list[tuple[str, str]]:
-    took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
-    rows = [("Recordings", ", ".join(result.recordings) or DASH), ("Model", result.model_in)]
-    out = result.model_out or "none was written"
-    return [*rows, ("New model", out), ("Time taken", took)]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adapter.gap.phrases import plain
-from adapter.gap.result import Curves, GapResult, Leftover, RolloutCurves
+from adapter.gap.result import GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
+from adapter.model.numbers import plain
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -165,13 +165,9 @@ def _running_mean(x: Array, y: Array) -> tuple[Array, Array]:
     return np.array([x[p].mean() for p in parts]), np.array([y[p].mean() for p in parts])
 
 
-def time_curves(result: GapResult) -> Curves:
-    """The recording that is shown over time: the first, where findings count their time."""
-    return result.curves[0]
-
-
 def _over_time(result: GapResult, j: int) -> Panel:
-    curves = time_curves(result)
+    """Of the first recording, where findings count their time."""
+    curves = result.curves[0]
     drawing = Drawing("half")
     ax = drawing.axes[0]
     _limits(ax, curves.t, [curves.before[:, j], curves.after[:, j]])
@@ -204,7 +200,7 @@ def _motion(result: GapResult, j: int) -> Panel:
     rollout = next((r for r in result.rollouts if np.isfinite(r.before[:, j]).any()), None)
     if rollout is not None:
         return _rollout(rollout, j)
-    curves = time_curves(result)
+    curves = result.curves[0]
     drawing = Drawing("half")
     ax, tau = drawing.axes[0], curves.tau[:, j]
     ax.plot(*_line(curves.t, tau), color=INK, linewidth=2.2, alpha=0.3)

@@ -8,21 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adapter.gap.phrases import (
-    DASH,
-    THETA,
-    THETA_UNITS,
-    parameter_lines,
-    plain,
-    plus_minus,
-    shown_unit,
-    who,
-)
+from adapter.gap.phrases import parameter_lines, shown_unit, who
 from adapter.gap.result import Finding, GapResult
 from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
+from adapter.model.inertia import PARAMETERS, UNITS
+from adapter.model.numbers import DASH, plain, plus_minus
 from adapter.model.spatial import Array
 from adapter.report.tables import Table
-from adapter.report.words import NARROW
+from adapter.report.words import NARROW, capital
 
 MOST_CORRECTIONS = 6
 
@@ -67,18 +60,15 @@ def _row(findings: Sequence[Finding]) -> FindingRow:
     else:
         when = span(first) or "throughout"
     return FindingRow(
-        what=_first_capital(first.title),
+        what=capital(first.title),
         where=who(first.effect, joints),
         when=when,
-        values=[RANGES.format(_ranges(ordered))]
+        values=[f"{_ranges(ordered)}; joint by joint below"]
         if in_matrix(ordered)
         else [line for f in ordered for line in _values(f, alone)],
         evidence=sure if alone or least >= 0.999 else f"{sure} and more",
         worth=_worth(ordered),
     )
-
-
-RANGES = "{}; joint by joint below"
 
 
 def in_matrix(findings: Sequence[Finding]) -> bool:
@@ -117,9 +107,12 @@ def joint_matrix(result: GapResult) -> Table | None:
         of = {f.joints[0]: f for f in findings}
         for key in findings[0].parameters:
             factor, unit = _unit(findings, key)
-            heads.append(_first_capital(findings[0].title))
+            heads.append(capital(findings[0].title))
             units.append(f"{key}, {unit}" + (f", {span(findings[0])}" if span(findings[0]) else ""))
-            columns.append({j: _scaled_value(f, key, factor) for j, f in of.items()})
+            std = {j: factor * np.asarray(f.std.get(key, np.nan), float) for j, f in of.items()}
+            columns.append(
+                {j: tied(plus_minus(factor * f.parameters[key], std[j])) for j, f in of.items()}
+            )
     if not columns:
         return None
     rows = [
@@ -127,11 +120,6 @@ def joint_matrix(result: GapResult) -> Table | None:
         for j, name in enumerate(result.joint_names, start=1)
     ]
     return Table(heads, rows, units)
-
-
-def _scaled_value(finding: Finding, key: str, factor: float) -> str:
-    value, std = finding.parameters[key], finding.std.get(key)
-    return tied(plus_minus(factor * value, None if std is None else factor * std))
 
 
 def _values(finding: Finding, alone: bool) -> list[str]:
@@ -152,10 +140,6 @@ def _worth(findings: Sequence[Finding]) -> str:
     return tied(f"{low} N m" if low == high else f"{low} to {high} N m")
 
 
-def _first_capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
 def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
     """(findings, what else they could be and how much of them that explains, how to tell)."""
     rows = []
@@ -163,7 +147,7 @@ def rival_rows(result: GapResult) -> list[tuple[str, str, str]]:
         shares = shares_of(findings)
         if shares:
             joints = sorted(j for f in findings for j in f.joints)
-            where = f"{_first_capital(findings[0].title)}, {who(findings[0].effect, joints)}"
+            where = f"{capital(findings[0].title)}, {who(findings[0].effect, joints)}"
             said = ", ".join(f"{title_of(name)} {share}" for name, share in shares)
             rows.append((where, said, findings[0].split_by))
     return rows
@@ -197,23 +181,22 @@ def error_table(result: GapResult) -> Table:
         pair = getattr(before, key), getattr(after, key)
         if all(x is None or not np.isfinite(x).any() for x in pair):
             continue
-        columns += [_scaled(x, factor, len(noise)) for x in pair]
+        nothing = np.full(len(noise), np.nan)
+        columns += [nothing if x is None else factor * np.asarray(x, dtype=float) for x in pair]
         heads += ["Before", "After"]
         units += [unit, unit]
         decimals += [digits, digits]
     rows = [
-        [name, *(_fixed(x[j], digits) for x, digits in zip(columns, decimals, strict=True))]
+        [
+            name,
+            *(
+                f"{x[j]:.{digits}f}" if np.isfinite(x[j]) else DASH
+                for x, digits in zip(columns, decimals, strict=True)
+            ),
+        ]
         for j, name in enumerate(result.joint_names)
     ]
     return Table(heads, rows, units)
-
-
-def _fixed(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else DASH
-
-
-def _scaled(values: Array | None, factor: float, n: int) -> Array:
-    return np.full(n, np.nan) if values is None else factor * np.asarray(values, dtype=float)
 
 
 def correction_table(result: GapResult) -> Table | None:
@@ -229,9 +212,9 @@ def correction_table(result: GapResult) -> Table | None:
         rows.append(
             [
                 f"link {link + 1}",
-                THETA[part],
-                tied(f"{result.corrections[link, part]:+.2g} {THETA_UNITS[part]}"),
-                f"± {plain(result.corrections_prior[link, part], 2)} {THETA_UNITS[part]}",
+                PARAMETERS[part],
+                tied(f"{result.corrections[link, part]:+.2g} {UNITS[part]}"),
+                f"± {plain(result.corrections_prior[link, part], 2)} {UNITS[part]}",
                 tied(f"{ratio[link, part]:+.1f}"),
             ]
         )

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from adapter.gap.phrases import plain, who
-from adapter.gap.result import Finding, GapResult
+from adapter.gap.phrases import who
+from adapter.gap.result import GapResult
 from adapter.gap.words import left_above_noise, noise_times, percent, stopped, worse
+from adapter.model.numbers import plain
 from adapter.model.robots import names as robot_names
 from adapter.report.gap_tables import rival_rows, tied
-from adapter.report.next_steps import Step
-from adapter.report.trust import BAD, GOOD, LOOK, Check
+from adapter.report.next_steps import Step, command
+from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
+from adapter.report.words import capital
 
 SURE = 0.99  # evidence from which a finding is called well known
 FIGURES = "gap.json"  # beside the page
@@ -35,12 +36,9 @@ def _evidence(result: GapResult) -> Check | None:
     if not result.findings:
         return None
     least = min(result.findings, key=lambda f: f.evidence)
-    said = f"the least sure of {len(result.findings)}: {_called(least)}, {percent(least.evidence)}"
+    called = f"{least.title}, {who(least.effect, least.joints)}"
+    said = f"the least sure of {len(result.findings)}: {called}, {percent(least.evidence)}"
     return Check(GOOD if least.evidence >= SURE else LOOK, "How sure", said)
-
-
-def _called(finding: Finding) -> str:
-    return f"{finding.title}, {who(finding.effect, finding.joints)}"
 
 
 def _rivals(result: GapResult) -> Check | None:
@@ -61,9 +59,8 @@ def _scored(result: GapResult) -> Check:
         return Check(LOOK, "On data not fitted", said)
     lost = worse(result)
     said = "errors before and after are of data that the fit never saw"
-    return Check(
-        LOOK if lost else GOOD, "On data not fitted", f"{said}{'; ' + lost if lost else ''}"
-    )
+    said += f"; {lost}" if lost else ""
+    return Check(LOOK if lost else GOOD, "On data not fitted", said)
 
 
 def _left(result: GapResult) -> Check:
@@ -72,15 +69,13 @@ def _left(result: GapResult) -> Check:
     joints = sorted({item.joint for item in result.unexplained})
     loud = left_above_noise(result)
     if joints:
-        listed = ", ".join(map(str, joints))
-        said = (
-            f"something that no effect explains on joint{'s' if len(joints) > 1 else ''} {listed}"
-        )
-        return Check(LOOK, "Torque not explained", f"{said}{'; ' + loud if loud else ''}")
+        where = f"joint{'s' if len(joints) > 1 else ''} {', '.join(map(str, joints))}"
+        said = f"something that no effect explains on {where}{'; ' + loud if loud else ''}"
+        return Check(LOOK, LEFT, said)
     if loud:
-        return Check(LOOK, "Torque not explained", f"{loud}, and nothing of the catalogue names it")
+        return Check(LOOK, LEFT, f"{loud}, and nothing of the catalogue names it")
     most = plain(float(np.nanmax(after)), 2) if np.isfinite(after).any() else "an unknown number of"
-    return Check(GOOD, "Torque not explained", f"at most {most} times the noise, on every joint")
+    return Check(GOOD, LEFT, f"at most {most} times the noise, on every joint")
 
 
 def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
@@ -90,16 +85,16 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     steps = [Step(text) for text in asked]
     if asked and result.findings:
         why = "The motion that tells these apart, inside the arm's limits"
-        steps.append(Step(why, _command("excite", *_robot(result), "--gap", figures)))
+        steps.append(Step(why, command("excite", *_robot(result), "--gap", figures)))
     if result.problem is not None and result.model_in:
         why = "Design a motion in which every joint moves enough"
-        steps.append(Step(why, _command("excite", *_robot(result))))
+        steps.append(Step(why, command("excite", *_robot(result))))
     out = result.model_out
     if out is not None:
         why = "See joint by joint what the new model holds otherwise"
-        steps.append(Step(why, _command("diff", result.model_in or "MODEL", out)))
+        steps.append(Step(why, command("diff", result.model_in or "MODEL", out)))
         why = "Use it in a simulator or planner: the robot's file with what was found"
-        steps.append(Step(why, _command("export", out, "--urdf", "learned.urdf")))
+        steps.append(Step(why, command("export", out, "--urdf", "learned.urdf")))
     return steps
 
 
@@ -112,7 +107,7 @@ def _asked(texts: Sequence[str]) -> list[str]:
     found = []
     for motion, clauses in told.items():
         signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
-        found.append(_first_capital(f"{motion}: the {signs}" if signs else motion))
+        found.append(tied(capital(f"{motion}: the {signs}" if signs else motion)))
     return found
 
 
@@ -120,11 +115,3 @@ def _robot(result: GapResult) -> tuple[str, ...]:
     """The option that names the robot, where it is not the usual one."""
     given = result.model_in
     return ("--robot", given) if given and given != robot_names()[0] else ()
-
-
-def _command(*words: str) -> str:
-    return shlex.join(["adapter", *words])
-
-
-def _first_capital(text: str) -> str:
-    return tied(text[:1].upper() + text[1:])

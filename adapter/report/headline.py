@@ -3,38 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adapter.model.self_model import LAMBDA_DOCUMENTATION as DOCUMENTATION
-from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report.torque_panels import refusal, theta_started
-from adapter.report.words import NARROW, is_live, missed_words, not_learned, plus_minus, quantity
-from adapter.report.worth import Fall, hand_off_m, loads, together, torque_fall, tracking_fall
+from adapter.report.words import (
+    NARROW,
+    capital,
+    is_live,
+    missed_words,
+    not_learned,
+    quantity,
+    with_doubt,
+)
+from adapter.report.worth import Worth, together
 from adapter.runs.run_folder import RunData
 
 MOVED_M = 1e-4  # of the hand, from which a measured λ is said to differ from the documentation
 MANY_LOADS = 3
-
-
-@dataclass(frozen=True)
-class Worth:
-    """What a run brought, in numbers; see `adapter.report.worth`."""
-
-    torque: Fall | None
-    tracking: Fall | None
-    hand_m: float | None
-    loads: list[tuple[float, float, float | None]]
-
-    @classmethod
-    def of(cls, data: RunData) -> Worth:
-        """Of a run."""
-        measured = data.figures["lambda"].get("source") == LAMBDA_MEASURED
-        hand_m = hand_off_m(data) if measured else None
-        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads(data))
 
 
 def headline(data: RunData, worth: Worth) -> list[str]:
@@ -56,8 +45,7 @@ def _late(figures: Mapping[str, Any]) -> list[str]:
     """Whether deadlines were missed, and by whose fault."""
     if not is_live(figures):
         return []
-    said = missed_words(figures)
-    return [f"{said[:1].upper()}{said[1:]}."]
+    return [f"{capital(missed_words(figures))}."]
 
 
 def against(figures: Mapping[str, Any]) -> str:
@@ -93,7 +81,8 @@ def _torque(data: RunData, worth: Worth) -> list[str]:
         ]
     more = np.square(fall.after) - np.square(fall.before)
     j = int(np.argmin(more) if fall.better else np.argmax(more))  # has most part in it
-    worst = f"joint {j + 1} {_fall_words(fall, j)}"
+    first, last = (quantity(x[j], "N m", 2) for x in (fall.before, fall.after))
+    worst = f"joint {j + 1} {first} → {last}"
     verb = "fell" if fall.better else "rose"
     return [
         f"The torque error of all joints {verb} from {before} with the documented model to "
@@ -105,17 +94,12 @@ def _all_joints(values: Any, std: Any) -> str:
     """All joints together, ± one standard deviation where it is known."""
     size = together(values)
     spread = None if std is None else float(np.sqrt(np.sum((values * std) ** 2))) / max(size, 1e-12)
-    return f"{plus_minus(size, spread)} N m".replace(" ", NARROW)
-
-
-def _fall_words(fall: Fall, j: int) -> str:
-    assert fall.before is not None
-    return f"{quantity(fall.before[j], 'N m', 2)} → {quantity(fall.after[j], 'N m', 2)}"
+    return f"{with_doubt(size, spread)} N m".replace(" ", NARROW)
 
 
 def _loads(worth: Worth) -> list[str]:
     said = [
-        f"A load of {plus_minus(mass, std)} kg was noticed at the hand "
+        f"A load of {with_doubt(mass, std)} kg was noticed at the hand "
         f"{quantity(at_s, 's')} after the first motion.".replace(" kg", f"{NARROW}kg")
         for at_s, mass, std in worth.loads
     ]

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from adapter.model.self_model import MJCF
-from adapter.report.headline import Worth
 from adapter.report.torque_panels import refusal, theta_started
 from adapter.report.words import is_live, not_learned
-from adapter.report.worth import SLOW, slow_share
+from adapter.report.worth import SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData
 
 MOST = 4
@@ -40,7 +39,7 @@ def next_steps(data: RunData, worth: Worth) -> list[Step]:
     files = _Files(data)
     if refusal(data.figures):
         why = "Mend it in the driver or the model; a log is taken with what the sentence names"
-        return [Step(why, files.command("replay", *files.logs or ["LOG"]))]
+        return [Step(why, command("replay", *files.logs or ["LOG"]))]
     started = theta_started(data)
     found: list[Step | None] = []
     if _left_to_find(data, worth):
@@ -53,6 +52,11 @@ def next_steps(data: RunData, worth: Worth) -> list[Step]:
     return steps[:MOST] or [files.gap("Look for what the documented model lacks")]
 
 
+def command(*words: Any) -> str:
+    """A line of the shell."""
+    return shlex.join(["adapter", *map(str, words)])
+
+
 class _Files:
     """Names of what the run left, and how commands take them."""
 
@@ -62,12 +66,9 @@ class _Files:
         logs = data.figures.get("recordings")
         self.logs: list[str] = [str(log) for log in logs] if logs else []
 
-    def command(self, *words: Any) -> str:
-        return shlex.join(["adapter", *map(str, words)])
-
     def gap(self, why: str) -> Step:
         logs = self.logs or ["LOG"]
-        return Step(why, self.command("gap", *logs, "--model", self.documented))
+        return Step(why, command("gap", *logs, "--model", self.documented))
 
 
 def _left_to_find(data: RunData, worth: Worth) -> bool:
@@ -91,10 +92,10 @@ def _longer(data: RunData, files: _Files) -> Step:
         more = _leave(data)
         if not data.figures.get("tracking"):  # somebody else moved the arm
             why = "The learner had not settled: listen for longer, to more motion of every joint"
-            return Step(why, files.command(*words, "--passive"))
-        return Step(why, files.command(*words, "--excitation", "designed", *more))
+            return Step(why, command(*words, "--passive"))
+        return Step(why, command(*words, "--excitation", "designed", *more))
     why = "The learner had not settled: see what this motion lacks"
-    return Step(why, files.command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))
+    return Step(why, command("info", *files.logs[:1] or ["LOG"], "--robot", files.documented))
 
 
 def _again(data: RunData) -> list[str]:
@@ -144,7 +145,7 @@ def _feedforward(data: RunData, worth: Worth) -> Step | None:
     why = "Let the learned model help the controller; the next report says what that is worth"
     if figures.get("feedforward") == "learned":
         why = "Run for longer, so that the learned model gets to help the controller"
-    return Step(why, shlex.join(["adapter", *words]))
+    return Step(why, command(*words))
 
 
 def _held_out(data: RunData, files: _Files) -> Step | None:
@@ -155,7 +156,7 @@ def _held_out(data: RunData, files: _Files) -> Step | None:
         return None
     at = f"{LEARNED_SHARE * span_s:.3g}"
     why = "Judge the model on data that it never saw"
-    return Step(why, files.command("replay", files.logs[0], "--validate-from", at))
+    return Step(why, command("replay", files.logs[0], "--validate-from", at))
 
 
 def _use(data: RunData, files: _Files) -> list[Step]:
@@ -163,13 +164,7 @@ def _use(data: RunData, files: _Files) -> list[Step]:
     source = data.model.source
     mjcf = source is not None and source.format == MJCF
     target = ("--mjcf", "learned.xml") if mjcf else ("--urdf", "learned.urdf")
-    return [
-        Step(
-            "See joint by joint what differs from the documentation",
-            files.command("diff", files.model),
-        ),
-        Step(
-            "Use it in a simulator or planner: the robot's file with what was learned",
-            files.command("export", files.model, *target),
-        ),
-    ]
+    see = "See joint by joint what differs from the documentation"
+    use = "Use it in a simulator or planner: the robot's file with what was learned"
+    exported = command("export", files.model, *target)
+    return [Step(see, command("diff", files.model)), Step(use, exported)]

@@ -8,7 +8,7 @@ from typing import Any
 from adapter.gap.monitor_judge import sentence
 from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.report import tables, words
-from adapter.report.headline import Worth, against, headline
+from adapter.report.headline import against, headline
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import schema_panels
@@ -25,7 +25,7 @@ from adapter.report.torque_panels import (
     theta_started,
 )
 from adapter.report.trust import checks
-from adapter.report.worth_panels import worth_panels, worth_table
+from adapter.report.worth import Worth, worth_panels, worth_table
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL
 

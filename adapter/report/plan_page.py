@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -17,17 +17,14 @@ from adapter.control.path_motion import PathMotion
 from adapter.model.spatial import Array, matrix_from_rpy
 from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import Step
-from adapter.report.skeleton import from_a_corner
+from adapter.report.skeleton import Projection, from_a_corner, ground
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 TEMPLATE = "plan.html"
 POSES = 80  # drawn along the path
 GOLDEN = 0.618034  # spreads them over the path without a step that a period could share
 RIM = 24  # corners of a circle
-VIEWS: tuple[tuple[str, Callable[[Array], Array], str], ...] = (
+VIEWS: tuple[tuple[str, Projection, str], ...] = (
     ("Seen from a corner", from_a_corner, "grey: where links go; blue: start; orange: nearest"),
     ("Seen from the side", lambda points: points[..., [0, 2]], "x to the right, z up"),
     ("Seen from above", lambda points: points[..., [0, 1]], "x to the right, y up"),
@@ -73,7 +70,7 @@ def _view(
     poses: Sequence[Array],
     nearest: Array,
     start: Array,
-    view: tuple[str, Callable[[Array], Array], str],
+    view: tuple[str, Projection, str],
 ) -> Panel:
     title, project, note = view
     drawing = Drawing("third", bare=True, stretch=1.3)
@@ -90,17 +87,8 @@ def _view(
         for ends, _ in arm.placed(q):
             line = _rim(project(ends))
             ax.plot(*line.T, color=color, linewidth=width, alpha=alpha, solid_capstyle="round")
-    _scale(ax, arm.cell.table, project)
+    ground(ax, project, 0.6 * arm.cell.table)
     return drawing.panel(title, "", note)
-
-
-def _scale(ax: Axes, table: bool, project: Callable[[Array], Array]) -> None:
-    if table:
-        square = 0.6 * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-        ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
-    left, foot = ax.get_xlim()[0], ax.get_ylim()[0]
-    ax.plot([left, left + 0.2], [foot, foot], color=INK, linewidth=1.2)
-    ax.text(left + 0.23, foot, "0.2 m", color=MUTED, va="center", fontsize=7.6)
 
 
 def _rim(points: Array) -> Array:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adapter.model.spatial import Array, matrix_from_zxz, rot_z
+from adapter.model.self_model import FixedFrame
+from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
+from adapter.physics.kernels import Frames, place_frames
 from adapter.report.style import ACCENT, GOAL, GRID, INK, MUTED, Drawing, Panel, joint_color
 from adapter.runs.run_folder import RunData
 
@@ -56,8 +58,8 @@ def skeleton_panels(data: RunData) -> list[Panel]:
         arms["reference"] = placed_arm(data, reference, q)
     views: tuple[tuple[str, Projection, str], ...] = (
         ("Seen from a corner", from_a_corner, "short ticks are the joint axes"),
-        ("Seen from the side", _side, "x to the right, z up"),
-        ("Seen from the front", _front, "y to the right, z up"),
+        ("Seen from the side", lambda points: points[..., [0, 2]], "x to the right, z up"),
+        ("Seen from the front", lambda points: points[..., [1, 2]], "y to the right, z up"),
     )
     tree = data.documented.tree
     return [_view(tree, arms, project, title, note) for title, project, note in views]
@@ -89,23 +91,27 @@ def some_postures(data: RunData) -> Array:
 
 def placed_arm(data: RunData, lam: Array, q: Array) -> Skeleton:
     """The arm of a λ (n, 6) in a posture (n,) rad."""
-    tree = data.documented.tree
-    R, p = placed(tree, matrix_from_zxz(lam[:, :3]) @ rot_z(q), lam[:, 3:])
+    arm = data.documented
+    return skeleton_of(arm.tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:], q, arm.frames)
+
+
+def skeleton_of(
+    tree: Tree, R0: Array, p0: Array, q: Array, frames: Sequence[FixedFrame] = ()
+) -> Skeleton:
+    """Where an arm is at q (n,) rad.
+
+    Args:
+        R0, p0: (n, 3, 3), (n, 3) m joint frames in their parents' at q = 0.
+        frames: that ride on links; the farthest one of an outermost link is its tip.
+    """
+    R, p = np.empty((tree.n, 3, 3)), np.empty((tree.n, 3))
+    place_frames(Frames(np.array(tree.parent), R0, np.ascontiguousarray(p0)), q, R, p)
     tips = {}
-    for j in set(range(tree.n)) - set(tree.parent):
-        riding = [f.position for f in data.documented.frames if f.parent == tree.link_names[j]]
+    for j in sorted(set(range(tree.n)) - set(tree.parent)):
+        riding = [f.position for f in frames if f.parent == tree.link_names[j]]
         if riding:
             tips[j] = p[j] + R[j] @ max(riding, key=lambda x: float(np.linalg.norm(x)))
     return Skeleton(p, R[:, :, 2], tips)
-
-
-def placed(tree: Tree, rotations: Array, shifts: Array) -> tuple[Array, Array]:
-    """R (n, 3, 3) and p (n, 3) of all joint frames in the base's, from those in their parents'."""
-    R, p = np.zeros((tree.n, 3, 3)), np.zeros((tree.n, 3))
-    for j, i in enumerate(tree.parent):
-        R_i, p_i = (np.eye(3), np.zeros(3)) if i == BASE else (R[i], p[i])
-        R[j], p[j] = R_i @ rotations[j], p_i + R_i @ shifts[j]
-    return R, p
 
 
 def from_a_corner(points: Array, turn_deg: float = -55.0, lift_deg: float = 18.0) -> Array:
@@ -115,14 +121,6 @@ def from_a_corner(points: Array, turn_deg: float = -55.0, lift_deg: float = 18.0
     towards = np.array([np.cos(turn), np.sin(turn), 0.0])
     up = np.array([0.0, 0.0, np.cos(lift)]) - np.sin(lift) * towards
     return np.stack([points @ right, points @ up], axis=-1)
-
-
-def _side(points: Array) -> Array:
-    return points[..., [0, 2]]
-
-
-def _front(points: Array) -> Array:
-    return points[..., [1, 2]]
 
 
 def _view(
@@ -139,14 +137,15 @@ def _view(
         tick = AXIS_SHARE * size * axis
         ax.plot(*project(np.stack([p - tick, p + tick])).T, color=joint_color(j), linewidth=1.3)
         ax.plot(*project(p), color=joint_color(j), marker="o", markersize=3.6)
-    _ground(ax, project, size)
+    ground(ax, project, 0.15 * size)
     return drawing.panel(title, "", note)
 
 
-def _ground(ax: Axes, project: Projection, size: float) -> None:
-    """A square on the ground around the base, and a scale."""
-    square = 0.15 * size * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
+def ground(ax: Axes, project: Projection, half: float) -> None:
+    """A square on the ground around the base, `half` (m) to either side, none of 0; a scale."""
+    if half:
+        square = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
+        ax.plot(*project(square).T, color=GRID, linewidth=1.2, zorder=0)
     left, foot = ax.get_xlim()[0], ax.get_ylim()[0]
     ax.plot([left, left + SCALE_M], [foot, foot], color=MUTED, linewidth=1.2)
     ax.text(left + 1.1 * SCALE_M, foot, f"{SCALE_M:g} m", color=MUTED, va="center", fontsize=7.6)

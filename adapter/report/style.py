@@ -10,7 +10,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -311,8 +311,8 @@ def _rounded(text: str, digits: int) -> str:
     return re.sub(rf"-?\d+\.\d{{{digits + 1},}}", short, text)
 
 
-def lines_by_joint(ax: Axes, t: Array, values: Array, joints: Iterable[int] | None = None) -> None:
+def lines_by_joint(ax: Axes, t: Array, values: Array) -> None:
     """One line per joint, values (k, n), in the joints' colours."""
-    for j in range(values.shape[1]) if joints is None else joints:
+    for j in range(values.shape[1]):
         line = thin(t, values[:, j])
         ax.plot(*line, color=joint_color(j), linewidth=1.1, gid=named(f"joint {j + 1}"))

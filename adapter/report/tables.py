@@ -11,16 +11,16 @@ import numpy as np
 
 from adapter.effects.active import active_effects
 from adapter.effects.base import ALL
-from adapter.gap.phrases import SHOWN_UNITS, THETA
+from adapter.gap.phrases import SHOWN_UNITS
+from adapter.model.inertia import PARAMETERS, UNITS
+from adapter.model.numbers import DASH
 from adapter.report.torque_panels import SHARE_ALONE, theta_started
-from adapter.report.words import NOTHING, REFUSALS, count, number, plus_minus
+from adapter.report.words import REFUSALS, count, number, with_doubt
 from adapter.runs.run_folder import RunData
 
 LAMBDA_NAMES = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 LAMBDA_UNITS = ("rad", "rad", "rad", "m", "m", "m")
-THETA_UNITS = ("kg", "kg m", "kg m", "kg m", *["kg m²"] * 6)
 HIDDEN = 1e-6  # a share below it is none
-DOCUMENTED = "taken from the documentation"
 
 TIMES = {
     "tick_us": "Compute: driver, filter, synthesis",
@@ -94,10 +94,11 @@ def joint_tables(data: RunData) -> list[Table]:
     if theta.get("validation_torque_rmse_nm"):
         columns.append(("Held out", "N m rms", _column(theta["validation_torque_rmse_nm"])))
     effects = _effect_columns(data)
-    return [_table(columns), *([_table([names, *effects])] if effects else [])]
+    return [by_column(columns), *([by_column([names, *effects])] if effects else [])]
 
 
-def _table(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
+def by_column(columns: Sequence[tuple[str, str, list[str]]]) -> Table:
+    """Columns (head, unit, cells)."""
     heads, units, cells = zip(*columns, strict=True)
     return Table(heads, list(zip(*cells, strict=True)), units)
 
@@ -126,9 +127,9 @@ def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
             given = effect.units()[key]
             factor, unit = SHOWN_UNITS.get(given, (1.0, given))
             head = effect.name.replace("_", " ").capitalize()
-            column = columns.setdefault((head, f"{key}, {unit}"), [NOTHING] * data.n)
+            column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * data.n)
             std = active.std.get(key)
-            shown = plus_minus(factor * value, None if std is None else factor * std)
+            shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown
     return [(head, unit, cells) for (head, unit), cells in columns.items()]
@@ -139,7 +140,7 @@ def schema_matrix(data: RunData) -> Matrix:
     std, names = data.model.lam_std, data.documented.tree.joint_names
     rank = data.figures["lambda"].get("identifiable_rank")
     rows = [
-        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k], DOCUMENTED) for k in range(6)])
+        (name, [_cell(shown[k], spread[k], LAMBDA_UNITS[k]) for k in range(6)])
         for name, shown, spread in zip(names, data.lam_shown, std, strict=True)
     ]
     summary = f"{rank} of {6 * data.n} directions"
@@ -154,20 +155,20 @@ def theta_matrix(data: RunData) -> Matrix:
     rows = []
     for j, name in enumerate(names):
         shares = data.theta_shown[j] if started else np.zeros(10)
-        cells = [_cell(shares[k], std[j, k], THETA_UNITS[k], DOCUMENTED) for k in range(10)]
+        cells = [_cell(shares[k], std[j, k], UNITS[k]) for k in range(10)]
         rows.append((name, cells))
     summary = f"{rank} combinations of {10 * data.n} parameters"
     if not started:
         summary = f"none of {10 * data.n} parameters: θ was not learned"
-    return Matrix("Dynamics θ", summary, THETA, rows)
+    return Matrix("Dynamics θ", summary, PARAMETERS, rows)
 
 
-def _cell(share: float, std: float, unit: str, instead: str) -> Cell:
+def _cell(share: float, std: float, unit: str) -> Cell:
     if share > SHARE_ALONE:
         return Cell("alone", f"identifiable, standard deviation {number(std, 2)} {unit}")
     if share > HIDDEN:
         return Cell("mixed", "identifiable only in combination with others")
-    return Cell("hidden", f"not identifiable, {instead}")
+    return Cell("hidden", "not identifiable, taken from the documentation")
 
 
 def timing_table(figures: Mapping[str, Any]) -> Table | None:
@@ -207,8 +208,8 @@ def changes_table(data: RunData) -> Table | None:
         rows.append(
             [
                 number(change["stamp_s"] - data.start_s, 4),
-                plus_minus(load["m"], load.get("m_std")) if load else NOTHING,
-                ", ".join(number(1e3 * x) for x in centre if x is not None) or NOTHING,
+                with_doubt(load["m"], load.get("m_std")) if load else DASH,
+                ", ".join(number(1e3 * x) for x in centre if x is not None) or DASH,
             ]
         )
     units = ["s after the first motion", "kg", "mm, in the last link's frame"]
@@ -222,12 +223,12 @@ def theta_table(data: RunData) -> Table:
         theta, std = data.model.theta[-data.n :][j], data.model.theta_std[-data.n :][j]
         alone = data.theta_shown[j] > SHARE_ALONE
         pairs = zip(theta, std, alone, strict=True)
-        rows.append([name, *(plus_minus(x, s) if a else f"({number(x)})" for x, s, a in pairs)])
+        rows.append([name, *(with_doubt(x, s) if a else f"({number(x)})" for x, s, a in pairs)])
     note = (
         "In brackets: not identifiable on its own; of all possible bodies with the learned "
         "combinations those nearest to the documented ones."
     )
-    return Table(["Link", *THETA], rows, ["", *THETA_UNITS], note)
+    return Table(["Link", *PARAMETERS], rows, ["", *UNITS], note)
 
 
 def schema_table(data: RunData) -> Table:

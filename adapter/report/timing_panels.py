@@ -40,28 +40,19 @@ def histogram_panels(figures: Mapping[str, Any]) -> list[Panel]:
     return panels
 
 
-def tracked(figures: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """The ways of control that were used and measured, by name."""
-    tracking = figures.get("tracking") or {}
-    names = dict(TRACKED)
-    if figures.get("feedforward"):
-        names["feedforward"] = f"with feed-forward of the {figures['feedforward']} model"
-    return {
-        names.get(name, name.replace("_", " ")): values
-        for name, values in tracking.items()
-        if isinstance(values, Mapping) and values.get("rms_rad")
-    }
-
-
 def tracking_table(figures: Mapping[str, Any]) -> Table | None:
     """Tracking error by way of control; None where nothing was tracked."""
-    rows = []
-    for name, values in tracked(figures).items():
+    names, rows = dict(TRACKED), []
+    if figures.get("feedforward"):
+        names["feedforward"] = f"with feed-forward of the {figures['feedforward']} model"
+    for name, values in (figures.get("tracking") or {}).items():
+        if not (isinstance(values, Mapping) and values.get("rms_rad")):
+            continue
         rms = 1e3 * np.array(values["rms_rad"], float)
         most = values.get("max_rad")
         rows.append(
             [
-                name,
+                names.get(name, name.replace("_", " ")),
                 count(values.get("samples") or 0),
                 number(float(np.sqrt(np.mean(rms**2)))),
                 number(None if not most else 1e3 * max(most)),

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from adapter.effects import effects_by_name
-from adapter.gap.phrases import SHOWN_UNITS, THETA
+from adapter.gap.phrases import SHOWN_UNITS
+from adapter.model.inertia import PARAMETERS
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -90,7 +91,7 @@ def body_panels(data: RunData) -> list[Panel]:
                     color=joint_color(COLOR_OF[k]),
                     linewidth=1.3 if alone else 0.7,
                     alpha=1.0 if alone else 0.6,
-                    gid=named(THETA[k] if alone else f"({THETA[k]})"),
+                    gid=named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})"),
                 )
             ax.set_ylabel(unit, color=MUTED, fontsize=SIZES["quarter"][2], labelpad=1.0)
             ax.yaxis.set_major_locator(_few())

@@ -10,7 +10,7 @@ import numpy as np
 
 from adapter.gap.phrases import numbered
 from adapter.model.self_model import LAMBDA_MEASURED, theta_doubt
-from adapter.report.headline import Worth, against
+from adapter.report.headline import against
 from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
@@ -23,7 +23,7 @@ from adapter.report.words import (
     small,
     spread,
 )
-from adapter.report.worth import BLOCK_S, SLOW, slow_share
+from adapter.report.worth import BLOCK_S, SLOW, Worth, slow_share
 from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL, counted_from
 from adapter.signals.validation import rms_of
@@ -58,11 +58,8 @@ def _unseen(data: RunData, worth: Worth) -> Check | None:
     """Whether what was learned holds on rows that the fit had not seen."""
     fall = worth.torque
     if fall is None:
-        return (
-            Check(BAD, "On data not learned from", "nothing to judge by")
-            if (theta_started(data))
-            else None
-        )
+        nothing = Check(BAD, "On data not learned from", "nothing to judge by")
+        return nothing if theta_started(data) else None
     fit = np.array(data.figures["theta"]["torque_rmse_nm"], float)
     ratio = fall.after / np.maximum(fit, 1e-12)
     said = (
@@ -132,16 +129,11 @@ def _frames(data: RunData) -> Check:
     off = _off_words(data, goal)
     shown = f"motion shows {rank} of {every} directions of λ"
     if schema.get("source") == LAMBDA_MEASURED:
-        when = (
-            f"did not stay within {GOALS}"
-            if at is None
-            else (f"within {GOALS} from {quantity(at, 's', 2)} after {start} on")
-        )
-        return Check(
-            LOOK if at is None else GOOD,
-            "Where the joints are",
-            f"measured; {shown}; {when}{off}",
-        )
+        when = f"did not stay within {GOALS}"
+        if at is not None:
+            when = f"within {GOALS} from {quantity(at, 's', 2)} after {start} on"
+        verdict = LOOK if at is None else GOOD
+        return Check(verdict, "Where the joints are", f"measured; {shown}; {when}{off}")
     if at is None:
         said = f"λ was to reproduce the documentation but did not stay within {GOALS}{off}"
         return Check(BAD, "Where the joints are", said)

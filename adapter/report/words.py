@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from adapter.model.numbers import plain, plus_minus
 from adapter.model.spatial import Array
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here
-NOTHING = "–"
 GOALS = f"{ROTATION_GOAL_RAD:g}{NARROW}rad and {1e3 * POSITION_GOAL_M:g}{NARROW}mm"
 
 REFUSALS = {
@@ -26,20 +25,13 @@ REFUSALS = {
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number with that many significant digits and no exponent; a dash where there is none.
+    """As `plain`, with a true minus; with an exponent where it is tiny.
 
     >>> number(0.012345), number(1234.5), number(None), number(1e-17)
     ('0.0123', '1235', '–', '0')
     """
-    if value is None or not math.isfinite(value):
-        return NOTHING
-    size = abs(float(value))
-    if size < 1e-9:
-        return "0"
-    if size < 1e-4:
-        return f"{value:.1e}"
-    decimals = max(0, digits - 1 - math.floor(math.log10(size)))
-    return f"{value:.{decimals}f}".replace("-", "−")
+    tiny = value is not None and 1e-9 <= abs(float(value)) < 1e-4
+    return f"{value:.1e}" if tiny else plain(value, digits).replace("-", "−")
 
 
 def small(value: float, unit: str) -> str:
@@ -47,17 +39,18 @@ def small(value: float, unit: str) -> str:
     return f"<{NARROW}0.001{NARROW}{unit}" if value < 1e-3 else quantity(value, unit, 2)
 
 
-def plus_minus(value: Any, std: Any) -> str:
-    """Value ± standard deviation: the latter with two digits, the value with as many decimals.
+def with_doubt(value: Any, std: Any) -> str:
+    """`plus_minus` with a true minus.
 
-    >>> plus_minus(0.2713, 0.0234), plus_minus(1.5, None)
-    ('0.271 ± 0.023', '1.50')
+    >>> with_doubt(-0.2713, 0.0234)
+    '−0.271 ± 0.023'
     """
-    if value is None or std is None or not math.isfinite(std) or std <= 0.0:
-        return number(value)
-    decimals = min(max(0, 1 - math.floor(math.log10(std))), 7)
-    shown = round(value, decimals) + 0.0  # no minus before 0.00
-    return f"{shown:.{decimals}f} ± {std:.{decimals}f}".replace("-", "−")
+    return plus_minus(value, std).replace("-", "−")
+
+
+def capital(text: str) -> str:
+    """As a sentence begins."""
+    return text[:1].upper() + text[1:]
 
 
 def count(value: int) -> str:

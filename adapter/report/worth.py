@@ -1,4 +1,7 @@
-"""What the learned model is worth: torque and tracking errors before and after, the load found."""
+"""What the learned model is worth: torque and tracking errors before and after, the load found.
+
+As numbers, as a table joint by joint, and as panels.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.torque import ModelTorque
+from adapter.model.numbers import DASH
+from adapter.model.self_model import LAMBDA_MEASURED
 from adapter.model.spatial import Array
+from adapter.report.gap_panels import fall_drawing
 from adapter.report.skeleton import placed_arm, some_postures
+from adapter.report.style import Panel
+from adapter.report.tables import Table, by_column
 from adapter.report.torque_panels import change_times, theta_started
+from adapter.report.words import number, with_doubt
 from adapter.runs.run_folder import RunData
 from adapter.signals.validation import rms_of
 
@@ -149,10 +158,72 @@ def hand_off_m(data: RunData) -> float | None:
 
 def loads(data: RunData) -> list[tuple[float, float, float | None]]:
     """(when, s after the first motion, kg, its standard deviation) of the loads that were found."""
-    found = []
-    pairs = zip(change_times(data), data.figures["theta"].get("changes") or [], strict=True)
-    for at_s, change in pairs:
-        load = change.get("payload")
-        if load:
-            found.append((at_s, load["m"], load.get("m_std")))
-    return found
+    changes = [change.get("payload") for change in data.figures["theta"].get("changes") or []]
+    pairs = zip(change_times(data), changes, strict=True)
+    return [(at_s, load["m"], load.get("m_std")) for at_s, load in pairs if load]
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a run brought: errors before and after, how far off the hand stood, the loads found."""
+
+    torque: Fall | None
+    tracking: Fall | None
+    hand_m: float | None
+    loads: list[tuple[float, float, float | None]]
+
+    @classmethod
+    def of(cls, data: RunData) -> Worth:
+        """Of a run."""
+        measured = data.figures["lambda"].get("source") == LAMBDA_MEASURED
+        hand_m = hand_off_m(data) if measured else None
+        return cls(torque_fall(data), tracking_fall(data.figures), hand_m, loads(data))
+
+
+def worth_table(data: RunData, worth: Worth) -> Table | None:
+    """One row per joint: torque and tracking errors before and after; None where neither is
+    known."""
+    columns: list[tuple[str, str, list[str]]] = []
+    torque, tracking = worth.torque, worth.tracking
+    if torque is not None:
+        if torque.size is not None:
+            columns.append(("Torque that acted", "N m rms", [number(x) for x in torque.size]))
+        if torque.before is not None:
+            shown = _values(torque.before, torque.before_std)
+            columns.append(("Error, documented model", "N m rms", shown))
+        shown = _values(torque.after, torque.after_std)
+        columns.append(("Error, learned model", "N m rms", shown))
+        if torque.before is not None:
+            columns.append(("Change", "", _changes(torque)))
+    if tracking is not None and tracking.before is not None:
+        columns.append(("Path error, feedback alone", "mrad rms", _values(1e3 * tracking.before)))
+        columns.append(("Path error, with model", "mrad rms", _values(1e3 * tracking.after)))
+    if not columns:
+        return None
+    return by_column([("Joint", "", list(data.documented.tree.joint_names)), *columns])
+
+
+def _values(values: Any, std: Any = None) -> list[str]:
+    doubts = [None] * len(values) if std is None else std
+    return [with_doubt(x, s) for x, s in zip(values, doubts, strict=True)]
+
+
+def _changes(fall: Fall) -> list[str]:
+    assert fall.before is not None
+    shares = 100.0 * (fall.after / np.maximum(fall.before, 1e-12) - 1.0)
+    return [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
+
+
+def worth_panels(data: RunData, worth: Worth) -> list[Panel]:
+    """Errors of every joint before and after, where both are known."""
+    panels = []
+    torque, tracking = worth.torque, worth.tracking
+    names = data.documented.tree.joint_names
+    if torque is not None and torque.before is not None:
+        drawing = fall_drawing(torque.before, torque.after, None, names)
+        panels.append(drawing.panel("Torque error by joint", "N m rms", torque.seen))
+    if tracking is not None and tracking.before is not None:
+        drawing = fall_drawing(1e3 * tracking.before, 1e3 * tracking.after, None, names)
+        note = f"feedback alone, and with the feed-forward of the {tracking.seen}"
+        panels.append(drawing.panel("Path error by joint", "mrad rms", note))
+    return panels

@@ -149,22 +149,20 @@ def compare(first: SelfModel, second: SelfModel, seed: int = 0) -> ModelDifferen
         changes.append(change)
     rms, apart = done(second)
     size = np.sqrt(np.mean(torque**2, axis=0))
-    reach_m = float(np.linalg.norm(hand, axis=1).max())
+    # what does most first, against the arm's largest torque and its reach
+    most_nm = max(float(size.max()), NOTHING)
+    reach_m = max(float(np.linalg.norm(hand, axis=1).max()), NOTHING)
+    changes.sort(key=lambda c: -(c.torque_nm / most_nm + c.hand_m / reach_m))
     return ModelDifference(
         (first.name, second.name),
         joints,
-        tuple(_ranked(changes, max(float(size.max()), NOTHING), max(reach_m, NOTHING))),
+        tuple(changes),
         rms,
         size,
         hand_frame(first).name,
         float(np.sqrt(np.mean(apart**2))),
         float(apart.max()),
     )
-
-
-def _ranked(changes: list[Change], torque_nm: float, reach_m: float) -> list[Change]:
-    """What does most first, against the arm's largest torque (rms) and its reach."""
-    return sorted(changes, key=lambda c: -(c.torque_nm / torque_nm + c.hand_m / reach_m))
 
 
 def _variants(first: SelfModel, second: SelfModel) -> Iterator[Variant]:
@@ -191,16 +189,13 @@ def _check_trees(first: SelfModel, second: SelfModel) -> None:
             told, way = what.replace("_", " "), ""
             if {*a.joint_names} < {*b.joint_names} or {*b.joint_names} < {*a.joint_names}:
                 way = "; --joints A,B,C compares these, --lock JOINT=VALUE takes one away"
-            raise ModelError(
-                f"{first.name} and {second.name} are different trees; {told}: {_listed(one)} and "
-                f"{_listed(other)}{way}"
+            both = " and ".join(
+                ", ".join(map(str, x)) if isinstance(x, tuple) else str(x) for x in (one, other)
             )
+            names = f"{first.name} and {second.name}"
+            raise ModelError(f"{names} are different trees; {told}: {both}{way}")
     if a.floating:
         raise ModelError(f"{first.name}: its base floats; only fixed-base arms are compared")
-
-
-def _listed(value: Any) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _motion(model: SelfModel, seed: int) -> tuple[Array, Array, Array, Array]:

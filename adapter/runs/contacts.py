@@ -44,12 +44,9 @@ class ReplayObserver:
             self.observer.step_each(stamp_ns[begin:end], signals[begin:end])
             self._samples += end - begin
             begin = end
-            if self._samples % ADOPT_EVERY == 0:
-                self._adopt()
-
-    def _adopt(self) -> None:
-        learner = self._learner
-        if learner.theta_converged:
+            learner = self._learner
+            if self._samples % ADOPT_EVERY or not learner.theta_converged:
+                continue
             theta, std = learner.theta, learner.theta.variance() ** 0.5
             now = theta.theta, theta.effect_values, theta.shapes, std
             self.observer.adopt(learner.schema.lam, *now)

@@ -24,6 +24,7 @@ from adapter.gap.workflow import find_gap as gap_of
 from adapter.learning.known_effects import learnable
 from adapter.learning.settings import LearnerSettings
 from adapter.model.model_file import save_model
+from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, effects_html
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -34,7 +35,7 @@ from adapter.runs.replay import ReplayOptions, fitted_to, from_s, held_out_rms, 
 from adapter.screening.screen import check_torque
 from adapter.signals.matching import matching, present
 from adapter.signals.records import stamps_of
-from drivers.files.html_table import html_table, plus_minus
+from drivers.files.html_table import html_table
 from drivers.files.mcap import Log
 from drivers.files.mcap import read_log as read_mcap
 from drivers.interface import JointSample, LinkMotion

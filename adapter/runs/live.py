@@ -174,11 +174,7 @@ class Publisher:
         std = np.sqrt(np.maximum(theta.covariance().diagonal(), 0.0))
         bodies = std[: 10 * (n + 1)].reshape(-1, 10)
         rows = np.r_[: n - 1, n] if theta.spare_in_use else np.arange(n)
-        return (
-            lam_std,
-            bodies[rows],
-            std[10 * (n + 1) :].reshape(-1, n),
-        )
+        return lam_std, bodies[rows], std[10 * (n + 1) :].reshape(-1, n)
 
 
 def news_of(learner: OnlineLearner) -> dict[str, Any]:

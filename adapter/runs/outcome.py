@@ -167,32 +167,21 @@ def _course_of_lam(learner: OnlineLearner) -> Array:
     return np.concatenate([rows[:, :1], lam.reshape(len(rows), 6 * n)], axis=1)
 
 
-@dataclass(frozen=True)
-class CompletedLambda:
-    """λ as it leaves the house.
-
-    Attributes:
-        lam: (n, 6), of all that explain the data as the learned one does the nearest to the
-            documented one.
-        filled: what of it the data do not show, so that the documentation says it; a sentence by
-            joint.
-    """
-
-    lam: Array
-    filled: list[str]
-
-
-def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda:
+def completed_lambda(outcome: Outcome, documented: SelfModel) -> tuple[Array, list[str]]:
     """The learned λ with what no data showed taken from the documentation, by a finite motion.
 
     Torques stay what they were with θ as it is: what changes no link's motion changes no torque
     (virtual work).
+
+    Returns:
+        (n, 6), of all that explain the data as the learned one does the nearest to the documented
+        one; and a sentence by joint on what of it the documentation says.
     """
     R, p = matrix_from_zxz(outcome.lam[:, :3]), outcome.lam[:, 3:]
     told = matrix_from_zxz(documented.lam[:, :3]), documented.lam[:, 3:]
     freedom = Freedom.of(np.eye(6) - outcome.lam_identifiable, p)
     if outcome.settings.schema.imus:  # began at the documentation, and stayed where none is shown
-        return CompletedLambda(outcome.lam, freedom.words(documented.tree))
+        return outcome.lam, freedom.words(documented.tree)
     moved = freedom.nearest(R, p, *told)
     found = [Frame(*x) for x in zip(*moved, strict=True)]
     if outcome.lam_converged:  # else what moments say is not what was learned
@@ -201,7 +190,7 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> CompletedLambda
             to = Frame(told[0][j], told[1][j])
             found[j] = nearest(sums, weights, frame, to, freedom.joint(j))
     lam = np.array([np.r_[zxz_from_matrix(frame.R0), frame.p] for frame in found])
-    return CompletedLambda(lam, freedom.words(documented.tree))
+    return lam, freedom.words(documented.tree)
 
 
 def completed_theta(
@@ -262,15 +251,15 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     documented, bodies = with_bodies(documented), documented.tree.bodies
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
-    completed = completed_lambda(outcome, documented)
-    base = shown_parameters(outcome, documented, completed.lam)
+    lam, filled = completed_lambda(outcome, documented)
+    base = shown_parameters(outcome, documented, lam)
     known = outcome.theta_started_ns is not None
-    theta, basis, said = completed_theta(outcome, documented, completed.lam)
+    theta, basis, said = completed_theta(outcome, documented, lam)
     share = np.einsum("ab,ab->a", basis, basis).reshape(-1, 10)
     return replace(
         documented,
         name=f"{documented.name} (learned)",
-        lam=completed.lam,
+        lam=lam,
         theta=theta,
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
@@ -281,9 +270,9 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
         provenance={
             **provenance,
-            "lambda_filled": completed.filled,
+            "lambda_filled": filled,
             **said,
-            "changes": changes(outcome),
+            "changes": changes_at(outcome.changes_ns, outcome.payload),
         },
     )
 
@@ -334,22 +323,14 @@ def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, An
     return found
 
 
-def changes(outcome: Outcome) -> list[dict[str, Any]]:
-    """Changes at the hand, with what the last one brought (payload in the last link's frame)."""
-    return changes_at(outcome.changes_ns, outcome.payload)
-
-
 def changes_at(
     stamps_ns: Sequence[int], payload: tuple[Array, Array] | None
 ) -> list[dict[str, Any]]:
-    """The same from their stamps and what the hand carries since the last one."""
+    """Changes at the hand, with what the last one brought (payload in the last link's frame)."""
     found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in stamps_ns]
     if found and payload is not None:
         theta, covariance = payload
-        found[-1]["payload"] = {
-            "m": float(theta[0]),
-            "m_std": float(np.sqrt(covariance[0, 0])),
-        }
+        found[-1]["payload"] = {"m": float(theta[0]), "m_std": float(np.sqrt(covariance[0, 0]))}
         if theta[0] > 0.0:
             _, centre, _ = body_from_theta(theta)
             found[-1]["payload"].update(zip(("cx", "cy", "cz"), map(float, centre), strict=True))

@@ -208,35 +208,26 @@ def replay(
 
 
 def _exact(
-    log: Log,
-    stop: int,
-    pipeline: Pipeline,
-    progress: Progress,
-    observer: ReplayObserver | None,
+    log: Log, stop: int, pipeline: Pipeline, progress: Progress, observer: ReplayObserver | None
 ) -> TickTimes:
     ticks = TickTimes()
     for start in range(0, stop, AT_ONCE):
         progress(start)
         piece = log.piece(start, min(start + AT_ONCE, stop))
-        _exact_piece(piece, pipeline, observer, ticks)
+        signals = np.stack([piece.q, piece.dq, piece.tau], axis=1)
+        tick_ns = np.zeros(len(piece), np.int64)
+        # the observer goes on with what is learned behind every so-many samples
+        for begin in range(0, len(piece), ADOPT_EVERY):
+            own = slice(begin, min(begin + ADOPT_EVERY, len(piece)))
+            part, before = piece.piece(own.start, own.stop), time.perf_counter_ns()
+            states = _filtered(part, pipeline.front_end)
+            tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
+            if len(states):
+                pipeline.learner.step_each(states)
+            if observer is not None:
+                observer.step_each(part.stamp_ns, signals[own])
+        ticks.add(tick_ns)
     return ticks
-
-
-def _exact_piece(
-    log: Log, pipeline: Pipeline, observer: ReplayObserver | None, ticks: TickTimes
-) -> None:
-    signals, tick_ns = np.stack([log.q, log.dq, log.tau], axis=1), np.zeros(len(log), np.int64)
-    # the observer goes on with what is learned behind every so-many samples
-    for begin in range(0, len(log), ADOPT_EVERY):
-        own = slice(begin, min(begin + ADOPT_EVERY, len(log)))
-        part, before = log.piece(own.start, own.stop), time.perf_counter_ns()
-        states = _filtered(part, pipeline.front_end)
-        tick_ns[own] = (time.perf_counter_ns() - before) // len(part)
-        if len(states):
-            pipeline.learner.step_each(states)
-        if observer is not None:
-            observer.step_each(part.stamp_ns, signals[own])
-    ticks.add(tick_ns)
 
 
 def filtered_tables(log: Log, stop: int, front_end: FrontEnd) -> Iterator[Array]:
@@ -289,18 +280,13 @@ def noise_levels(log: Log) -> dict[str, Array]:
     Not numbers where there are too few samples, or too few that are not the one before. Of a
     mapped recording it is that of stretches, see `Log.spread`.
     """
-    found = [_noise_levels(part) for part in log.spread()]
-    with np.errstate(invalid="ignore"):
-        return {
-            name: np.sqrt(np.mean(_known([x[name] for x in found]) ** 2, axis=0))
-            for name in ("q", "dq", "tau")
-        }
-
-
-def _known(levels: list[Array]) -> Array:
-    """(k, n) those of (n,) that are numbers; where none are, one that is not."""
-    known = [x for x in levels if np.isfinite(x).all()]
-    return np.stack(known or levels[:1])
+    found, told = [_noise_levels(part) for part in log.spread()], {}
+    for name in ("q", "dq", "tau"):
+        levels = [x[name] for x in found]
+        known = [x for x in levels if np.isfinite(x).all()]
+        with np.errstate(invalid="ignore"):
+            told[name] = np.sqrt(np.mean(np.stack(known or levels[:1]) ** 2, axis=0))
+    return told
 
 
 def _noise_levels(log: Log) -> dict[str, Array]:

@@ -23,7 +23,7 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.runs.outcome import (
     TORQUE_GOAL,
     Outcome,
-    changes,
+    changes_at,
     completed_lambda,
     frame_errors,
     shown_parameters,
@@ -130,9 +130,9 @@ def schema_score(
 
     λ has converged when the learner has said so and its errors are inside both goals, for good.
     """
-    completed = completed_lambda(outcome, documented)
+    lam, filled = completed_lambda(outcome, documented)
     if outcome.settings.schema.imus:
-        reference = _slid(documented, reference, completed.lam)
+        reference = _slid(documented, reference, lam)
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
     turn, shift = course_errors(outcome, documented, reference)
     inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
@@ -140,7 +140,7 @@ def schema_score(
     at = settled_at(stamps_s(outcome.schema_trace), inside)
     hidden = np.eye(6) - outcome.lam_identifiable
     freedom = Freedom.of(hidden, outcome.lam[:, 3:])
-    last_turn, last_shift = frame_errors(completed.lam, reference.lam, freedom)
+    last_turn, last_shift = frame_errors(lam, reference.lam, freedom)
     spread = np.sqrt(np.maximum(np.einsum("jaa->ja", outcome.lam_covariance), 0.0))
     return {
         "converged_s": _since(start_s, at) if outcome.verdict.good else None,
@@ -155,8 +155,8 @@ def schema_score(
         "settled": outcome.lam_converged,
         "source": "measured" if outcome.lam_measured else "reproduces the documentation",
         "reference": reference.source,
-        "values": completed.lam.tolist(),
-        "filled": completed.filled,
+        "values": lam.tolist(),
+        "filled": filled,
         "restarts": outcome.lam_restarts,
     }
 
@@ -227,7 +227,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     Convergence is judged up to the first change at the hand: prequential torque error against
     the batch solution's on the same samples, joints in units of their noise.
     """
-    lam = completed_lambda(outcome, documented).lam
+    lam, _ = completed_lambda(outcome, documented)
     base = shown_parameters(outcome, documented, lam)
     score: dict[str, Any] = {
         "converged_s": None,
@@ -241,7 +241,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
             effect.name: outcome.effects[k].tolist()
             for k, effect in enumerate(effects_by_name(outcome.settings.effects))
         },
-        "changes": changes(outcome),
+        "changes": changes_at(outcome.changes_ns, outcome.payload),
         "rebuilds": outcome.rebuilds,
         "started_s": None,
         "values": outcome.theta.tolist(),
@@ -286,11 +286,7 @@ class Course(NamedTuple):
 
 
 def figures(
-    outcome: Outcome,
-    documented: SelfModel,
-    reference: Reference,
-    course: Course,
-    **more: Any,
+    outcome: Outcome, documented: SelfModel, reference: Reference, course: Course, **more: Any
 ) -> dict[str, Any]:
     """The figures of `run` and `replay`.
 

@@ -87,8 +87,12 @@ class _Stage:
     @classmethod
     def of(cls, arm: RigidArm, acting: Sequence[Active]) -> _Stage:
         """Of the effects that act in it."""
-        torques = [a for a in acting if isinstance(a.effect, TorqueEffect)]
-        last, bent = [a for a in torques if _after_sensors(a)], with_bristles(torques)
+        torques, last = [], []
+        for a in acting:
+            if isinstance(a.effect, TorqueEffect):
+                torques.append(a)
+                last += [a] if a.effect.after_sensors else []
+        bent = with_bristles(torques)
         laws = [a for a in torques if isinstance(a.effect, JointTorque) and a not in last + bent]
         n = arm.n
         return cls(
@@ -104,10 +108,6 @@ class _Stage:
     def reads_true(self) -> bool:
         """Whether the torque sensors say what is."""
         return not (self.sensors.gain.any() or self.sensors.delay_s.any() or self.shifts.laws)
-
-
-def _after_sensors(active: Active) -> bool:
-    return isinstance(active.effect, TorqueEffect) and active.effect.after_sensors
 
 
 @dataclass(frozen=True, eq=False)

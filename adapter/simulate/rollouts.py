@@ -98,31 +98,18 @@ class Rollouts:
                 self.troubles.append(trouble)
             return out[0], out[1]
         try:
-            _along(arm, motion, segments, (drive == "measured", steps), out)
+            t, effects = motion.t, arm.effects
+            u = effects.driving(t, motion.u) if drive == "measured" else motion.u
+            q, dq = effects.links(t, motion.q, motion.dq, u)
+            middles = (np.arange(steps) + 0.5) / steps
+            for start, stop in segments:
+                now = float(t[start])
+                arm.place(q[start], dq[start], now)
+                effects.settle(q[start], dq[start], u[start], now, motion.q[start])
+                for k in range(start, stop):
+                    out[:, k] = effects.measured(*arm.state(), u[k], float(t[k]))[:2]
+                    for part in middles if k + 1 < stop else ():
+                        arm.step(u[k] + part * (u[k + 1] - u[k]))
         finally:
             arm.close()
         return out[0], out[1]
-
-
-def _along(
-    arm: SimulatedArm,
-    motion: DrivenMotion,
-    segments: Sequence[tuple[int, int]],
-    how: tuple[bool, int],
-    out: Array,
-) -> None:
-    """Fill out (2, m, n); `how`: whether u is what sensors read, and steps from row to row."""
-    sensed, steps = how
-    t, effects = motion.t, arm.effects
-    u = effects.driving(t, motion.u) if sensed else motion.u
-    q, dq = effects.links(t, motion.q, motion.dq, u)
-    middles = (np.arange(steps) + 0.5) / steps
-    for start, stop in segments:
-        arm.place(q[start], dq[start], float(t[start]))
-        effects.settle(q[start], dq[start], u[start], float(t[start]), motion.q[start])
-        for k in range(start, stop):
-            now = float(t[k])
-            out[:, k] = effects.measured(*arm.state(), u[k], now)[:2]
-            if k + 1 < stop:
-                for part in middles:
-                    arm.step(u[k] + part * (u[k + 1] - u[k]))

@@ -1,8 +1,8 @@
 """The run over Foxglove's WebSocket protocol, for Foxglove, Lichtblick, PlotJuggler and the like.
 
 Every topic is a ROS 2 message (CDR, with its definition beside it), the only encoding that all of
-them plot; rosbags knows definitions and bytes, Foxglove's own library (extra `live`) does the
-rest: who is slow loses the oldest messages.
+them plot; Foxglove's own library (extra `live`) does the rest: who is slow loses the oldest
+messages.
 
     /joint_states             sensor_msgs/JointState     q, dq, tau of the filtered state
     /residuals                sensor_msgs/JointState     effort: what the estimate does not explain
@@ -23,45 +23,49 @@ from __future__ import annotations
 
 import importlib.util
 import socket
-from collections.abc import Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_typestore
 
 from adapter.effects.export import to_urdf
 from adapter.errors import MeansError, UsageError
 from adapter.gap.monitor_judge import sentence
-from adapter.model.spatial import Array, matrix_from_zxz, rot_z
-from adapter.model.tree import BASE
-from adapter.view.now import KnownRun, Now
+from adapter.model.inertia import PARAMETERS
+from adapter.model.spatial import Array, matrix_from_zxz, quaternion_from_matrix, rot_z
+from adapter.realtime.run_messages import table_fields, wrench_fields, xyz
+from adapter.view.now import KnownRun, Now, untold
 from adapter.view.server import HOST
+from drivers.files.messages import Fields, encode, header
+from drivers.files.ros_types import (
+    FLOAT64_MULTI_ARRAY,
+    JOINT_STATE,
+    SCHEMAS,
+    STRING,
+    TF,
+    WRENCH_STAMPED,
+)
 
 BACKLOG = 64  # messages that wait for a slow client; then the oldest go
 DESCRIPTION_S = 2.0  # the description comes again and again: nobody is told what was before
 LEARNED = "learned/"  # prefix of the learned arm's frames
-JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
-WRENCH, TEXT, TRANSFORMS = (
-    "geometry_msgs/msg/WrenchStamped",
-    "std_msgs/msg/String",
-    "tf2_msgs/msg/TFMessage",
-)
+NONE: Array = np.zeros(0)
 TOPICS = {
     "/joint_states": JOINT_STATE,
     "/residuals": JOINT_STATE,
     "/residual_noise": JOINT_STATE,
     "/external_torques": JOINT_STATE,
-    "/external_wrench": WRENCH,
-    "/lambda": ARRAY,
-    "/lambda_std": ARRAY,
-    "/theta": ARRAY,
-    "/theta_std": ARRAY,
-    "/load": ARRAY,
-    "/loop_time": ARRAY,
-    "/findings": TEXT,
-    "/state": TEXT,
-    "/robot_description": TEXT,
-    "/tf": TRANSFORMS,
+    "/external_wrench": WRENCH_STAMPED,
+    "/lambda": FLOAT64_MULTI_ARRAY,
+    "/lambda_std": FLOAT64_MULTI_ARRAY,
+    "/theta": FLOAT64_MULTI_ARRAY,
+    "/theta_std": FLOAT64_MULTI_ARRAY,
+    "/load": FLOAT64_MULTI_ARRAY,
+    "/loop_time": FLOAT64_MULTI_ARRAY,
+    "/findings": STRING,
+    "/state": STRING,
+    "/robot_description": STRING,
+    "/tf": TF,
 }
 
 
@@ -85,75 +89,6 @@ def free_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-class Messages:
-    """ROS 2 messages of an arm, as bytes.
-
-    Args:
-        joints: names.
-    """
-
-    def __init__(self, joints: Sequence[str]) -> None:
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
-        self._types, self._joints = self._store.types, list(joints)
-        self._none = np.zeros(0)
-
-    def definition(self, name: str) -> str:
-        """Of a message and of all that it uses (ros2msg)."""
-        return str(self._store.generate_msgdef(name, ros_version=2)[0])
-
-    def joint_state(self, stamp_ns: int, q: Array, dq: Array, tau: Array) -> bytes:
-        """(n,) each, or none of it (0,)."""
-        return self._bytes(JOINT_STATE, self._header(stamp_ns), self._joints, q, dq, tau)
-
-    def effort(self, stamp_ns: int, tau: Array) -> bytes:
-        """(n,) torques, N m."""
-        return self.joint_state(stamp_ns, self._none, self._none, tau)
-
-    def wrench(self, stamp_ns: int, frame: str, wrench: Array) -> bytes:
-        """(6,) [f; m], N and N m."""
-        force, torque = (
-            self._of("geometry_msgs/msg/Vector3", *part) for part in np.split(wrench, 2)
-        )
-        both = self._of("geometry_msgs/msg/Wrench", force, torque)
-        return self._bytes(WRENCH, self._header(stamp_ns, frame), both)
-
-    def array(self, values: Array, labels: Sequence[str]) -> bytes:
-        """Any shape; a label for each dimension."""
-        sizes, dims = np.shape(values), []
-        for k, (label, size) in enumerate(zip(labels, sizes, strict=True)):
-            stride = int(np.prod(sizes[k:]))
-            dims.append(self._of("std_msgs/msg/MultiArrayDimension", label, size, stride))
-        layout = self._of("std_msgs/msg/MultiArrayLayout", dims, 0)
-        return self._bytes(ARRAY, layout, np.ascontiguousarray(values, np.float64).ravel())
-
-    def text(self, words: str) -> bytes:
-        """A line."""
-        return self._bytes(TEXT, words)
-
-    def transforms(self, stamp_ns: int, frames: Sequence[tuple[str, str, Array, Array]]) -> bytes:
-        """Frames: (parent, child, (3, 3) rotation, (3,) shift in m)."""
-        from scipy.spatial.transform import Rotation
-
-        found = []
-        for parent, child, R, p in frames:
-            turn = self._of("geometry_msgs/msg/Quaternion", *Rotation.from_matrix(R).as_quat())
-            shift = self._of("geometry_msgs/msg/Vector3", *p)
-            both = self._of("geometry_msgs/msg/Transform", shift, turn)
-            header = self._header(stamp_ns, parent)
-            found.append(self._of("geometry_msgs/msg/TransformStamped", header, child, both))
-        return self._bytes(TRANSFORMS, found)
-
-    def _of(self, name: str, *parts: Any) -> Any:
-        return self._types[name](*parts)
-
-    def _header(self, stamp_ns: int, frame: str = "") -> Any:
-        time = self._of("builtin_interfaces/msg/Time", *divmod(int(stamp_ns), 1_000_000_000))
-        return self._of("std_msgs/msg/Header", time, frame)
-
-    def _bytes(self, name: str, *parts: Any) -> bytes:
-        return bytes(self._store.serialize_cdr(self._of(name, *parts), name))
-
-
 class FoxgloveView:
     """Serves and feeds them; stamps are the arm's own.
 
@@ -169,8 +104,7 @@ class FoxgloveView:
         need_foxglove()
         import foxglove
 
-        arm = known.documented
-        self._arm, self._messages = arm, Messages(arm.tree.joint_names)
+        arm = self._arm = known.documented
         self._context = context = foxglove.Context()  # channels end with it
         self._channels = {topic: self._channel(topic, context) for topic in TOPICS}
         try:
@@ -184,7 +118,7 @@ class FoxgloveView:
             )
         except (RuntimeError, OSError) as error:
             raise MeansError(f"nothing can be served on port {port}: {error}") from None
-        self._description = self._messages.text(to_urdf(arm))
+        self._description = {"data": to_urdf(arm)}
         self._described_s, self._version = -np.inf, 0
         self._told: set[str] = set()
         self._headline = ""
@@ -193,79 +127,92 @@ class FoxgloveView:
         import foxglove
 
         name = TOPICS[topic]
-        data = self._messages.definition(name).encode()
+        data = SCHEMAS[name].encode()
         schema = foxglove.Schema(name=name, encoding="ros2msg", data=data)
         return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
 
     def __call__(self, now: Now) -> None:
         """Take what is to be seen now; waits for nobody."""
-        for topic, data in self._due(now).items():
+        for topic, fields in self._due(now).items():
+            data = encode(TOPICS[topic], fields)
             self._channels[topic].log(data, log_time=max(now.stamp_ns, 0))
         if now.view.done:
             self._server.stop()
 
-    def _due(self, now: Now) -> dict[str, bytes]:
-        made, due, stamp_ns = self._messages, dict[str, bytes](), now.stamp_ns
+    def _due(self, now: Now) -> dict[str, Fields]:
+        due, stamp_ns = dict[str, Fields](), now.stamp_ns
         if np.isfinite(now.q).all():
-            due["/joint_states"] = made.joint_state(stamp_ns, now.q, now.dq, now.tau)
-            due["/tf"] = made.transforms(stamp_ns, self._transforms(now))
+            due["/joint_states"] = self._joints(stamp_ns, now.tau, now.q, now.dq)
+            due["/tf"] = {"transforms": self._transforms(now)}
         if np.isfinite(now.residual).all():
-            due["/residuals"] = made.effort(stamp_ns, now.residual)
-            due["/residual_noise"] = made.effort(stamp_ns, now.noise)
+            due["/residuals"] = self._joints(stamp_ns, now.residual)
+            due["/residual_noise"] = self._joints(stamp_ns, now.noise)
         push = now.view.push
         if push is not None:
-            due["/external_torques"] = made.effort(push.stamp_ns, push.torque)
-            base = self._arm.tree.base_name
-            due["/external_wrench"] = made.wrench(push.stamp_ns, base, push.wrench)
+            due["/external_torques"] = self._joints(push.stamp_ns, push.torque)
+            base, wrench = self._arm.tree.base_name, push.wrench.reshape(2, 3)
+            due["/external_wrench"] = wrench_fields(push.stamp_ns, base, wrench)
         return due | self._slow(now) | self._words(now)
 
-    def _slow(self, now: Now) -> dict[str, bytes]:
+    def _joints(self, stamp_ns: int, tau: Array, q: Array = NONE, dq: Array = NONE) -> Fields:
+        """Torques (n,) N m, where they are told with q and dq (n,) rad and rad/s."""
+        signals = {"position": q, "velocity": dq, "effort": tau}
+        return {"header": header(stamp_ns), "name": self._arm.tree.joint_names, **signals}
+
+    def _slow(self, now: Now) -> dict[str, Fields]:
         """What is said when there is a new estimate, or news."""
-        made, due, snapshot = self._messages, dict[str, bytes](), now.view.snapshot
+        due, snapshot = dict[str, Fields](), now.view.snapshot
         if snapshot is not None and now.frames is not None and snapshot.version != self._version:
             self._version = snapshot.version
             by_joint = "joint", "turn x y z in rad; shift x y z in m"
-            due["/lambda"] = made.array(now.frames.off, by_joint)
-            due["/lambda_std"] = made.array(now.frames.off_std, by_joint)
-            by_link = "link", "m mX mY mZ XX XY XZ YY YZ ZZ"
-            due["/theta"] = made.array(snapshot.theta, by_link)
-            due["/theta_std"] = made.array(snapshot.theta_std, by_link)
+            due["/lambda"] = table_fields(by_joint, now.frames.off)
+            due["/lambda_std"] = table_fields(by_joint, now.frames.off_std)
+            by_link = "link", " ".join(PARAMETERS)
+            due["/theta"] = table_fields(by_link, snapshot.theta)
+            due["/theta_std"] = table_fields(by_link, snapshot.theta_std)
         if now.load is not None:
             mass = np.array([now.load["m"], now.load["m_std"]])
-            due["/load"] = made.array(mass, ("mass and its standard deviation, kg",))
+            due["/load"] = table_fields(("mass and its standard deviation, kg",), mass)
         if now.lately is not None:
             loop = now.lately.of("loop_us")
             shares = np.array([loop.percentile_us(share) or np.nan for share in (50.0, 99.0)])
-            due["/loop_time"] = made.array(shares, ("p50 and p99 of the last seconds, us",))
+            due["/loop_time"] = table_fields(("p50 and p99 of the last seconds, us",), shares)
         return due
 
-    def _words(self, now: Now) -> dict[str, bytes]:
-        made, due = self._messages, dict[str, bytes]()
+    def _words(self, now: Now) -> dict[str, Fields]:
+        due = dict[str, Fields]()
         if now.view.elapsed_s - self._described_s > DESCRIPTION_S:
             self._described_s = now.view.elapsed_s
             due["/robot_description"] = self._description
             self._headline = ""  # once more with it, for those who came meanwhile
         if now.headline != self._headline:
             self._headline = now.headline
-            due["/state"] = made.text(now.headline)
-        for found in now.findings:
-            key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
-            if key not in self._told:
-                self._told.add(key)
-                due["/findings"] = made.text(sentence(found, 0.0))
-                break  # the next one with the next frame
+            due["/state"] = {"data": now.headline}
+        for found in islice(untold(now.findings, self._told), 1):  # the next with the next frame
+            due["/findings"] = {"data": sentence(found, 0.0)}
         return due
 
-    def _transforms(self, now: Now) -> list[tuple[str, str, Array, Array]]:
-        arm, tree = self._arm, self._arm.tree
-        turned = rot_z(now.q)
-        arms = {"": (matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:])}
-        found = [(tree.base_name, LEARNED + tree.base_name, np.eye(3), np.zeros(3))]
+    def _transforms(self, now: Now) -> list[Fields]:
+        tree, lam = self._arm.tree, self._arm.lam
+        same = np.eye(3)[None], np.zeros((1, 3))
+        found = [([tree.base_name], [LEARNED + tree.base_name], *same)]
+        arms = {"": (matrix_from_zxz(lam[:, :3]), lam[:, 3:])}
         if now.frames is not None:
             arms[LEARNED] = now.frames.R, now.frames.p
         for prefix, (R, p) in arms.items():
-            for j, i in enumerate(tree.parent):
-                parent = tree.base_name if i == BASE else tree.link_names[i]
-                child = prefix + tree.link_names[j]
-                found.append((prefix + parent, child, R[j] @ turned[j], p[j]))
-        return found
+            names = [prefix + name for name in (*tree.link_names, tree.base_name)]  # BASE: the last
+            found.append(([names[i] for i in tree.parent], names[:-1], R @ rot_z(now.q), p))
+        return [
+            {
+                "header": header(now.stamp_ns, parent),
+                "child_frame_id": child,
+                "transform": {
+                    "translation": xyz(place),
+                    "rotation": dict(zip("wxyz", quaternion.tolist(), strict=True)),
+                },
+            }
+            for parents, children, R, p in found
+            for parent, child, quaternion, place in zip(
+                parents, children, quaternion_from_matrix(R), p, strict=True
+            )
+        ]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -21,18 +22,17 @@ import numpy as np
 
 from adapter.effects.base import with_squares
 from adapter.effects.catalogue import CATALOGUE, effects_by_name
+from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz
+from adapter.report.skeleton import Skeleton, skeleton_of
 from adapter.runs.terminal import json_ready
-from adapter.view.history import Recent, Whole
-from adapter.view.now import Now, Onlooker, Skeleton, skeleton
+from adapter.view.now import Now, Onlooker
 
 DIGITS, FINE_DIGITS = 4, 6  # significant, of what moves and of what is estimated
 ESTIMATE_S = 0.5
-THETA = (
-    *(("m", "kg"), ("mX", "kg m"), ("mY", "kg m"), ("mZ", "kg m")),
-    *((f"{a}{b}", "kg m²") for a, b in ("XX", "XY", "XZ", "YY", "YZ", "ZZ")),
-)
+FAST_ROWS, SLOW_ROWS = 400, 240  # kept of the past, for a page that comes late or comes back
+FIRST_S = 0.25  # between two of the slow rows, at first
 LAMBDA = (
     *((f"turn about {axis}", "mrad") for axis in "xyz"),
     *((f"shift along {axis}", "mm") for axis in "xyz"),
@@ -69,7 +69,8 @@ class Messages:
     def __init__(self, onlooker: Onlooker) -> None:
         self._onlooker, self._known = onlooker, onlooker.known
         self._documented = self._known.documented
-        self._recent, self._whole = Recent(), Whole()
+        self._recent = deque[bytes](maxlen=FAST_ROWS)
+        self._whole = Whole()
         self._estimate_at = -np.inf
         self._said: Message = {}
         self._timing: Any = None
@@ -86,7 +87,7 @@ class Messages:
             "links": list(arm.tree.link_names),
             "parents": list(arm.tree.parent),
             "lambda": [list(entry) for entry in LAMBDA],
-            "theta": [list(entry) for entry in THETA],
+            "theta": [list(entry) for entry in zip(PARAMETERS, UNITS, strict=True)],
             "theta_documented": numbers(arm.theta),
             "theta_alone": self._onlooker.shown_alone.tolist(),
             "effects": [
@@ -98,13 +99,13 @@ class Messages:
 
     def history(self) -> bytes:
         """What was shown before, encoded."""
-        parts = b",".join(self._recent.rows()), b",".join(self._whole.rows())
+        parts = b",".join(self._recent), b",".join(self._whole.rows)
         return b'{"frames":[%s],"estimates":[%s]}' % parts
 
     def take(self, now: Now) -> dict[str, Message]:
         """Messages that are due, by their kind."""
         due = {"frame": self._frame(now)}
-        self._recent.add(encode({key: due["frame"][key] for key in RECENT}))
+        self._recent.append(encode({key: due["frame"][key] for key in RECENT}))
         final, elapsed_s = now.view.done, now.view.elapsed_s
         if now.frames is not None and (final or elapsed_s >= self._estimate_at):
             self._estimate_at = elapsed_s + ESTIMATE_S
@@ -151,10 +152,13 @@ class Messages:
         if not np.isfinite(now.q).all():
             return {}
         told = matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:]
-        arms = {"documented": _points(skeleton(arm, *told, now.q))}
+        placed = {"documented": told}
         if now.frames is not None:
-            arms["learned"] = _points(skeleton(arm, now.frames.R, now.frames.p, now.q))
-        return arms
+            placed["learned"] = now.frames.R, now.frames.p
+        return {
+            name: _points(skeleton_of(arm.tree, *frames, now.q, arm.frames))
+            for name, frames in placed.items()
+        }
 
     def _estimate(self, now: Now) -> Message:
         snapshot, frames = now.view.snapshot, now.frames
@@ -217,8 +221,29 @@ def _finding(found: Mapping[str, Any]) -> Message:
 
 
 def _points(arm: Skeleton) -> Message:
-    places = {"joints": arm.joints, "axes": arm.axes, "tips": arm.tips}
-    return {key: np.round(x, 4).tolist() for key, x in places.items()} | {"tip_of": arm.tip_of}
+    places: dict[str, Any] = {"joints": arm.p, "axes": arm.axis, "tips": list(arm.tips.values())}
+    return {k: np.round(x, 4).tolist() for k, x in places.items()} | {"tip_of": list(arm.tips)}
+
+
+class Whole:
+    """Rows over the whole run, at ever longer distances in time, encoded, oldest first.
+
+    Where they get more than `SLOW_ROWS`, every other one goes.
+    """
+
+    def __init__(self) -> None:
+        self.rows: list[bytes] = []
+        self._every_s, self._due_s = FIRST_S, -math.inf
+
+    def add(self, t_s: float, row: bytes) -> None:
+        """Keep the row of this time if it is due."""
+        if t_s < self._due_s:
+            return
+        self.rows.append(row)
+        if len(self.rows) >= SLOW_ROWS:
+            del self.rows[1::2]
+            self._every_s *= 2.0
+        self._due_s = t_s + self._every_s
 
 
 def reach(arm: SelfModel) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +17,6 @@ from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, log_rotation, matrix_from_zxz
 from adapter.model.tree import Tree
 from adapter.physics.identifiability import base_parameters, frame_observability
-from adapter.physics.kernels import Frames, place_frames
 from adapter.realtime.loop_board import LoopTiming
 from adapter.realtime.showing import View
 from adapter.realtime.snapshot import Snapshot
@@ -259,6 +259,15 @@ def learned_frames(documented: SelfModel, snapshot: Snapshot) -> LearnedFrames:
     return LearnedFrames(R, p, off, snapshot.lam_std, ~seen.flags)
 
 
+def untold(findings: list[dict[str, Any]], told: set[str]) -> Iterator[dict[str, Any]]:
+    """Findings that were not told yet, nor so: how long they last is news; `told` grows."""
+    for found in findings:
+        key = f"{found['what']} {found['joints']} {found['since_s']:.3f} {found['over_s']}"
+        if key not in told:
+            told.add(key)
+            yield found
+
+
 def states_of(view: View, learning: bool) -> tuple[str, str]:
     """How far λ and θ are."""
     snapshot = view.snapshot
@@ -317,45 +326,11 @@ def headline(view: View, states: tuple[str, str], tree: Tree) -> str:
     if view.news.get("refusal"):
         return "The torques are not those of this arm: nothing is called converged"
     late = f"; the learner is {view.waiting} samples behind" if view.waiting > BEHIND else ""
-    return progress(*states) + late
-
-
-def progress(lam: str, theta: str) -> str:
-    """How far learning is, in a sentence."""
+    lam, theta = states
     if lam == WAITING:
-        return "Waiting for the first motion"
+        return f"Waiting for the first motion{late}"
     if lam == LEARNING:
-        return "Learning where the joints sit (λ)"
+        return f"Learning where the joints sit (λ){late}"
     if theta == CONVERGED:
-        return "Learned: λ and θ have converged"
-    return "Learning what the links weigh (θ); λ has converged"
-
-
-@dataclass(frozen=True)
-class Skeleton:
-    """Points of an arm in the base's axes, m.
-
-    Attributes:
-        joints: (n, 3) origins; axes: (n, 3) unit, of the joints.
-        tips: (t, 3) of the outermost links; tip_of: the links (t,) they are of.
-    """
-
-    joints: Array
-    axes: Array
-    tips: Array
-    tip_of: list[int] = field(default_factory=list)
-
-
-def skeleton(arm: SelfModel, R: Array, p: Array, q: Array) -> Skeleton:
-    """Where an arm of these frames is at q (n,) rad."""
-    n = arm.tree.n
-    rotations, places = np.empty((n, 3, 3)), np.empty((n, 3))
-    place_frames(Frames(np.array(arm.tree.parent), R, p), q, rotations, places)
-    tips, tip_of = [], []
-    for j in sorted(set(range(n)) - set(arm.tree.parent)):
-        riding = [f.position for f in arm.frames if f.parent == arm.tree.link_names[j]]
-        if riding:
-            far = max(riding, key=lambda x: float(np.linalg.norm(x)))
-            tips.append(places[j] + rotations[j] @ far)
-            tip_of.append(j)
-    return Skeleton(places, rotations[:, :, 2], np.reshape(tips, (-1, 3)), tip_of)
+        return f"Learned: λ and θ have converged{late}"
+    return f"Learning what the links weigh (θ); λ has converged{late}"

@@ -6,7 +6,6 @@ import base64
 import hashlib
 import socket
 from collections.abc import Callable
-from typing import Any
 
 from markupsafe import Markup
 
@@ -25,10 +24,7 @@ Show = Callable[[Now], None]
 def page_of(known: KnownRun) -> tuple[str, str]:
     """HTML of the page and its Content-Security-Policy: nothing from elsewhere, no other script."""
     script = fill("live.js", {}, __package__)
-    context: dict[str, Any] = {
-        "robot": known.documented.name,
-        "script": Markup(script),
-    }
+    context = {"robot": known.documented.name, "script": Markup(script)}
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; "

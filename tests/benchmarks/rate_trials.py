@@ -189,7 +189,7 @@ def at_rate(log: Log, rate: int, robot: SelfModel, every: int) -> dict[str, Any]
     theta = learner.theta
     excess = np.sqrt(theta.variance() / theta.variance(theta.least_squares()))
     freedom = Freedom.of(np.eye(6) - outcome.lam_identifiable, outcome.lam[:, 3:])
-    turn, shift = frame_errors(completed_lambda(outcome, robot).lam, robot.lam, freedom)
+    turn, shift = frame_errors(completed_lambda(outcome, robot)[0], robot.lam, freedom)
     return {
         "rate": rate,
         "over_ls": (error / best).round(3).tolist(),

@@ -102,7 +102,6 @@ def _parser(command: str):
         ("run --set lniks=true", "did you mean links?"),
         ("run --driver pybulet:panda", "did you mean pybullet?"),
         ("run --fault lsot=0.1", "did you mean lost?"),
-        ("replay LOG --robot pnada", "did you mean panda?"),
         ("replay LOG --joints panda_jiont1", "did you mean panda_joint1?"),
         ("replay LOG --topic /joint_sates", "did you mean /joint_states?"),
         ("sim can --motors opnarm", "have: "),

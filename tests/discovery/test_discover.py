@@ -11,18 +11,23 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.discovery import Discovery, discover, learn, log_from_arrays
+from adapter.discovery import Discovery, discover, learn
 from adapter.discovery.hypotheses import FREE, Option
 from adapter.discovery.tree_search import TreeSearch, cycle
 from adapter.errors import ModelError, SettingsError
 from adapter.model.model_file import load_model
 from adapter.model.spatial import log_rotation, matrix_from_zxz
 from drivers.files.mcap import write_log
-from tests.helpers.discovery_data import Case, Motion, record, robot
-
-TRUSTED = 0.9
-RATE_HZ = 250.0
-SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
+from tests.helpers.discovery_data import (
+    RATE_HZ,
+    SHORT,
+    TRUSTED,
+    Case,
+    Motion,
+    confidences,
+    record,
+    robot,
+)
 
 
 @cache
@@ -30,12 +35,8 @@ def _case(name: str, motion: Motion, seed: int, noise: float = 1.0, parts: str =
     return record(robot(name), motion, seed, noise=noise, parts=parts)
 
 
-def _named(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
-    return {(e.joint, e.link, e.parent): e.confidence for e in found.edges if e.joint}
-
-
 def _worst_wrong(case: Case, found: Discovery) -> float:
-    return max((c for edge, c in _named(found).items() if edge not in case.edges), default=0.0)
+    return max((c for edge, c in confidences(found).items() if edge not in case.edges), default=0.0)
 
 
 @pytest.mark.parametrize("parts", ["ta", "t"])
@@ -44,9 +45,9 @@ def test_tree_comes_back(name: str, parts: str, seed: int) -> None:
     whole = _case(name, SHORT, seed)
     log = whole.log if parts == "ta" else replace(whole.log, accels=None)
     found = discover(log)
-    assert set(_named(found)) == whole.edges
+    assert set(confidences(found)) == whole.edges
     assert found.root == whole.root
-    assert min(_named(found).values()) > 0.99 and found.root_confidence > 0.99
+    assert min(confidences(found).values()) > 0.99 and found.root_confidence > 0.99
     assert found.undecided == ()
 
 
@@ -65,7 +66,7 @@ def test_a_second_of_motion_is_enough_with_real_parts() -> None:
     case = _case("atlas", Motion(seconds=1.0, rate_hz=RATE_HZ), 4)
     found = discover(case.log)
     assert _worst_wrong(case, found) < TRUSTED
-    assert len(case.edges & set(_named(found))) >= 28
+    assert len(case.edges & set(confidences(found))) >= 28
 
 
 @pytest.mark.parametrize("still", [(2,), (1, 4)])
@@ -101,7 +102,6 @@ def test_a_missing_link_leaves_its_child_open() -> None:
     gone = next(link for _, link, _ in case.edges if _is_link(case, link, 3))
     keep = [k for k, name in enumerate(case.log.link_names) if name != gone]
     log = case.log
-    assert log.twists is not None and log.accels is not None
     found = discover(
         replace(
             log,
@@ -120,18 +120,17 @@ def test_base_at_rest_in_the_recording_is_the_root() -> None:
     case = record(robot("panda"), SHORT, 7, base=True)
     found = discover(case.log)
     assert found.root == case.root != "base"
-    assert set(_named(found)) == case.edges and found.root_confidence > 0.99
+    assert set(confidences(found)) == case.edges and found.root_confidence > 0.99
 
 
 def test_gaps_and_slow_sensors_are_bridged() -> None:
     case = _case("panda", SHORT, 1)
     log = case.log
-    assert log.twists is not None and log.accels is not None
     twists, accels = log.twists.copy(), log.accels.copy()
     twists[np.arange(len(log)) % 5 != 0] = np.nan
     accels[300:360, 2] = np.nan
     found = discover(replace(log, twists=twists, accels=accels))
-    assert set(_named(found)) == case.edges
+    assert set(confidences(found)) == case.edges
 
 
 def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
@@ -149,20 +148,12 @@ def test_lambda_follows_and_its_spread_is_what_it_is_off_by() -> None:
     assert 0.7 < np.sqrt(np.mean((off / learned.schema.std[shown]) ** 2)) < 1.4
 
 
-def test_arrays_without_names_serve_as_a_recording_does() -> None:
+def test_positions_and_twists_alone_serve() -> None:
     case = _case("panda", SHORT, 0)
-    log = case.log
-    arrays = log_from_arrays(1e-9 * log.stamp_ns, log.q, log.twists, log.accels, log.dq, log.tau)
-    found, same = discover(arrays), discover(log)
-    joint = dict(zip(arrays.joint_names, log.joint_names, strict=True))
-    link = dict(zip(arrays.link_names, log.link_names, strict=True)) | {"base": "base"}
-    told = {(joint[e.joint or ""], link[e.link], link[e.parent or ""]) for e in found.edges}
-    assert told == case.edges
-    assert np.array_equal(found.log.q, same.log.q)
-    assert found.hypotheses.excess == dict.fromkeys(("w", "dw", "v", "a"), 1.0)
-    bare = discover(log_from_arrays(1e-9 * log.stamp_ns, log.q, log.twists))
+    nothing = np.full_like(case.log.q, np.nan)
+    bare = discover(replace(case.log, dq=nothing, tau=nothing, accels=None))
     assert bare.log.tau is None and bare.log.measured == ("w", "v")
-    assert {(joint[e.joint or ""], link[e.link]) for e in bare.edges} == {x[:2] for x in case.edges}
+    assert {(e.joint, e.link, e.parent) for e in bare.edges} == case.edges
 
 
 def _chain(case: Case) -> np.ndarray:
@@ -212,7 +203,6 @@ def _by_all_combinations(options: list[tuple[Option, ...]]) -> float:
 def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     case = _case("panda", Motion(seconds=2.0, rate_hz=RATE_HZ), 8)
     log = case.log
-    assert log.twists is not None and log.accels is not None
     write_log(log, tmp_path / "log.mcap", {})
     names = {key: str(tmp_path / key) for key in ("model.json", "figures.json")}
     arguments = ["--model", names["model.json"], "--json", names["figures.json"]]

@@ -47,7 +47,6 @@ def _write(
     """Joint states at 1 kHz and each link's Imu at 200 Hz, by another encoder than ours."""
     rng = np.random.default_rng(4)
     log = case.log
-    assert log.twists is not None and log.accels is not None
     stamp_ns = START_NS + log.stamp_ns + (JITTER_NS * rng.normal(size=len(log))).astype(np.int64)
     with path.open("wb") as file:
         writer = RosWriter(file)

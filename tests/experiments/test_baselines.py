@@ -44,22 +44,17 @@ def robot(seed: int) -> tuple[np.ndarray, np.ndarray]:
     return lam, theta_from_log_cholesky(rng.normal(size=(TREE.bodies, 10)) * 0.3)
 
 
-def samples(seed: int, count: int, links: bool = True) -> TreeData:
+def samples(seed: int, count: int) -> TreeData:
     """Independent random states of the robot, torques from Pinocchio."""
     lam, theta = robot(seed)
     rng = np.random.default_rng([seed, count])
     q, dq, ddq = (rng.uniform(-s, s, (count, TREE.n)) for s in (1.0, 1.0, 3.0))
     base = BodyMotion(*(rng.normal(size=(count, 3)) for _ in range(4)))
     tau = _pinocchio(lam, theta, q, dq, ddq, base)
-    moving = None
-    if links:
-        signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
-        v, w, a, dw = (
-            x[:, 1:].numpy()
-            for x in link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
-        )
-        moving = BodyMotion(w, a, dw, v)
-    return TreeData(TREE, q, dq, ddq, tau, base, moving)
+    signals = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
+    found = link_motion(TREE, torch.from_numpy(lam), signals, base.torch())
+    v, w, a, dw = (x[:, 1:].numpy() for x in found)
+    return TreeData(TREE, q, dq, ddq, tau, base, BodyMotion(w, a, dw, v))
 
 
 def _pinocchio(
@@ -103,16 +98,11 @@ def relative(found: np.ndarray, true: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_arm_problem_is_well_posed_and_complete(seed: int) -> None:
-    """Known λ and X alone give the torques; λ gives the carrier's motion as sensors do."""
+    """Known λ and X alone give the torques."""
     data = samples(seed, 40)
-    lam, _ = robot(seed)
     x, y = arm_problem(data, ARM, CARRIER)
     columns = Columns(3)
     assert x.shape == (40, columns.width) and np.array_equal(y, data.tau[:, [8, 9, 10]])
-    bare = TreeData(TREE, data.q, data.dq, data.ddq, data.tau, data.base)
-    computed, _ = arm_problem(bare, ARM, CARRIER, lam, velocity=True)
-    np.testing.assert_allclose(computed[:, : columns.width], x, atol=1e-12)
-    assert np.allclose(Columns(3, True).carrier(computed).v, data.links.v[:, 1], atol=1e-12)
     squares = least_squares(seed)
     squares.fit(x, y)
     more, truth = arm_problem(samples(seed, 60), ARM, CARRIER)
@@ -126,13 +116,12 @@ def least_squares(seed: int) -> RegressorLeastSquares:
 
 
 def test_what_is_no_sub_chain_is_refused() -> None:
-    data = samples(0, 5, links=False)
+    data = samples(0, 5)
     for joints, carrier, words in (
         (("joint3", "joint4"), CARRIER, "all that hangs on it"),
         (("joint3", "joint5", "joint4", "joint1"), CARRIER, "all that hangs on it"),
         (ARM, "link1", "hangs on link 'link2'"),
         (("elbow",), CARRIER, "no joint 'elbow'"),
-        (ARM, CARRIER, "not measured; give lam"),
     ):
         with pytest.raises(ModelError, match=words):
             arm_problem(data, joints, carrier)
@@ -140,7 +129,7 @@ def test_what_is_no_sub_chain_is_refused() -> None:
 
 def test_lagranges_form_with_the_true_mass_matrix_is_inverse_dynamics() -> None:
     """Against Pinocchio's torques on a moving base; v is free to choose (Galilei)."""
-    data = samples(0, 30, links=False)
+    data = samples(0, 30)
     lam, theta = (torch.from_numpy(x) for x in robot(0))
 
     def mass(q: torch.Tensor) -> torch.Tensor:
@@ -305,8 +294,7 @@ def test_the_experiments_learners_have_the_papers_sizes() -> None:
         found = {choice.key: choice.make() for choice in learners(*schema, full=full)}
         assert list(found) == ["FFNN", "ELM", "GPR", "DeLaN", "WLS"]
         elm, gpr, net = found["ELM"], found["GPR"], found["FFNN"]
-        assert isinstance(elm, ElmCommittee) and isinstance(gpr, GaussianProcess)
-        assert isinstance(net, FeedForward) and net.units == 1000
+        assert net.units == 1000
         assert (elm.members, elm.units, elm.points, gpr.points) == (members, 4000, 10_000, 10_000)
 
 
@@ -375,20 +363,3 @@ def test_without_scikit_learn_the_error_says_what_to_install(
     monkeypatch.setitem(sys.modules, "sklearn.neural_network", None)
     with pytest.raises(ModelError, match=r"pip install 'panda-adapter\[experiment\]'"):
         FeedForward(units=3).fit(np.ones((5, 2)), np.ones((5, 1)))
-
-
-def test_sizes_that_cannot_be_are_refused() -> None:
-    for make, words in (
-        (lambda: FeedForward(units=0), "units must be at least 1, got 0"),
-        (lambda: FeedForward(epochs=2), "epochs must be at least 4"),
-        (lambda: ElmCommittee(members=0), "members must be at least 1"),
-        (lambda: ElmCommittee(ridge=0.0), "ridge must be positive"),
-        (lambda: GaussianProcess(points=0), "points must be at least 1"),
-        (lambda: DeepLagrangian(Columns(2), steps=0), "steps must be at least 1"),
-        (lambda: DeepLagrangian(Columns(2), rate=np.nan), "rate must be positive"),
-        (lambda: DeepLagrangian(Columns(2), ()), "hidden_layers must be at least 1"),
-        (lambda: RegressorLeastSquares(Columns(2), (-1, 0), np.zeros((3, 6))), "as many parents"),
-        (lambda: RegressorLeastSquares(Columns(1), (-1,), np.full((1, 6), np.nan)), "finite"),
-    ):
-        with pytest.raises(ModelError, match=words):
-            make()

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from adapter.discovery import Discovery
 from adapter.errors import ModelWarning
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
@@ -267,3 +268,13 @@ def record(
     )
     body = {name: b for b, name in link_name.items()}
     return Case(log, edges, link_name.get(0, "base"), model, body, mounts)
+
+
+TRUSTED = 0.9
+RATE_HZ = 250.0
+SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
+
+
+def confidences(found: Discovery) -> dict[tuple[str | None, str, str | None], float]:
+    """Of the edges with a joint."""
+    return {(e.joint, e.link, e.parent): e.confidence for e in found.edges if e.joint}

@@ -10,7 +10,7 @@ from adapter.learning.change import ChangeDetector, explained_share
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import ChangeSettings, ThetaSettings
 from adapter.runs.library import regressor
-from adapter.runs.outcome import changes, collect, learned_model
+from adapter.runs.outcome import changes_at, collect, learned_model
 from adapter.signals.records import stamps_of
 from sim.scenarios import build
 from sim.truth import Truth
@@ -81,7 +81,8 @@ def test_the_load_is_weighed(mass: float) -> None:
     assert abs(theta[0] - mass) < 4.0 * np.sqrt(covariance[0, 0]) + 0.01 * mass
     com = [loaded_arm(mass).effects[0].number(key) for key in ("cx", "cy", "cz")]
     assert np.abs(theta[1:4] / theta[0] - com).max() < (0.02 if mass >= 0.3 else 0.06)
-    told = changes(collect(run.learner))
+    outcome = collect(run.learner)
+    told = changes_at(outcome.changes_ns, outcome.payload)
     assert len(told) == 1 and told[0]["payload"]["m"] == theta[0]
 
 

@@ -19,7 +19,6 @@ from adapter.model.spatial import exp_rotation, zxz_from_matrix
 from adapter.report.difference_words import (
     difference_json,
     difference_matrix,
-    difference_rows,
     difference_summary,
     effect_rows,
 )
@@ -50,9 +49,20 @@ def only(found: ModelDifference) -> Change:
     return change
 
 
+def told(found: ModelDifference) -> dict[str, str]:
+    """What is listed, by joint and kind, or by the effect's name."""
+    of_joints = {
+        f"{joint} {kind}": cell
+        for joint, *cells in difference_matrix(found)
+        for kind, cell in zip(("frame", "body"), cells, strict=True)
+        if cell
+    }
+    return of_joints | {what: said for what, said, *_ in effect_rows(found)}
+
+
 def test_a_model_is_the_same_as_itself() -> None:
     found = compare(PANDA, PANDA)
-    assert not difference_rows(found)
+    assert not told(found)
     assert difference_summary(found) == ["panda and panda are the same"]
     assert found.hand_max_m == 0.0 and not found.torque_nm.any()
 
@@ -66,8 +76,7 @@ def test_a_frame_that_moved_moves_the_hand() -> None:
     assert moved.shown == 1.0 and moved.z is None
     assert 0.004 < found.hand_rms_m < 0.02 * 0.7 + 0.004 and found.torque_nm[1] > 0.01
     assert moved.hand_m == found.hand_rms_m and moved.torque_nm == found.torque_nm.max()
-    row = difference_rows(found)[0]
-    assert row[:3] == ("panda_joint4 frame", "turned by 1.15°, moved by 4 mm", "-")
+    assert told(found)["panda_joint4 frame"].startswith("turned by 1.15°, moved by 4 mm\n(hand")
 
 
 def test_what_no_motion_shows_is_said() -> None:
@@ -79,7 +88,7 @@ def test_what_no_motion_shows_is_said() -> None:
         found = compare(PANDA, model)
         moved = only(found)
         assert moved.joint == name and not moved.shown
-        assert "data can show none of it" in difference_rows(found)[0][1]
+        assert "data can show none of it" in told(found)[f"{name} frame"]
         assert found.torque_nm.max() < 1e-9
         assert found.hand_max_m > 5e-3  # and yet the hand is elsewhere
 
@@ -88,19 +97,20 @@ def test_masses_that_no_torque_shows_are_said() -> None:
     found = compare(PANDA, heavier({(0, 0): 1.0}))
     hidden = only(found)
     assert hidden.what == "body" and not hidden.shown and hidden.torque_nm < 1e-9
-    assert not difference_rows(found)
+    assert not told(found)
     assert "the hand stays: panda_link1 body" in difference_summary(found)[-1]
     found = compare(PANDA, heavier({(6, 0): 0.5}))
     assert only(found).shown and found.torque_nm[1] > 1.0 and found.hand_max_m == 0.0
-    assert difference_rows(found)[0][1].startswith("0.7355 -> 1.236 kg")
+    assert told(found)["panda_joint7 body"].startswith("0.7355 -> 1.236 kg")
 
 
 def test_what_does_most_stands_first() -> None:
     theta = heavier({(6, 0): 0.5, (3, 0): 1e-3}).theta
     model = replace(bent(5, [0.0, 0.0, 0.0], [0.0, 5e-4, 0.0]), theta=theta)
     found = compare(PANDA, model)
-    names = [row[0] for row in difference_rows(found)]
-    assert names == ["panda_link7 body", "panda_joint6 frame", "panda_link4 body"]
+    order = [f"{change.joint} {change.what}" for change in found.changes]
+    assert order == ["panda_joint7 body", "panda_joint6 frame", "panda_joint4 body"]
+    assert told(found).keys() == set(order)
     assert found.changes[0].torque_joint == "panda_joint2"
 
 
@@ -118,7 +128,7 @@ def test_standard_deviations_count() -> None:
 def test_noise_is_one_sentence() -> None:
     noise = replace(heavier({(6, 1): 0.02}), theta_std=np.full((7, 10), 0.01))
     found = compare(PANDA, noise)
-    assert only(found).z == pytest.approx(2.0, rel=1e-6) and not difference_rows(found)
+    assert only(found).z == pytest.approx(2.0, rel=1e-6) and not told(found)
     assert difference_summary(found)[-1] == (
         "not listed: 1 by less than 4 standard deviations (body 1)"
     )
@@ -133,9 +143,7 @@ def test_effects_are_compared() -> None:
     assert change.torque_joint == "panda_joint3"
     assert change.torque_nm == pytest.approx(0.2, rel=0.05)
     gone = compare(replace(PANDA, effects=(rubs,)), PANDA)
-    assert ("panda_joint3 coulomb_friction", "Fc 0.3 -> none N m") in [
-        row[:2] for row in difference_rows(gone)
-    ]
+    assert "panda_joint3: Fc 0.3 -> none N m" in told(gone)["coulomb_friction"].splitlines()
     json.dumps(difference_json(gone), allow_nan=False)
 
 
@@ -146,10 +154,10 @@ def test_gravity_tool_and_load_are_compared() -> None:
     wall = np.array([9.81, 0.0, 0.0])
     found = compare(PANDA, replace(PANDA, effects=(load,), tool=tool, gravity=wall))
     assert {change.what for change in found.changes} == {"body", "tool", "gravity"}
-    said = {row[0]: row[1] for row in difference_rows(found)}
+    said = told(found)
     assert said["gravity"] == "0 0 -9.81 -> 9.81 0 0 m/s²"
     assert said["tool"] == "mass_kg 0 -> 0.8 kg"
-    assert said["panda_link7 body"].startswith("0.7355 -> 1.236 kg")
+    assert said["panda_joint7 body"].startswith("0.7355 -> 1.236 kg")
 
 
 def test_other_trees_are_refused() -> None:

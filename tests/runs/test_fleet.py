@@ -20,7 +20,7 @@ from adapter.model import model_file
 from adapter.physics.identifiability import base_parameters
 from adapter.runs.config import PipelineSettings
 from adapter.runs.fleet import engine
-from adapter.runs.fleet.arm import FleetArm, learn_arm
+from adapter.runs.fleet.arm import FleetArm, Information, learn_arm
 from adapter.runs.fleet.engine import AT_HAND, here, on_cluster
 from adapter.runs.fleet.fleet import (
     Fleet,
@@ -31,7 +31,6 @@ from adapter.runs.fleet.fleet import (
     read_manifest,
     recall,
 )
-from adapter.runs.fleet.information import Information
 from adapter.runs.fleet.moments import Broken, LogMoments, Task, learner_of, moments_of
 from adapter.runs.pipeline import make_front_end
 from drivers.files.mcap import read_log, write_log
@@ -103,13 +102,13 @@ def test_logs_are_told_apart_and_broken_ones_said(fleet: Fleet) -> None:
     (broken,) = fleet.broken
     assert broken.path.endswith("cut.mcap") and broken.why
     assert fleet.read == LOGS + 1 and fleet.known == 0
+    assert all(log.worth > 0.0 and not log.disagrees for log in the_arm(fleet).logs)
 
 
 def test_the_load_of_one_log_is_weighed(fleet: Fleet) -> None:
     loads = [log.load for log in the_arm(fleet).logs]
     assert [x is not None for x in loads] == [day == LOADED for day in range(LOGS)]
     load = loads[LOADED]
-    assert load is not None
     assert abs(load.mass - MASS) < max(4.0 * load.std, 0.05 * MASS)
 
 
@@ -118,11 +117,6 @@ def test_friction_that_grows_is_named(fleet: Fleet) -> None:
     assert (first.effect, first.joint, first.follows) == ("viscous_friction", WORN, "time")
     assert abs(first.slope - WEAR) < max(4.0 * first.std, 0.1 * WEAR)
     assert not more
-
-
-def test_no_log_of_this_arm_disagrees(fleet: Fleet) -> None:
-    assert all(not log.disagrees for log in the_arm(fleet).logs)
-    assert all(log.worth > 0.0 for log in the_arm(fleet).logs)
 
 
 def oracle_moments(paths: Sequence[Path]) -> LogMoments:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from adapter.realtime.session import run_lockstep
-from adapter.report.headline import Worth, headline
+from adapter.report.headline import headline
+from adapter.report.worth import Worth
 from adapter.runs import live
 from adapter.runs.config import PipelineSettings
 from adapter.runs.live_screen import FIRST_S

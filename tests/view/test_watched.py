@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +21,28 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from adapter.cli.display import LiveTable, table_of
-from adapter.realtime.timing import Histogram
+from adapter.control.observer import ContactObserver
+from adapter.learning.settings import LearnerSettings
+from adapter.realtime.loop_board import LoopBoard
+from adapter.realtime.ring import Ring
+from adapter.realtime.session import run_lockstep
+from adapter.realtime.showing import Looker, View
+from adapter.realtime.snapshot import ExternalTorque, SnapshotReader, SnapshotWriter
+from adapter.realtime.timing import Histogram, Timing
+from adapter.runs.config import PipelineSettings
+from adapter.runs.live import Publisher, news_of, single_thread_learner
 from adapter.runs.live_screen import FIRST_S
+from adapter.runs.pipeline import make_front_end
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
 from adapter.view.foxglove_view import FoxgloveView, free_port
 from adapter.view.messages import Messages, encode
-from adapter.view.now import Now, Onlooker
+from adapter.view.now import KnownRun, Now, Onlooker
 from adapter.view.page import LivePage, page_of
 from adapter.view.server import address, bind
 from tests.helpers.browser import ids_of_a_page_that_fetches_nothing, tab
-from tests.helpers.live_tools import PANDA
+from tests.helpers.live_tools import PANDA, parts, simulated_arm
 from tests.helpers.robot_models import PANDA as PANDA_URDF
-from tests.helpers.viewed import TICK_NS, Seen, again, seen_run
 
 SECONDS = 5.5
 PROTOCOLS = [Subprotocol("foxglove.sdk.v1")]
@@ -48,6 +57,79 @@ FOUND = {
     "score": 9.0,
     "ambiguous_with": [{"what": "coulomb_friction", "joints": [2]}],
 }
+EVERY = 50  # states between two looks
+TICK_NS = 200_000
+FRICTION = ("viscous_friction", "coulomb_friction")
+
+
+@dataclass
+class Seen:
+    """A run: what was known of it, what a display saw, and the arm's own truth beside.
+
+    Attributes:
+        known: the run.
+        views: in order; the last one is done.
+        states: all filtered states, (m, size).
+        residuals: (n,) N m of the newest state of each look, by the learner itself.
+    """
+
+    known: KnownRun
+    views: list[View]
+    states: np.ndarray
+    residuals: list[np.ndarray]
+
+
+def seen_run(seconds: float) -> Seen:
+    """Drive the simulated arm, learn, publish, look: all of it real, in one thread."""
+    pipeline = PipelineSettings(learner=LearnerSettings(effects=FRICTION))
+    known = KnownRun(PANDA, FRICTION, "pybullet:panda", seconds, "a run")
+    learner, publish = single_thread_learner(PANDA, pipeline, None), Publisher()
+    front_end, controller = make_front_end(PANDA, pipeline), parts()[1]
+    ring = Ring.create(front_end.layout.size, 4000)
+    names = PANDA.tree.joint_names
+    board, loop = SnapshotWriter.create(names, FRICTION, name=None), LoopBoard.create()
+    reader, observer = SnapshotReader(board.name), ContactObserver(PANDA, FRICTION)
+    looker, timing, views = Looker(ring, reader, loop), Timing(loop.bins), list[View]()
+    states, residuals = list[np.ndarray](), list[np.ndarray]()
+
+    class Published:
+        """A learner whose estimate is published, and looked at."""
+
+        def step(self, state: np.ndarray) -> None:
+            if not states:
+                loop.write_begin(int(state[:1].view(np.int64)[0]))
+            states.append(state.copy())
+            learner.step(state)
+            ring.push(state)
+            ring.release(1)
+            timing.add(len(states) * 10**6, len(states) * 10**6, len(states) * 10**6 + TICK_NS, 0)
+            if len(states) % EVERY == 0:
+                board.publish(publish(learner))
+                board.publish_news(news_of(learner))
+                views.append(looker.look(False))
+                tau = state[front_end.layout.joint_tau]
+                residuals.append(tau - learner.predict(state[None])[0])
+
+    def watch(sample, command) -> None:
+        torque = observer.step(sample)
+        wrench = observer.wrench()
+        push = ExternalTorque(torque, observer.std, *wrench, None, False, sample.stamp_ns)
+        board.publish_external(push)
+
+    run_lockstep(simulated_arm(), front_end, Published(), controller, seconds, each=watch)
+    loop.write_end("duration", None)
+    ring.finish()
+    views.append(replace(looker.look(True), elapsed_s=views[-1].elapsed_s + 1.0))
+    for part in (reader, board, loop, ring):
+        part.close()
+    for made in (board, loop, ring):
+        made.unlink()
+    return Seen(known, views, np.array(states), residuals)
+
+
+def again(views: list[View]) -> Iterator[View]:
+    """The same without the end."""
+    return (view for view in views if not view.done)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +199,6 @@ def troubled(seen: Seen) -> Now:
     for view in again(seen.views):
         last = view
         onlooker.look(view)
-    assert last.push is not None
     begin_s = 1e-9 * last.began_ns
     found = {k: v + begin_s if k in ("since_s", "reported_s") else v for k, v in FOUND.items()}
     load = {"m": 0.5231, "m_std": 0.0112, "since_s": begin_s + 2.0}

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.baselines.features import Columns, arm_problem, sub_chain, sub_parents
-from adapter.experiments.baselines.learner import Baseline
 from adapter.experiments.baselines.presets import Choice, learners
 from adapter.experiments.falls import Falls, sets_of
 from adapter.experiments.results import BOX_PERCENTILES, LearnerScores
@@ -61,7 +60,10 @@ def compare(
         seed: of the samples that are judged, and of the validation part.
         say: takes a sentence on progress.
     """
-    judged = {name: _some(table, seed, JUDGED) for name, table in sets.items()}
+    judged = {}
+    for name, (x, y) in sets.items():
+        rows = np.random.default_rng(seed).permutation(len(x))[:JUDGED]
+        judged[name] = x[rows], y[rows]
     validation = ValidationPart.of(sets["train"], seed)
     found = []
     for choice in chosen:
@@ -79,12 +81,6 @@ def compare(
         learned.tuning = [sizes, *facts.tuning, _told(choice, selection)]
         found.append(errors.into(learned))
     return found
-
-
-def _some(table: Table, seed: int, most: int) -> Table:
-    """Random samples of a table, all of a small one."""
-    rows = np.random.default_rng(seed).permutation(len(table[0]))[:most]
-    return table[0][rows], table[1][rows]
 
 
 # --- settings, chosen on a part of the training set that no trial learns from -------------------
@@ -116,7 +112,7 @@ class ValidationPart:
 
 
 def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
-    """The candidate with the smallest median error by eq. 20 on the validation part.
+    """The candidate with the smallest median error by eq. 20 on the validation part, all joints.
 
     Returns:
         chosen (settings), candidates (settings and validation_median of each; none where there
@@ -129,7 +125,9 @@ def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
     for candidate in choice.candidates:
         learner = choice.make(**{**(choice.trial or {}), **candidate})
         learner.fit(*part.fit)
-        rows.append({**candidate, "validation_median": validation_error(learner, part)})
+        x, y = part.judge
+        error = float(np.nanmedian(relative_errors(y, learner.predict(x))))
+        rows.append({**candidate, "validation_median": error})
     errors = [row["validation_median"] for row in rows]
     best = int(np.argmin(np.nan_to_num(errors, nan=np.inf)))
     return {
@@ -138,12 +136,6 @@ def select(choice: Choice, part: ValidationPart, say: Say) -> dict[str, Any]:
         "validation_samples": len(part.judge[0]),
         "trial": {"samples": len(part.fit[0]), **(choice.trial or {})},
     }
-
-
-def validation_error(learner: Baseline, part: ValidationPart) -> float:
-    """Median relative error by eq. 20, of all joints."""
-    x, y = part.judge
-    return float(np.nanmedian(relative_errors(y, learner.predict(x))))
 
 
 def _told(choice: Choice, selection: dict[str, Any]) -> str:

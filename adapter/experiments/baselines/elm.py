@@ -8,36 +8,15 @@ definite in float32.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import linalg
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import gram, solve_positive
-from adapter.experiments.baselines.learner import (
-    Progress,
-    ScaledBaseline,
-    Told,
-    at_least,
-    positive,
-)
+from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 MEMBERS, UNITS, POINTS = 50, 4000, 10_000  # the paper's
-
-
-@dataclass(frozen=True)
-class _Machine:
-    """One member: units tanh(x weights + biases), then the output weights."""
-
-    weights: Array
-    biases: Array
-    output: Array
-
-    def __call__(self, x: Array) -> Array:
-        y: Array = np.tanh(x @ self.weights + self.biases) @ self.output
-        return y
 
 
 class ElmCommittee(ScaledBaseline):
@@ -65,19 +44,13 @@ class ElmCommittee(ScaledBaseline):
                 the units close to their linear part, so that their sums are low polynomials.
             ridge: added to the mean Gram matrix of the units.
             seed: of weights and parts.
-
-        Raises:
-            ModelError: sizes below 1, or a spread or ridge that is not positive.
         """
-        at_least(1, members=members, units=units, points=points)
-        positive(spread=spread, ridge=ridge)
         self.members, self.units, self.points = members, units, points
         self.spread, self.ridge, self.seed = spread, ridge, seed
-        self._machines: list[_Machine] = []
 
     def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Train every member on its own part. Raises ModelError for too weak a ridge."""
-        self._machines = []
+        self._machines: list[tuple[Array, Array, Array]] = []
         points = min(self.points, len(x))
         for member in range(self.members):
             rng = np.random.default_rng([self.seed, member])
@@ -86,7 +59,8 @@ class ElmCommittee(ScaledBaseline):
             progress(f"committee: machine {member + 1} of {self.members}")
         return self._told(points, x.shape[1])
 
-    def _machine(self, x: Array, y: Array, rng: np.random.Generator) -> _Machine:
+    def _machine(self, x: Array, y: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Weights and biases of units tanh(x weights + biases), and the output weights."""
         weights = rng.normal(size=(x.shape[1], self.units)) * self.spread / np.sqrt(x.shape[1])
         biases = rng.uniform(-1.0, 1.0, self.units)
         hidden = np.tanh(x @ weights + biases)
@@ -98,22 +72,15 @@ class ElmCommittee(ScaledBaseline):
             raise ModelError(
                 f"the units' Gram matrix is singular in float64; take a ridge above {self.ridge:g}"
             ) from None
-        return _Machine(weights, biases, output)
+        return weights, biases, output
 
     def _answer_scaled(self, x: Array) -> Array:
         """The mean over the committee."""
-        mean: Array = np.asarray(sum(machine(x) for machine in self._machines)) / len(
-            self._machines
-        )
-        return mean
+        every = sum(np.tanh(x @ w + b) @ output for w, b, output in self._machines)
+        return np.asarray(every) / len(self._machines)
 
     def _told(self, points: int, inputs: int) -> Told:
-        sizes = {
-            "members": self.members,
-            "units": self.units,
-            "points": points,
-            "inputs": inputs,
-        }
+        sizes = {"members": self.members, "units": self.units, "points": points, "inputs": inputs}
         tuning = (
             f"Random input weights with deviation {self.spread:g} / sqrt({inputs}) on standardised "
             "inputs, biases uniform in -1 to 1.",

@@ -13,12 +13,7 @@ from scipy import linalg, optimize
 
 from adapter.errors import ModelError
 from adapter.experiments.baselines.dense import solve_positive
-from adapter.experiments.baselines.learner import (
-    Progress,
-    ScaledBaseline,
-    Told,
-    at_least,
-)
+from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 POINTS = 10_000  # the paper's
@@ -45,11 +40,7 @@ class GaussianProcess(ScaledBaseline):
             tuned_on: how many of these find the length scales and the noise.
             steps: of L-BFGS on the marginal likelihood, at most.
             seed: of the draw.
-
-        Raises:
-            ModelError: sizes below 1.
         """
-        at_least(1, points=points, tuned_on=tuned_on, steps=steps)
         self.points, self.tuned_on, self.steps, self.seed = points, tuned_on, steps, seed
 
     def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
@@ -93,12 +84,7 @@ class GaussianProcess(ScaledBaseline):
             f"equal lengths, at most {self.steps} steps; one kernel for all joints.",
             "Exact solution by Cholesky in float64 on all points.",
         )
-        sizes = {
-            "points": points,
-            "tuned_on": tuned_on,
-            "inputs": len(self._lengths),
-        }
-        return sizes, tuning
+        return {"points": points, "tuned_on": tuned_on, "inputs": len(self._lengths)}, tuning
 
 
 def kernel(first: Array, second: Array) -> Array:

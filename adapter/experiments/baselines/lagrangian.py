@@ -22,13 +22,7 @@ from torch import Tensor, nn
 
 from adapter.experiments.baselines.dense import accelerator
 from adapter.experiments.baselines.features import Columns
-from adapter.experiments.baselines.learner import (
-    Baseline,
-    Progress,
-    Told,
-    at_least,
-    positive,
-)
+from adapter.experiments.baselines.learner import Baseline, Progress, Told
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
 from adapter.model.spatial import Array
 from adapter.physics.networks import FrameMotion
@@ -130,14 +124,7 @@ class DeepLagrangian(Baseline):
             batch: samples of one step, drawn from all.
             rate: of ADAM at the start.
             seed: of weights and batches.
-
-        Raises:
-            ModelError: sizes below 1, or a rate that is not positive.
         """
-        at_least(
-            1, steps=steps, batch=batch, hidden_layers=len(hidden), units=min(hidden, default=1)
-        )
-        positive(rate=rate)
         self.columns, self.hidden, self.steps = columns, hidden, steps
         self.batch, self.rate, self.seed = batch, rate, seed
 
@@ -200,9 +187,4 @@ class DeepLagrangian(Baseline):
             f"ADAM with batches of {self.batch} for {self.steps} steps, rate {self.rate:g} "
             "falling along half a cosine, float32.",
         )
-        sizes = {
-            "samples": samples,
-            "steps": self.steps,
-            "inputs": self.columns.width,
-        }
-        return sizes, tuning
+        return {"samples": samples, "steps": self.steps, "inputs": self.columns.width}, tuning

@@ -143,17 +143,3 @@ def checked(X: Array, Y: Array | None = None, width: int | None = None) -> Array
         if not np.isfinite(Y).all():
             raise ModelError("Y holds values that are not finite; leave those samples out")
     return x
-
-
-def at_least(least: int, **counts: int) -> None:
-    """Raises ModelError naming the count that is too small."""
-    for name, value in counts.items():
-        if value < least:
-            raise ModelError(f"{name} must be at least {least}, got {value}")
-
-
-def positive(**numbers: float) -> None:
-    """Raises ModelError naming the number that is not positive and finite."""
-    for name, value in numbers.items():
-        if not 0.0 < value < np.inf:
-            raise ModelError(f"{name} must be positive and finite, got {value}")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from adapter.errors import ModelError
 from adapter.experiments.baselines.features import Columns
 from adapter.experiments.baselines.learner import Baseline, Progress, Told
 from adapter.model.spatial import Array
@@ -36,18 +35,8 @@ class RegressorLeastSquares(Baseline):
             parents: for each joint of the arm the arm's link that it hangs on, -1 for the
                 carrier (`features.sub_parents`).
             lam: (n, 6) λ of these joints.
-
-        Raises:
-            ModelError: sizes that don't fit each other, or λ that is not finite.
         """
         self.tree = Tree(tuple(parents), floating=True)
-        if columns.n != self.tree.n or np.shape(lam) != (self.tree.n, 6):
-            raise ModelError(
-                f"{columns.n} joints in X need as many parents and λ of shape ({columns.n}, 6), "
-                f"got {self.tree.n} and {np.shape(lam)}"
-            )
-        if not np.isfinite(lam).all():
-            raise ModelError("λ must be finite")
         self.columns, self.lam = columns, torch.as_tensor(np.asarray(lam), dtype=DTYPE)
 
     def _learn(self, X: Array, Y: Array, progress: Progress) -> Told:

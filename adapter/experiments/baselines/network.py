@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
 
 from adapter.errors import ModelError
-from adapter.experiments.baselines.learner import (
-    Progress,
-    ScaledBaseline,
-    Told,
-    at_least,
-    positive,
-)
+from adapter.experiments.baselines.learner import Progress, ScaledBaseline, Told
 from adapter.model.spatial import Array
 
 UNITS = 1000  # the paper's
@@ -22,17 +15,6 @@ BATCH = 200  # samples
 # (share of the epochs, share of ADAM's first rate): constant rates leave the loss where their
 # noise is.
 SCHEDULE = ((0.35, 1.0), (0.3, 0.5), (0.2, 0.15), (0.15, 0.05))
-
-
-def _regressor_class() -> Any:
-    """scikit-learn's network; imported only when one is wanted."""
-    try:
-        from sklearn.neural_network import MLPRegressor
-    except ImportError:
-        raise ModelError(
-            "the feed-forward network needs scikit-learn; pip install 'panda-adapter[experiment]'"
-        ) from None
-    return MLPRegressor
 
 
 class FeedForward(ScaledBaseline):
@@ -56,23 +38,19 @@ class FeedForward(ScaledBaseline):
             batch: samples of one step.
             rate: of ADAM at the start.
             seed: of the weights and of the order of samples.
-
-        Raises:
-            ModelError: sizes below 1; fewer epochs than the schedule's parts; a rate that is not
-                positive.
         """
-        at_least(1, units=units, batch=batch)
-        positive(rate=rate)
-        at_least(len(SCHEDULE), epochs=epochs)
         self.units, self.epochs, self.batch, self.seed = units, epochs, batch, seed
         self.rate = rate
-        self._net: Any = None
 
     def _learn_scaled(self, x: Array, y: Array, progress: Progress) -> Told:
         """Train on all samples in float32. Raises ModelError without scikit-learn."""
-        make = _regressor_class()
+        try:
+            from sklearn.neural_network import MLPRegressor
+        except ImportError:
+            said = "the feed-forward network needs scikit-learn; "
+            raise ModelError(f"{said}pip install 'panda-adapter[experiment]'") from None
         x, y = x.astype(np.float32), y.astype(np.float32)
-        self._net = make(
+        self._net = MLPRegressor(
             hidden_layer_sizes=(self.units,),
             activation="tanh",
             solver="adam",
@@ -97,16 +75,11 @@ class FeedForward(ScaledBaseline):
         return np.asarray(found.reshape(len(x), -1), dtype=np.float64)
 
     def _told(self, samples: int, inputs: int) -> Told:
-        sizes = {
-            "units": self.units,
-            "epochs": self.epochs,
-            "samples": samples,
-            "inputs": inputs,
-        }
+        own = {"units": self.units, "epochs": self.epochs}
         rates = ", ".join(f"{part * self.rate:g} for {share:.0%}" for share, part in SCHEDULE)
         tuning = (
             "Inputs and outputs at zero mean and unit deviation, float32, no weight decay.",
             f"ADAM with batches of {self.batch} for {self.epochs} epochs, its rate falling in "
             f"steps: {rates} of the epochs.",
         )
-        return sizes, tuning
+        return {**own, "samples": samples, "inputs": inputs}, tuning

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from adapter.experiments.page.figure4 import KINDS
-from adapter.experiments.page.words import grouped, listed, scientific, with_unit
+from adapter.experiments.page.words import grouped, scientific, with_unit
 from adapter.experiments.results import AtlasResults, PandaResults
+from adapter.gap.phrases import listed
+from adapter.model.numbers import DASH
 from adapter.model.spatial import Array
 from adapter.report.style import (
     ACCENT,
@@ -24,7 +26,6 @@ from adapter.report.style import (
     time_axis,
 )
 from adapter.report.tables import Table
-from adapter.report.words import NOTHING
 from adapter.runs.score import TORQUE_GOAL
 
 DECADE = 10.0  # largest over smallest value from which a plot is logarithmic
@@ -83,6 +84,10 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
     if not online:
         return None
     settled = online.get("lambda_settled_s")
+    rank, joints = online.get("lambda_rank"), online.get("joints")
+    shown = DASH
+    if rank is not None and joints is not None:
+        shown = f"{grouped(rank)} of {grouped(6 * joints)}"
     steps = [_time(online.get(key)) for key in ("step_p50_us", "step_p99_us")]
     rows = [
         ["samples a second, on one core", with_unit(online.get("samples_per_second"), "1/s", 3)],
@@ -92,7 +97,7 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
             "λ settled, θ begins after",
             "not reached" if settled is None else with_unit(settled, "s", 3),
         ],
-        ["directions of λ shown", _ranks(online.get("lambda_rank"), online.get("joints"))],
+        ["directions of λ shown", shown],
     ]
     return Table(["", "ATLAS"], rows)
 
@@ -102,12 +107,6 @@ def _time(us: float | None) -> str:
     if us is not None and us >= 1000.0:
         return with_unit(1e-3 * us, "ms", 3)
     return with_unit(us, "µs", 3)
-
-
-def _ranks(rank: int | None, joints: int | None) -> str:
-    if rank is None or joints is None:
-        return NOTHING
-    return f"{grouped(rank)} of {grouped(6 * joints)}"
 
 
 def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:

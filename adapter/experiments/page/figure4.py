@@ -17,12 +17,11 @@ from adapter.experiments.results import AtlasResults
 from adapter.model.spatial import Array, matrix_from_zxz
 from adapter.model.tree import BASE, Tree
 from adapter.physics.freedom import Freedom
-from adapter.report.skeleton import Skeleton, from_a_corner, placed
+from adapter.report.skeleton import Skeleton, from_a_corner, skeleton_of
 from adapter.report.style import (
     ACCENT,
     GOAL,
     INK,
-    JOINT_COLORS,
     MUTED,
     SIZES,
     Drawing,
@@ -100,11 +99,6 @@ def _name(joints: Sequence[str]) -> str:
     return joints[0] if len(joints) == 1 else f"{joints[0]} to {joints[-1]}"
 
 
-def limb_key(tree: Tree) -> list[tuple[int, str]]:
-    """Colour (1 to 8, as the page names it) and name of each limb."""
-    return [(limb.color % JOINT_COLORS + 1, limb.name) for limb in limbs(tree)]
-
-
 def skeleton(tree: Tree, lam: Array) -> Skeleton:
     """Joint origins and axes in the base's frame, all joint angles zero, of λ (n, 6).
 
@@ -114,8 +108,7 @@ def skeleton(tree: Tree, lam: Array) -> Skeleton:
     lam = np.asarray(lam, dtype=float)
     if lam.shape != (tree.n, 6) or not np.isfinite(lam).all():
         raise ValueError(f"a skeleton needs finite λ ({tree.n}, 6), got shape {lam.shape}")
-    R, p = placed(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:])
-    return Skeleton(p, R[:, :, 2], {})
+    return skeleton_of(tree, matrix_from_zxz(lam[:, :3]), lam[:, 3:], np.zeros(tree.n))
 
 
 def epoch_panels(atlas: AtlasResults) -> list[Panel]:

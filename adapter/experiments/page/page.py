@@ -24,7 +24,6 @@ from adapter.experiments.page.words import (
     headline,
     last_ratio,
     letter,
-    listed,
     measured,
     ours_text,
     percent,
@@ -33,11 +32,13 @@ from adapter.experiments.page.words import (
     with_unit,
 )
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
+from adapter.gap.phrases import listed
 from adapter.learning.batch.prediction_errors import LEAST_TORQUE
+from adapter.model.numbers import DASH
 from adapter.report.html import fill, write_whole
 from adapter.report.style import JOINT_COLORS
 from adapter.report.tables import Table, Tile
-from adapter.report.words import JOIN, NARROW, NOTHING
+from adapter.report.words import JOIN, NARROW
 
 TEMPLATE = "experiment.html"
 NOT_STATED = "not stated"
@@ -79,7 +80,10 @@ def context(atlas: AtlasResults | None, panda: PandaResults | None, written: str
     """What the template shows."""
     shown = [*(atlas_tiles(atlas) if atlas else []), *(panda_tiles(panda) if panda else [])]
     reasons = [ATLAS_LEFT_OUT] if atlas is None else _atlas_reasons(atlas)
-    reasons += [PANDA_LEFT_OUT] if panda is None else _panda_reasons(panda)
+    if panda is None:
+        reasons.append(PANDA_LEFT_OUT)
+    elif not math.isfinite(panda.theta_start_s):
+        reasons.append("Fig. 6b: θ was not learned, it waits until λ has converged.")
     return {
         "headline": headline(atlas, panda),
         "tiles": shown,
@@ -104,13 +108,8 @@ def atlas_tiles(atlas: AtlasResults) -> list[Tile]:
         value = percent(best.median["control"])
         found.append(Tile("Best baseline, control set", value, f"{best.name}; median, eq. 20"))
     if times is not None:
-        found.append(
-            Tile(
-                "Advantage",
-                scientific(times),
-                f"times smaller on the arm, joints {arm_joints(atlas)}",
-            )
-        )
+        note = f"times smaller on the arm, joints {arm_joints(atlas)}"
+        found.append(Tile("Advantage", scientific(times), note))
     return found
 
 
@@ -132,7 +131,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
     summary = figure5.side_by_side(atlas)
     return {
         "n": atlas.tree.n,
-        "limbs": figure4.limb_key(atlas.tree),
+        "limbs": [(limb.color % JOINT_COLORS + 1, limb.name) for limb in figure4.limbs(atlas.tree)],
         "schema": [*figure4.epoch_panels(atlas), *([histogram] if histogram else [])],
         "schema_more": [*([moments] if moments else []), *figure4.schema_panels(atlas)],
         "not_converged": _not_converged(atlas),
@@ -146,7 +145,7 @@ def _atlas(atlas: AtlasResults) -> dict[str, Any]:
         "full": atlas.full,
         "stated": stated_table(atlas.stated),
         "learners": learner_table(atlas),
-        "tuning": tuning_rows(atlas),
+        "tuning": [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners],
     }
 
 
@@ -210,13 +209,6 @@ def _atlas_reasons(atlas: AtlasResults) -> list[str]:
     return reasons
 
 
-def _panda_reasons(panda: PandaResults) -> list[str]:
-    """What of Fig. 6 is missing, and why."""
-    if math.isfinite(panda.theta_start_s):
-        return []
-    return ["Fig. 6b: θ was not learned, it waits until λ has converged."]
-
-
 def stated_table(items: Sequence[Stated]) -> Table | None:
     """What the paper states, what we measured, what differs; None without any."""
     rows = [[item.what, item.paper or NOT_STATED, ours_text(item), item.note] for item in items]
@@ -231,7 +223,7 @@ def learner_table(atlas: AtlasResults) -> Table | None:
     units = ["", "", "", "", "eq. 20", "eq. 20", "by joint, N m"]
     rows = []
     for learner in atlas.learners:
-        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [NOTHING]
+        known = [s for s in SETS if s in learner.median or s in learner.rmse] or [DASH]
         for name in known:
             first = name == known[0]
             row = [learner.name, _joints(learner), with_unit(learner.train_s, "s", 3)]
@@ -247,14 +239,9 @@ def learner_table(atlas: AtlasResults) -> Table | None:
     return Table(heads, rows, units)
 
 
-def tuning_rows(atlas: AtlasResults) -> list[tuple[str, str, str]]:
-    """Name, title and how it was tuned, of each learner."""
-    return [(x.name, x.title.rstrip("."), sentences(x.tuning)) for x in atlas.learners]
-
-
 def _joints(learner: LearnerScores) -> str:
     known = {len(x) for x in (*learner.rmse.values(), *learner.boxes.values())}
-    return str(max(known)) if known else NOTHING
+    return str(max(known)) if known else DASH
 
 
 def _spread(values: np.ndarray | None) -> str:
@@ -262,6 +249,6 @@ def _spread(values: np.ndarray | None) -> str:
     finite = np.asarray([] if values is None else values, dtype=float)
     finite = finite[np.isfinite(finite)]
     if not len(finite):
-        return NOTHING
+        return DASH
     low, high = scientific(float(finite.min())), scientific(float(finite.max()))
     return low if low == high else f"{low}{NARROW}–{JOIN}{NARROW}{high}"

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.experiments.results import AtlasResults, LearnerScores, PandaResults, Stated
+from adapter.model.numbers import DASH
 from adapter.report.style import SUPERSCRIPTS
-from adapter.report.words import NARROW, NOTHING, count, number
+from adapter.report.words import NARROW, count, number
 
 OURS = "FOPnet"
 # The paper's Fig. 5 by the first word of a learner's name, without regard to capitals.
@@ -28,7 +29,7 @@ def scientific(value: float | int | None, digits: int = 2) -> str:
     (['2.1', '×', '10⁻⁹'], '0.50', '–', '0')
     """
     if value is None or not math.isfinite(value):
-        return NOTHING
+        return DASH
     if value == 0.0 or PLAIN_FROM <= abs(value) < PLAIN_TO:
         return number(value, digits)
     mantissa, power = f"{value:.{digits - 1}e}".split("e")
@@ -53,15 +54,6 @@ def grouped(value: int) -> str:
     ('1500', ['375', '000'])
     """
     return str(value) if abs(value) < PLAIN_TO else count(value)
-
-
-def listed(words: Sequence[str]) -> str:
-    """Words as a sentence lists them.
-
-    >>> listed(["a"]), listed(["a", "b", "c"])
-    ('a', 'a, b and c')
-    """
-    return " and ".join([part for part in (", ".join(words[:-1]), *words[-1:]) if part])
 
 
 def sentences(pieces: Sequence[str]) -> str:

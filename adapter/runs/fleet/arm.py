@@ -7,12 +7,13 @@ all else and taken off its moments. λ is the documented one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
 from scipy.stats import chi2
 
 from adapter.learning.learner import OnlineLearner
@@ -21,7 +22,6 @@ from adapter.learning.theta_kernels import Moments
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.runs.fleet.course import Drift, Series, StandsOut, courses
-from adapter.runs.fleet.information import Information
 from adapter.runs.fleet.moments import LogMoments, effects_for, learner_of
 from adapter.runs.outcome import Outcome, collect, learned_model
 
@@ -96,6 +96,41 @@ class FleetArm:
     standing_out: tuple[StandsOut, ...]
 
 
+class Information:
+    """What moments tell of (θ, effects): one linear map for recordings by the thousand.
+
+    Information of the joints' torques, with the weights and shapes of effects as they are now.
+
+    `Theta.data_information` for one set of moments after the other: what it looks up is looked up
+    once here, which makes it a hundred times faster.
+
+    Args:
+        theta: whose parameters and weights these are.
+    """
+
+    def __init__(self, theta: Theta) -> None:
+        self._width = theta.P + 1  # the torque is the last column
+        at, weights = theta.rows, theta.weights()
+        parts = []
+        for j, size in enumerate(at.sizes):
+            place, share = np.r_[at.place[j, :size], theta.P], np.r_[at.share[j, :size], 1.0]
+            first, second = np.triu_indices(size + 1)
+            value = weights[j] * share[first] * share[second]
+            number = at.starts[j] + np.arange(len(first))
+            mirrored = first != second
+            for a, b, use in ((first, second, slice(None)), (second, first, mirrored)):
+                to = place[a] * self._width + place[b]
+                parts.append((value[use], to[use], number[use]))
+        value, to, number = (np.concatenate(x) for x in zip(*parts, strict=True))
+        shape = self._width**2, len(theta.moments.A)
+        self._map: csr_array = coo_array((value, (to, number)), shape=shape).tocsr()
+
+    def __call__(self, A: Array) -> tuple[Array, Array]:
+        """Information (P, P) and right side (P,) of moments A, see `Moments`."""
+        whole = np.asarray(self._map @ A).reshape(self._width, self._width)
+        return whole[:-1, :-1], whole[:-1, -1]
+
+
 def learn_arm(
     name: str,
     found: Sequence[LogMoments],
@@ -147,7 +182,8 @@ def _learned(
 
 def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array]) -> None:
     """Put the sum of all moments in place, loads taken off, and solve for (θ, effects)."""
-    A = _sum(_without(theta, log.A, loads.get(log.content)) for log in found)
+    # one after the other, so that no more than two are made at once
+    A = reduce(np.add, (_without(theta, log.A, loads.get(log.content)) for log in found))
     count = sum(log.count for log in found)
     theta.replace_moments(Moments(A, theta.moments.C, *theta.moments[2:]), count)
     for _ in range(FITS):
@@ -242,7 +278,7 @@ def _solved(
     when all others have said what the arm is (Schur complement).
     """
     hand = theta.hand
-    H, rhs = information(_sum(x.A for x in found))
+    H, rhs = information(reduce(np.add, (x.A for x in found)))
     H, rhs = H + theta.prior, rhs + theta.prior_rhs
     for k in loaded:
         own, side = information(found[k].A)
@@ -262,11 +298,6 @@ def _solved(
         body: Array = alone @ (side[hand] - own[hand] @ common)
         bodies.append(Body(body, alone, _gain(own, hand), inverse))
     return bodies
-
-
-def _sum(parts: Iterable[Array]) -> Array:
-    """One after the other, so that no more than two are made at once."""
-    return reduce(np.add, parts)
 
 
 def _gain(information: Array, hand: slice) -> Array:

@@ -12,7 +12,6 @@ from concurrent.futures import (
     FIRST_COMPLETED,
     Future,
     ProcessPoolExecutor,
-    ThreadPoolExecutor,
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
@@ -112,14 +111,6 @@ def _context() -> BaseContext:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([LOADED_ONCE])
     return context
-
-
-def in_threads(
-    function: Callable[[Task], Result], tasks: Sequence[Task]
-) -> Iterator[tuple[Task, Result]]:
-    """Do tasks that wait for disks rather than compute in threads of this process, in order."""
-    with ThreadPoolExecutor() as pool:
-        yield from zip(tasks, pool.map(function, tasks), strict=True)
 
 
 def on_cluster(

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import glob
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, TypeVar
@@ -13,7 +15,7 @@ from adapter.errors import SettingsError
 from adapter.model import model_file
 from adapter.model.self_model import SelfModel
 from adapter.runs.fleet.arm import FleetArm, learn_arm
-from adapter.runs.fleet.engine import here, in_threads, on_cluster
+from adapter.runs.fleet.engine import here, on_cluster
 from adapter.runs.fleet.moments import (
     Broken,
     LogMoments,
@@ -147,7 +149,8 @@ def read_manifest(path: Path) -> Manifest:
         arms: dict[str, str] = {}
         told: dict[str, dict[str, float]] = {}
         for number, row in enumerate(reader, start=2):
-            log = _resolved((row[key] or "").strip(), path.parent)
+            log = (row[key] or "").strip()
+            log = log if _is_address(log) else str((path.parent / log).resolve())
             if log in told:
                 raise SettingsError(f"{path}, line {number}: tells of {log} a second time")
             told[log] = {}
@@ -157,20 +160,10 @@ def read_manifest(path: Path) -> Manifest:
                 if name.strip().lower() == ARM_COLUMN:
                     arms[log] = text.strip()
                 else:
-                    _number(told[log], name.strip(), text)
+                    # words (an operator's name) say nothing that can be fitted
+                    with suppress(ValueError):
+                        told[log][name.strip()] = float(text)
     return Manifest(arms, told)
-
-
-def _number(into: dict[str, float], name: str, text: str) -> None:
-    """Keep it where it is one; words (an operator's name) say nothing that can be fitted."""
-    try:
-        into[name] = float(text)
-    except ValueError:
-        return
-
-
-def _resolved(text: str, folder: Path) -> str:
-    return text if "://" in text else str((folder / text).resolve())
 
 
 def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings) -> Fleet:
@@ -195,7 +188,7 @@ def learn_fleet(given: Sequence[str], documented: SelfModel, settings: Settings)
     work.look_up(tasks, settings)
     left = work.left(tasks)
     settings.progress(0, len(left))
-    for number, (task, result) in enumerate(_taken(left, settings), start=1):
+    for number, (task, result) in enumerate(_done(moments_of, left, settings), start=1):
         if isinstance(result, LogMoments):
             if not store.has(result.content):
                 store.add(result)
@@ -251,9 +244,7 @@ class _Work:
                 self.contents[task.path] = content
             elif remote or not _is_address(task.path):
                 unseen.append(task)
-        if not unseen:
-            return
-        for task, result in _each(content_of, unseen, settings):
+        for task, result in _done(content_of, unseen, settings):
             if isinstance(result, Broken):
                 self.broken.append(result)
             else:
@@ -319,23 +310,20 @@ def _is_address(path: str) -> bool:
     return "://" in path
 
 
-def _each(
-    function: Callable[[Task], Found], tasks: Sequence[Task], settings: Settings
+def _done(
+    function: Callable[[Task], Found | Broken], tasks: Sequence[Task], settings: Settings
 ) -> Iterator[tuple[Task, Found | Broken]]:
-    """Do what waits for disks."""
-    if settings.cluster is not None:
-        return on_cluster(function, tasks, settings.cluster)
-    return in_threads(function, tasks)
-
-
-def _taken(tasks: Sequence[Task], settings: Settings) -> Iterator[tuple[Task, LogMoments | Broken]]:
+    """Results of tasks as they are ready; what waits for disks is done by threads."""
     if not tasks:
         return iter(())
     if settings.cluster is not None:
-        return on_cluster(moments_of, tasks, settings.cluster)
+        return on_cluster(function, tasks, settings.cluster)
+    if function is content_of:
+        with ThreadPoolExecutor() as pool:
+            return zip(tasks, list(pool.map(function, tasks)), strict=True)
     if not settings.workers:
-        return ((task, moments_of(task)) for task in tasks)
-    return here(moments_of, tasks, settings.workers)
+        return ((task, function(task)) for task in tasks)
+    return here(function, tasks, settings.workers)
 
 
 def _newest(heads: Sequence[LogMoments]) -> list[LogMoments]:

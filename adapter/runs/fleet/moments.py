@@ -122,10 +122,14 @@ def content_of(task: Task) -> str | Broken:
         return _broken(task.path, error)
 
 
+def files_of(path: Path) -> list[Path]:
+    """A recording's files, of a folder in the order of their names."""
+    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
+
+
 def _content(path: Path) -> str:
     digest = hashlib.sha256()
-    files = sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
-    for file in files:
+    for file in files_of(path):
         if path.is_dir():
             digest.update(str(file.relative_to(path)).encode() + b"\0")
         with file.open("rb") as opened:

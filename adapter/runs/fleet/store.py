@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from adapter.runs.fleet.moments import FORMAT, LogMoments, opened
+from adapter.runs.fleet.moments import FORMAT, LogMoments, files_of, opened
 
 SEEN, FOLDER, GONE = "seen.jsonl", "moments", ".forgotten"
 
@@ -123,16 +123,8 @@ def mark_of(path: str) -> str:
             files = filesystem.find(inside) if filesystem.isdir(inside) else [inside]
             said = [(str(file), str(filesystem.ukey(file))) for file in files]
         else:
-            said = [(str(file), _changed(file)) for file in _files(Path(path))]
+            stats = [(str(file), os.stat(file)) for file in files_of(Path(path))]
+            said = [(name, f"{x.st_size} {x.st_mtime_ns} {x.st_ino}") for name, x in stats]
     except (OSError, ValueError, RuntimeError, NotImplementedError):
         return ""
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:32]
-
-
-def _files(path: Path) -> list[Path]:
-    return sorted(x for x in path.rglob("*") if x.is_file()) if path.is_dir() else [path]
-
-
-def _changed(file: Path) -> str:
-    there = os.stat(file)
-    return f"{there.st_size} {there.st_mtime_ns} {there.st_ino}"

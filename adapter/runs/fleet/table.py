@@ -13,14 +13,12 @@ from adapter.model.model_file import whole_file
 from adapter.runs.fleet.arm import FleetArm, OfLog
 from adapter.runs.fleet.fleet import Fleet
 
-USED, DISAGREES, BROKEN, FORGOTTEN = "used", "disagrees", "broken", "forgotten"
-
 
 def rows(found: Fleet) -> list[dict[str, Any]]:
     """A row for each recording; columns of joints are numbered from 1."""
     out = [_row(arm, k) for arm in found.arms for k in range(len(arm.logs))]
-    out += [{"log": x.path, "state": BROKEN, "why": x.why} for x in found.broken]
-    out += [{"log": path, "state": FORGOTTEN} for path in found.forgotten]
+    out += [{"log": x.path, "state": "broken", "why": x.why} for x in found.broken]
+    out += [{"log": path, "state": "forgotten"} for path in found.forgotten]
     columns = dict.fromkeys(key for row in out for key in row)
     return [{key: row.get(key) for key in columns} for row in out]
 
@@ -31,7 +29,7 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
     out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
     return {
         "log": taken.path,
-        "state": USED if log.used else DISAGREES,
+        "state": "used" if log.used else "disagrees",
         "why": None,
         "arm": arm.name,
         "content": taken.content,

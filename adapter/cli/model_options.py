@@ -1,0 +1,265 @@
+"""Options of the commands that hold recordings and models beside each other.
+
+`adapter gap`, `fleet`, `load`, `diff` and `discover`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+from adapter.cli.options import (
+    add_joints,
+    add_json,
+    add_results,
+    add_told,
+    add_topic,
+    check_files,
+    check_logs,
+    check_robot,
+    check_told,
+)
+from adapter.errors import UsageError
+
+READ_S = 120.0  # of `discover`: as long as a recording that other commands hold in memory
+
+
+def declare_gap(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Find where a model and recordings disagree, name the effects that the model lacks, add "
+        "them, and measure the gap again on data that the fit never saw. Several "
+        "recordings are of one arm: friction, inertias and offsets are common, what the hand "
+        "carries and what pushes it is each one's own. A recording in which too little moves to "
+        "tell anything is an answer too; one that does not fit the model (another robot, flipped "
+        "signs, other units) cannot be used."
+    )
+    add = parser.add_argument
+    add("logs", nargs="+", type=Path, metavar="LOG", help="recording, or a folder of such")
+    add_topic(parser)
+    add(
+        "--model",
+        required=True,
+        metavar="MODEL",
+        help="self model (.json), .urdf, .xml (MJCF), or a robot known by name: panda",
+    )
+    add_joints(parser)
+    add(
+        "--servo",
+        type=Path,
+        metavar="FILE",
+        help="recordings of a position-controlled arm (commanded and measured positions, no "
+        "torque): its servos as documented, TOML as the results' servo.toml (default: nobody "
+        "documented them, commands should be where the arm is)",
+    )
+    add_told(parser)
+    add(
+        "--inertia-prior",
+        type=float,
+        metavar="SHARE",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.02; "
+        "it may turn out to be up to 8 times that)",
+    )
+    add(
+        "--hold-out",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=Path,
+        metavar="LOG",
+        help="score on these, fit all others (default: blocks of time are held out in turn)",
+    )
+    add("--validate-from", type=float, metavar="S", help="fit before this second, score after it")
+    add(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="rounds of the search, in each of which something may be named (default 24)",
+    )
+    add(
+        "--simulator",
+        choices=("pybullet", "mujoco"),
+        help="of the forward simulation (default pybullet where it is installed, extra [sim]; "
+        "mujoco is the extra [mujoco])",
+    )
+    add("--no-simulation", action="store_true", help="compare torques only")
+    add_results(parser)
+    parser.set_defaults(check=_check_gap)
+
+
+def _check_gap(args: argparse.Namespace) -> None:
+    args.logs, args.hold_out = check_logs(*args.logs), check_logs(*args.hold_out)
+    if args.validate_from is not None and (args.hold_out or len(args.logs) > 1):
+        raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
+    check_told(args)
+    check_robot(args.model)
+
+
+def declare_fleet(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Learn one model per arm from many recordings, and tell what each of them carried, what "
+        "drifts, which of them disagree, are broken, or would teach most once more. The moments "
+        "of a recording are kept in --out: recordings join those of before, and none is read "
+        "twice. λ is the model's."
+    )
+    add = parser.add_argument
+    add(
+        "logs",
+        nargs="*",
+        metavar="LOG",
+        help="recording, folder (with those inside it), pattern ('logs/**/*.mcap'), or address "
+        "that fsspec opens (s3://...); none: those of before alone",
+    )
+    add_topic(parser)
+    add(
+        "--model", required=True, metavar="MODEL", help="self model, .urdf, MJCF, or a robot's name"
+    )
+    add_joints(parser)
+    add_told(parser)
+    add(
+        "--by",
+        choices=("log", "folder"),
+        default="log",
+        help="what tells arms apart: the name or serial number in the log (default; the model's "
+        "name where there is none), or the folder that it lies in",
+    )
+    add(
+        "--manifest",
+        type=Path,
+        metavar="CSV",
+        help="a table with a column log, and arm, or numbers that friction may follow "
+        "(temperature, age); goes before --by",
+    )
+    for name, said in (
+        ("--forget", "leave these out from now on, though they are gone or given"),
+        ("--remember", "do not leave these out any more"),
+    ):
+        add(name, nargs="+", action="extend", default=[], metavar="LOG", help=said)
+    add(
+        "--workers",
+        type=int,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes on this machine (default: as many as it has processors; 0: none beside "
+        "this one)",
+    )
+    add("--cluster", metavar="ADDRESS", help="of a Dask scheduler to send the tasks to")
+    add_results(parser)
+    parser.set_defaults(check=_check_fleet)
+
+
+def _check_fleet(args: argparse.Namespace) -> None:
+    check_robot(args.model)
+    check_told(args)
+    if args.learn_gains:
+        raise UsageError("--tau-gain fit: learn gains with `gap` or `replay`, and give them here")
+    if not args.logs and args.out is None:
+        raise UsageError("give LOGs, or --out FOLDER with those of before")
+    for option in ("forget", "remember"):
+        if getattr(args, option) and args.out is None:
+            raise UsageError(f"--{option} needs --out, the folder of the fleet that knows the LOG")
+    if args.workers < 0:
+        raise UsageError(f"--workers takes 0 or more, got {args.workers}")
+    check_files(args.manifest)
+
+
+def declare_load(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "Weigh what the hand carries from the first sample of a recording on: mass, centre and "
+        "inertia with standard deviations, and the lines that Franka and Universal Robots take. "
+        "Without --empty the documented arm is the reference."
+    )
+    add = parser.add_argument
+    add("log", type=Path, metavar="LOG", help="recording with the load, moving or at rest")
+    add_topic(parser)
+    add("--empty", type=Path, metavar="LOG", help="of the same arm without it: errors cancel")
+    add("--robot", metavar="NAME|FILE", help="documented robot; the log's own, else panda")
+    add_joints(parser)
+    add_told(parser)
+    add("--frame", metavar="NAME", help="in whose axes (default: the flange of the last link)")
+    add(
+        "--inertia-prior",
+        type=float,
+        metavar="SHARE",
+        help="standard deviation of the model's inertial numbers, of their size (default 0.05; "
+        "0.2 with --empty)",
+    )
+    add_json(parser, or_output=True)
+    parser.set_defaults(check=_check_load)
+
+
+def _check_load(args: argparse.Namespace) -> None:
+    check_told(args)
+    if args.learn_gains and args.empty is None:
+        raise UsageError("--tau-gain fit needs --empty LOG: gains and load cannot be told apart")
+    if args.inertia_prior is not None and not 0.0 < args.inertia_prior <= 1.0:
+        raise UsageError(f"--inertia-prior must be in (0, 1], got {args.inertia_prior}")
+    check_robot(args.robot)
+    check_logs(args.log, args.empty)
+
+
+def declare_diff(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "What differs from model A to model B, joint by joint: frames, inertias and effects, by "
+        "how many standard deviations, whether any data could show it, and what it does to torques "
+        "and to the hand's place. Of one model alone: from its documentation to it."
+    )
+    add = parser.add_argument
+    add("first", metavar="A", help="model file (.json), robot file or known name")
+    add("second", nargs="?", metavar="B", help="the same; without it A and its documentation")
+    add_joints(parser)
+    add_json(parser, or_output=True)
+    parser.set_defaults(check=_check_diff)
+
+
+def _check_diff(args: argparse.Namespace) -> None:
+    check_robot(args.first)
+    check_robot(args.second)
+
+
+def declare_discover(parser: argparse.ArgumentParser) -> None:
+    """Declare them, and what checks them."""
+    parser.description = (
+        "From joint signals and link motion in unknown order find which joint moves which link "
+        "and who is whose parent, each with a confidence; say what the data leave open; then "
+        "learn λ, and θ where torques were recorded."
+    )
+    add = parser.add_argument
+    add(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="MCAP recording with link motion: Imu topics, "
+        "or /link_twists/<link> and /link_accels/<link>",
+    )
+    add_topic(parser)
+    add("--from", dest="from_s", type=float, default=0.0, metavar="S", help="begin at this second")
+    add(
+        "--seconds",
+        type=float,
+        default=READ_S,
+        metavar="S",
+        help=f"read so many seconds, default {READ_S:g}; all of them are held in memory",
+    )
+    add("--cutoff", type=float, metavar="HZ", help="of the filter, default 20")
+    add(
+        "--base",
+        metavar="LINK",
+        help="the link that carries all others; needed for a floating base whose links' frames "
+        "do not turn about their z",
+    )
+    add("--model", type=Path, metavar="FILE", help="write the self model (.json)")
+    add_json(parser)
+    parser.set_defaults(check=_check_discover)
+
+
+def _check_discover(args: argparse.Namespace) -> list[Path]:
+    if not args.from_s >= 0.0:
+        raise UsageError(f"--from takes 0 or more seconds, got {args.from_s}")
+    if not args.seconds > 0.0:
+        raise UsageError(f"--seconds must be above zero, got {args.seconds}")
+    return check_logs(args.log)
