@@ -40,10 +40,10 @@ from drivers.files.messages import Fields, encode, header
 from drivers.files.ros_types import (
     FLOAT64_MULTI_ARRAY,
     JOINT_STATE,
-    SCHEMAS,
     STRING,
     TF,
     WRENCH_STAMPED,
+    schemas,
 )
 
 BACKLOG = 64  # messages that wait for a slow client; then the oldest go
@@ -127,7 +127,7 @@ class FoxgloveView:
         import foxglove
 
         name = TOPICS[topic]
-        data = SCHEMAS[name].encode()
+        data = schemas()[name].encode()
         schema = foxglove.Schema(name=name, encoding="ros2msg", data=data)
         return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
 
