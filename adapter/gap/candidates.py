@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -217,7 +216,10 @@ def _signatures(at: Stages, effect: Effect, template: Template, joint: int) -> A
 def _differences(at: Stages, effect: Effect, template: Template, joint: int) -> Array:
     """(c, k, n) change of the torque per unit of each coefficient, from zero on."""
     if isinstance(effect, Pattern):
-        return at.signals.low_basis(effect.basis(at.links, at.rigid, joint), joint)
+        basis = effect.basis(at.links, at.rigid, joint)
+        table = np.zeros((basis.shape[1], *at.signals.tau.shape))
+        table[:, :, joint] = at.signals.low(basis).T
+        return table
     own = joint if isinstance(effect, TorqueEffect | SensorEffect) else -1
     out = []
     for i, std in enumerate(template.prior_std):
@@ -257,10 +259,11 @@ class Pattern(TorqueEffect):
     Args:
         label: tells patterns apart; depends_on: signals that it follows ("dq3"), own joint first.
         basis: motion and rigid torque to basis functions (m, k) at the joint.
-        count: k; log_odds: before any data.
+        count: k.
     """
 
     title = "something that is not in the catalogue"
+    log_odds = -7.0
 
     def __init__(
         self,
@@ -268,54 +271,48 @@ class Pattern(TorqueEffect):
         depends_on: tuple[str, ...],
         basis: Callable[[Motion, Array, int], Array],
         count: int,
-        log_odds: float = -7.0,
     ) -> None:
         self.name = f"{UNEXPLAINED}:{label}"  # type: ignore[misc]
         self.parameters = (Parameter("x", "N m", count=count),)  # type: ignore[misc]
         self.depends_on, self.basis, self._count = depends_on, basis, count
         self.by_load = any(name.startswith("tau") for name in depends_on)  # type: ignore[misc]
-        self.log_odds = log_odds  # type: ignore[misc]
-
-    @property
-    def is_line(self) -> bool:
-        """Whether it is a sine in time."""
-        return self.name.endswith("Hz")
 
     def templates(self) -> tuple[Template, ...]:
         """All its coefficients at once."""
-        return (Template((SIZE_NM,) * self._count, _decode),)
+        return (Template((SIZE_NM,) * self._count, lambda x: {"x": np.asarray(x)}),)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """Coefficients times basis."""
         return on_joint(motion, joint, self.basis(motion, tau, joint) @ np.asarray(values["x"]))
 
 
-def _decode(x: Array) -> dict[str, Any]:
-    return {"x": np.asarray(x)}
-
-
 def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
     """What the torque on a joint (from 0) of n may follow."""
     k = joint + 1
+    curves = ("q", "dq", "ddq", "tau")
     own = [
-        Pattern(f"q{k}", (f"q{k}",), _curve("q"), PIECES + DEGREE),
-        Pattern(f"dq{k}", (f"dq{k}",), _curve("dq"), PIECES + DEGREE),
-        Pattern(f"ddq{k}", (f"ddq{k}",), _curve("ddq"), PIECES + DEGREE),
-        Pattern(f"tau{k}", (f"tau{k}",), _curve("tau"), PIECES + DEGREE),
+        *(Pattern(f"{x}{k}", (f"{x}{k}",), _curve(x), PIECES + DEGREE) for x in curves),
         Pattern(f"q{k},sign", (f"q{k}", f"dq{k}"), _times_sign, PIECES + DEGREE),
         Pattern(f"q{k},dq", (f"q{k}", f"dq{k}"), _times_speed, PIECES + DEGREE),
-        Pattern("t", ("t",), _over_time, SLOW_PIECES + DEGREE),
+        Pattern(
+            "t", ("t",), lambda motion, *_: _spline(motion.t, SLOW_PIECES), SLOW_PIECES + DEGREE
+        ),
     ]
     for i in range(n):
         if i != joint:
-            own.append(Pattern(f"dq{i + 1}", (f"dq{i + 1}",), _other("dq", i), 1, -7.0))
-            own.append(Pattern(f"tau{i + 1}", (f"tau{i + 1}",), _other("tau", i), 1, -7.0))
+            own.append(Pattern(f"dq{i + 1}", (f"dq{i + 1}",), _other("dq", i), 1))
+            own.append(Pattern(f"tau{i + 1}", (f"tau{i + 1}",), _other("tau", i), 1))
     return tuple(own)
 
 
 def line(hz: float) -> Pattern:
     """A sine in time."""
-    return Pattern(f"t at {hz:.2f} Hz", ("t",), _sine(hz), 2, -7.0)
+
+    def basis(motion: Motion, tau: Array, joint: int) -> Array:
+        angle = 2.0 * np.pi * hz * motion.t
+        return np.column_stack([np.sin(angle), np.cos(angle)])
+
+    return Pattern(f"t at {hz:.2f} Hz", ("t",), basis, 2)
 
 
 def line_hz(residual: Array, rate_hz: float) -> float | None:
@@ -373,22 +370,10 @@ def _times_speed(motion: Motion, tau: Array, joint: int) -> Array:
     return _spline(motion.q[:, joint], PIECES) * motion.dq[:, joint, None]
 
 
-def _over_time(motion: Motion, tau: Array, joint: int) -> Array:
-    return _spline(motion.t, SLOW_PIECES)
-
-
 def _other(name: str, i: int) -> Callable[[Motion, Array, int], Array]:
     def basis(motion: Motion, tau: Array, joint: int) -> Array:
         x = _signal_of(name, motion, tau, i)
         return np.asarray(((x - x.mean()) / (x.std() + 1e-9))[:, None])
-
-    return basis
-
-
-def _sine(hz: float) -> Callable[[Motion, Array, int], Array]:
-    def basis(motion: Motion, tau: Array, joint: int) -> Array:
-        angle = 2.0 * np.pi * hz * motion.t
-        return np.column_stack([np.sin(angle), np.cos(angle)])
 
     return basis
 

@@ -23,8 +23,7 @@ from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.evidence import ORDER
 from adapter.gap.fit import EDGE_S, Fit
 from adapter.gap.long_recording import LongRecording, Span
-from adapter.gap.nominal import nominal_fit
-from adapter.gap.real_arm import load_in, loaded_arm, real_arm
+from adapter.gap.real_arm import load_in, loaded_arm, nominal_fit, real_arm
 from adapter.gap.signals import RATE_HZ, regressor_of
 from adapter.gap.weighed import pieces_of
 from adapter.model.self_model import SelfModel
@@ -64,7 +63,8 @@ class Windows:
         """Of a whole recording about a fit to some of its stretches."""
         every_s = max(WINDOW_S, whole.span[1] / MOST_WINDOWS)
         count = int(whole.span[1] // every_s) + 1
-        std = _prior_std(fit.n)
+        own_std = [effect.templates()[0].prior_std[0] for effect in _of_joints()]
+        std = np.concatenate([HELD.templates()[0].prior_std, np.repeat(own_std, fit.n)])
         G, g = np.zeros((count, len(std), len(std))), np.zeros((count, len(std)))
         power, rows = np.zeros(count), np.zeros(count)
         for piece in pieces_of(replace(fit, weights=()), whole):
@@ -211,14 +211,8 @@ def _of_joints() -> list[Effect]:
     return [e for e in CATALOGUE.values() if e.sudden and isinstance(e, LinearEffect)]
 
 
-def _prior_std(n: int) -> Array:
-    """(c,) of what may change: ten numbers of a body at the hand, then each effect's joints."""
-    own = [effect.templates()[0].prior_std[0] for effect in _of_joints()]
-    return np.concatenate([HELD.templates()[0].prior_std, np.repeat(own, n)])
-
-
 def _signatures(piece: Fit) -> Array:
-    """(c, k, n) of all that may change."""
+    """(c, k, n) of all that may change: a body at the hand, then each effect's joints."""
     own, motion = piece.recordings[0], piece.recordings[0].motion
     at, unit = JointSignals(motion.q, motion.dq, motion.ddq), np.eye(piece.n)
     body = own.low_of(lambda rows: regressor_of(motion, rows)[:, :, -10:])

@@ -26,7 +26,7 @@ from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
-START_NM = 0.5  # of static friction, published values of a Panda's joints are 0.2 to 0.5
+START_NM = 0.5  # static friction holds at the first sample of a stretch; a Panda's is 0.2 to 0.5
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump: friction turns round more softly than its equation
@@ -172,11 +172,12 @@ class Model:
 
     def predicted(self, recording: int) -> Array:
         """(k, n) torque in the band, N m."""
-        return np.asarray(self._once(("low", recording), lambda: self._predicted(recording)))
-
-    def _predicted(self, recording: int) -> Array:
         own, held = self.recordings[recording], self.start_nm[self.starts(recording)].ravel()
-        return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
+
+        def made() -> Array:
+            return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
+
+        return np.asarray(self._once(("low", recording), made))
 
     def residual(self, recording: int) -> Array:
         """(k, n) measured less predicted, N m; zero where nothing was measured."""
@@ -219,7 +220,7 @@ class Model:
             if e.recording not in (None, recording):
                 tables.append(np.zeros((len(e.x), *own.tau.shape)))
             elif isinstance(e.candidate.effect, TorqueEffect):
-                tables.append(self._torque_slopes(e, at))
+                tables.append(self.torque_slopes(e, at))
             elif e.candidate.columns_are_theta:
                 link = e.candidate.joint if e.candidate.joint >= 0 else len(self.dtheta) - 1
                 gate = None if e.interval_s == WHOLE else e.gate(at.links.t)
@@ -228,16 +229,7 @@ class Model:
                 tables.append(self._slopes(recording, place))
         return np.concatenate(tables)
 
-    def slopes_of(self, e: Named) -> list[Array]:
-        """(c, k, n) of each recording: change of an added torque per unit of its coefficients."""
-        return [
-            self._torque_slopes(e, self.stages(i))
-            if e.recording in (None, i)
-            else np.zeros((len(e.x), *own.tau.shape))
-            for i, own in enumerate(self.recordings)
-        ]
-
-    def _torque_slopes(self, e: Named, at: Stages) -> Array:
+    def torque_slopes(self, e: Named, at: Stages) -> Array:
         """(c, k, n) change of an added torque per unit of each of its coefficients.
 
         Those of an effect that hangs on the measured motion alone are the same in every fit.
@@ -288,7 +280,6 @@ class Fit:
         prior: (n, 10) standard deviation of the nominal inertias.
         noise: one model per recording.
         timing_std_s: how far the torques' timing may be off without being an effect.
-        start_std: (n,) N m, what static friction may hold at the first sample of a stretch.
         caution: nats that what is rare must be worth beside all else, where the inertias are those
             of another unit.
         hand_judged: whether it is settled what the hand held from the first sample on.
@@ -300,7 +291,6 @@ class Fit:
     noise: tuple[Noise, ...] = ()
     timing_std_s: float = TIMING_STD_S
     weights: tuple[Array, ...] = ()
-    start_std: float | Array = START_NM
     caution: float = 0.0
     hand_judged: bool = False
 
@@ -339,16 +329,8 @@ class Fit:
     @property
     def is_linear(self) -> bool:
         """Whether the predicted torque is linear in all coefficients (a delay of 1 ms is)."""
-        return self.links_stay and not any(
-            isinstance(e.candidate.effect, SensorEffect) for e in self.named
-        )
-
-    @property
-    def links_stay(self) -> bool:
-        """Whether the torque that the sensors read is linear in all coefficients."""
         return all(
-            isinstance(e.candidate.effect, TorqueEffect | SensorEffect)
-            or e.candidate.columns_are_theta
+            isinstance(e.candidate.effect, TorqueEffect) or e.candidate.columns_are_theta
             for e in self.named
         )
 
@@ -356,8 +338,8 @@ class Fit:
     def prior_std(self) -> Array:
         """Of the coefficients."""
         own = [e.candidate.prior_std for e in self.named]
-        held = np.broadcast_to(self.start_std, self.model.start_nm.shape)
-        return np.concatenate([self.prior.ravel(), [self.timing_std_s], held.ravel(), *own])
+        held = np.full(self.model.start_nm.size, START_NM)
+        return np.concatenate([self.prior.ravel(), [self.timing_std_s], held, *own])
 
     def at(self, x: Array) -> Fit:
         """The same with other coefficients."""
@@ -374,10 +356,6 @@ class Fit:
     def instead(self, place: int, other: Named) -> Fit:
         """The same with another effect in the place of one."""
         return self.with_named((*self.named[:place], other, *self.named[place + 1 :]))
-
-    def without_patterns(self) -> Fit:
-        """With the effects of the catalogue alone."""
-        return self.with_named([e for e in self.named if not e.is_pattern])
 
     def own_noise(self) -> tuple[Noise, ...]:
         """Noise that its residuals show."""
@@ -445,17 +423,13 @@ def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
 def unsure(model: Model, recording: int, place: int) -> Array:
     """(k, n) by how much a named effect's torque may be otherwise in truth, N m."""
     effect, own = model.named[place].candidate.effect, model.recordings[recording]
-    torque = model.contribution(recording, place)
-    band = effect.band * np.abs(torque).max(axis=0) * own.slowness
-    return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, EDGE * _jumps(torque))))
-
-
-def _jumps(torque: Array) -> Array:
-    """(k, n) by how much a torque (k, n) changes around each instant."""
-    back, ahead = JUMP_ROWS
+    torque, (back, ahead) = model.contribution(recording, place), JUMP_ROWS
     size, shift = back + ahead + 1, (back - ahead) // 2
-    high = maximum_filter1d(torque, size, axis=0, origin=shift)
-    return np.asarray(high - minimum_filter1d(torque, size, axis=0, origin=shift))
+    # how much it changes around each instant
+    jumps = maximum_filter1d(torque, size, axis=0, origin=shift)
+    jumps -= minimum_filter1d(torque, size, axis=0, origin=shift)
+    band = effect.band * np.abs(torque).max(axis=0) * own.slowness
+    return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, EDGE * jumps)))
 
 
 def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
@@ -465,20 +439,17 @@ def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
     replaced by the spread of the gradients of whole seconds (White 1980, by clusters).
     """
     plain = known.covariance()
-    seconds = known.seconds if isinstance(known, Moments) else _by_seconds(fit, known)
+    if isinstance(known, Moments):
+        seconds = known.seconds
+    else:
+        white = known.data - known.x @ known.N
+        ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
+        cuts = [np.arange(a, b, BLOCK * fit.n) for a, b in pairwise([0, *ends])]
+        scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
+        seconds = scores @ scores.T
     robust = plain @ (seconds + np.diag(known.prior_std**-2.0)) @ plain
     wider = np.sqrt(np.maximum(np.diagonal(robust) / np.diagonal(plain), 1.0))
     return plain * np.outer(wider, wider)
-
-
-def _by_seconds(fit: Fit, known: Carried) -> Array:
-    """(c, c) products of the gradients of whole seconds with one another."""
-    white = known.data - known.x @ known.N
-    ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
-    size = BLOCK * fit.n
-    cuts = [np.arange(a, b, size) for a, b in pairwise([0, *ends])]
-    scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
-    return np.asarray(scores @ scores.T)
 
 
 def worth(fit: Fit, carried: Carried | Moments, place: int) -> Score:
@@ -579,7 +550,13 @@ def _reshaped(fit: Fit, place: int) -> Fit:
     for step in SHAPE_STEPS:
         for other in _other_shapes(named, step):
             N = carried.N.copy()
-            N[own] = fit.whiten(fit.model.slopes_of(other))
+            slopes = [
+                fit.model.torque_slopes(other, fit.model.stages(i))
+                if other.recording in (None, i)
+                else np.zeros((len(other.x), *x.tau.shape))
+                for i, x in enumerate(fit.recordings)
+            ]
+            N[own] = fit.whiten(slopes)
             trial = Carried(N, carried.prior_std, carried.data)
             if trial.g @ trial.x > best.g @ best.x:
                 best, named = trial, other

@@ -9,21 +9,24 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
 from scipy.ndimage import maximum_filter1d
 
 from adapter.effects.torque import ModelTorque
 from adapter.errors import ModelError
-from adapter.gap.evidence import Carried, Moments
+from adapter.gap.evidence import Carried, Moments, Normal
 from adapter.gap.findings import entries, noise_floor
-from adapter.gap.fit import Fit, Model, refitted
+from adapter.gap.fit import Fit, Model, place_of, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.long_recording import LongRecording
-from adapter.gap.possible import possible
 from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import COMMANDS, ROLLOUT_STEP_S, Recorded
 from adapter.gap.weighed import weighed
+from adapter.learning.batch.conic import solve_conic
+from adapter.learning.batch.theta_filling import KEPT, UNSOLVED, Measure
+from adapter.model.inertia import is_consistent
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.signals.validation import EDGE_S as RECIPE_EDGE_S
@@ -62,6 +65,62 @@ def held_out_models(
         for each, one in zip(models, own, strict=True):
             each.append(one)
     return models
+
+
+def possible(fit: Fit, known: Normal) -> Fit:
+    """The fit at the most probable coefficients with which every body can exist.
+
+    All coefficients give way together, each as far as the data and its prior let it: a link whose
+    numbers are corrected alone takes the torques along.
+
+    Args:
+        fit: at coefficients that need not be possible.
+        known: what is known of them.
+
+    Raises:
+        ModelError: the solver gave up without an answer.
+    """
+    nominal, change = _bodies(fit)
+    learned = nominal + np.tensordot(fit.coefficients, change, 1)
+    if not len(nominal) or is_consistent(learned):
+        return fit
+    measure = Measure(nominal)
+    root = cholesky(known.G + np.diag(known.prior_std**-2.0), lower=True)
+    # of coefficients one standard deviation away, each independent of the others
+    slopes = solve_triangular(root, measure.of(change), lower=True)
+    size = len(root)
+    start = measure.of(learned) - KEPT * measure.own
+    z, _, _ = solve_conic(np.eye(size), np.zeros(size), -slopes.T, start, measure.cones)
+    found = fit.at(fit.coefficients + solve_triangular(root, z, lower=True, trans=1))
+    if not is_consistent(nominal + np.tensordot(found.coefficients, change, 1)):
+        raise ModelError(UNSOLVED)
+    return found
+
+
+def _bodies(fit: Fit) -> tuple[Array, Array]:
+    """Nominal bodies (b, 10) and their change (c, b, 10) by unit coefficients.
+
+    Each link, and each link with the bodies that were named on it and act at the same time. Left
+    out is what cannot exist by the nominal model.
+    """
+    theta, size = fit.recordings[0].motion.arm.theta, len(fit.coefficients)
+    link = {
+        k: e.candidate.joint % fit.n
+        for k, e in enumerate(fit.named)
+        if e.candidate.columns_are_theta
+    }
+    parts: list[tuple[int, list[int]]] = [(j, []) for j in range(fit.n)]
+    for k, j in link.items():
+        begin, end = fit.named[k].interval_s
+        others = [i for i in link if link[i] == j and fit.named[i].interval_s[0] < end]
+        parts.append((j, [i for i in others if fit.named[i].interval_s[1] > begin]))
+    parts = [part for part in parts if is_consistent(theta[part[0]])]
+    change = np.zeros((size, len(parts), 10))
+    for b, (j, named) in enumerate(parts):
+        change[10 * j : 10 * j + 10, b] = np.eye(10)
+        for k in named:
+            change[place_of(fit, k), b] = fit.named[k].candidate.theta
+    return theta[[j for j, _ in parts]], change
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,7 +447,9 @@ def _curves(name: str, found: Found, i: int) -> Curves:
     after = np.empty_like(own.tau)
     for f, known in enumerate(Folds.of(found.fit, found.carried).known()):
         rows = fold_of(own.t, block_s(found.fit)) == f
-        after[rows] = found.fit.at(known.x).without_patterns().model.residual(i)[rows]
+        fit = found.fit.at(known.x)
+        named = fit.with_named([e for e in fit.named if not e.is_pattern])
+        after[rows] = named.model.residual(i)[rows]
     motion = own.motion
     rows = np.searchsorted(motion.t, own.t - 1e-9)
     signals = motion.q[rows], motion.dq[rows], motion.ddq[rows]

@@ -144,7 +144,13 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         survey = Survey.of(of_this_robot(log, model))
         own = survey.busiest(log)
     own, _, said = cleaned(own, model)
-    moves, torque, more = _judged(own, model)
+    smoothed, torque = smoothed_rows(own), Judged()
+    moves = float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S >= MOVES_S
+    more = ["the arm hardly moves: static friction in its joints counts as load"]
+    if moves:  # asked of the arm without what is fitted: a load of 90 kg explains N cm
+        dead = silent(own, model.tree.joint_names)
+        torque = judged(own, model, smoothed)
+        more = dead + torque.notes
     alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
     own = torque.in_time(own if survey is None else survey.log)
     pieces = (_moments(x, model, own) for x in ([own] if survey is None else own.pieces()))
@@ -160,20 +166,6 @@ def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:
     )
     at = np.linspace(begin, end, len(q))
     return moments_of(model, Rows(q, dq, ddq, tau), EVERY * GRID_S, at)
-
-
-def _judged(log: Log, model: SelfModel) -> tuple[bool, Judged, list[str]]:
-    """Whether the arm moves, its torques, and notes. Refuses another unit, sign or order.
-
-    Asked of the arm without what is fitted: a load of 90 kg explains N cm.
-    """
-    smoothed = smoothed_rows(log)
-    if float((np.abs(smoothed[1]).max(axis=1) > MOVES_DQ).sum()) * GRID_S < MOVES_S:
-        rests = ["the arm hardly moves: static friction in its joints counts as load"]
-        return False, Judged(), rests
-    dead = silent(log, model.tree.joint_names)
-    torque = judged(log, model, smoothed)
-    return True, torque, dead + torque.notes
 
 
 def _changed(
@@ -204,13 +196,6 @@ def _changed(
     ]
 
 
-def _in_frame(theta: Array, covariance: Array, frame: FixedFrame) -> tuple[Array, Array]:
-    """Ten parameters of a load and their covariance in a frame instead of its link's."""
-    back = frame.rotation.T, -frame.rotation.T @ frame.position
-    turn = move_theta(np.eye(10), *back)  # row i: of a unit of parameter i
-    return theta @ turn, turn.T @ covariance @ turn
-
-
 def _body(theta: Array) -> Array:
     """Mass, centre and the six numbers of the inertia about it (10,)."""
     mass, com, inertia = body_from_theta(theta)
@@ -223,24 +208,21 @@ def load_of(theta: Array, covariance: Array, frame: FixedFrame) -> HandLoad:
     Args:
         covariance: (10, 10) of the parameters; frame: in whose axes the load is told.
     """
-    theta, covariance = _in_frame(theta, covariance, frame)
+    back = frame.rotation.T, -frame.rotation.T @ frame.position
+    turn = move_theta(np.eye(10), *back)  # row i: of a unit of parameter i
+    theta, covariance = theta @ turn, turn.T @ covariance @ turn
     mass, com, inertia = body_from_theta(theta)
     steps = STEP * np.diag(np.sqrt(np.diagonal(covariance)))
     slopes = np.array([(_body(theta + d) - _body(theta - d)) / (2.0 * d.max()) for d in steps])
     std = np.sqrt(np.diagonal(slopes.T @ covariance @ slopes))
+    values, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
+    spread = (axes * np.maximum(values, 0.0)) @ axes.T  # of the nearest that a body may have
     return HandLoad(
         float(mass),
         com,
-        _possible(inertia),
+        np.trace(spread) * np.eye(3) - spread,
         float(std[0]),
         std[1:4],
         tensor_from_six(std[4:]),
         frame.name,
     )
-
-
-def _possible(inertia: Array) -> Array:
-    """The nearest inertia (3, 3) about its centre that a body may have."""
-    values, axes = np.linalg.eigh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
-    spread = (axes * np.maximum(values, 0.0)) @ axes.T
-    return np.asarray(np.trace(spread) * np.eye(3) - spread)

@@ -38,7 +38,6 @@ from adapter.gap.signals import (
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.screening.screen import (
-    Judged,
     RecordingFault,
     RecordingRefused,
     at_source,
@@ -141,10 +140,6 @@ class Survey:
         begins, counts, moments = (np.array(x) for x in zip(*told, strict=True))
         moments[counts < WHOLE_SHARE * counts.max()] = np.nan
         return replace(bare, begins=begins, moments=moments)
-
-    def in_time(self, torque: Judged) -> Survey:
-        """The same where torques come in time, else of the recording with them put in time."""
-        return Survey.of(torque.in_time(self.log)) if torque.late_s else self
 
     @property
     def end_s(self) -> float:
@@ -279,11 +274,6 @@ class LongRecording(Recorded):
         """How much of it is in memory."""
         return sum(b - a for a, b in self.spans)
 
-    @property
-    def whole_s(self) -> float:
-        """How much of it there is."""
-        return sum(max(run.samples, 0) for run in self.runs) * DECIMATION / RATE_HZ
-
     def between(self, begin_s: float, end_s: float) -> LongRecording:
         """The same in a part of its time alone."""
         own = replace(self, span=(max(begin_s, self.span[0]), min(end_s, self.span[1])))
@@ -295,12 +285,15 @@ class LongRecording(Recorded):
         edge, survey = SCORED_EDGE_S, self.survey
         parts = [survey.recorded(*survey.rows(a - edge, b + edge)) for a, b in spans]
         begins = np.cumsum([0, *(len(x.t) for x in parts[:-1])])
-        t, q, dq, tau = (np.concatenate([getattr(x, k) for x in parts]) for k in _RAW)
+        t, q, dq, tau = (
+            np.concatenate([getattr(x, k) for x in parts]) for k in ("t", "q", "dq", "tau")
+        )
         own = replace(self, t=t, q=q, dq=dq, tau=tau, spans=tuple(spans))
         own = replace(own, begins=tuple(begins.tolist()))
         if any(x.commands is None for x in parts):
             return replace(own, command_t=None, commands=None)
-        at, commands = (np.concatenate([getattr(x, k) for x in parts]) for k in _COMMANDS)
+        at = np.concatenate([x.command_t for x in parts])
+        commands = np.concatenate([x.commands for x in parts])
         _, first = np.unique(at, return_index=True)
         return replace(own, command_t=at[first], commands=commands[first])
 
@@ -348,10 +341,6 @@ class LongRecording(Recorded):
         return in_band(Motion(t, q, dq, ddq, arm, bands_hz=bands_hz), noise, tau, known, TRIM)
 
 
-_RAW = ("t", "q", "dq", "tau")
-_COMMANDS = "command_t", "commands"
-
-
 def _smooth(survey: Survey, smoothness: Smoothness) -> tuple[RowsFile, tuple[Run, ...]]:
     """Splines through a recording in pieces that overlap, and the runs between its holes."""
     log, size = survey.log, round(PIECE_S * RATE_HZ)
@@ -390,7 +379,7 @@ def sampling(recordings: Sequence[Recorded]) -> tuple[dict[str, Any], ...]:
     return tuple(
         {
             "recording": own.name,
-            "seconds": own.whole_s,
+            "seconds": sum(max(run.samples, 0) for run in own.runs) * DECIMATION / RATE_HZ,
             "searched_s": own.seconds,
             "stretches_s": [[float(a), float(b)] for a, b in own.spans],
             "weighed_on_all": len(recordings) == 1,

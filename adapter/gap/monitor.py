@@ -143,7 +143,12 @@ class Monitor:
         rows = self._blocks.add(table)
         if not rows:
             return
-        if learner.theta.count >= ENOUGH and self._outdated(learner):
+        outdated = self._frames is None  # or λ was learned further while nothing else was new
+        if self._frames is not None and not self._found.active:
+            R0, p = learner.frames
+            moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
+            outdated = moved > MOVED
+        if learner.theta.count >= ENOUGH and outdated:
             self._take_over(learner)
         if self._frames is None:
             return
@@ -151,14 +156,6 @@ class Monitor:
             self._rows.append(row)
             if len(self._rows) == ROWS_PER_GROUP:
                 self._take(learner, self._frames)
-
-    def _outdated(self, learner: OnlineLearner) -> bool:
-        """Nothing is known yet, or λ was learned further while nothing else was new."""
-        if self._frames is None:
-            return True
-        R0, p = learner.frames
-        moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
-        return bool(moved > MOVED) and not self._found.active
 
     def _take_over(self, learner: OnlineLearner) -> None:
         """Start from what the learner knows."""

@@ -64,37 +64,37 @@ class DisagreementDetector:
         left = evidence.residual - evidence.rows.Z @ evidence.shift
         left *= np.sqrt(self._level.share(evidence.rows.doubt))
         power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
-        ended = self._end_something(evidence, scores, power)
+        ended = False
+        for found in self._found.active:
+            over_s = self._end_of(found, evidence, scores, power) if found.lasts else None
+            if over_s is not None:  # something reported acts no more
+                self._found.close(found, over_s)
+                ended = True
+                break
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
         if not ended and ready and len(self._found.active) < MOST:
             self._report_something(evidence, scores, power)
-        self._remember(scores.max(axis=1), power)
+        best = scores.max(axis=1)  # that leaves the window without a report raises the bar
+        quiet = not self._found.active and now_s > self._quiet_until_s
+        self._recent.append(best if quiet else np.zeros_like(best))
+        self._powers.append(power if quiet else np.ones_like(power))
+        self._peaks *= PEAK_KEEP
+        self._power_peak = np.maximum(PEAK_KEEP * self._power_peak, 1.0)
+        if len(self._recent) > GROUPS:
+            self._peaks = np.maximum(self._peaks, self._recent.pop(0))
+            self._power_peak = np.maximum(self._power_peak, self._powers.pop(0))
         if ended or len(self._found.reports) > before:
-            self._rest()
+            # what led to a report was no burst that passed; what follows it has to wait
+            self._quiet_until_s, self._began_s = now_s + REST_S, np.inf
+            self._recent = [np.zeros_like(x) for x in self._recent]
+            self._powers = [np.ones_like(x) for x in self._powers]
         self._found.refresh(self._belief, evidence)
-
-    def _rest(self) -> None:
-        """What led to a report was no burst that passed; what follows it has to wait."""
-        self._quiet_until_s, self._began_s = self._now_s + REST_S, np.inf
-        self._recent = [np.zeros_like(x) for x in self._recent]
-        self._powers = [np.ones_like(x) for x in self._powers]
 
     def _evidence(self, weight: Array | None = None) -> Evidence:
         rows = RowGroup.joined(self._groups)
         if weight is None:
             weight = self._found.weights(rows.t, self._level.weight(rows.doubt))
         return Evidence(replace(rows, Z=self._found.columns(rows)), weight, self._belief)
-
-    def _end_something(self, evidence: Evidence, scores: Array, power: Array) -> bool:
-        """Notice that something reported acts no more."""
-        for found in self._found.active:
-            if not found.lasts:
-                continue
-            over_s = self._end_of(found, evidence, scores, power)
-            if over_s is not None:
-                self._found.close(found, over_s)
-                return True
-        return False
 
     def _end_of(
         self, found: Disagreement, evidence: Evidence, scores: Array, power: Array
@@ -129,8 +129,13 @@ class DisagreementDetector:
         bar = np.maximum(THRESHOLD, PEAK_FACTOR * self._peaks)
         which = int(np.argmax(np.where(best > bar, best, -np.inf)))
         if best[which] <= bar[which]:
-            self._began_s = np.inf
-            self._report_power(power)
+            self._began_s = np.inf  # but that no candidate looks like may be there for a second
+            known = {j for found in self._found.active for j in found.joints if found.lasts}
+            loud = np.flatnonzero(power > np.maximum(POWER, PEAK_FACTOR * self._power_peak))
+            joints = [int(j) for j in loud if int(j) not in known]
+            if joints:
+                score = float(np.sqrt(power[joints].max()))
+                self._found.unexplained(joints, self._now_s - POWER_S, self._now_s, score)
             return
         candidate, t = self._candidates[which], evidence.rows.t
         G, b = evidence.information(1, candidate.columns)
@@ -179,26 +184,6 @@ class DisagreementDetector:
         much = np.mean(left, axis=0) > LEFT_RATIO * self._level.row
         much &= left.sum(axis=0) > LEFT_SHARE * whole
         return [int(j) for j in np.flatnonzero(much & (evidence.weight[-1] > 0.0))]
-
-    def _report_power(self, power: Array) -> None:
-        """Something that no candidate looks like, but that is there for a second."""
-        known = {j for found in self._found.active for j in found.joints if found.lasts}
-        loud = np.flatnonzero(power > np.maximum(POWER, PEAK_FACTOR * self._power_peak))
-        joints = [int(j) for j in loud if int(j) not in known]
-        if joints:
-            score = float(np.sqrt(power[joints].max()))
-            self._found.unexplained(joints, self._now_s - POWER_S, self._now_s, score)
-
-    def _remember(self, best: Array, power: Array) -> None:
-        """Evidence that left the window without a report raises the bar; it fades in a minute."""
-        quiet = not self._found.active and self._now_s > self._quiet_until_s
-        self._recent.append(best if quiet else np.zeros_like(best))
-        self._powers.append(power if quiet else np.ones_like(power))
-        self._peaks *= PEAK_KEEP
-        self._power_peak = np.maximum(PEAK_KEEP * self._power_peak, 1.0)
-        if len(self._recent) > GROUPS:
-            self._peaks = np.maximum(self._peaks, self._recent.pop(0))
-            self._power_peak = np.maximum(self._power_peak, self._powers.pop(0))
 
 
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states
@@ -344,15 +329,12 @@ class DisagreementList:
 def sentence(report: Mapping[str, Any], start_s: float) -> str:
     """One line on a report, for people; times count from the stamp `start_s`."""
     where = f" on joint {', '.join(map(str, report['joints']))}" if report["joints"] else ""
-    size = ", ".join(_written(report["what"], key, x) for key, x in report["size"].items())
+    effect = CATALOGUE.get(report["what"])
+    units = {p.key: p.unit for p in effect.parameters} if effect else {}
+    sizes = report["size"].items()
+    size = ", ".join(f"{key} {measured(x, None, units[key])}" for key, x in sizes)
     over = "" if report["over_s"] is None else f", over at {report['over_s'] - start_s:.2f} s"
     also = " or ".join(other["what"] for other in report["ambiguous_with"])
     what = report["what"] + (f" (or {also})" if also else "")
     line = f"{what.replace('_', ' ')}{where} since {report['since_s'] - start_s:.2f} s{over}"
     return f"{line}{': ' + size if size else ''} (seen at {report['reported_s'] - start_s:.2f} s)"
-
-
-def _written(effect: str, key: str, value: float) -> str:
-    """A parameter of an effect with its unit."""
-    unit = next(p.unit for p in CATALOGUE[effect].parameters if p.key == key)
-    return f"{key} {measured(value, None, unit)}"

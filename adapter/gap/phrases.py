@@ -16,6 +16,7 @@ from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import plain, plus_minus
 
 SMALL_RAD = 0.1  # angles below it are shown in mrad
+MOST_PARTS = 4  # of a change of ten inertial parameters
 SHOWN_UNITS = {
     "1": (100.0, "%"),
     "s": (1e3, "ms"),
@@ -46,7 +47,7 @@ def parameter(finding: Finding, key: str, size: bool = False) -> str:
     """One parameter, a number, of a finding; `size`: without its sign."""
     value, std = _number(finding.parameters.get(key)), _number(finding.std.get(key))
     unit = finding.units.get(key, "")
-    if unit == "per turn" and math.isfinite(value) and not _is_size(std):
+    if unit == "per turn" and math.isfinite(value) and not (math.isfinite(std) and std):
         return f"{value:g} {unit}"  # a whole number that was chosen, not fitted
     return measured(abs(value) if size else value, std, unit)
 
@@ -61,23 +62,16 @@ def parameter_lines(finding: Finding) -> list[str]:
         if length.name:
             lines.append(f"{length.name} {norm(finding, length)}")
     if "dtheta" in finding.parameters:
-        lines += inertia_lines(finding.parameters["dtheta"], finding.std.get("dtheta"))
+        # the surest parts of a change of ten, in standard deviations of each
+        std, value = finding.std.get("dtheta"), np.asarray(finding.parameters["dtheta"], float)
+        doubt = np.full(10, np.nan) if std is None else np.asarray(std, dtype=float)
+        usable = np.isfinite(doubt) & (doubt > 0.0)
+        surety = np.where(usable, np.abs(value) / np.where(usable, doubt, 1.0), 0.0)
+        if not usable.any():
+            surety = np.abs(value)
+        for k in sorted(k for k in np.argsort(-surety)[:MOST_PARTS] if surety[k] > 0.0):
+            lines.append(f"Δ{PARAMETERS[k]} = {plus_minus(value[k], doubt[k])} {UNITS[k]}")
     return lines
-
-
-MOST_PARTS = 4
-
-
-def inertia_lines(dtheta: Sequence[float], std: Any) -> list[str]:
-    """The surest parts of a change of ten inertial parameters, in standard deviations of each."""
-    doubt = np.full(10, np.nan) if std is None else np.asarray(std, dtype=float)
-    value = np.asarray(dtheta, dtype=float)
-    usable = np.isfinite(doubt) & (doubt > 0.0)
-    surety = np.where(usable, np.abs(value) / np.where(usable, doubt, 1.0), 0.0)
-    if not usable.any():
-        surety = np.abs(value)
-    best = [k for k in np.argsort(-surety)[:MOST_PARTS] if surety[k] > 0.0]
-    return [f"Δ{PARAMETERS[k]} = {plus_minus(value[k], doubt[k])} {UNITS[k]}" for k in sorted(best)]
 
 
 def norm(finding: Finding, length: Length) -> str:
@@ -129,10 +123,12 @@ def phrase(finding: Finding) -> str:
     """What is missing and how much of it, without when."""
     known = phrase_of(finding)
     if finding.two_readings:
-        return _two_readings(finding)
+        x, less = parameter(finding, "m", size=True), _number(finding.parameters.get("m")) < 0.0
+        load, link = (f"{x} less", "lighter") if less else (f"a load of {x}", "heavier")
+        return f"{load} at the hand (or the last link {link} by that: this log cannot tell)"
     main = finding.parameters.get(known.key)
     template = known.less if known.less and _number(main) < 0.0 else known.more
-    several = len(finding.joints) > 1
+    several, worth = len(finding.joints) > 1, np.asarray(finding.torque_rms_nm, dtype=float)
     values: Mapping[str, str] = {
         key: parameter(finding, key)
         for key, value in finding.parameters.items()
@@ -144,7 +140,9 @@ def phrase(finding: Finding) -> str:
         "has": "have" if several else "has",
         "is": "are" if several else "is",
         "x": parameter(finding, known.key, size=True) if known.key else "",
-        "torque": _worth(finding),
+        "torque": f"{plain(np.max(worth), 2)} N m of torque"
+        if worth.size
+        else "its torque differs",
         "title": finding.title,
     }
     if known.lengths:
@@ -152,23 +150,6 @@ def phrase(finding: Finding) -> str:
         length = next(shown, known.lengths[-1])
         derived["length"] = length.before + norm(finding, length)
     return template.format_map({**values, **derived})
-
-
-def _two_readings(finding: Finding) -> str:
-    """A load at the hand and a heavier last link, which are the same to the data."""
-    x = parameter(finding, "m", size=True)
-    if _number(finding.parameters.get("m")) < 0.0:
-        return f"{x} less at the hand (or the last link lighter by that: this log cannot tell)"
-    return f"a load of {x} at the hand (or the last link heavier by that: this log cannot tell)"
-
-
-def _worth(finding: Finding) -> str:
-    worth = np.asarray(finding.torque_rms_nm, dtype=float)
-    return f"{plain(np.max(worth), 2)} N m of torque" if worth.size else "its torque differs"
-
-
-def _is_size(value: float) -> bool:
-    return math.isfinite(value) and value != 0.0
 
 
 def _number(value: Any) -> float:

@@ -13,12 +13,15 @@ from functools import cached_property
 
 import numpy as np
 
+from adapter.effects.active import active_effects
 from adapter.effects.base import Effect, Template
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried, Moments, score
 from adapter.gap.fit import (
+    TIMING_STD_S,
     Fit,
+    Model,
     Named,
     honest_covariance,
     place_of,
@@ -26,10 +29,16 @@ from adapter.gap.fit import (
     under_own_noise,
     worth,
 )
-from adapter.gap.hand import MASSES_KG
+from adapter.gap.hand import MASSES_KG, hand_of
+from adapter.gap.long_recording import LongRecording
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF
+from adapter.gap.signals import Recorded, prepare
+from adapter.judgement.priors import theta_prior
+from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
+from adapter.physics.rigid_arm import RigidArm
+from adapter.screening.timing import TIMING_SHARE
 
 BRISTLES = CATALOGUE["bristle_friction"].templates()[1]  # a Panda's
 WHERE_IT_MOVES = (
@@ -42,7 +51,7 @@ WHERE_IT_MOVES = (
 COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
 # Of a real arm: what its torques lack of the motion's band, and a table that is not level
 OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
-SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias
+SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias, that are tried
 MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
 LAST_SHARE = 2.5  # of the last link at most: an error of it that looks like a load is called one
 OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
@@ -52,6 +61,34 @@ WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
 LARGER = 2.0  # times what is believed of friction: an arm that has it has larger joints
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
+
+
+def nominal_fit(
+    recordings: Sequence[Recorded],
+    model: SelfModel,
+    inertia_prior: float,
+    period_s: float,
+    others: Sequence[Recorded] = (),
+) -> Fit:
+    """The nominal model on smoothed recordings, under the noise that it leaves.
+
+    Args:
+        inertia_prior: by which share its inertias may be off, one standard deviation.
+        period_s: the longest sample period.
+        others: recordings of the same motion may be among these too.
+    """
+    arm = RigidArm.of(model)
+    every = [x for x in (*recordings, *others) if not isinstance(x, LongRecording)]
+    signals = tuple(
+        r.signals(arm) if isinstance(r, LongRecording) else prepare(r, arm, r.repeated_in(every))
+        for r in recordings
+    )
+    known = active_effects(model.effects, arm.n)
+    return Fit(
+        Model(signals, np.zeros_like(arm.theta), known=known, hand=hand_of(model)),
+        theta_prior(arm.theta, inertia_prior),
+        timing_std_s=max(TIMING_STD_S, TIMING_SHARE * period_s),
+    ).with_noise()
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,27 +121,22 @@ class RealArm:
         return bool(shown > SURE or (shown > SHOWN and self.value(k) > BELIEF))
 
 
-def real_arm(
-    fit: Fit, joints: Sequence[int], loaded: Sequence[int], shares: Sequence[float] = SHARES
-) -> RealArm:
+def real_arm(fit: Fit, joints: Sequence[int], loaded: Sequence[int]) -> RealArm:
     """The nominal model with all that any arm may have.
 
     Args:
         fit: the nominal model on the recordings; joints: (from 0) that move.
         loaded: recordings (from 0) in which the hand may hold something.
-        shares: times the prior of the inertias that are tried, least first.
     """
     loads = [load_in(fit, None if len(fit.recordings) == 1 else i) for i in loaded]
-    return loaded_arm(fit, joints, loads, shares)
+    return loaded_arm(fit, joints, loads)
 
 
-def loaded_arm(
-    fit: Fit, joints: Sequence[int], loads: Sequence[Named], shares: Sequence[float] = SHARES
-) -> RealArm:
+def loaded_arm(fit: Fit, joints: Sequence[int], loads: Sequence[Named]) -> RealArm:
     """The nominal model with these loads, and all that any arm may have; see `real_arm`."""
     trial = _beside(fit.with_named(loads), joints)
     for _ in range(WAY_ROUNDS):
-        found, known = _as_wide_as_open(trial, shares)
+        found, known = _as_wide_as_open(trial)
         fitting = [_fitting(fit, e) for e in found.named]
         if list(map(_way, fitting)) == list(map(_way, trial.named)):
             break
@@ -159,17 +191,17 @@ def _fitting(fit: Fit, e: Named) -> Named:
     return replace(e, candidate=replace(e.candidate, template=template))
 
 
-def _as_wide_as_open(fit: Fit, shares: Sequence[float]) -> tuple[Fit, Carried]:
+def _as_wide_as_open(fit: Fit) -> tuple[Fit, Carried]:
     """A fit with the widest prior of the inertias that its data do not speak against."""
-    wide, known = under_own_noise(replace(fit, prior=_shared(fit, shares[-1])))
+    wide, known = under_own_noise(replace(fit, prior=_shared(fit, SHARES[-1])))
     std, worths = known.prior_std.copy(), []
-    for share in (*shares, MADE_UP):
+    for share in (*SHARES, MADE_UP):
         std[: fit.dtheta.size] = _shared(fit, share).ravel()
         worths.append(score(known.G, known.g, std).log_evidence)
     *open_to, made_up = worths
-    if made_up > max(open_to) + MADE_UP_NATS and len(shares) > 1:
+    if made_up > max(open_to) + MADE_UP_NATS:
         return under_own_noise(replace(fit, prior=_shared(fit, MADE_UP)))
-    share = shares[int(np.flatnonzero(np.array(open_to) > max(open_to) - OPEN_NATS)[-1])]
+    share = SHARES[int(np.flatnonzero(np.array(open_to) > max(open_to) - OPEN_NATS)[-1])]
     return refitted(replace(wide, prior=_shared(fit, share)))
 
 
@@ -194,7 +226,7 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
     every = range(len(fit.recordings))
     if fit.named:
         loaded = list(range(len(fit.named)))
-        arm = RealArm(*_as_wide_as_open(_beside(fit, joints), SHARES), len(loaded))
+        arm = RealArm(*_as_wide_as_open(_beside(fit, joints)), len(loaded))
     else:
         arm = real_arm(fit, joints, every)
         loaded = [k for k in every if arm.is_there(k)]
@@ -206,7 +238,13 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
     if _is_another_unit(arm, fit):
         whole = [_named(effect, effect.templates()[0], -1) for effect in OF_THE_WHOLE]
         begun = begun.with_named([*begun.named, *whole])
-    begun = _without_impossible(begun.with_noise())
+    begun = begun.with_noise()
+    while True:  # without what came out as no arm has it: friction that drives, a sensor ahead
+        begun, _ = refitted(begun)
+        kept = [e for e in begun.named if e.possible]
+        if len(kept) == len(begun.named):
+            break
+        begun = begun.with_named(kept)
     seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
     caution = CAUTION / seconds if _is_another_unit(arm, fit) else 0.0
     return replace(begun, caution=caution, hand_judged=caution > 0.0)
@@ -214,16 +252,6 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
 
 def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
     return bool(arm.fit.prior[0, 0] >= OTHER_UNIT * fit.prior[0, 0])
-
-
-def _without_impossible(fit: Fit) -> Fit:
-    """A fit without what came out as no arm has it: friction that drives, a sensor ahead."""
-    while True:
-        fit, _ = refitted(fit)
-        kept = [e for e in fit.named if e.possible]
-        if len(kept) == len(fit.named):
-            return fit
-        fit = fit.with_named(kept)
 
 
 def _named(effect: Effect, template: Template, joint: int) -> Named:

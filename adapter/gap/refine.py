@@ -21,7 +21,7 @@ from adapter.effects.base import TorqueEffect
 from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.gap.candidates import is_finer
 from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Noise, noise_of
-from adapter.gap.fit import Fit, Named, refitted, shaped, unsure
+from adapter.gap.fit import Fit, refitted, shaped, unsure
 from adapter.gap.search import Found, weak, worst
 from adapter.model.spatial import Array
 
@@ -53,22 +53,18 @@ class DoubtedNoise(Noise):
     @cached_property
     def _spans(self) -> list[tuple[int, slice, Array, Array]]:
         """Of each joint and span: joint, rows, root of the covariance, that of the noise alone."""
-        out = []
+        out, ends = [], pairwise([*self.seams, len(self.doubt)])
+        rows_of = [
+            slice(a, min(a + SPAN, end)) for begin, end in ends for a in range(begin, end, SPAN)
+        ]
         for j, (ar, sigma) in enumerate(zip(self.ar, self.sigma, strict=True)):
             answer = lfilter([sigma], np.append(1.0, -ar), np.eye(1, MEMORY)[0])
             known = np.correlate(answer, answer, "full")[MEMORY - 1 : MEMORY - 1 + SPAN]
-            for rows in self._rows:
+            for rows in rows_of:
                 own = self.doubt[rows, j]
                 noise = toeplitz(known[: len(own)])
                 out.append((j, rows, cholesky(noise + np.diag(own**2), lower=True), noise))
         return out
-
-    @property
-    def _rows(self) -> list[slice]:
-        ends = pairwise([*self.seams, len(self.doubt)])
-        return [
-            slice(a, min(a + SPAN, end)) for begin, end in ends for a in range(begin, end, SPAN)
-        ]
 
     def whiten(self, x: Array) -> Array:
         """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""
@@ -121,19 +117,13 @@ def _refitted(fit: Fit, counted: Sequence[Array]) -> tuple[Fit, Carried]:
             noise = list(map(_noise, noise, doubts, fit.model.residuals(), seams))
         fit = replace(fit, noise=tuple(map(DoubtedNoise.of, noise, doubts, seams)), weights=())
         fit = refitted(fit)[0]
-        for k in range(len(fit.named)):
-            if not _is_rest(fit, k):
+        for k, e in enumerate(fit.named):
+            # what was assumed beside a simpler form by name is what that leaves: with a shape of
+            # its own it would take that one's place
+            rest = e.assumed and any(is_finer(e.candidate, x.candidate) for x in fit.named)
+            if not rest:
                 fit = shaped(fit, k)
     return refitted(fit)
-
-
-def _is_rest(fit: Fit, k: int) -> bool:
-    """Whether it was assumed, and its joint has a simpler form by name: it is what that leaves.
-
-    With a shape of its own it would take that one's place.
-    """
-    e = fit.named[k]
-    return e.assumed and any(is_finer(e.candidate, other.candidate) for other in fit.named)
 
 
 def _noise(before: Noise, doubt: Array, residual: Array, seams: tuple[int, ...]) -> Noise:
@@ -145,25 +135,18 @@ def _noise(before: Noise, doubt: Array, residual: Array, seams: tuple[int, ...])
 
 def doubt_of(fit: Fit, recording: int, counted: Array) -> Array:
     """(k, n) N m by which the named effects may be wrong; `counted` (k, n) is zero where all is."""
-    own = fit.recordings[recording]
+    own, at = fit.recordings[recording], fit.model.stages(recording)
     square = np.where(counted > 0.0, 0.0, NOT_COUNTED_NM**2)
     for k, e in enumerate(fit.named):
-        if e.candidate.effect.inexact and e.recording in (None, recording):
-            square += unsure(fit.model, recording, k) ** 2
-            square += _by_speed(fit, e, recording) ** 2
+        effect, joint = e.candidate.effect, e.candidate.joint
+        if not effect.inexact or e.recording not in (None, recording):
+            continue
+        square += unsure(fit.model, recording, k) ** 2
+        if isinstance(effect, TorqueEffect):  # a speed may be off by what counts as rest
+            fast, slow = (
+                effect.torque(replace(at.links, dq=at.links.dq + off), at.rigid, joint, e.values)
+                for off in (SMOOTHING_DQ, -SMOOTHING_DQ)
+            )
+            change = np.abs(own.low(0.5 * (fast - slow) * e.gate(at.links.t)))
+            square += maximum_filter1d(change, NEAR, axis=0) ** 2
     return np.asarray(np.sqrt(square).reshape(own.tau.shape))
-
-
-def _by_speed(fit: Fit, e: Named, recording: int) -> Array:
-    """(k, n) N m by which an effect changes where a speed is off by what counts as rest."""
-    effect, at, own = e.candidate.effect, fit.model.stages(recording), fit.recordings[recording]
-    if not isinstance(effect, TorqueEffect):
-        return np.zeros_like(own.tau)
-    fast, slow = (
-        effect.torque(
-            replace(at.links, dq=at.links.dq + off), at.rigid, e.candidate.joint, e.values
-        )
-        for off in (SMOOTHING_DQ, -SMOOTHING_DQ)
-    )
-    change = np.abs(own.low(0.5 * (fast - slow) * e.gate(at.links.t)))
-    return np.asarray(maximum_filter1d(change, NEAR, axis=0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -96,12 +95,6 @@ class _Products:
     data: Array
     own: tuple[Array, ...]
 
-    @classmethod
-    def of(cls, X: Array, carried: Carried, table: SignatureTable) -> _Products:
-        """Of white signatures X (c, r) in one interval."""
-        own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
-        return cls(X @ carried.N.T, X @ carried.data, own)
-
 
 def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standing, ...]:
     """Each named effect of a fit against all candidates in its interval."""
@@ -110,7 +103,9 @@ def standings(fit: Fit, carried: Carried, table: SignatureTable) -> tuple[Standi
     for k, named in enumerate(fit.named):
         when = (named.interval_s, named.recording)
         if when not in products:
-            products[when] = _Products.of(fit.whiten(table.within(*when)), carried, table)
+            X = fit.whiten(table.within(*when))
+            own = tuple(X[list(c.columns)] @ X[list(c.columns)].T for c in table.candidates)
+            products[when] = _Products(X @ carried.N.T, X @ carried.data, own)
         out.append(_standing(fit, carried, table.candidates, products[when], k))
     return tuple(out)
 
@@ -121,7 +116,7 @@ def _standing(
     """The k-th named effect of a fit among the candidates."""
     named, (own, rest) = fit.named[k], beside(fit, k)
     mine = carried.worth(own, rest)
-    found = _rivals(named, candidates, products, _reduced(named.x, carried, products, own, rest))
+    found = _rivals(named, candidates, products, carried, own, rest)
     best: dict[tuple[str, int], Rival] = {}
     for rival in sorted(found, key=lambda x: -x.log_evidence):
         if named.interval_s == WHOLE or not rival.candidate.effect.steady:
@@ -133,58 +128,40 @@ def _standing(
     return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.assumed, named.tried)
 
 
-class _Reduced(NamedTuple):
-    """Products of the candidates once all but one named effect explain what they can.
+def _rivals(
+    named: Named,
+    candidates: Sequence[Candidate],
+    products: _Products,
+    carried: Carried,
+    own: np.ndarray,
+    rest: np.ndarray,
+) -> list[Rival]:
+    """Every candidate in the place of a named effect, in order.
 
-    Attributes:
-        C: (c, p) with what is carried along; solved: the same times its covariance.
-        g: (c,) with the data; cross: (c,) with the named effect; size: of that with itself.
+    Its coefficients are at `own`; all but these, at `rest`, have explained what they can.
     """
-
-    C: Array
-    solved: Array
-    g: Array
-    cross: Array
-    size: float
-
-
-def _reduced(
-    x: Array, carried: Carried, products: _Products, own: np.ndarray, rest: np.ndarray
-) -> _Reduced:
-    """About a named effect with coefficients x (k,) at `own`, beside those at `rest`."""
-    others, mine = carried.part(rest), x @ carried.G[own]
+    others, mine = carried.part(rest), named.x @ carried.G[own]
     C = products.carried[:, rest]
     solved = others.solved(C)
-    size = float(mine[own] @ x - others.solved(mine[rest]) @ mine[rest])
-    cross = products.carried[:, own] @ x - solved @ mine[rest]
-    return _Reduced(C, solved, products.data - solved @ others.g, cross, size)
-
-
-def _rivals(
-    named: Named, candidates: Sequence[Candidate], products: _Products, left: _Reduced
-) -> list[Rival]:
-    """Every candidate in the place of a named effect, in order."""
+    size = float(mine[own] @ named.x - others.solved(mine[rest]) @ mine[rest])
+    cross = products.carried[:, own] @ named.x - solved @ mine[rest]
+    left = products.data - solved @ others.g
     found: dict[int, Rival] = {}
-    for places in _alike(candidates):
+    alike: dict[int, list[int]] = {}
+    for i, c in enumerate(candidates):
+        alike.setdefault(len(c.columns), []).append(i)
+    for places in alike.values():
         at = np.array([candidates[i].columns for i in places])
         std = np.array([candidates[i].prior_std for i in places])
         G = np.array([products.own[i] for i in places])
-        G -= left.solved[at] @ left.C[at].swapaxes(1, 2)
-        evidence, chi2, x = scores(G, left.g[at], std)
+        G -= solved[at] @ C[at].swapaxes(1, 2)
+        evidence, chi2, x = scores(G, left[at], std)
         wide = G + (WIDE * std[:, :, None]) ** -2.0 * np.eye(at.shape[1])
-        reached = np.linalg.solve(wide, left.cross[at][..., None])[..., 0]
-        overlap = np.einsum("bi,bi->b", left.cross[at], reached) / left.size
+        reached = np.linalg.solve(wide, cross[at][..., None])[..., 0]
+        overlap = np.einsum("bi,bi->b", cross[at], reached) / size
         for b, i in enumerate(places):
             c = candidates[i]
             worth = float(evidence[b]) + price(replace(named, candidate=c))
             possible = c.possible(x[b], named.interval_s)
             found[i] = Rival(c, worth, float(chi2[b]), float(overlap[b]), x[b], possible)
     return [found[i] for i in sorted(found)]
-
-
-def _alike(candidates: Sequence[Candidate]) -> list[list[int]]:
-    """Places of the candidates, those of as many coefficients together."""
-    groups: dict[int, list[int]] = {}
-    for i, c in enumerate(candidates):
-        groups.setdefault(len(c.columns), []).append(i)
-    return list(groups.values())

@@ -98,7 +98,7 @@ def rich_noise(
     prior = np.zeros(len(X))
     for c in candidates:
         # patterns are so many that they would explain noise, but for a line that stands out
-        if not isinstance(c.effect, Pattern) or c.effect.is_line:
+        if not isinstance(c.effect, Pattern) or c.effect.name.endswith("Hz"):
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))

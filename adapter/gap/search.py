@@ -155,7 +155,14 @@ def _round(
             return again, True
         trial = _with(fit, move, table.fit.noise, progress)
         if trial is not None:
-            return _alongside(trial, move, moves, table, progress), True
+            taken = {move.joint, -1}  # plain moves of other joints do not touch this one
+            for other in moves:
+                if other.joint in taken or other.log_evidence < BELIEF + SURE_NATS:
+                    continue
+                taken.add(other.joint)  # the best move of a joint decides, whatever it is
+                if other.plain:
+                    trial = _with(trial, other, table.fit.noise, progress) or trial
+            return trial, True
         refused.update(x.candidate.key for x in move.leads if len(move.leads) == 1)
     return fit, bool(fit.caution and moves)  # those that were refused may have hidden others
 
@@ -240,20 +247,6 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
     return fit
 
 
-def _alongside(
-    fit: Fit, first: Move, moves: Sequence[Move], table: SignatureTable, progress: Progress
-) -> Fit:
-    """With the plain moves of other joints, which do not touch the first one."""
-    taken = {first.joint, -1}
-    for move in moves:
-        if move.joint in taken or move.log_evidence < BELIEF + SURE_NATS:
-            continue
-        taken.add(move.joint)  # the best move of a joint decides, whatever it is
-        if move.plain:
-            fit = _with(fit, move, table.fit.noise, progress) or fit
-    return fit
-
-
 def _with(
     fit: Fit, move: Move, rich: Sequence[Noise], progress: Progress = lambda text: None
 ) -> Fit | None:
@@ -263,8 +256,11 @@ def _with(
     not in yet counts as noise, and would be kept out by itself.
     """
     progress(", ".join(f"{x.candidate.effect.title} {x.candidate.joint + 1}" for x in move.leads))
-    before = len(fit.named)
-    new = *_held_before(fit, move), *(_named(x) for x in move.leads)
+    before, lead = len(fit.named), move.leads[-1]
+    new = [Named(x.candidate, x.x, x.interval_s, x.recording) for x in move.leads]
+    known = [a.effect for a in (*fit.model.known, *(e.candidate for e in fit.named))]
+    if _puts_down(lead) and HELD not in known:  # then the hand held it before
+        new.insert(0, Named(lead.candidate, np.zeros(len(lead.x)), recording=lead.recording))
     trial, _ = refitted(fit.with_named((*fit.named, *new)).with_noise(rich))
     last = len(trial.named) - 1
     if new[-1].interval_s != WHOLE:
@@ -283,18 +279,6 @@ def _with(
             return None
 
 
-def _named(lead: Lead) -> Named:
-    return Named(lead.candidate, lead.x, lead.interval_s, lead.recording)
-
-
-def _held_before(fit: Fit, move: Move) -> tuple[Named, ...]:
-    """The load that a move puts down, where the model has none yet."""
-    lead, known = move.leads[-1], [a.effect for a in fit.model.known]
-    if not _puts_down(lead) or HELD in [*known, *(e.candidate.effect for e in fit.named)]:
-        return ()
-    return (Named(lead.candidate, np.zeros(len(lead.x)), recording=lead.recording),)
-
-
 def _puts_down(e: Named | Lead) -> bool:
     """Whether the hand carries less from some time on."""
     return e.candidate.effect is HELD and bool(np.isfinite(e.interval_s[0]) and e.x[0] < 0.0)
@@ -306,31 +290,29 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
     while True:
         fit, carried = under_own_noise(fit)
         if before is not None and _lost(before, fit):
-            fit, before = _refused(before, fit), None
+            pairs = zip(before.named, fit.named, strict=True)
+            tried = [  # those that it got instead
+                replace(a, tried=a.tried | {b.candidate.key})
+                if a.candidate is not b.candidate
+                else a
+                for a, b in pairs
+            ]
+            fit, before = before.with_named(tried), None
             continue
         before, values = None, weak(fit, carried)
         bad = worst(fit, values)
         if bad is not None:
-            fit = _dropped(fit, bad)
+            gone, fit = fit.named[bad].candidate, fit.without(bad)
+            for k, e in enumerate(fit.named):  # beside it one of its form explained the rest alone
+                alike = e.candidate.joint == gone.joint
+                if alike and gone.effect.form and e.candidate.effect.form == gone.effect.form:
+                    fit = shaped(refitted(fit)[0], k)
             continue
         ranked = standings(fit, carried, SignatureTable(fit, joints, CATALOGUED, rich=False))
         swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
         before, fit, swaps = fit, dated_anew(swapped), swaps + 1
-
-
-def _dropped(fit: Fit, place: int) -> Fit:
-    """Without one of its effects; what has the same form on its joint takes its own shape anew.
-
-    Beside the other it had to explain the rest alone.
-    """
-    gone, fit = fit.named[place].candidate, fit.without(place)
-    for k, e in enumerate(fit.named):
-        alike = e.candidate.joint == gone.joint and e.candidate.effect.form == gone.effect.form
-        if alike and gone.effect.form:
-            fit = shaped(refitted(fit)[0], k)
-    return fit
 
 
 def _lost(before: Fit, fit: Fit) -> bool:
@@ -340,16 +322,6 @@ def _lost(before: Fit, fit: Fit) -> bool:
         for own in (before, fit)
     )
     return len(before.named) == len(fit.named) and bool((b > LOST * a).any())
-
-
-def _refused(before: Fit, fit: Fit) -> Fit:
-    """A fit before names were exchanged; those that it got instead have been tried."""
-    return before.with_named(
-        [
-            replace(a, tried=a.tried | {b.candidate.key}) if a.candidate is not b.candidate else a
-            for a, b in zip(before.named, fit.named, strict=True)
-        ]
-    )
 
 
 def worst(fit: Fit, values: Mapping[int, float]) -> int | None:

@@ -171,9 +171,12 @@ def explain(
     unseen = tuple(_track(log, names) for log in hold_out)
     arm = _Arm(RigidArm.of(model), documented, tracks, inertia_prior)
     progress("fitting each joint's servo")
-    tracks_noise = np.max([_noise(track) for track in tracks], axis=0)
+    # of an encoder's reading, by its third differences
+    noise = np.max(
+        [np.std(np.diff(x.q, 3, axis=0), axis=0) / np.sqrt(20.0) for x in tracks], axis=0
+    )
     error = np.max([documented.tracking_error(track, arm.rigid) for track in tracks], axis=0)
-    if np.all(error < NOISE_SHARE * tracks_noise):
+    if np.all(error < NOISE_SHARE * noise):
         fits: list[JointFit] = []
         servos = documented
     else:
@@ -181,7 +184,12 @@ def explain(
         servos = _servos(arm, fits)
     progress("foretelling what was held out")
     before, after, scored = _scored(arm, fits, servos, unseen)
-    found = _found(arm, fits)
+    found = _Table(arm)
+    for j, fit in enumerate(fits):
+        found.add_joint(j, fit)
+    for j, fit in enumerate(fits):
+        if fit.x[DELAY] != documented.delay_s:
+            found.add("servo_delay", j, fit.x[DELAY], fit.delay_std, documented.delay_s)
     return ServoGap(
         joint_names=names,
         model_name=model.name,
@@ -214,11 +222,6 @@ def _track(log: Log, names: tuple[str, ...]) -> Track:
             "0.3 rad with at least 0.3 rad/s, for some 20 s.",
         )
     return track
-
-
-def _noise(track: Track) -> Array:
-    """(n,) rad, standard deviation of an encoder's reading, by its third differences."""
-    return np.asarray(np.std(np.diff(track.q, 3, axis=0), axis=0) / np.sqrt(20.0))
 
 
 def _everything() -> NDArray[np.bool_]:
@@ -343,15 +346,11 @@ def _weighed(arm: _Arm, fit: JointFit, drawn: Sequence[Sequence[Sequence[Load]]]
             far[A] = np.inf
         k = int(np.nanargmin(far))
         freedom = Freedom(fit.freedom.free, fixed).without(k)
-        without = fit_joint(fit.task, freedom, _started(fit, freedom))
+        without = fit_joint(fit.task, freedom, freedom.full(fit.x[freedom.free]))
         apart = not known or far[k] > SURE
         if not np.isfinite(far[k]) or (apart and _paid(fit, without) > TIE_CHI2):
             return replace(fit, values=values, doubt=covariance)
         fit = replace(without, delay_std=fit.delay_std)
-
-
-def _started(fit: JointFit, freedom: Freedom) -> Array:
-    return freedom.full(fit.x[freedom.free])
 
 
 def physical(fit: JointFit, others: Sequence[Sequence[Load]] = ()) -> tuple[Array, Array]:
@@ -477,12 +476,6 @@ class _Table:
         if free[RUBS]:
             self.add("coulomb_friction", j, values[4], std[4], float(docs.coulomb[j]))
 
-    def add_delay(self, fits: Sequence[JointFit]) -> None:
-        """The delay that all joints share."""
-        for j, fit in enumerate(fits):
-            if fit.x[DELAY] != self.docs.delay_s:
-                self.add("servo_delay", j, fit.x[DELAY], fit.delay_std, self.docs.delay_s)
-
     def findings(self) -> tuple[ServoFinding, ...]:
         """By effect."""
         found = []
@@ -493,11 +486,3 @@ class _Table:
                 said = WITH_FRICTION if both else ""
                 found.append(ServoFinding(effect, joints, values, stds, documented, said))
         return tuple(found)
-
-
-def _found(arm: _Arm, fits: Sequence[JointFit]) -> _Table:
-    table = _Table(arm)
-    for j, fit in enumerate(fits):
-        table.add_joint(j, fit)
-    table.add_delay(fits)
-    return table

@@ -135,8 +135,17 @@ class JointFit:
     @cached_property
     def unit(self) -> float:
         """Squares (rad²) that one unit of chi squared is worth, neighbours knowing each other."""
-        left = self.task.fitted(self.x)
-        return float(np.mean(left**2)) * _memory(self.task, self.x)
+        task, most = self.task, 1.0
+        # how many neighbours tell as much as one that knows nothing of its neighbours
+        for left, track, take in zip(task.left(self.x), task.tracks, task.rows, strict=True):
+            own = np.where(take, left, 0.0)
+            lags = max(int(MEMORY_S / np.median(np.diff(track.stamp_s))), 1)
+            size = 1 << int(np.ceil(np.log2(2 * len(own))))
+            power = np.fft.irfft(np.abs(np.fft.rfft(own, size)) ** 2)[:lags]
+            share = power / max(power[0], 1e-30)
+            below = np.flatnonzero(share < 0.05)
+            most = max(most, 1.0 + 2.0 * float(share[1 : below[0] if below.size else lags].sum()))
+        return float(np.mean(task.fitted(self.x) ** 2)) * most
 
     def moved(self, others: Sequence[Sequence[Load]]) -> Array:
         """(s, f) by how much the parameters over their scales would move under other loads."""
@@ -181,24 +190,10 @@ def _slopes(task: JointTask, freedom: Freedom, part: Array, scale: Array) -> Arr
     return np.column_stack(found)
 
 
-def _memory(task: JointTask, x: Array) -> float:
-    """How many neighbouring readings tell as much as one that knows nothing of its neighbours."""
-    most = 1.0
-    for left, track, take in zip(task.left(x), task.tracks, task.rows, strict=True):
-        own = np.where(take, left, 0.0)
-        lags = max(int(MEMORY_S / np.median(np.diff(track.stamp_s))), 1)
-        size = 1 << int(np.ceil(np.log2(2 * len(own))))
-        power = np.fft.irfft(np.abs(np.fft.rfft(own, size)) ** 2)[:lags]
-        share = power / max(power[0], 1e-30)
-        below = np.flatnonzero(share < 0.05)
-        most = max(most, 1.0 + 2.0 * float(share[1 : below[0] if below.size else lags].sum()))
-    return most
-
-
 def first_guess(task: JointTask) -> Array:
     """(6,) by equation error on smooth signals, the delay by trying."""
-    best, least = np.zeros(PARAMETERS), np.inf
-    sides = [_sides(track, load, task.joint) for track, load in _each(task)]
+    best, least, pairs = np.zeros(PARAMETERS), np.inf, zip(task.tracks, task.loads, strict=True)
+    sides = [_sides(track, load, task.joint) for track, load in pairs]
     for delay in np.arange(0.0, LATEST_S, EVERY_S):
         rows = [side.at(delay) for side in sides]
         matrix, wanted = (np.concatenate(part) for part in zip(*rows, strict=True))
@@ -207,10 +202,6 @@ def first_guess(task: JointTask) -> Array:
         if left < least:
             least, best = left, np.array([*(x / size), delay])
     return best
-
-
-def _each(task: JointTask) -> list[tuple[Track, Load]]:
-    return list(zip(task.tracks, task.loads, strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -89,15 +89,11 @@ class ServoModel:
             f"delay_s = {self.delay_s:.6g}",
         ]
         for j, name in enumerate(self.joint_names):
-            lines += ["", "[[joint]]", f"name = {_quoted(name)}"]
+            quoted = name.replace("\\", "\\\\").replace('"', '\\"')
+            lines += ["", "[[joint]]", f'name = "{quoted}"']
             lines += [f"{key} = {float(getattr(self, key)[j]):.6g}" for key in KEYS]
             lines.append(f"feeds_speed = {str(bool(self.feeds_speed[j])).lower()}")
         path.write_text("\n".join(lines) + "\n", "utf-8")
-
-
-def _quoted(name: str) -> str:
-    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 def read_servos(path: Path, joint_names: tuple[str, ...]) -> ServoModel:

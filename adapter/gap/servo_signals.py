@@ -52,7 +52,13 @@ class Track:
         step = period / np.ceil(period / LONGEST_STEP_S - 1e-6)
         count = round(stamp_s[-1] / step)
         grid = step * np.arange(count + 1)
-        at, held, gained = _integrals(1e-9 * (orders.stamp_ns - first), orders.q)
+        at = 1e-9 * (orders.stamp_ns - first)
+        at = np.concatenate([[at[0] - BEYOND_S], at, [at[-1] + BEYOND_S]])
+        q, usual = np.concatenate([orders.q[:1], orders.q]), float(np.median(np.diff(at)))
+        rate, width = np.zeros_like(q), np.diff(at)[:, None]
+        rate[2:] = np.diff(q[1:], axis=0) / np.maximum(width[1:-1], 0.5 * usual)
+        nothing = np.zeros((1, q.shape[1]))
+        held, gained = (np.concatenate([nothing, np.cumsum(x * width, axis=0)]) for x in (q, rate))
         smooth = smoothed(columns(grid, stamp_s, log.q), step, period)
         return cls(log.path.name, grid[1:], step, stamp_s, log.q, at, held, gained, smooth)
 
@@ -115,19 +121,6 @@ class Track:
 def columns(at: Array, t: Array, table: Array) -> Array:
     """(m, n) of a table (k, n) over t (k,), between its rows by a line."""
     return np.column_stack([np.interp(at, t, column) for column in table.T])
-
-
-def _integrals(at: Array, q: Array) -> tuple[Array, Array, Array]:
-    """Times, and the integrals of held commands (k, n) and of their rates, linear in between."""
-    at = np.concatenate([[at[0] - BEYOND_S], at, [at[-1] + BEYOND_S]])
-    q = np.concatenate([q[:1], q])
-    rate = np.zeros_like(q)
-    usual = float(np.median(np.diff(at)))
-    rate[2:] = np.diff(q[1:], axis=0) / np.maximum(np.diff(at[1:-1]), 0.5 * usual)[:, None]
-    width = np.diff(at)[:, None]
-    nothing = np.zeros((1, q.shape[1]))
-    held = np.concatenate([nothing, np.cumsum(q * width, axis=0)])
-    return at, held, np.concatenate([nothing, np.cumsum(rate * width, axis=0)])
 
 
 def smoothed(q: Array, step_s: float, period_s: float) -> Array:

@@ -10,7 +10,6 @@ from rich.markup import escape
 from adapter.gap.phrases import listed, numbered, shown_unit
 from adapter.gap.servo import TITLES, UNITS, ServoFinding, ServoGap
 from adapter.model.numbers import plain, plus_minus
-from adapter.model.spatial import Array
 
 WORSE = 0.05  # share by which an error of a joint may grow, and unsaid
 LABEL = 30  # columns of a figure's name
@@ -18,21 +17,14 @@ LABEL = 30  # columns of a figure's name
 
 def headline(gap: ServoGap) -> str:
     """The outcome in one sentence."""
-    before, after = _errors(gap.before), _errors(gap.after)
+    before, after = (f"{plain(1e3 * float(x.max()), 2)} mrad" for x in (gap.before, gap.after))
     if not gap.findings:
         return f"the arm does what its servos' documentation says: tracking as foretold to {before}"
     parts = [_short(finding) for finding in gap.findings]
     said = f"tracking error of the worst joint {before} -> {after} ({gap.scored})"
-    return "; ".join([*parts, said, *_worse(gap)])
-
-
-def _errors(error: Array) -> str:
-    return f"{plain(1e3 * float(np.max(error)), 2)} mrad"
-
-
-def _worse(gap: ServoGap) -> list[str]:
     worse = np.flatnonzero(gap.after > (1.0 + WORSE) * gap.before) + 1
-    return [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
+    left = [f"joint {numbered(worse.tolist())}: not better"] if worse.size else []
+    return "; ".join([*parts, said, *left])
 
 
 def _short(finding: ServoFinding) -> str:

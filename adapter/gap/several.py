@@ -32,14 +32,16 @@ NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: m
 FEWEST = 3  # recordings: of two nobody can say which one is the odd one
 
 
-@dataclass(frozen=True)
-class Contradiction:
-    """A recording that is not of the arm of the others.
+class Difference(NamedTuple):
+    """One recording's correction of something that is common to all.
 
     Attributes:
+        size: in units of the noise; chi2: what it explains.
         recording: place of it; kind: of the difference; what: differs, for people.
     """
 
+    size: float
+    chi2: float
     recording: int
     kind: str
     what: str
@@ -95,7 +97,7 @@ class Several:
         return tuple(load_of(*own, self.frame) for own in self.own)
 
     @cached_property
-    def odd(self) -> list[Contradiction]:
+    def odd(self) -> list[Difference]:
         """Recordings that are not of the arm of the others, the worst first."""
         return contradictions(self.fits[0], self.together)
 
@@ -103,14 +105,15 @@ class Several:
     def same_load(self) -> bool:
         """Whether all show one and the same load, within three standard deviations."""
         mass = np.array([load.mass for load in self.loads])
-        std = np.array([_alone_std(*x) for x in zip(*self._shares, strict=True)])
+        std = np.empty(len(mass))
+        for i, (part, (_, scores)) in enumerate(
+            zip(self.together.parts, self.together.scores, strict=True)
+        ):  # beside the others': without what is common
+            off = scores @ part.free[:, -10]
+            std[i] = np.sqrt(max(part.free[-10, -10], float(off @ off)))
         off = mass - np.average(mass, weights=std**-2.0)
         there = all(load.is_there for load in self.loads)
         return there and bool((np.abs(off) < SHOWN * std).all())
-
-    @property
-    def _shares(self) -> tuple[Sequence[Part], list[Array]]:
-        return self.together.parts, [own for _, own in self.together.scores]
 
     def started(self, fit: Fit) -> Fit:
         """A fit on the same recordings with the loads shown; one load where all are the same."""
@@ -126,7 +129,12 @@ class Several:
     def told(self, result: GapResult) -> GapResult:
         """A result with what each recording carries, and with recordings that contradict."""
         rows = tuple(map(_row, self.names, self.loads))
-        result = replace(result, loads=rows, contradictions=tuple(map(self._said, self.odd)))
+        said = tuple(
+            f"{self.names[x.recording]} contradicts the other recordings: {x.what} differs by more "
+            "than recordings of one arm do; fit it alone"
+            for x in self.odd
+        )
+        result = replace(result, loads=rows, contradictions=said)
         if self.same_load:
             return result
         kept = [f for f in result.findings if f.effect != HELD.name or not f.throughout]
@@ -155,23 +163,11 @@ class Several:
             recording=self.names[i],
         )
 
-    def _said(self, odd: Contradiction) -> str:
-        return (
-            f"{self.names[odd.recording]} contradicts the other recordings: {odd.what} differs by "
-            "more than recordings of one arm do; fit it alone"
-        )
-
 
 def _row(name: str, load: HandLoad) -> LogLoad:
     com = tuple(map(float, load.com)) if load.com_shown else None
     std = tuple(map(float, load.com_std)) if load.com_shown else None
     return LogLoad(name, load.is_there, load.mass, load.mass_std, com, std, load.frame)
-
-
-def _alone_std(part: Part, scores: Array) -> float:
-    """How well a recording's mass is known beside the others', kg: without what is common."""
-    off = scores @ part.free[:, -10]
-    return float(np.sqrt(max(part.free[-10, -10], float(off @ off))))
 
 
 def _own(fit: Fit) -> np.ndarray:
@@ -198,7 +194,7 @@ def _together(parts: Sequence[Part], inertias: int) -> Together:
     return Together(parts, wider(best))
 
 
-def contradictions(fit: Fit, together: Together) -> list[Contradiction]:
+def contradictions(fit: Fit, together: Together) -> list[Difference]:
     """Recordings that contradict the rest, the worst first, one after the other.
 
     Each recording's own correction of a friction, an offset or a link's inertia, about what all
@@ -208,17 +204,17 @@ def contradictions(fit: Fit, together: Together) -> list[Contradiction]:
     Args:
         fit: any of the recordings'.
     """
-    out: list[Contradiction] = []
+    out: list[Difference] = []
     std, places = np.diagonal(together.prior) ** -0.5, list(range(len(together.parts)))
     while len(places) >= FEWEST:
         odd = _odd_one(fit, [together.parts[i] for i in places], std)
         if odd is None:
             break
-        out.append(replace(odd, recording=places.pop(odd.recording)))
+        out.append(odd._replace(recording=places.pop(odd.recording)))
     return out
 
 
-def _odd_one(fit: Fit, parts: Sequence[Part], std: Array) -> Contradiction | None:
+def _odd_one(fit: Fit, parts: Sequence[Part], std: Array) -> Difference | None:
     """The recording that differs from all others by more than these do, if there is one."""
     found = []
     for worst in map(max, _differences(fit, Together(parts, std)).values()):
@@ -228,25 +224,12 @@ def _odd_one(fit: Fit, parts: Sequence[Part], std: Array) -> Contradiction | Non
         among = max(_differences(fit, others)[worst.kind]).size
         if worst.size > OTHERS * max(among, 1.0):
             found.append(worst)
-    if not found:
-        return None
-    worst = max(found, key=lambda x: x.chi2)
-    return Contradiction(worst.recording, worst.kind, worst.what)
+    return max(found, key=lambda x: x.chi2, default=None)
 
 
-class _Difference(NamedTuple):
-    """One recording's correction of something: in units of the noise, and what it explains."""
-
-    size: float
-    chi2: float
-    recording: int
-    kind: str
-    what: str
-
-
-def _differences(fit: Fit, rest: Together) -> dict[str, list[_Difference]]:
+def _differences(fit: Fit, rest: Together) -> dict[str, list[Difference]]:
     """Of each kind, of every recording about all others."""
-    found: dict[str, list[_Difference]] = {FRICTION: [], OFFSET: [], LINK: []}
+    found: dict[str, list[Difference]] = {FRICTION: [], OFFSET: [], LINK: []}
     for i, part in enumerate(rest.parts):
         x, covariance = rest.without(i)
         left, unsure = part.g - part.G @ x, part.G + part.G @ covariance @ part.G
@@ -254,7 +237,7 @@ def _differences(fit: Fit, rest: Together) -> dict[str, list[_Difference]]:
             C, d = directions @ unsure @ directions.T, directions @ left
             inverse = np.linalg.inv(C + np.eye(len(C)))
             chi2, shown = float(d @ inverse @ d), max(float(np.trace(C @ inverse)), 0.5)
-            found[kind].append(_Difference(math.sqrt(chi2 / shown), chi2, i, kind, what))
+            found[kind].append(Difference(math.sqrt(chi2 / shown), chi2, i, kind, what))
     return found
 
 

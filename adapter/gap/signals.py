@@ -174,12 +174,6 @@ class Signals:
         out[:, joint] = self.low(x[:, joint])
         return out
 
-    def low_basis(self, basis: Array, joint: int) -> Array:
-        """Torques (m, c) on one joint in the band (c, k, n)."""
-        out = np.zeros((basis.shape[1], *self.tau.shape))
-        out[:, :, joint] = self.low(basis).T
-        return out
-
     @cached_property
     def low_regressor(self) -> Array:
         """(10 n, k, n) regressor of the measured motion in the band; whatever the inertias are."""

@@ -26,13 +26,12 @@ from adapter.errors import SettingsError
 from adapter.gap.candidates import Candidate
 from adapter.gap.evidence import Carried
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
-from adapter.gap.nominal import nominal_fit
-from adapter.gap.real_arm import as_driven, fitting_way, load_in
+from adapter.gap.real_arm import as_driven, fitting_way, load_in, nominal_fit
 from adapter.gap.signals import RATE_HZ, Recorded, prepare
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.readings import TorqueShares, torque_shares
+from adapter.screening.readings import torque_shares
 from adapter.screening.screen import cleaned, judged_rows, moving_joints, smoothed_rows
 from adapter.screening.timing import lateness
 from adapter.signals.matching import present
@@ -164,7 +163,7 @@ def learn_gains(
         notes += said
     usable = [cleaned(log, model) for log in logs]
     recordings = [Recorded.of(log, lateness(clock)).cut() for log, clock, _ in usable]
-    shares = [_shares(log, model) for log, *_ in usable]
+    shares = [torque_shares(*judged_rows(x, model, smoothed_rows(x))) for x, *_ in usable]
     if not any(x.tells.any() for x in shares):
         raise SettingsError(
             f"{logs[0].path}: no joint's effort follows the model's torque: no gain can be learned"
@@ -177,7 +176,12 @@ def learn_gains(
         max(clock.period_s for _, clock, _ in usable),
         np.any([x.tells for x in shares], axis=0),
     )
-    start = _first_gains(shares)
+    # of each joint from the recording that tells most of it; else the middle of the told
+    doubt = np.array([np.where(x.tells, x.std / np.abs(x.share), np.inf) for x in shares])
+    best = np.argmin(doubt, axis=0)
+    own = np.array([1.0 / abs(shares[k].factor[j]) for j, k in enumerate(best)])
+    told = np.isfinite(doubt).any(axis=0)
+    start = np.where(told, own, np.median(own[told]))
     begun = [r.between(0.0, float(r.t[int(LEARNED_SHARE * len(r.t))])) for r in recordings]
     first, fit, _ = _fitted(replace(task, recordings=tuple(begun)), start)
     held_out, size = _on_the_rest(task, fit, first)
@@ -204,31 +208,21 @@ class _GainTask:
     tells: NDArray[np.bool_]
 
 
-def _shares(log: Log, model: SelfModel) -> TorqueShares:
-    rows, telling = judged_rows(log, model, smoothed_rows(log))
-    return torque_shares(rows, telling)
-
-
-def _first_gains(shares: Sequence[TorqueShares]) -> Array:
-    """(n,) of each joint from the recording that tells most of it; else the middle of the told."""
-    doubt = np.array([np.where(x.tells, x.std / np.abs(x.share), np.inf) for x in shares])
-    best = np.argmin(doubt, axis=0)
-    own = np.array([1.0 / abs(shares[k].factor[j]) for j, k in enumerate(best)])
-    told = np.isfinite(doubt).any(axis=0)
-    return np.asarray(np.where(told, own, np.median(own[told])))
-
-
 def _fitted(task: _GainTask, gain: Array) -> tuple[Array, Fit, Array]:
     """Gains (n,), the fit in N m under them, and their standard deviations (n,)."""
     n, known = len(gain), task.load_kg if any(task.loaded) else None
-    std = DOCUMENTED_STD if known is None else WEIGHED_STD
+    std, own = (DOCUMENTED_STD if known is None else WEIGHED_STD), GAIN.templates()[0]
+    wide = Template((GAIN_STD,), own.decode, own.label)
+    # of joints whose torque tells one; of all where a known load makes torque in every joint
+    joints = range(n) if known is not None else np.flatnonzero(task.tells).tolist()
+    gains = [Named(Candidate(GAIN, wide, int(j), ()), np.zeros(1)) for j in joints]
     for _ in range(ROUNDS):
         scaled = [replace(r, tau=r.tau * gain) for r in task.recordings]
         start = nominal_fit(scaled, task.model, std, task.period_s)
         moving = sorted(
             {j for s in start.recordings for j in moving_joints(s.motion.q, s.motion.dq)}
         )
-        fit = as_driven(start, moving, [*_loads(start, task), *_gains(n, task, known)])
+        fit = as_driven(start, moving, [*_loads(start, task), *gains])
         fit = fit.with_named([_open(fit, e) if e.assumed else e for e in fit.named])
         for _ in range(FLAT_ROUNDS):
             flat = [noise.flat() for noise in fit.own_noise()]
@@ -254,14 +248,6 @@ def _loads(fit: Fit, task: _GainTask) -> list[Named]:
     held = np.zeros(len(loads[0].x))
     held[0] = task.load_kg
     return [fitting_way(fit, e.at(held)) for e in loads]
-
-
-def _gains(n: int, task: _GainTask, known: float | None) -> list[Named]:
-    """Of joints whose torque tells one; of all where a known load makes torque in every joint."""
-    own = GAIN.templates()[0]
-    wide = Template((GAIN_STD,), own.decode, own.label)
-    joints = range(n) if known is not None else np.flatnonzero(task.tells).tolist()
-    return [Named(Candidate(GAIN, wide, int(j), ()), np.zeros(1)) for j in joints]
 
 
 def _open(fit: Fit, e: Named) -> Named:

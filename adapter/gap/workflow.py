@@ -20,10 +20,9 @@ import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.robots import read_robot
-from adapter.gap.at_rest import held_at_rest
 from adapter.gap.changes import loaded, with_changes
-from adapter.gap.findings import ODD, disagreement, noise_floor, told_of
-from adapter.gap.fit import Fit
+from adapter.gap.findings import ODD, disagreement, findings_of, noise_floor, told_of
+from adapter.gap.fit import Fit, worth
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
@@ -35,11 +34,12 @@ from adapter.gap.long_recording import (
     sampling,
     sampling_words,
 )
-from adapter.gap.nominal import nominal_fit
+from adapter.gap.real_arm import nominal_fit, real_arm
 from adapter.gap.result import GapResult
-from adapter.gap.search import ROUNDS, search
+from adapter.gap.rivals import Standing
+from adapter.gap.search import ROUNDS, Found, search
 from adapter.gap.several import Several
-from adapter.gap.signals import RATE_HZ, Recorded
+from adapter.gap.signals import LEAST_S, RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
 from adapter.judgement.priors import theta_prior
 from adapter.model.model_file import save_model
@@ -49,6 +49,7 @@ from adapter.screening.screen import (
     RecordingFault,
     RecordingRefused,
     Screened,
+    cleaned,
     moving_joints,
     of_this_robot,
     refuse,
@@ -169,12 +170,26 @@ def find_gap(
 def _with_what_is_held(
     untold: GapResult, log: Path | str | Log, model: SelfModel, settings: GapSettings
 ) -> GapResult:
-    """A load at the hand shows in an arm at rest as well."""
+    """A load at the hand, where it is more than static friction and offsets can hold at rest."""
     whole = log if isinstance(log, Log) else read_log(Path(log))
-    own = part_of(whole, present(model, whole.joint_names, whole.path.name)[0])
-    load = held_at_rest(settings.told.log(own, model), model, settings.inertia_prior)
-    if load is None:
+    part = part_of(whole, present(model, whole.joint_names, whole.path.name)[0])
+    part = settings.told.log(part, model)
+    model, _ = present(model, part.joint_names, part.path.name)
+    clean, clock, _ = cleaned(part, model)
+    own = Recorded.of(clean, lateness(clock))
+    if own.t[-1] - own.t[0] < LEAST_S:
         return untold
+    nominal = nominal_fit([own], model, settings.inertia_prior, clock.period_s)
+    arm = real_arm(nominal, (), (0,))
+    if not arm.is_there(0):
+        return untold
+    values = [worth(arm.fit, arm.known, k) for k in range(len(arm.fit.named))]
+    standings = tuple(
+        Standing(e.candidate, value.log_evidence, value.chi2, ())
+        for e, value in zip(arm.fit.named, values, strict=True)
+    )
+    others = frozenset(range(1, len(standings)))
+    (load,) = findings_of(Found(arm.fit, arm.known, standings, weak=others), {own.name: own.t[-1]})
     said = f"{untold.problem} The hand holds {load.parameters['m']:.2g} ± {load.std['m']:.2g} kg."
     return replace(untold, problem=said, findings=(load,))
 
@@ -240,7 +255,9 @@ def _taken(log: Log, name: str, model: SelfModel) -> _Taken:
     if is_long(log):
         survey = Survey.of(of_this_robot(log, model))
         seen = refuse(survey.busiest(log), model)
-        long = LongRecording.through(survey.in_time(seen.torque), name)
+        if seen.torque.late_s:
+            survey = Survey.of(seen.torque.in_time(survey.log))
+        long = LongRecording.through(survey, name)
         motion = long.signals(RigidArm.of(model)).motion
         moving = moving_joints(motion.q, motion.dq, 1.0 / RATE_HZ) or seen.moving
         said = standing(model.tree.joint_names, moving, motion.q, motion.dq)

@@ -40,7 +40,7 @@ from adapter.gap.fit import (
 )
 from adapter.gap.folds import Folds, fold_rows, pays_held_out
 from adapter.gap.hand import MASSES_KG, Hand
-from adapter.gap.possible import possible
+from adapter.gap.held_out import possible
 from adapter.gap.refine import DoubtedNoise, refined
 from adapter.gap.rivals import Rival, Standing, standings
 from adapter.gap.scan import BELIEF, BLOCK_S, MARGIN_S, PATTERNS, SignatureTable, honest_moves

@@ -10,8 +10,7 @@ import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from adapter.effects.robots import read_robot
-from adapter.gap.nominal import nominal_fit
-from adapter.gap.real_arm import RealArm, real_arm
+from adapter.gap.real_arm import RealArm, nominal_fit, real_arm
 from adapter.gap.signals import Recorded
 from adapter.model.self_model import SelfModel
 from adapter.screening.screen import refuse

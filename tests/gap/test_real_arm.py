@@ -11,8 +11,7 @@ import pytest
 from adapter.effects.catalogue import HELD
 from adapter.gap.fit import place_of, refitted
 from adapter.gap.hand import Hand, hand_of
-from adapter.gap.nominal import nominal_fit
-from adapter.gap.real_arm import OTHER_UNIT, RealArm, real_arm, start
+from adapter.gap.real_arm import OTHER_UNIT, RealArm, nominal_fit, real_arm, start
 from adapter.gap.signals import Recorded
 from adapter.gap.workflow import find_gap
 from adapter.model.self_model import SelfModel
