@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import smooth_sign
+from adapter.effects.bristle_friction import bending
+from adapter.effects.by_joint import WAYS_RAD, smooth_sign
 from adapter.effects.torque import ModelTorque
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -43,6 +44,8 @@ LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 219, 0.004
 class Rows(NamedTuple):
     """Instants of a recording: q, dq, ddq, tau (m, n); and twice the log of tau's scale.
 
+    `slides` (m, n), -1 to 1, is which way friction acts; the way that joints move where None.
+
     A reading that divides torques makes its misfit smaller by that alone, which counts for nothing.
     """
 
@@ -51,6 +54,7 @@ class Rows(NamedTuple):
     ddq: Array
     tau: Array
     scaled: float = 0.0
+    slides: Array | None = None
 
 
 class Explained(NamedTuple):
@@ -154,7 +158,9 @@ class Telling:
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
         model = self.torque(rows)
         m, n = model.shape
-        step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
+        step = rows.slides
+        if step is None:
+            step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
         joint = np.zeros((m, n, len(FRICTION), n))
         for k, column in enumerate((np.ones_like(model), step, rows.dq, model)):
             joint[:, range(n), k, range(n)] = FRICTION[k] * column
@@ -174,6 +180,9 @@ class Telling:
 def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     """How much later than the motion torques come, s, where that is clear; 0 up to `LATE_S`.
 
+    Friction that winds up over a small way comes late, too, where joints move slowly: torques that
+    such friction explains as well are in time.
+
     Args:
         signals: q, dq, ddq, tau (m, n), 1 ms apart.
     """
@@ -181,8 +190,8 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     if len(q) < 2 * LATEST_MS + ROWS:
         return 0.0
     at = np.linspace(LATEST_MS, len(q) - 1 - LATEST_MS, ROWS).astype(int)
-
-    of = telling.explaining(Rows(q[at], dq[at], ddq[at], tau[at]))
+    rows = Rows(q[at], dq[at], ddq[at], tau[at])
+    of = telling.explaining(rows)
 
     def cost(late_ms: int) -> float:
         return of(tau[at + late_ms]).cost
@@ -190,8 +199,11 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     late_ms = 0
     for step, reach in LATE_STEPS:
         late_ms = min((late_ms + step * k for k in range(-reach, reach + 1)), key=cost)
-    clear = cost(late_ms) < cost(0) - EVIDENCE
-    return 1e-3 * late_ms if clear and abs(late_ms) > 1e3 * LATE_S else 0.0
+    if abs(late_ms) <= 1e3 * LATE_S or cost(late_ms) > cost(0) - EVIDENCE:
+        return 0.0
+    wound = (np.column_stack([bending(x, way)[0][at] for x in q.T]) for way in WAYS_RAD)
+    rival = min(telling.explained(rows._replace(slides=slides)).cost for slides in wound)
+    return 1e-3 * late_ms if cost(late_ms) < rival - EVIDENCE else 0.0
 
 
 def inertial_std(arm: RigidArm) -> Array:

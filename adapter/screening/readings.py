@@ -235,7 +235,7 @@ class Readings:
 
     def _own(self, j: int) -> Iterator[Reading]:
         """Readings of joint j alone."""
-        (q, dq, ddq, tau, scaled), unit = self.rows, np.eye(len(self.names))[j]
+        (q, dq, ddq, tau, scaled, _), unit = self.rows, np.eye(len(self.names))[j]
         turn, name = 1.0 - 2.0 * unit, self.names[j]
         said = f"{name} counts the other way round: --turn {name}"
         yield Reading("joint", said, Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled))
@@ -253,7 +253,7 @@ class Readings:
 
         Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or not.
         """
-        (q, dq, ddq, tau, scaled), names = self.rows, self.names
+        (q, dq, ddq, tau, scaled, _), names = self.rows, self.names
         for sign, word in ((-1.0, "minus"), (1.0, "plus")):
             turn = np.eye(len(names))
             turn[j, i] = sign
