@@ -24,11 +24,11 @@ from adapter.physics.rigid_arm import RigidArm
 
 FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m, share of the torque
 INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
-PAYLOAD = (3.0, 0.3, 0.05)  # kg, kg m, kg m2
+LOAD_STD = np.repeat((3.0, 0.3, 0.05), (1, 3, 6))  # kg, kg m, kg m2
 FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
 SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
-CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count
+CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
@@ -129,7 +129,11 @@ class Telling:
                 sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
             noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
             cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
-            share = 1.0 - left / np.maximum(tau.var(axis=0), floor**2)
+            used = weight * np.tensordot(
+                squares, np.linalg.inv(normal), 2
+            )  # of the samples, to fit
+            honest = left / np.maximum(1.0 - used / self.samples, 1.0 / self.samples)
+            share = 1.0 - honest / np.maximum(tau.var(axis=0), floor**2)
             size = 1.0 + FRICTION[-1] * x[gains]
             return Explained(cost + beyond, share, size, x[: gains.stop])
 
@@ -149,9 +153,16 @@ class Telling:
         return np.asarray(model + bodies.torque(rows.q, rows.dq, rows.ddq) + friction)
 
     def apart(self, rows: Rows) -> float:
-        """How far the model without corrections is from rows; a true reading brings it nearer."""
-        apart = np.mean((rows.tau - self.torque(rows)) ** 2, axis=0)[self.alive]
-        return float(np.log(apart + SENSOR_NM**2).sum()) + rows.scaled
+        """How far the model with any load is from rows; a true reading brings it nearer."""
+        model = self.torque(rows)
+        sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(model**2, axis=0))
+        weight = np.sqrt(self.samples / len(model)) * self.alive / sigma
+        load = self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
+        columns, apart = load * weight[:, None], (rows.tau - model) * weight
+        flat = columns.reshape(-1, 10)
+        x = np.linalg.solve(flat.T @ flat + np.eye(10), flat.T @ apart.ravel())
+        left = np.mean((rows.tau - model - load @ x) ** 2, axis=0)[self.alive]
+        return float(np.log(left + SENSOR_NM**2).sum()) + rows.scaled
 
     def _columns(self, rows: Rows, changed: int | None) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
@@ -167,7 +178,7 @@ class Telling:
         parts = [regressor * inertial_std(self.arm).ravel(), joint.reshape(m, n, -1)]
         if changed is not None:
             later = (np.arange(m) >= changed)[:, None, None]
-            parts.append(later * regressor[:, :, -10:] * np.repeat(PAYLOAD, (1, 3, 6)))
+            parts.append(later * regressor[:, :, -10:] * LOAD_STD)
         return np.concatenate(parts, axis=2), model
 
     def _beyond(self, q: Array) -> float:
@@ -213,7 +224,7 @@ def inertial_std(arm: RigidArm) -> Array:
     first = INERTIA_SHARE * (np.abs(theta[:, 1:4]) + RADIUS_M * mass)
     second = INERTIA_SHARE * (np.abs(theta[:, 4:]) + RADIUS_M**2 * mass)
     std = np.concatenate([INERTIA_SHARE * mass, first, second], axis=1)
-    std[-1] += np.repeat(PAYLOAD, (1, 3, 6))
+    std[-1] += LOAD_STD
     return np.asarray(std)
 
 
