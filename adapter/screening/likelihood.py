@@ -152,12 +152,12 @@ class Telling:
         friction = own[0] + own[1] * step + own[2] * rows.dq + own[3] * model
         return np.asarray(model + bodies.torque(rows.q, rows.dq, rows.ddq) + friction)
 
-    def apart(self, rows: Rows) -> float:
-        """How far the model with any load is from rows; a true reading brings it nearer."""
+    def apart(self, rows: Rows, loaded: bool) -> float:
+        """How far the model, with any load or bare, is from rows; a true reading is nearer."""
         model = self.torque(rows)
         sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(model**2, axis=0))
         weight = np.sqrt(self.samples / len(model)) * self.alive / sigma
-        load = self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
+        load = loaded * self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
         columns, apart = load * weight[:, None], (rows.tau - model) * weight
         flat = columns.reshape(-1, 10)
         x = np.linalg.solve(flat.T @ flat + np.eye(10), flat.T @ apart.ravel())

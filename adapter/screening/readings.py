@@ -322,8 +322,13 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
     now = telling.explained(rows)
     found: list[Reading] = []
     while len(found) < MOST:
-        far = telling.apart(rows)
-        nearer = [x for x in Readings(rows, telling) if telling.apart(x.rows) < far]
+        # a load bends a joint told otherwise towards the model, too: it is left out there
+        far = {loaded: telling.apart(rows, loaded) for loaded in (True, False)}
+        nearer = [
+            x
+            for x in Readings(rows, telling)
+            if telling.apart(x.rows, x.kind != "joint") < far[x.kind != "joint"]
+        ]
         explained = [telling.explained(x.rows) for x in nearer]
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:
