@@ -155,7 +155,9 @@ def learn_theta(
     factors_s = time.perf_counter() - began
     solve.run()
     for _ in range(settings.rounds if settings.std is None else 0):
-        if solve.reweigh() < SETTLED_WEIGHTS:
+        floor, before = RESIDUAL_FLOOR * scales(rows), solve.std
+        solve.std = np.maximum([row.residual(solve.theta) for row in rows], floor)
+        if np.abs(solve.std / before - 1.0).max() < SETTLED_WEIGHTS:
             break
         solve.again()
     names = [row.name for row in rows]
@@ -209,12 +211,6 @@ class _Solve:
         """All bodies together, from where they are."""
         if self.settings.whole:
             self._stage("whole tree", tuple(range(self.tree.bodies)))
-
-    def reweigh(self) -> float:
-        """Weigh every row by what the solution leaves of it; the largest share a weight moved."""
-        floor, before = RESIDUAL_FLOOR * scales(self.rows), self.std
-        self.std = np.maximum([row.residual(self.theta) for row in self.rows], floor)
-        return float(np.abs(self.std / before - 1.0).max())
 
     def rank(self, bodies: tuple[int, ...]) -> int:
         """Base parameters that the rows of these bodies show."""

@@ -80,7 +80,10 @@ def consistent_theta(r: Array, b: Array) -> Solution:
     scale, u, values, vt = _decomposed(r)
     shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
     hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
-    found = possible_theta(r, b, shown, hidden)
+    found = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    if not found.solved:  # least is left by possible bodies, what does not show near a small one
+        closest = _closest(r, b)
+        found = replace(closest, steps=found.steps + closest.steps)
     cost = _cost(r, b, found.theta)
     return Solution(found.theta, cost, found.steps, len(values), found.solved)
 
@@ -94,18 +97,12 @@ def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
     """
     scale = np.linalg.norm(r, axis=0)
     scale = np.where(scale > RANK_TOLERANCE * scale.max(initial=1e-300), scale, np.inf)
-    u, values, vt = _svd(r / scale)
+    try:
+        u, values, vt = np.linalg.svd(r / scale, full_matrices=True)
+    except np.linalg.LinAlgError:  # the slower algorithm
+        u, values, vt = scipy.linalg.svd(r / scale, full_matrices=True, lapack_driver="gesvd")
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
     return scale, u[:, :rank], values[:rank], vt
-
-
-def _svd(matrix: Array) -> tuple[Array, Array, Array]:
-    """Full SVD; by the slower algorithm where the fast one does not converge."""
-    try:
-        u, values, vt = np.linalg.svd(matrix, full_matrices=True)
-    except np.linalg.LinAlgError:
-        u, values, vt = scipy.linalg.svd(matrix, full_matrices=True, lapack_driver="gesvd")
-    return u, values, vt
 
 
 _UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
@@ -129,26 +126,10 @@ class Possible:
     solved: bool
 
 
-def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> Possible:
-    """The possible bodies that leave least of R θ = b, and what does not show near a small body.
-
-    Args:
-        r: (k, 10 bodies); b: (k,).
-        shown: (10 bodies,) a least-squares solution.
-        hidden: (10 bodies, h) directions of θ that R does not show.
-
-    Raises:
-        ModelError: the solver gave up without an answer.
-    """
-    exact = _roomiest(shown.reshape(-1, PER_BODY), hidden)
-    if exact.solved:
-        return exact
-    found = _closest(r, b)
-    return replace(found, steps=exact.steps + found.steps)
-
-
 def _roomiest(shown: Array, hidden: Array) -> Possible:
     """Among all least-squares solutions the one whose bodies are furthest from impossible.
+
+    `hidden` (10 bodies, h) are directions of θ that R does not show.
 
     Maximised is the least eigenvalue t of all bodies, up to `ROOM`; solved if it is above zero.
     """
