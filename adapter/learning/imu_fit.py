@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.learning.imu_windows import BELL, BEND, OVERLAP, Course, Readings, Windows
+from adapter.learning.imu_windows import BELL, BEND, OVERLAP, Course, Readings, Sums, Windows
 from adapter.model.spatial import Array, exp_rotation, log_rotation, rot_z, skew
 from adapter.model.tree import BASE, Tree
 
@@ -180,7 +180,7 @@ class ImuFit:
         self.windows = Windows.over(joints, readings.t_s)
         t_s = self.windows.t_s
         self.q, self.dq = joints.at(t_s), joints.rate(t_s)
-        self._bell, self._bend = self.windows.sums(BELL), self.windows.sums(BEND)
+        self._bell, self._bend = Sums(BELL, self.windows), Sums(BEND, self.windows)
         self._sensors, self._whole = [], []
         for s in range(len(links)):
             told = np.concatenate([readings.w[:, s], readings.a[:, s]], axis=1)

@@ -189,7 +189,11 @@ class OnlineLearner:
         by_rates = any(effect.by_rates for effect in self.theta.effects)
         self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
         self.rates = self._rates if by_rates else None
-        places = [(column, self._rates.place(rate)) for column, rate in self.theta.rate_columns]
+        places, column = [], 0
+        for effect in self.theta.effects:
+            if effect.rate is not None:
+                places.append((column, self.layout.rates.start + effect.rate * tree.n))
+            column += len(effect.shapes) or 1
         self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
         self.given = tuple(known.effects)
@@ -204,7 +208,13 @@ class OnlineLearner:
         self.schema.tangent, self.theta.x = tangent.reshape(-1, 6), x
         slope, self.theta.gradient = np.split(self.adam.gradient, [6 * tree.n])
         self.schema.gradient = slope.reshape(-1, 6)
-        self._cap = _caps(self.layout)
+        self._cap, at = np.full(self.layout.size, np.inf), self.layout  # stamps may be anything
+        joint = (at.q, MOST_Q), (at.dq, MOST_DQ), (at.ddq, MOST_DDQ), (at.tau, MOST_TAU)
+        for part, most in (*joint, (at.motion_q, MOST_Q), (at.motion_dq, MOST_DQ)):
+            self._cap[part] = most
+        self._cap[at.motion] = np.tile(MOST_MOTION, at.n)
+        if at.floating:
+            self._cap[at.base] = MOST_MOTION
         self.learned = self.refused = self.rebuilds = 0
         self.stamp_ns = 0
         self.theta_started_ns: int | None = None
@@ -326,7 +336,8 @@ class OnlineLearner:
         count = int(steps(table, self._parts(int(ends[-1])), tuple(done)))
         self.schema.updates += count - 1
         self.adam.steps += count
-        self.theta.took(int(ends[count - 1]), count)
+        self.theta.count += self.theta.weight * int(ends[count - 1])
+        self.theta.updates += count
         self._look_back(table[:count], done)
         return count
 
@@ -636,18 +647,6 @@ def _taken_off(
         needed = "a base that rests" if floating else "the model's arm beside them"
         raise SettingsError(f"effects of a model ({names}) need {needed}, or have to be learned")
     return KnownEffects(fixed, known.arm, smoothing_s)
-
-
-def _caps(at: StateLayout) -> Array:
-    """(size,) most that each number of a state may be; the stamp may be anything."""
-    cap = np.full(at.size, np.inf)
-    joint = (at.q, MOST_Q), (at.dq, MOST_DQ), (at.ddq, MOST_DDQ), (at.tau, MOST_TAU)
-    for part, most in (*joint, (at.motion_q, MOST_Q), (at.motion_dq, MOST_DQ)):
-        cap[part] = most
-    cap[at.motion] = np.tile(MOST_MOTION, at.n)
-    if at.floating:
-        cap[at.base] = MOST_MOTION
-    return cap
 
 
 @jit

@@ -308,26 +308,11 @@ class Theta:
             self.updates,
         )
 
-    @property
-    def rate_columns(self) -> list[tuple[int, int]]:
-        """Columns of effects that are rates of the model's torque, and which rates these are."""
-        first, found = 0, []
-        for effect in self.effects:
-            if effect.rate is not None:
-                found.append((first, effect.rate))
-            first += len(effect.shapes) or 1
-        return found
-
     def steady(self) -> bool:
         """Whether every state is one step, with nothing to start or restart at any of them."""
         if self.spare_in_use:
             return self.count > max(self.settings.restarts, default=0)
         return self.count >= self.settings.warm_up
-
-    def took(self, states: int, steps: int) -> None:
-        """`steps` has given it so many states, and moved it so often."""
-        self.count += self.weight * states
-        self.updates += steps
 
     def compute_gradient(self) -> bool:
         """Fill the gradient of one ADAM step; False while there is too little to step on."""

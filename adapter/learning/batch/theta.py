@@ -114,7 +114,6 @@ class ThetaResult:
         residual: by name of row, root mean square of what is left, N or N m.
         std: the weights' standard deviations by row.
         min_eigenvalue: smallest of all pseudo-inertias; above zero: every body is possible.
-        factors_s: time that building the factors took.
         converged: whether the last solve of every body did; if not, θ is the best found and may
             be far from what the data say.
     """
@@ -125,7 +124,6 @@ class ThetaResult:
     residual: dict[str, float]
     std: dict[str, float]
     min_eigenvalue: float
-    factors_s: float
     converged: bool
 
 
@@ -149,10 +147,8 @@ def learn_theta(
         ModelError: unknown names, shapes that don't fit, numbers that are not finite.
     """
     settings = settings or BatchThetaSettings()
-    began = time.perf_counter()
     rows = row_factors(data, lam, settings.supervision, wrenches)
     solve = _Solve(data, rows, settings, np.random.default_rng(seed))
-    factors_s = time.perf_counter() - began
     solve.run()
     for _ in range(settings.rounds if settings.std is None else 0):
         floor, before = RESIDUAL_FLOOR * scales(rows), solve.std
@@ -171,7 +167,6 @@ def learn_theta(
         residual=dict(zip(names, left, strict=True)),
         std=dict(zip(names, solve.std.tolist(), strict=True)),
         min_eigenvalue=least,
-        factors_s=factors_s,
         converged=possible and all(solve.converged.values()),
     )
 

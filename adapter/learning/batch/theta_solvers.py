@@ -9,7 +9,7 @@ furthest from impossible, so that no digit is lost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -80,12 +80,11 @@ def consistent_theta(r: Array, b: Array) -> Solution:
     scale, u, values, vt = _decomposed(r)
     shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
     hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
-    found = _roomiest(shown.reshape(-1, PER_BODY), hidden)
-    if not found.solved:  # least is left by possible bodies, what does not show near a small one
-        closest = _closest(r, b)
-        found = replace(closest, steps=found.steps + closest.steps)
-    cost = _cost(r, b, found.theta)
-    return Solution(found.theta, cost, found.steps, len(values), found.solved)
+    theta, steps, solved = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    if not solved:  # least is left by possible bodies, what does not show near a small one
+        theta, more, solved = _closest(r, b)
+        steps += more
+    return Solution(theta, _cost(r, b, theta), steps, len(values), solved)
 
 
 def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
@@ -111,23 +110,10 @@ _TO_THETA = np.linalg.inv(_FROM_THETA)
 _ONE = entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
 
 
-@dataclass(frozen=True)
-class Possible:
-    """What was found.
-
-    Attributes:
-        theta: (bodies, 10), every body possible.
-        steps: of the solver.
-        solved: whether nothing better is possible; else it is the best found.
-    """
-
-    theta: Array
-    steps: int
-    solved: bool
-
-
-def _roomiest(shown: Array, hidden: Array) -> Possible:
+def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     """Among all least-squares solutions the one whose bodies are furthest from impossible.
+
+    θ, steps, and whether all its bodies are possible.
 
     `hidden` (10 bodies, h) are directions of θ that R does not show.
 
@@ -151,13 +137,13 @@ def _roomiest(shown: Array, hidden: Array) -> Possible:
         in_cones,
     )
     if not np.isfinite(x).all():
-        return Possible(shown, steps, False)
+        return shown, steps, False
     theta = (fixed + size * (free @ x[:count])).reshape(bodies, PER_BODY) @ _TO_THETA.T
-    return Possible(theta, steps, bool(min_eigenvalue(theta).min() > 0.0))
+    return theta, steps, bool(min_eigenvalue(theta).min() > 0.0)
 
 
-def _closest(r: Array, b: Array) -> Possible:
-    """Least squares with every eigenvalue at least `EDGE`."""
+def _closest(r: Array, b: Array) -> tuple[Array, int, bool]:
+    """Least squares with every eigenvalue at least `EDGE`: θ, steps, and whether it is the best."""
     bodies = r.shape[1] // PER_BODY
     table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, PER_BODY), _TO_THETA)
     table = table.reshape(len(r), -1)
@@ -178,7 +164,7 @@ def _closest(r: Array, b: Array) -> Possible:
     least = np.linalg.eigvalsh(_UNITS @ pseudo_inertia(theta) @ _UNITS).min(axis=-1)
     # where the solver stopped short of the edge's right side
     lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
-    return Possible(theta + lifted, steps, solved)
+    return theta + lifted, steps, solved
 
 
 def adam_theta(r: Array, b: Array, start: Array, steps: int = 5000) -> Solution:
