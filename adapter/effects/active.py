@@ -20,7 +20,7 @@ from adapter.effects.base import (
     Parameter,
     Values,
 )
-from adapter.effects.by_joint import ByJoint, EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.catalogue import CATALOGUE
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
@@ -122,12 +122,13 @@ def with_bodies(model: SelfModel) -> SelfModel:
 
 def by_joint(effects: Iterable[Active], n: int) -> ByJoint:
     """Sums over n joints of effects, whatever their intervals; those of bodies stay out."""
-    sums, left_out = EffectSums.zero(n), set()
+    sums, left_out = ByJoint.zero(n), set()
     for active in effects:
         joint = slice(None) if active.joint < 0 else active.joint
         if not active.effect.at_instant(sums, joint, active.values):
             left_out.add(active.effect.name)
-    return sums.by_joint(left_out)
+    sums.left_out = tuple(sorted(left_out))
+    return sums
 
 
 def _of_entry(entry: Any, n: int) -> list[Active]:

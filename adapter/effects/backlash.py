@@ -13,7 +13,7 @@ from adapter.effects.base import (
     Values,
     late_jit,
 )
-from adapter.effects.by_joint import EffectSums, smooth_sign
+from adapter.effects.by_joint import ByJoint, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import FLANK
 
@@ -83,7 +83,7 @@ class Backlash(MotionEffect):
         """What starts and stops leave of the noise in accelerations looks like a narrow play."""
         return NARROW if abs(float(values["b"])) < SIZES_RAD[0] else 0.0
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """Half the play."""
         sums.half_play[joint] += 0.5 * float(values["b"])
         return True

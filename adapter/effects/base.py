@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import EffectSums, JointSignals, smooth_sign
+from adapter.effects.by_joint import ByJoint, JointSignals, smooth_sign
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import DecidingExperiment
 from adapter.errors import ModelError
@@ -273,7 +273,6 @@ class Effect(ABC):
         passing: whether it comes and goes by itself.
         watched: whether the monitor looks for it while an arm is learned: an effect of a joint
             with `columns`, a body or a wrench at the flange.
-        own_to_log: whether each recording has one of its own, where several are of one arm.
         bundled: whether any joint may have it: such effects of one joint hide one another.
         over_angle: whether it is a curve over the joint's angle.
         is_theta: whether its coefficients are the ten inertial parameters of a link.
@@ -297,7 +296,6 @@ class Effect(ABC):
     steady: ClassVar[bool] = False
     passing: ClassVar[bool] = False
     watched: ClassVar[bool] = False
-    own_to_log: ClassVar[bool] = False
     bundled: ClassVar[bool] = False
     over_angle: ClassVar[bool] = False
     is_theta: ClassVar[bool] = False
@@ -338,7 +336,7 @@ class Effect(ABC):
         """ln of how much rarer these parameters are met than others of the effect."""
         return 0.0
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """Add what one instant shows of the effect to sums; False where it shows nothing.
 
         `joint` from 0, or all of them.
@@ -364,23 +362,22 @@ class Effect(ABC):
                 if p.optional:
                     continue
                 raise ModelError(f"{self.name} needs '{p.key}' ({p.unit})")
-            _check_number(self.name, p, values[p.key])
+            given = values[p.key]
+            try:
+                value = np.asarray(given, dtype=float)
+            except (TypeError, ValueError):
+                value = np.full(p.count, np.nan)
+            shape = () if p.count == 1 else (p.count,)
+            where = f"{self.name}: '{p.key}'"
+            if value.shape != shape or not np.all(np.isfinite(value)):
+                wanted = "a finite number" if p.count == 1 else f"{p.count} finite numbers"
+                raise ModelError(f"{where} must hold {wanted} ({p.unit}), got {given!r}")
+            if np.any(value < p.lower) or np.any(value > p.upper):
+                raise ModelError(f"{where} is {given}, outside {p.lower:g} to {p.upper:g}")
 
     def units(self) -> dict[str, str]:
         """Unit of each parameter."""
         return {p.key: p.unit for p in self.parameters}
-
-
-def _check_number(name: str, p: Parameter, given: Any) -> None:
-    try:
-        value = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        value = np.full(p.count, np.nan)
-    if value.shape != (() if p.count == 1 else (p.count,)) or not np.all(np.isfinite(value)):
-        wanted = "a finite number" if p.count == 1 else f"{p.count} finite numbers"
-        raise ModelError(f"{name}: '{p.key}' must hold {wanted} ({p.unit}), got {given!r}")
-    if np.any(value < p.lower) or np.any(value > p.upper):
-        raise ModelError(f"{name}: '{p.key}' is {given}, outside {p.lower:g} to {p.upper:g}")
 
 
 class MotionEffect(Effect):
@@ -454,7 +451,7 @@ class JointTorque(TorqueEffect):
         numbers = {key: float(value) for key, value in values.items()}
         return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), numbers))
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The law itself."""
         assert isinstance(joint, int)
         sums.add_law(self, joint, values)

@@ -40,5 +40,6 @@ class BaseTilt(BodyEffect):
         """A base that stands on an upright link."""
         if more.floating:
             return NO_PLACE
-        more.turn_base(self.turn(values))
+        turn = self.turn(values)
+        more.tilt = turn if more.tilt is None else more.tilt @ turn
         return None

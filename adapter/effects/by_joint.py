@@ -7,7 +7,7 @@ call, and nothing is looked up by name on the way.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -82,8 +82,8 @@ class JointLaw(Protocol):
 
 
 @dataclass(eq=False)
-class EffectSums:
-    """Sums over the effects of n joints, to which each effect adds its own.
+class ByJoint:
+    """Effects of n joints at one instant, to which each adds its own; without any all is zero.
 
     Attributes:
         wrench: (6,) [f; m] on the last link, base axes.
@@ -94,6 +94,7 @@ class EffectSums:
         log_gain: (n,) ln of the torque sensors' gains.
         delay_s: (n,) of the torque sensors.
         laws: torques at the joints with each parameter (n,); one twice where a joint has two.
+        left_out: names of what a single instant cannot show.
     """
 
     wrench: Array
@@ -104,10 +105,11 @@ class EffectSums:
     log_gain: Array
     delay_s: Array
     laws: list[tuple[JointLaw, dict[str, Array]]] = field(default_factory=list)
+    left_out: tuple[str, ...] = ()
     _taken: list[set[int]] = field(default_factory=list)
 
     @classmethod
-    def zero(cls, n: int) -> EffectSums:
+    def zero(cls, n: int) -> ByJoint:
         """Of n joints without effects."""
         offset, half_play, compliance, log_gain, delay_s = np.zeros((5, n))
         wave = np.zeros(n, dtype=complex)
@@ -124,43 +126,20 @@ class EffectSums:
         for key, value in values.items():
             self.laws[at][1][key][joint] = float(value)
 
-    def by_joint(self, left_out: Iterable[str]) -> ByJoint:
-        """All that was added; `left_out`: names of what was not."""
-        return ByJoint(
-            laws=tuple(self.laws),
-            wrench=self.wrench,
-            offset=self.offset,
-            ripple=np.abs(self.wave),
-            phase=np.angle(self.wave),
-            half_play=self.half_play,
-            compliance=self.compliance,
-            gain=np.expm1(self.log_gain),
-            delay_s=self.delay_s,
-            left_out=tuple(sorted(left_out)),
-        )
+    @cached_property
+    def ripple(self) -> Array:
+        """(n,) rad, of what an encoder adds once a turn."""
+        return np.abs(self.wave)
 
+    @cached_property
+    def phase(self) -> Array:
+        """(n,) rad, of the same."""
+        return np.angle(self.wave)
 
-@dataclass(frozen=True, eq=False)
-class ByJoint:
-    """Effects of n joints at one instant; what a joint has none of is zero.
-
-    Attributes:
-        laws, wrench, offset, half_play, compliance, delay_s: see `EffectSums`.
-        ripple, phase: (n,) rad, of what an encoder adds once a turn.
-        gain: (n,) of the torque sensors.
-        left_out: names of what a single instant cannot show.
-    """
-
-    laws: tuple[tuple[JointLaw, dict[str, Array]], ...]
-    wrench: Array
-    offset: Array
-    ripple: Array
-    phase: Array
-    half_play: Array
-    compliance: Array
-    gain: Array
-    delay_s: Array
-    left_out: tuple[str, ...]
+    @cached_property
+    def gain(self) -> Array:
+        """(n,) of the torque sensors."""
+        return np.expm1(self.log_gain)
 
     @cached_property
     def moves(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS
 from adapter.model.urdf_text import Additions
@@ -26,7 +26,7 @@ class EncoderOffset(MotionEffect):
         still = np.zeros(len(motion.t))
         return motion.moved(joint, still - float(values["o"]), still, still)
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The offset."""
         sums.offset[joint] += float(values["o"])
         return True

@@ -14,7 +14,7 @@ from adapter.effects.base import (
     Values,
     polar,
 )
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, TURN
 
@@ -42,7 +42,7 @@ class EncoderRipple(MotionEffect):
         sine, cosine = a * np.sin(angle), a * np.cos(angle)
         return motion.moved(joint, -sine, -cosine * dq, sine * dq**2 - cosine * ddq)
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The wave."""
         sums.wave[joint] += float(values["a"]) * np.exp(1j * float(values["phase"]))
         return True

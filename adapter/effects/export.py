@@ -19,7 +19,7 @@ from adapter.model.mjcf_text import MJCF_PLACES, mjcf_text
 from adapter.model.self_model import MJCF, SelfModel, theta_doubt
 from adapter.model.urdf import file_text
 from adapter.model.urdf_onto import urdf_onto
-from adapter.model.urdf_text import URDF_PLACES, Additions, unplaced, urdf_text
+from adapter.model.urdf_text import STIFFNESS, URDF_PLACES, Additions, unplaced, urdf_text
 from adapter.model.xml_edit import XmlText
 
 
@@ -129,19 +129,19 @@ def _additions(model: SelfModel, places: Sequence[str], acting: Sequence[Active]
             if part is None:
                 continue
             note = part
-        more.left_out.append(_said(model, active) + (f" ({note})" if note else ""))
-        names.add(active.effect.name)
-    more.without_negative(model.tree.joint_names)
+        name, units = active.effect.name, active.effect.units()
+        where = "" if active.joint < 0 else f" of {model.tree.joint_names[active.joint]}"
+        numbers = [f"{key} = {_number(x)} {units[key]}" for key, x in active.values.items()]
+        said = f"{name}{where}, {', '.join(numbers)}"
+        more.left_out.append(said + (f" ({note})" if note else ""))
+        names.add(name)
+    for what, table in more.joint.items():  # no format takes negative losses
+        for j in np.flatnonzero(table < 0.0) if what != STIFFNESS else ():
+            name = model.tree.joint_names[j]
+            more.left_out.append(f"{what} of {name}, which is negative: {table[j]:g}")
+            table[j] = 0.0
     more.names = sorted(names)
     return more
-
-
-def _said(model: SelfModel, active: Active) -> str:
-    """An effect in words: name, joint, parameters with units."""
-    units = active.effect.units()
-    where = "" if active.joint < 0 else f" of {model.tree.joint_names[active.joint]}"
-    numbers = (f"{key} = {_number(x)} {units[key]}" for key, x in active.values.items())
-    return f"{active.effect.name}{where}, {', '.join(numbers)}"
 
 
 def _number(value: object) -> str:

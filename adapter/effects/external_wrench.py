@@ -12,7 +12,7 @@ from adapter.effects.base import (
     TorqueEffect,
     Values,
 )
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import Length, Phrase
 from adapter.effects.splits import ALONE
 
@@ -39,14 +39,13 @@ class ExternalWrench(TorqueEffect):
     sudden = True
     passing = True
     watched = True
-    own_to_log = True
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """-J^T w."""
         wrench = np.array([values[key] for key in KEYS], dtype=float)
         return -motion.arm.wrench_torque(motion.q, wrench)
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The wrench."""
         sums.wrench += np.array([values[key] for key in KEYS], dtype=float)
         return True

@@ -28,7 +28,6 @@ class FrictionDrift(TorqueEffect):
     prior_std = 0.05
     log_odds = -5.0
     inexact = 0.03
-    own_to_log = True
     phrase = Phrase(
         "the friction of {who} rises by {x}", "dFc", "the friction of {who} falls by {x}"
     )

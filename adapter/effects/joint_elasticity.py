@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from adapter.effects.base import Array, Motion, MotionEffect, Parameter, Values
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS
 
@@ -33,7 +33,7 @@ class JointElasticity(MotionEffect):
         speed = motion.rate(twist)
         return motion.moved(joint, twist, speed, motion.rate(speed))
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The compliance."""
         sums.compliance[joint] += 1.0 / float(values["k"])
         return True

@@ -34,7 +34,6 @@ class Payload(BodyEffect):
     shows = ((BARE, "is gone"),)
     sudden = True
     watched = True
-    own_to_log = True
     is_theta = True
 
     def decode(self, x: Array) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import ALL, LATE, Array, Motion, Parameter, SensorEffect, Values
-from adapter.effects.by_joint import EffectSums
+from adapter.effects.by_joint import ByJoint
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import LOADS, SPEEDS, STILL
 
@@ -46,7 +46,7 @@ class SignalDelay(SensorEffect):
         out[:, joint] = late[:, joint]
         return np.asarray(out)
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The delay."""
         sums.delay_s[joint] += float(values["d"])
         return True

@@ -13,7 +13,6 @@ from adapter.effects.base import (
     SMOOTH_HZ,
     ArmDynamics,
     BodyEffect,
-    Flags,
     Motion,
     MotionEffect,
     SensorEffect,
@@ -44,18 +43,13 @@ def moved_links(motion: Motion, effects: Sequence[Active], tau: Array | None = N
             if guess is None:
                 guess = bodies(motion, effects)
             moved = active.effect.link_side(motion, guess, active.joint, active.values)
-            motion = _where(active.on(motion.t), moved, motion)
+            on = active.on(motion.t)
+            if on is not None:
+                pairs = {k: (getattr(moved, k), getattr(motion, k)) for k in ("q", "dq", "ddq")}
+                tables = {k: np.where(on[:, None], *pair) for k, pair in pairs.items()}
+                moved = replace(motion, **tables)
+            motion = moved
     return motion
-
-
-def _where(on: Flags | None, moved: Motion, motion: Motion) -> Motion:
-    if on is None:
-        return moved
-    tables = {
-        key: np.where(on[:, None], getattr(moved, key), getattr(motion, key))
-        for key in ("q", "dq", "ddq")
-    }
-    return replace(motion, **tables)
 
 
 def bodies(motion: Motion, effects: Sequence[Active]) -> Array:

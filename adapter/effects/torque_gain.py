@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adapter.effects.base import Array, Motion, Parameter, SensorEffect, Values
-from adapter.effects.by_joint import EffectSums, JointSignals
+from adapter.effects.by_joint import ByJoint, JointSignals
 from adapter.effects.phrases import Phrase
 from adapter.effects.splits import KNOWN_WEIGHT, LOADS
 
@@ -31,7 +31,7 @@ class TorqueGain(SensorEffect):
         out[:, joint] *= 1.0 + float(values["g"])
         return out
 
-    def at_instant(self, sums: EffectSums, joint: int | slice, values: Values) -> bool:
+    def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """The gain."""
         sums.log_gain[joint] += np.log1p(float(values["g"]))
         return True

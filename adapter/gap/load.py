@@ -124,8 +124,8 @@ def find_load(
     if taken[0].moves:
         notes += _changed(parts, std, alive, 1e-9 * (log.end_ns - log.begin_ns))
     load = load_of(found.x[:10], found.covariance[:10, :10], riding)
-    left = found.left_nm, taken[0].moments.rms
-    return replace(load, left_nm=left[0], before_nm=left[1], notes=tuple(dict.fromkeys(notes)))
+    left, before = (alive * x for x in (found.left_nm, taken[0].moments.rms))
+    return replace(load, left_nm=left, before_nm=before, notes=tuple(dict.fromkeys(notes)))
 
 
 class _Taken(NamedTuple):

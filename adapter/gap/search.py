@@ -258,7 +258,7 @@ def _with(
     progress(", ".join(f"{x.candidate.effect.title} {x.candidate.joint + 1}" for x in move.leads))
     before, lead = len(fit.named), move.leads[-1]
     new = [Named(x.candidate, x.x, x.interval_s, x.recording) for x in move.leads]
-    known = [a.effect for a in (*fit.model.known, *(e.candidate for e in fit.named))]
+    known = [*(a.effect for a in fit.model.known), *(e.candidate.effect for e in fit.named)]
     if _puts_down(lead) and HELD not in known:  # then the hand held it before
         new.insert(0, Named(lead.candidate, np.zeros(len(lead.x)), recording=lead.recording))
     trial, _ = refitted(fit.with_named((*fit.named, *new)).with_noise(rich))
@@ -290,14 +290,10 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
     while True:
         fit, carried = under_own_noise(fit)
         if before is not None and _lost(before, fit):
-            pairs = zip(before.named, fit.named, strict=True)
-            tried = [  # those that it got instead
-                replace(a, tried=a.tried | {b.candidate.key})
-                if a.candidate is not b.candidate
-                else a
-                for a, b in pairs
-            ]
-            fit, before = before.with_named(tried), None
+            for k, (a, b) in enumerate(zip(before.named, fit.named, strict=True)):
+                if a.candidate is not b.candidate:  # that it got instead has been tried
+                    before = before.instead(k, replace(a, tried=a.tried | {b.candidate.key}))
+            fit, before = before, None
             continue
         before, values = None, weak(fit, carried)
         bad = worst(fit, values)

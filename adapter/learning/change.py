@@ -110,8 +110,16 @@ class ChangeDetector:
         armed = self.settings.enabled and self.samples >= self._armed_at
         if armed and self._alarming(most, mean):
             self._wait = self.settings.wait
-        else:
-            self._remember_burst(samples, most, mean)
+        elif self.samples >= self._armed_at - self.settings.slow:
+            # largest ratios, block by block: a block counts once it is over, so that what is just
+            # rising does not raise its own bar
+            block, peaks = self._block, self._peaks
+            block[0], block[1] = max(block[0], most), max(block[1], mean)
+            self._block_samples += samples
+            if self._block_samples >= BURST_BLOCK:
+                fade = 1.0 - self._block_samples / self.settings.burst_memory
+                peaks[:] = np.maximum(fade * peaks, block)
+                block[:], self._block_samples = 0.0, 0
 
     def weigh_all(self, samples: NDArray[np.int64], ratios: Array) -> None:
         """`weigh` step by step: (m,) samples each, and (m or more, 2) of `compare` where any."""
@@ -135,19 +143,6 @@ class ChangeDetector:
             one, every = (fade * s.burst_factor * self._peaks).tolist()
             most = max(s.one_factor, one), max(s.all_factor, every)
         return (s.fast, s.slow), self.samples, self.recent, self.level, most
-
-    def _remember_burst(self, samples: int, most: float, mean: float) -> None:
-        """Largest ratios, block by block: a block counts once it is over, so that what is just
-        rising does not raise its own bar."""
-        if self.samples < self._armed_at - self.settings.slow:
-            return
-        block, peaks = self._block, self._peaks
-        block[0], block[1] = max(block[0], most), max(block[1], mean)
-        self._block_samples += samples
-        if self._block_samples >= BURST_BLOCK:
-            fade = 1.0 - self._block_samples / self.settings.burst_memory
-            peaks[:] = np.maximum(fade * peaks, block)
-            block[:], self._block_samples = 0.0, 0
 
     def _alarming(self, most: float, mean: float) -> bool:
         s = self.settings

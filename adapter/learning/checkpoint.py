@@ -111,7 +111,12 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
             f"{path}: is of another robot or other learner settings: {arrays.get('about')}; "
             f"here: {_about(learner)}"
         )
-    _check_sound(arrays, path)
+    lacking = [key for key in (*_NEEDED, *_FINITE) if key not in arrays]
+    if lacking:
+        raise SettingsError(f"{path}: the checkpoint lacks '{lacking[0]}'")
+    for key in _FINITE:
+        if arrays[key].dtype.kind not in "fiub" or not np.isfinite(arrays[key]).all():
+            raise SettingsError(f"{path}: '{key}' of the checkpoint holds what is no finite number")
     learner._shadow = learner.theta.empty_moments() if "_shadow.A" in arrays else None
     for part, names in _STATE.items():
         owner = attrgetter(part)(learner) if part else learner
@@ -124,16 +129,6 @@ def load_checkpoint(learner: OnlineLearner, path: str | Path) -> None:
     learner._held[np.arange(learner._held_from, learner._held_to) % size] = arrays[".held"]
     learner.changes[:] = [Change(int(stamp)) for stamp in arrays[".changes"]]
     learner.adam.steps = int(arrays["adam.steps"])
-
-
-def _check_sound(arrays: Mapping[str, np.ndarray], path: str | Path) -> None:
-    """Refuse a checkpoint that lacks parts, or whose estimate holds what is no number."""
-    lacking = [key for key in (*_NEEDED, *_FINITE) if key not in arrays]
-    if lacking:
-        raise SettingsError(f"{path}: the checkpoint lacks '{lacking[0]}'")
-    for key in _FINITE:
-        if arrays[key].dtype.kind not in "fiub" or not np.isfinite(arrays[key]).all():
-            raise SettingsError(f"{path}: '{key}' of the checkpoint holds what is no finite number")
 
 
 def _put(owner: object, name: str, value: np.ndarray | None) -> None:

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.learning.imu_windows import BELL, BEND, OVERLAP, Course, Readings, Windows
+from adapter.learning.imu_windows import BELL, BEND, OVERLAP, Course, Readings, Sums, Windows
 from adapter.model.spatial import Array, exp_rotation, log_rotation, rot_z, skew
 from adapter.model.tree import BASE, Tree
 
@@ -155,14 +155,11 @@ class Fit:
     Attributes:
         estimate: at the least cost.
         covariance: (P, P) of all unknowns, in the order of `Estimate.moved`; zero in the gauge.
-        w_std, a_std: (s,) what is left of w and a in a window, rad/s, m/s².
-        w_share: (s,) the same for w, as a share of how the sensor turned.
+        w_share: (s,) what is left of w in a window, as a share of how the sensor turned.
     """
 
     estimate: Estimate
     covariance: Array
-    w_std: Array
-    a_std: Array
     w_share: Array
 
 
@@ -183,7 +180,7 @@ class ImuFit:
         self.windows = Windows.over(joints, readings.t_s)
         t_s = self.windows.t_s
         self.q, self.dq = joints.at(t_s), joints.rate(t_s)
-        self._bell, self._bend = self.windows.sums(BELL), self.windows.sums(BEND)
+        self._bell, self._bend = Sums(BELL, self.windows), Sums(BEND, self.windows)
         self._sensors, self._whole = [], []
         for s in range(len(links)):
             told = np.concatenate([readings.w[:, s], readings.a[:, s]], axis=1)
@@ -235,7 +232,11 @@ class ImuFit:
                 break
         free = self._free(at)
         covariance = free @ np.linalg.inv(free.T @ slope.curvature @ free) @ free.T
-        return Fit(at, covariance, stds[:, 0], stds[:, 1], self._share(stds[:, 0]))
+        share = np.zeros(len(self.links))
+        for k, course in enumerate(self._sensors):
+            w = self._bell(course.at(self.windows.t_s)[:, :3])[self._whole[k]]
+            share[k] = stds[k, 0] / max(float(np.sqrt(np.mean((w - w.mean(axis=0)) ** 2))), 1e-12)
+        return Fit(at, covariance, share)
 
     def known(self, prior: Prior, at: Estimate) -> Prior:
         """All that a prior and these readings say, for when the readings are no longer held."""
@@ -254,13 +255,6 @@ class ImuFit:
         gauge = basis.T @ np.pad(base_gauge(self.tree, self.gravity, at), ((0, OWN * s), (0, 0)))
         rest, _ = np.linalg.qr(gauge, mode="complete")
         return np.asarray(basis @ rest[:, gauge.shape[1] :])
-
-    def _share(self, w_std: Array) -> Array:
-        share = np.zeros(len(self.links))
-        for k, course in enumerate(self._sensors):
-            w = self._bell(course.at(self.windows.t_s)[:, :3])[self._whole[k]]
-            share[k] = w_std[k] / max(float(np.sqrt(np.mean((w - w.mean(axis=0)) ** 2))), 1e-12)
-        return share
 
     def _cost(self, at: Estimate, stds: Array, prior: Prior) -> float:
         arm, total = _Arm.of(self, at.R0, at.p), prior.at(at).cost

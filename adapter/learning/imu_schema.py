@@ -6,7 +6,7 @@ each time from where the last solution stood. What is no longer held stays as a 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -44,7 +44,12 @@ class ImuSchema(Schema):
 
     def __init__(self, tree: Tree, base: RestingBase | None, settings: SchemaSettings, lam: Array):
         super().__init__(tree, base, settings)
-        self._tree, self._links = tree, imu_links(tree, settings.imus)
+        for name in settings.imus:
+            if name not in tree.link_names:
+                have = choices(name, tree.link_names)
+                raise SettingsError(f"no link '{name}' that a sensor could be on; {have}")
+        self._tree = tree
+        self._links = tuple(tree.link_names.index(name) for name in settings.imus)
         if base is None:
             raise SettingsError("sensors on links need a base that rests")
         self._gravity = -base.measured[6:9]
@@ -114,13 +119,20 @@ class ImuSchema(Schema):
         self._choose(rows)
         if not self._used:
             return
-        readings = self._readings(rows)
+        n = self._tree.n
+        _, first = np.unique(rows[:, 0], return_index=True)  # in order of time
+        ordered = rows[first]
+        told = ordered[:, 1 + n :].reshape(len(ordered), -1, 9)[:, list(self._used)]
+        told = np.where(told[..., HEARD, None] > 0.0, told, np.nan)
+        readings = Readings(ordered[:, 0], ordered[:, 1 : 1 + n], told[..., W], told[..., A])
         fit = self._fit_of(readings)
         if not fit.count:
             return
         if self._at is None:
             self._at = fit.begin(self.R0, self.p)
-        prior = self._prior or Prior.springs(self._start(self._at))
+        # the documented frames, and sensors of which nothing is known but what turns them
+        frames = matrix_from_zxz(self.start_lam[:, :3]), self.start_lam[:, 3:]
+        prior = self._prior or Prior.springs(Estimate.of(*frames, self._at.turn))
         found = fit.solve(prior, self._at)
         self._take(found)
         if readings.t_s[-1] - readings.t_s[0] > HELD_S:
@@ -129,22 +141,9 @@ class ImuSchema(Schema):
             self._prior = half.known(prior, found.estimate)
             self._tables = [rows[old:]]
 
-    def _start(self, at: Estimate) -> Estimate:
-        """The documented frames, and sensors of which nothing is known but what turns them."""
-        return Estimate.of(matrix_from_zxz(self.start_lam[:, :3]), self.start_lam[:, 3:], at.turn)
-
     def _fit_of(self, readings: Readings) -> ImuFit:
         links = tuple(self._links[s] for s in self._used)
         return ImuFit(self._tree, self._gravity, links, readings)
-
-    def _readings(self, rows: Array) -> Readings:
-        """Of the sensors in use, in order of time."""
-        n = self._tree.n
-        _, first = np.unique(rows[:, 0], return_index=True)
-        rows = rows[first]
-        told = rows[:, 1 + n :].reshape(len(rows), -1, 9)[:, list(self._used)]
-        told = np.where(told[..., HEARD, None] > 0.0, told, np.nan)
-        return Readings(rows[:, 0], rows[:, 1 : 1 + n], told[..., W], told[..., A])
 
     def _choose(self, rows: Array) -> None:
         """Sensors that can be used; where they become others, the search begins anew."""
@@ -183,12 +182,6 @@ class ImuSchema(Schema):
             step = np.abs(vectors[:, certain].T @ moved[j])
             std = np.sqrt(values[certain])
             calm &= bool((step < np.maximum(self.settings.distance_goal, SURE * std)).all())
-        self._note_astray(found)
-        calm &= not self._astray and bool(ranks.any()) and bool((ranks == self.ranks).all())
-        self.rank, self.ranks[:] = int(np.einsum("jaa->", self.identifiable).round()), ranks
-        self.converged = calm
-
-    def _note_astray(self, found: Fit) -> None:
         names = [self.settings.imus[s] for s in self._used]
         self._astray = [
             f"the sensor on {name} turns otherwise than {name} of the model does (off by "
@@ -196,6 +189,9 @@ class ImuSchema(Schema):
             for name, share in zip(names, found.w_share, strict=True)
             if share > ASTRAY
         ]
+        calm &= not self._astray and bool(ranks.any()) and bool((ranks == self.ranks).all())
+        self.rank, self.ranks[:] = int(np.einsum("jaa->", self.identifiable).round()), ranks
+        self.converged = calm
 
     def more_state(self) -> dict[str, Array]:
         """What a checkpoint holds of this beside what it holds of any `Schema`."""
@@ -227,15 +223,6 @@ class ImuSchema(Schema):
         centre = Estimate.from_arrays(state, "centre.")
         if centre is not None:
             self._prior = Prior(centre, state["gradient"], state["curvature"])
-
-
-def imu_links(tree: Tree, names: Sequence[str]) -> tuple[int, ...]:
-    """Places of links by name. Raises SettingsError with the names there are."""
-    for name in names:
-        if name not in tree.link_names:
-            have = choices(name, tree.link_names)
-            raise SettingsError(f"no link '{name}' that a sensor could be on; {have}")
-    return tuple(tree.link_names.index(name) for name in names)
 
 
 def _wrong(t_s: Array, told: Array) -> str | None:

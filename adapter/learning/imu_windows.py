@@ -55,9 +55,16 @@ class Course:
     def __init__(self, t_s: Array, x: Array) -> None:
         from scipy.interpolate import CubicSpline  # takes long to load, and few runs need it
 
-        longest = max(LONGEST_GAP_S, LONGEST_PERIODS * float(np.median(np.diff(t_s))))
-        t_s, x = _thinned(t_s, x)
-        self._t_s, self._longest_s = t_s, longest
+        period_s = float(np.median(np.diff(t_s)))
+        self._longest_s = max(LONGEST_GAP_S, LONGEST_PERIODS * period_s)
+        count = int(1.0 / (FASTEST_HZ * period_s) + 1e-6)
+        if count > 1:  # averages of so many readings; none across a gap
+            part = np.cumsum(np.diff(t_s, prepend=t_s[0]) > LONGEST_PERIODS * period_s)
+            start = np.flatnonzero(np.diff(part, prepend=-1))
+            first = np.flatnonzero((np.arange(len(t_s)) - start[part]) % count == 0)
+            size = np.diff(first, append=len(t_s))
+            t_s, x = np.add.reduceat(t_s, first) / size, np.add.reduceat(x, first) / size[:, None]
+        self._t_s = t_s
         self._curve = CubicSpline(t_s, x)
 
     def at(self, t_s: Array) -> Array:
@@ -74,21 +81,6 @@ class Course:
         near = self._t_s[behind] - self._t_s[behind - 1] <= self._longest_s
         inside = (t_s >= self._t_s[0]) & (t_s <= self._t_s[-1])
         return np.asarray(near & inside)
-
-
-def _thinned(t_s: Array, x: Array) -> tuple[Array, Array]:
-    """Averages of so many readings that `FASTEST_HZ` is about their rate; none across a gap."""
-    period_s = float(np.median(np.diff(t_s)))
-    count = int(1.0 / (FASTEST_HZ * period_s) + 1e-6)
-    if count < 2:
-        return t_s, x
-    part = np.cumsum(np.diff(t_s, prepend=t_s[0]) > LONGEST_PERIODS * period_s)
-    start = np.flatnonzero(np.diff(part, prepend=-1))
-    place = np.arange(len(t_s)) - start[part]
-    first = np.flatnonzero(place % count == 0)
-    size = np.diff(first, append=len(t_s))
-    t_mean, mean = np.add.reduceat(t_s, first) / size, np.add.reduceat(x, first) / size[:, None]
-    return t_mean, mean
 
 
 @dataclass(frozen=True)
@@ -122,10 +114,6 @@ class Windows:
             np.concatenate(starts) if starts else none.astype(int),
         )
 
-    def sums(self, kernel: Array) -> Sums:
-        """What weighs signals on the grid with a kernel, window by window."""
-        return Sums(kernel, self.starts, len(self.t_s))
-
     def whole(self, heard: np.ndarray) -> np.ndarray:
         """(k,) windows in all of which something was heard, from (g,)."""
         missing = np.concatenate([[0], np.cumsum(~heard)])
@@ -133,14 +121,15 @@ class Windows:
 
 
 class Sums:
-    """A kernel laid over a grid at each window."""
+    """What weighs signals on the grid with a kernel, window by window."""
 
-    def __init__(self, kernel: Array, starts: np.ndarray, size: int) -> None:
+    def __init__(self, kernel: Array, windows: Windows) -> None:
         from scipy.sparse import csr_array
 
-        columns = (starts[:, None] + np.arange(len(kernel))).ravel()
+        count, size = len(windows.starts), len(windows.t_s)
+        columns = (windows.starts[:, None] + np.arange(len(kernel))).ravel()
         rows = np.arange(0, len(columns) + 1, len(kernel))
-        self._table = csr_array((np.tile(kernel, len(starts)), columns, rows), (len(starts), size))
+        self._table = csr_array((np.tile(kernel, count), columns, rows), (count, size))
 
     def __call__(self, x: Array) -> Array:
         """(k, ...) weighted sums of x (g, ...)."""

@@ -8,7 +8,6 @@ what is linear in them (offsets, gains, twists of gears, delays) is undone after
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,21 +27,14 @@ TWIST_SMOOTHING_S = 0.03
 SMALLEST_STD = 1e-3  # of the effect's own; a model that is surer than that is not believed
 
 
-class SensorErrors(NamedTuple):
-    """What gears' play and torque sensors do to readings, each (n,); see `ByJoint`."""
-
-    half_play: Array
-    gain: Array
-    delay_s: Array
-
-
 @jit
 def to_joints(stamps, table, sensors, gears, clock, memory):
     """Undo what sensors and gears do to states (m, size), in place, one after the other.
 
     Args:
         stamps: (m,) int64 ns; table: (m, size) of `StateLayout`.
-        sensors: `SensorErrors`; gears: `Gears`.
+        sensors: half the gears' play, gain and delay of the torque sensors, (n,) each, see
+            `ByJoint`; gears: `Gears`.
         clock: (2,) int64 stamp of the state before, and states since a hole, at most 2.
         memory: (4, n) torque of the state before, its rate, link angle behind the play, second
             rate of torque.
@@ -140,7 +132,7 @@ class KnownEffects:
         n = arm.n
         self._layout, self._arm, self._smoothing_s = StateLayout(n), arm, smoothing_s
         self._own = own = by_joint(effects, n)
-        self._sensors = SensorErrors(own.half_play, own.gain, own.delay_s)
+        self._sensors = own.half_play, own.gain, own.delay_s
         self._gears = Gears.of(own)
         turned = own.offset.any() or own.ripple.any()
         self._encoders = self._gears._replace(compliance=np.zeros(n)) if turned else None
@@ -171,13 +163,9 @@ class KnownEffects:
         if own.laws:
             tau -= own.torque(signals)
         if self._encoders is not None:
-            self._turn_back(table, self._encoders)
+            still, unused = np.zeros(at.n), np.zeros(at.n)
+            untwisted = JointTorques(still, still, still)
+            for m in np.flatnonzero(table[:, KIND] >= LinkMotionKind.MEASURED):
+                motion = JointMotion(table[m, at.motion_q], table[m, at.motion_dq], unused)
+                to_links(motion, untwisted, self._encoders)
         return table
-
-    def _turn_back(self, table: Array, encoders: Gears) -> None:
-        """Take the encoders' errors off the angles that measured link motion goes with."""
-        at, still, unused = self._layout, np.zeros(self._layout.n), np.zeros(self._layout.n)
-        untwisted = JointTorques(still, still, still)
-        for m in np.flatnonzero(table[:, KIND] >= LinkMotionKind.MEASURED):
-            q, dq = table[m, at.motion_q], table[m, at.motion_dq]
-            to_links(JointMotion(q, dq, unused), untwisted, encoders)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
@@ -161,9 +160,20 @@ class OnlineLearner:
         filtered, known = filtered or Filtered(), known or KnownArm()
         self.tree, self.layout = tree, StateLayout(tree.n, tree.floating)
         each_sample = s.mode == Mode.SAMPLE
-        rest = _resting_base(tree, gravity, known.arm)
+        rest = None
+        if not tree.floating:
+            if gravity is None:
+                raise SettingsError("a robot whose base rests needs the gravity it stands in")
+            documented = base_at_rest(gravity)
+            measured = documented if known.arm is None else base_at_rest(known.arm.gravity)
+            rest = RestingBase(documented, measured)
         self.base = np.empty(0) if rest is None else rest.measured
-        self.schema = self._schema(rest, known.lam)
+        if not s.schema.imus:
+            self.schema = Schema(tree, rest, s.schema, each_sample, s.seed)
+        elif known.lam is None:
+            raise SettingsError("sensors on links need a documented λ to start from")
+        else:
+            self.schema = ImuSchema(tree, rest, s.schema, known.lam)
         told = believed(known.effects, s.effects, tree.n)
         before = ThetaKnowledge(
             None if rest is None else rest.measured,
@@ -179,7 +189,11 @@ class OnlineLearner:
         by_rates = any(effect.by_rates for effect in self.theta.effects)
         self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
         self.rates = self._rates if by_rates else None
-        places = [(column, self._rates.place(rate)) for column, rate in self.theta.rate_columns]
+        places, column = [], 0
+        for effect in self.theta.effects:
+            if effect.rate is not None:
+                places.append((column, self.layout.rates.start + effect.rate * tree.n))
+            column += len(effect.shapes) or 1
         self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
         self.given = tuple(known.effects)
@@ -188,8 +202,19 @@ class OnlineLearner:
         rate = s.theta.sample_rate if each_sample else s.theta.rate
         # one flat parameter, so that one step serves λ and θ
         self.adam = FlatAdam(6 * tree.n + self.theta.P, rate, s.theta.betas)
-        self._bind(self.adam.parameters, self.adam.gradient)
-        self._cap = _caps(self.layout)
+        # λ's tangent, θ's parameters and their gradients are views of the flat arrays
+        tangent, x = np.split(self.adam.parameters, [6 * tree.n])
+        x[:] = self.theta.x
+        self.schema.tangent, self.theta.x = tangent.reshape(-1, 6), x
+        slope, self.theta.gradient = np.split(self.adam.gradient, [6 * tree.n])
+        self.schema.gradient = slope.reshape(-1, 6)
+        self._cap, at = np.full(self.layout.size, np.inf), self.layout  # stamps may be anything
+        joint = (at.q, MOST_Q), (at.dq, MOST_DQ), (at.ddq, MOST_DDQ), (at.tau, MOST_TAU)
+        for part, most in (*joint, (at.motion_q, MOST_Q), (at.motion_dq, MOST_DQ)):
+            self._cap[part] = most
+        self._cap[at.motion] = np.tile(MOST_MOTION, at.n)
+        if at.floating:
+            self._cap[at.base] = MOST_MOTION
         self.learned = self.refused = self.rebuilds = 0
         self.stamp_ns = 0
         self.theta_started_ns: int | None = None
@@ -213,23 +238,6 @@ class OnlineLearner:
         memory = self.layout.memory.stop - self.layout.memory.start
         self.score_trace = Trace(1 + 5 * tree.n + moving + memory, capacity=12_000)
         self._torque_states = np.zeros((0, self.layout.before_links.stop))
-
-    def _schema(self, rest: RestingBase | None, lam: Array | None) -> Schema:
-        s = self.settings
-        if not s.schema.imus:
-            each_sample = s.mode == Mode.SAMPLE
-            return Schema(self.tree, rest, s.schema, each_sample, s.seed)
-        if lam is None:
-            raise SettingsError("sensors on links need a documented λ to start from")
-        return ImuSchema(self.tree, rest, s.schema, lam)
-
-    def _bind(self, parameters: Array, gradient: Array) -> None:
-        """Let λ's tangent, θ's parameters and their gradients be views of the flat arrays."""
-        n = self.tree.n
-        parameters[6 * n :] = self.theta.x
-        self.schema.tangent = parameters[: 6 * n].reshape(n, 6)
-        self.schema.gradient = gradient[: 6 * n].reshape(n, 6)
-        self.theta.x, self.theta.gradient = parameters[6 * n :], gradient[6 * n :]
 
     def step(self, state: Array) -> bool:
         """Learn from one filtered state (a record of `StateLayout`): one update of λ and θ.
@@ -286,7 +294,9 @@ class OnlineLearner:
         due = self._theta_is_due(table)
         theta_too = due and self._take_torque(table)
         if updating:
-            self._update(theta_too)
+            theta_too = theta_too and self.theta.compute_gradient()
+            self.follow_convergence()
+            self._adam_step(theta_too)
         self.learned += len(table)
         self._trace_schema(table)
         if self.watch is not None:
@@ -312,11 +322,22 @@ class OnlineLearner:
         if self.schema.looked:
             self._judge_theta()
         self.follow_convergence()
-        done = self._room(rows[: ends[-1]], ends)
+        rows, m, n = rows[: ends[-1]], len(ends), self.tree.n
+        done = Done(
+            rows,
+            self.theta.effect_columns(rows),
+            np.empty((len(rows), n)),
+            ends,
+            np.empty((m, 2)),
+            np.empty((m, self.theta.P)),
+            np.empty((m, n, 3, 3)),
+            np.empty((m, n, 3)),
+        )
         count = int(steps(table, self._parts(int(ends[-1])), tuple(done)))
         self.schema.updates += count - 1
         self.adam.steps += count
-        self.theta.took(int(ends[count - 1]), count)
+        self.theta.count += self.theta.weight * int(ends[count - 1])
+        self.theta.updates += count
         self._look_back(table[:count], done)
         return count
 
@@ -331,20 +352,6 @@ class OnlineLearner:
         if (self.rates is not None and not self._rates_known) or not same_bits():
             return 0
         return self.schema.steady(table)
-
-    def _room(self, rows: Array, ends: NDArray[np.int64]) -> Done:
-        """Room for what steps leave, with the states that θ will be given."""
-        m, k, n = len(ends), len(rows), self.tree.n
-        return Done(
-            rows,
-            self.theta.effect_columns(rows),
-            np.empty((k, n)),
-            ends,
-            np.empty((m, 2)),
-            np.empty((m, self.theta.P)),
-            np.empty((m, n, 3, 3)),
-            np.empty((m, n, 3)),
-        )
 
     def _look_back(self, table: Array, done: Done) -> None:
         """Count, trace and look at what `steps` has done with states (m, size)."""
@@ -451,10 +458,6 @@ class OnlineLearner:
         if self.rates is not None:
             self.rates.take_every(states, triples)
 
-    def set_rate(self, rate: float) -> None:
-        """Let ADAM go on at this rate per update."""
-        self.adam.rate = rate
-
     def follow_convergence(self) -> None:
         """Let ADAM go on at the rate that the settings have before or after θ has converged."""
         if self.settings.mode == Mode.MOMENTS:
@@ -467,12 +470,6 @@ class OnlineLearner:
         while self.schema.started_anew:
             j = self.schema.started_anew.pop()
             self.adam.forget(slice(6 * j, 6 * j + 6))
-
-    def _update(self, theta_too: bool) -> None:
-        """One ADAM step on λ and, if it is being learned, on θ."""
-        ready = theta_too and self.theta.compute_gradient()
-        self.follow_convergence()
-        self._adam_step(ready)
 
     def _adam_step(self, theta_too: bool) -> None:
         """One ADAM step on the gradients as they stand; θ's counts only if asked for."""
@@ -513,7 +510,12 @@ class OnlineLearner:
 
     def _take_torque(self, table: Array) -> bool:
         """Add states to θ's moments; whether θ may be stepped on."""
-        table = self._torque_states = self._with_rates(table)
+        if self.rates is not None:
+            # until θ has seen enough they count as zero, and nothing has to wait for them
+            self._rates_known = self._rates_known or self.theta.count >= RATES_FROM
+            if self._rates_known:
+                table = self.rates.follow(table, self.frames, self.theta.theta, self.base)
+        self._torque_states = table
         if not len(table):
             return not self.change.waiting
         if self.change.waiting:
@@ -526,20 +528,8 @@ class OnlineLearner:
         self._look_on(table, error)
         if self.theta.restart_due(self.theta.weight * len(table)):
             self.theta.restart_spare()
-            self._forget_momentum()
+            self.adam.forget(slice(6 * self.tree.n, None))  # momentum is of no use after a jump
         return True
-
-    def _with_rates(self, table: Array) -> Array:
-        """The states whose rates of torque are known, where an effect asks for those.
-
-        Until θ has seen enough they count as zero, and nothing has to wait for them.
-        """
-        if self.rates is None:
-            return table
-        self._rates_known = self._rates_known or self.theta.count >= RATES_FROM
-        if not self._rates_known:
-            return table
-        return self.rates.follow(table, self.frames, self.theta.theta, self.base)
 
     def _judge_theta(self) -> None:
         """θ has converged when it predicts the last seconds as well as it fits all samples."""
@@ -608,10 +598,6 @@ class OnlineLearner:
         self._held_from = self._held_to
         self._shadow = None
         self.theta_converged = False
-        self._forget_momentum()
-
-    def _forget_momentum(self) -> None:
-        """ADAM's averages of θ's gradient are of no use after a jump."""
         self.adam.forget(slice(6 * self.tree.n, None))
 
     def _hold(self, table: Array) -> None:
@@ -649,16 +635,6 @@ class OnlineLearner:
             self.rebuilds += 1
 
 
-def _resting_base(tree: Tree, gravity: Array | None, arm: RigidArm | None) -> RestingBase | None:
-    """Motion of a base that rests; None where it floats."""
-    if tree.floating:
-        return None
-    if gravity is None:
-        raise SettingsError("a robot whose base rests needs the gravity it stands in")
-    documented = base_at_rest(gravity)
-    return RestingBase(documented, documented if arm is None else base_at_rest(arm.gravity))
-
-
 def _taken_off(
     known: KnownArm, learned: Sequence[str], smoothing_s: float, floating: bool
 ) -> KnownEffects | None:
@@ -671,18 +647,6 @@ def _taken_off(
         needed = "a base that rests" if floating else "the model's arm beside them"
         raise SettingsError(f"effects of a model ({names}) need {needed}, or have to be learned")
     return KnownEffects(fixed, known.arm, smoothing_s)
-
-
-def _caps(at: StateLayout) -> Array:
-    """(size,) most that each number of a state may be; the stamp may be anything."""
-    cap = np.full(at.size, np.inf)
-    joint = (at.q, MOST_Q), (at.dq, MOST_DQ), (at.ddq, MOST_DDQ), (at.tau, MOST_TAU)
-    for part, most in (*joint, (at.motion_q, MOST_Q), (at.motion_dq, MOST_DQ)):
-        cap[part] = most
-    cap[at.motion] = np.tile(MOST_MOTION, at.n)
-    if at.floating:
-        cap[at.base] = MOST_MOTION
-    return cap
 
 
 @jit

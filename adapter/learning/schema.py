@@ -196,7 +196,7 @@ class Schema:
         if not self.settings.spin_measured and self.kind == LinkMotionKind.MEASURED:
             table = table.copy()
             carry_spin(self._frames, base, table)
-        keep = self._keep() if self.settings.forget_s is not None else 1.0
+        keep = self._keep(1e3 * self.settings.forget_s) if self.settings.forget_s else 1.0
         absorb(self._parent, base, table, self._moments, float(self.kind), (keep, self.weight))
 
     def steady(self, table: Array) -> int:
@@ -251,16 +251,14 @@ class Schema:
             part[:] = 0.0
         self._calm_ns, self.converged = 0, False
 
-    def _keep(self) -> float:
+    def _keep(self, window: float) -> float:
         """Forgetting factor per sample; one while the window would lose what it shows."""
-        window = self.settings.forget_s * 1e3 if self.settings.forget_s else np.inf
-        return 1.0 - 1.0 / window if self.count >= 0.9 * window and self._excited() else 1.0
-
-    def _excited(self) -> bool:
-        """Whether the newest sample moves every joint that the moments know about."""
+        if self.count < 0.9 * window:
+            return 1.0
+        # whether the newest sample moves every joint that the moments know about
         fresh = np.abs(self.moments.newest[:, 0, 3:6, 3:6]).max(axis=(1, 2))
         held = np.abs(self.moments.M[:, 0, 3:6, 3:6]).max(axis=(1, 2)) / max(self.count, 1.0)
-        return bool((fresh >= 1e-2 * held).all())
+        return 1.0 - 1.0 / window if (fresh >= 1e-2 * held).all() else 1.0
 
     def noise_variance(self) -> Array:
         """(n + 1, 4) noise variance of measured v, w, a, dw of the base and of each link.
@@ -287,7 +285,13 @@ class Schema:
         self.updates += 1
         frames, moments = self._frames, self.moments
         if looking:
-            self._profile()
+            # the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
+            # size), and the curvature from what of them is motion
+            clean = moments.M
+            if self.kind == LinkMotionKind.MEASURED:
+                clean, noise = self._clean, self.noise_variance()
+                without_noise(self._parent, moments.M, moments.counts, noise, clean)
+            profiled(frames, moments.M, self.count, clean, self.gradient, self.information)
             self._judge()
         if self.each_sample:
             steepest(frames, moments.newest, self.gradient)
@@ -297,15 +301,12 @@ class Schema:
             outputs = self.gradient, self._distance
             descend(frames, moments.M, self.count, self._inverse, *outputs)
         if self._rough and self.count >= CARRIED_SAMPLES:
-            self._check_carried()
-
-    def _check_carried(self) -> None:
-        """Begin anew where the frames that carried dw were not yet those of now."""
-        turned = log_rotation(np.swapaxes(self._then, 1, 2) @ self.R0)
-        shown = np.einsum("jaa->j", self.identifiable)
-        self._rough = bool(np.abs(turned).max() > CARRIED_TURN or shown.min() < 1.0)
-        if self._rough:
-            self._carry_anew()
+            # begin anew where the frames that carried dw were not yet those of now
+            turned = log_rotation(np.swapaxes(self._then, 1, 2) @ self.R0)
+            shown = np.einsum("jaa->j", self.identifiable)
+            self._rough = bool(np.abs(turned).max() > CARRIED_TURN or shown.min() < 1.0)
+            if self._rough:
+                self._carry_anew()
 
     def _carry_anew(self) -> None:
         """Drop moments that other frames than those of now have carried dw in."""
@@ -323,16 +324,6 @@ class Schema:
         else:
             pace = s.rate, s.share, rate
             retract(self._frames, self.tangent, self._may_move, self._distance, pace)
-
-    def _profile(self) -> None:
-        """Fill the gradient from the moments as they are (noise in them bends λ by 1e-4 of its
-        size), and the curvature from what of them is motion."""
-        M, counts = self.moments.M, self.moments.counts
-        clean = M
-        if self.kind == LinkMotionKind.MEASURED:
-            clean = self._clean
-            without_noise(self._parent, M, counts, self.noise_variance(), clean)
-        profiled(self._frames, M, self.count, clean, self.gradient, self.information)
 
     @property
     def _exact(self) -> bool:
@@ -367,11 +358,16 @@ class Schema:
         if self._exact:  # ADAM forgets the large gradients of its way too slowly to come close soon
             finish(self._frames, self._left, NEAR, self.gradient)
         else:
-            self._hold_unshown()
+            # Steps keep out of shifts that the data do not show, but while noise still tilts the
+            # picture of what is shown, a little leaks into them: back to where they started.
+            unshown = np.eye(6) - self.identifiable
+            pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < PURE_SHIFT
+            leaked = np.einsum("jab,jb->ja", unshown[:, 3:, 3:], self.p - self.start_lam[:, 3:])
+            self.p -= pure[:, None] * leaked
         checked = self.each_sample
         if not self.each_sample and not self._rough:
             self._check_valleys()
-            checked = self.check.passed(self.ranks)
+            checked = bool((self.check.passed_rank == self.ranks).all())
         calm = 1e-9 * self._calm_ns / self.settings.stable_s
         settled = checked and calm >= 1.0 and not self._rough
         if self._exact:  # no noise hides for long what is shown
@@ -396,17 +392,6 @@ class Schema:
                 self._calm_ns = 0
         if self.started_anew and not self.settings.spin_measured:
             self._carry_anew()
-
-    def _hold_unshown(self) -> None:
-        """Put shifts that the data do not show back to where they started.
-
-        Steps keep out of such directions, but while noise still tilts the picture of what is
-        shown, a little leaks into them.
-        """
-        unshown = np.eye(6) - self.identifiable
-        pure = np.abs(unshown[:, :3, 3:]).max(axis=(1, 2)) < PURE_SHIFT
-        leaked = np.einsum("jab,jb->ja", unshown[:, 3:, 3:], self.p - self.start_lam[:, 3:])
-        self.p -= pure[:, None] * leaked
 
     def covariance(self) -> Array:
         """(n, 6, 6) covariance of (phi, d) in the directions the data show, zero in others."""

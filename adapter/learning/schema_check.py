@@ -77,10 +77,6 @@ class SchemaCheck:
             joints += [int(j) for j in np.flatnonzero(self.passed_rank != ranks)[:1]]
         return joints
 
-    def passed(self, ranks: np.ndarray) -> bool:
-        """Whether every joint was found right with these (n,) directions shown."""
-        return bool((self.passed_rank == ranks).all())
-
     def better(self, j: int, frame: Frame, start: Frame, known: Evidence) -> Frame | None:
         """Where joint j is to start anew; None where it is right, or still on its way.
 

@@ -27,7 +27,6 @@ from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
     Given,
-    Indices,
     Moments,
     Prior,
     Rows,
@@ -152,8 +151,9 @@ class Theta:
         self.bodies = tree.bodies + 1
         self.P = 10 * self.bodies + n * e
         hand = n - 1 if known.hand is None else known.hand
-        self.hand = self._body(int(tree.floating) + hand)
-        self.spare = self._body(self.bodies - 1)
+        first = 10 * (int(tree.floating) + hand)
+        self.hand = slice(first, first + 10)
+        self.spare = slice(self._effects_from - 10, self._effects_from)
         self._parent = np.array(tree.parent, dtype=np.int64)
         self.columns = sum(len(effect.shapes) or 1 for effect in self.effects)
         self.rows = rows_of(tree, self.effects)
@@ -169,7 +169,9 @@ class Theta:
         nothing: Array = np.full((e, n), np.nan)
         self._believed, self._belief_std = known.believed or (nothing, nothing)
         self._set_prior(*self._neutral_prior())
-        self.x, self.gradient = self._neutral(), np.zeros(self.P)
+        self.x, self.gradient = np.zeros((2, self.P))
+        self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
+        self.x[self._effects_from :] = np.nan_to_num(self._believed).ravel() / self.rows.steps
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
         values(self.mean, self.rows.steps, self.th)
         if known.base is None and not tree.floating:
@@ -186,19 +188,9 @@ class Theta:
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
 
-    @staticmethod
-    def _body(k: int) -> slice:
-        return slice(10 * k, 10 * k + 10)
-
     @property
     def _effects_from(self) -> int:
         return 10 * self.bodies
-
-    def _neutral(self) -> Array:
-        x = np.zeros(self.P)
-        x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
-        x[self._effects_from :] = np.nan_to_num(self._believed).ravel() / self.rows.steps
-        return x
 
     def _neutral_prior(self) -> tuple[Array, Array]:
         """Information of the prior: bodies and effects; the spare body waits without one."""
@@ -286,7 +278,12 @@ class Theta:
             self._set_prior(0.5 * (self.prior + neutral), 0.5 * (self.prior_rhs + neutral_rhs))
 
     def _set_prior(self, H: Array, rhs: Array) -> None:
-        self.prior, self.prior_rhs, self._ranges = H, rhs, ranges_of(H)
+        full = H != 0.0
+        some = full.any(axis=1)
+        first, last = full.argmax(axis=1), len(H) - full[:, ::-1].argmax(axis=1)
+        # first and one behind the last column that is not zero, of each row
+        self._ranges = np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=1)
+        self.prior, self.prior_rhs = H, rhs
         self._before = tuple(Prior(H, rhs, self._ranges, 1.0))
 
     def parts(self, frames: tuple[Array, Array], settled: bool) -> tuple[Any, ...]:
@@ -311,26 +308,11 @@ class Theta:
             self.updates,
         )
 
-    @property
-    def rate_columns(self) -> list[tuple[int, int]]:
-        """Columns of effects that are rates of the model's torque, and which rates these are."""
-        first, found = 0, []
-        for effect in self.effects:
-            if effect.rate is not None:
-                found.append((first, effect.rate))
-            first += len(effect.shapes) or 1
-        return found
-
     def steady(self) -> bool:
         """Whether every state is one step, with nothing to start or restart at any of them."""
         if self.spare_in_use:
             return self.count > max(self.settings.restarts, default=0)
         return self.count >= self.settings.warm_up
-
-    def took(self, states: int, steps: int) -> None:
-        """`steps` has given it so many states, and moved it so often."""
-        self.count += self.weight * states
-        self.updates += steps
 
     def compute_gradient(self) -> bool:
         """Fill the gradient of one ADAM step; False while there is too little to step on."""
@@ -496,10 +478,16 @@ class Theta:
         variance = diagonal[self._effects_from :].reshape(-1, n)
         widest = np.array([effect.learned_std for effect in self.effects])
         values, free = self.effect_values, np.isnan(self._believed)
+        shares = [
+            self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
+        ]
+        first = np.cumsum([0, *(len(effect.shapes) or 1 for effect in self.effects)])[:-1]
+        # whether an effect acts at all; of one that does not no data speak
+        acting = np.add.reduceat(np.array(shares), first, axis=1).T > 0.0
         found = [
             likely_spread(x[f & on], v[f & on], before) if (f & on).any() else before * f.any()
             for x, v, f, on, before in zip(
-                values, variance, free, self._acting(), self.effect_spread, strict=True
+                values, variance, free, acting, self.effect_spread, strict=True
             )
         ]
         spread = np.clip(found, SMALLEST_SPREAD * widest, widest)
@@ -551,14 +539,6 @@ class Theta:
                         chosen[k, j] = tried[gain.argmax()]
             first += columns
         self._choose_shapes(chosen)
-
-    def _acting(self) -> NDArray[np.bool_]:
-        """(e, n) whether an effect acts at all; of one that does not no data speak."""
-        shares = [
-            self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
-        ]
-        first = np.cumsum([0, *(len(effect.shapes) or 1 for effect in self.effects)])[:-1]
-        return np.asarray(np.add.reduceat(np.array(shares), first, axis=1).T > 0.0)
 
     def _look_at_rates(self, motion_noise: Array) -> None:
         """Let effects of the torque's rates act where they explain more than noise of motion can.
@@ -716,7 +696,13 @@ class Theta:
         hand, spare = self.hand, self.spare
         H, rhs = self.information()
         if self.spare_in_use:
-            H, rhs = _marginalise(H, rhs, spare)
+            # information about the rest when it is integrated out; zero rows in its place
+            rest = np.setdiff1d(np.arange(len(H)), np.arange(spare.start, spare.stop))
+            gain = np.linalg.solve(H[spare, spare], np.c_[H[spare, rest], rhs[spare]]).T
+            out, out_rhs = np.zeros_like(H), np.zeros_like(rhs)
+            out[np.ix_(rest, rest)] = H[np.ix_(rest, rest)] - H[rest, spare] @ gain[:-1].T
+            out_rhs[rest] = rhs[rest] - H[rest, spare] @ gain[-1]
+            H, rhs = out, out_rhs
         link = np.diag(1.0 / PRIOR_STD**2)
         H[hand, hand] += link
         H[spare, spare] += link
@@ -796,21 +782,3 @@ def rows_of(tree: Tree, effects: Sequence[LearnedEffect]) -> Rows:
         np.array(near, dtype=np.int64),
         steps.astype(np.float64),
     )
-
-
-def ranges_of(H: Array) -> Indices:
-    """(P, 2) first and one behind the last column that is not zero, of each row of H."""
-    full = H != 0.0
-    some = full.any(axis=1)
-    first, last = full.argmax(axis=1), len(H) - full[:, ::-1].argmax(axis=1)
-    return np.stack([np.where(some, first, 0), np.where(some, last, 0)], axis=1)
-
-
-def _marginalise(H: Array, rhs: Array, block: slice) -> tuple[Array, Array]:
-    """Information about the rest when `block` is integrated out; zero rows in its place."""
-    rest = np.setdiff1d(np.arange(len(H)), np.arange(block.start, block.stop))
-    gain = np.linalg.solve(H[block, block], np.c_[H[block, rest], rhs[block]]).T
-    out, out_rhs = np.zeros_like(H), np.zeros_like(rhs)
-    out[np.ix_(rest, rest)] = H[np.ix_(rest, rest)] - H[rest, block] @ gain[:-1].T
-    out_rhs[rest] = rhs[rest] - H[rest, block] @ gain[-1]
-    return out, out_rhs

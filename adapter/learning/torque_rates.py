@@ -205,7 +205,7 @@ class TorqueRates:
     def __init__(self, tree: Tree, smoothing_s: float, delay_s: float) -> None:
         layout = StateLayout(tree.n, tree.floating)
         self._parent = np.array(tree.parent, dtype=np.int64)
-        self._width, self._rates_from = layout.before_links.stop, layout.rates.start
+        self._width = layout.before_links.stop
         self._span_ns = round(1e9 * max(smoothing_s, LEAST_SPAN_S))
         rows, tau = np.zeros((ROOM, self._width)), np.zeros((ROOM, tree.n))
         stamps, marks, bends = np.zeros(ROOM, np.int64), np.zeros(2, np.int64), np.zeros(tree.n + 1)
@@ -261,10 +261,6 @@ class TorqueRates:
         ends = np.zeros(len(own), dtype=np.int64)
         ends = ends[: coming(own, self._span_ns, tuple(self._ring), out, ends)]
         return out[: ends[-1] if len(ends) else 0], ends
-
-    def place(self, rate: int) -> int:
-        """Where one of the rates begins in a state."""
-        return self._rates_from + rate * len(self._parent)
 
     @property
     def parts(self) -> tuple[Any, ...]:

@@ -63,11 +63,18 @@ def locked(model: SelfModel, values: Mapping[str, float]) -> SelfModel:
     source = whole.source
     if source is not None:
         source = replace(source, lam=_joint_frames(whole.tree, source.lam, at)[0])
+    number = {BASE: BASE, **{k: i for i, k in enumerate(kept)}}
+    tree = replace(
+        whole.tree,
+        parent=tuple(number[carrier[whole.tree.parent[k]]] for k in kept),
+        joint_names=tuple(whole.tree.joint_names[k] for k in kept),
+        link_names=tuple(whole.tree.link_names[k] for k in kept),
+    )
     rows = [0, *(k + 1 for k in kept)]
     names = {whole.tree.joint_names[k]: value for k, value in at.items()}
     changed = replace(
         whole,
-        tree=_tree(whole.tree, carrier, kept),
+        tree=tree,
         lam=lam,
         lam_std=lam_std,
         theta=theta[rows],
@@ -98,16 +105,6 @@ def _carriers(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[dict[int
             turn = matrix_from_zxz(lam[k, :3]) @ rot_z(at[k])
             carrier[k], placement[k] = carrier[parent], (r @ turn, p + r @ lam[k, 3:])
     return carrier, placement
-
-
-def _tree(tree: Tree, carrier: Mapping[int, int], kept: Sequence[int]) -> Tree:
-    number = {BASE: BASE, **{k: i for i, k in enumerate(kept)}}
-    return replace(
-        tree,
-        parent=tuple(number[carrier[tree.parent[k]]] for k in kept),
-        joint_names=tuple(tree.joint_names[k] for k in kept),
-        link_names=tuple(tree.link_names[k] for k in kept),
-    )
 
 
 def _joint_frames(tree: Tree, lam: Array, at: Mapping[int, float]) -> tuple[Array, list[int]]:

@@ -166,7 +166,20 @@ class MjcfFile:
         self._numbers = {self._joint_name(j): j for j in range(compiled.njnt)}
         self._parents = compiled.body_parentid.tolist()
         self.root, self._bodies = self._choose(floating)
-        self._say_unused()
+        m = compiled
+        self.unused += [f"tendon '{m.tendon(k).name or k}'" for k in range(m.ntendon)]
+        for k in range(m.neq):
+            if m.eq_type[k] != EQUAL_JOINTS:
+                self.unused.append(f"equality '{m.equality(k).name or k}'")
+        for i, mocap in enumerate(m.body_mocapid):
+            self.unused += [f"mocap body '{self._name(i)}'"] if mocap >= 0 else []
+        for what, count in (
+            ("sensors", m.nsensor),
+            ("actuators, but for the torque that they can give,", m.nu),
+            ("flexible bodies", m.nflex),
+            ("keyframes", m.nkey),
+        ):
+            self.unused += [f"what it says of {what} ({count})"] if count else []
 
     def robot(self) -> FileRobot:
         """Links and joints as a file's content."""
@@ -210,7 +223,9 @@ class MjcfFile:
         """The base's body and those that hang on it."""
         m = self.compiled
         free = [i for i in range(m.nbody) if any(m.jnt_type[j] == FREE for j in self._joints_in(i))]
-        over = [self._over(i) for i in range(m.nbody)]  # each with all that carry it
+        over: list[set[int]] = []  # each with all that carry it, which come before it
+        for i, parent in enumerate(self._parents):
+            over.append({i} | (over[parent] if i else set()))
 
         def hinges(root: int) -> int:
             return sum(
@@ -237,29 +252,6 @@ class MjcfFile:
             if root in over[i] and i != root and not any(x in dropped for x in over[i])
         ]
         return root, below
-
-    def _over(self, body: int) -> set[int]:
-        found = {body}
-        while body:
-            body = self._parents[body]
-            found.add(body)
-        return found
-
-    def _say_unused(self) -> None:
-        m = self.compiled
-        self.unused += [f"tendon '{m.tendon(k).name or k}'" for k in range(m.ntendon)]
-        for k in range(m.neq):
-            if m.eq_type[k] != EQUAL_JOINTS:
-                self.unused.append(f"equality '{m.equality(k).name or k}'")
-        for i, mocap in enumerate(m.body_mocapid):
-            self.unused += [f"mocap body '{self._name(i)}'"] if mocap >= 0 else []
-        for what, count in (
-            ("sensors", m.nsensor),
-            ("actuators, but for the torque that they can give,", m.nu),
-            ("flexible bodies", m.nflex),
-            ("keyframes", m.nkey),
-        ):
-            self.unused += [f"what it says of {what} ({count})"] if count else []
 
     def _theta(self, body: int) -> Array:
         """θ (10,) of a body in the frame of its link."""
@@ -373,13 +365,10 @@ class _Writer:
         joint = element.child("joint")
         if joint is None:
             raise ModelError(f"{self.file.path}: no <joint> stands in body '{body}' itself")
-        for key, value in values.items():
-            degrees = key == "springref" and self._in_degrees()
-            self.xml.set(joint, key, number_text(np.degrees(value) if degrees else value))
-
-    def _in_degrees(self) -> bool:
         said = [x.attributes.get("angle") for x in self.xml.root.children if x.tag == "compiler"]
-        return "radian" not in said
+        for key, value in values.items():
+            degrees = key == "springref" and "radian" not in said
+            self.xml.set(joint, key, number_text(np.degrees(value) if degrees else value))
 
     def _element(self, body: str) -> Element:
         for element in self.xml.root.walk():

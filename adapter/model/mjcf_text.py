@@ -62,7 +62,16 @@ def mjcf_text(model: SelfModel, more: Additions) -> str:
         on[name] = _body(on[parent], name, *placed)
         theta = turned_theta(link_theta(model)[k] + more.dtheta[k], turns[name])
         on[name].append(inertial(theta, name))
-        ET.SubElement(on[name], "joint", _hinge(model, more, k))
+        hinge = {"name": tree.joint_names[k], "type": "hinge", "axis": number_text(model.axis[k])}
+        span = np.array([model.limits.lower[k], model.limits.upper[k]])
+        if np.isfinite(span).all():
+            hinge["range"] = number_text(span)
+        effort = model.limits.effort[k]
+        if np.isfinite(effort):
+            hinge["actuatorfrcrange"] = number_text([-effort, effort])
+        own = joint_attributes(more, k)
+        hinge |= {key: number_text(value) for key, value in own.items() if value}
+        ET.SubElement(on[name], "joint", hinge)
     for frame in model.frames:
         turn = turns[frame.parent]
         _body(on[frame.parent], frame.name, turn @ frame.rotation, turn @ frame.position)
@@ -127,16 +136,3 @@ def joint_attributes(more: Additions, joint: int) -> dict[str, float]:
     if own.get("stiffness"):  # -stiffness (q - springref) is what MuJoCo adds
         own["springref"] = float(more.pull[joint] / -own["stiffness"])
     return own
-
-
-def _hinge(model: SelfModel, more: Additions, k: int) -> dict[str, str]:
-    """Attributes of joint k."""
-    limits = model.limits
-    out = {"name": model.tree.joint_names[k], "type": "hinge", "axis": number_text(model.axis[k])}
-    span = np.array([limits.lower[k], limits.upper[k]])
-    if np.isfinite(span).all():
-        out["range"] = number_text(span)
-    if np.isfinite(limits.effort[k]):
-        out["actuatorfrcrange"] = number_text([-limits.effort[k], limits.effort[k]])
-    own = joint_attributes(more, k)
-    return out | {key: number_text(value) for key, value in own.items() if value}

@@ -87,7 +87,12 @@ def loads(text: str) -> SelfModel:
 
 
 def _to_json(model: SelfModel) -> dict[str, Any]:
-    tree = model.tree
+    tree, source = model.tree, None
+    if model.source is not None:
+        given = model.source
+        text = None if given.text is None else given.text.splitlines(keepends=True)
+        lam = _numbers(given.lam)
+        source = {"format": given.format, "file": given.file, "lambda": lam, "text": text}
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -114,7 +119,7 @@ def _to_json(model: SelfModel) -> dict[str, Any]:
         "limits": {key: _numbers(getattr(model.limits, key)) for key in LIMITS},
         "axis": _numbers(model.axis),
         "frames": [_plain(asdict(frame)) for frame in model.frames],
-        "source": None if model.source is None else _source_to_json(model.source),
+        "source": source,
     }
 
 
@@ -133,12 +138,14 @@ def _from_json(data: Mapping[str, Any]) -> SelfModel:
     lam, theta = _array(data, "lambda", (n, 6)), _array(data, "theta", (bodies, 10))
     if lam is None or theta is None:
         raise ModelError("'lambda' and 'theta' must hold numbers, not null")
+    given = _part(data, "limits", dict) if data.get("limits") else {}
+    limits = {key: _array(given, key, (n,)) for key in LIMITS}
     return SelfModel(
         name=_part(data, "name", str),
         tree=tree,
         lam=lam,
         theta=theta,
-        limits=_limits(_part(data, "limits", dict), n) if data.get("limits") else Limits.unknown(n),
+        limits=Limits(**{k: np.full(n, np.nan) if v is None else v for k, v in limits.items()}),
         frames=tuple(_frame(item) for item in _part(data, "frames", list, [])),
         tool=_tool(_part(data, "tool", dict)) if data.get("tool") else None,
         effects=tuple(_part(data, "effects", list, [])),
@@ -165,11 +172,6 @@ def _tree(data: Mapping[str, Any]) -> Tree:
     return Tree(tuple(parent), floating, tuple(map(str, joints)), tuple(map(str, links)), base)
 
 
-def _limits(data: Mapping[str, Any], n: int) -> Limits:
-    arrays = {key: _array(data, key, (n,)) for key in LIMITS}
-    return Limits(**{k: np.full(n, np.nan) if v is None else v for k, v in arrays.items()})
-
-
 def _frame(data: Any) -> FixedFrame:
     if not isinstance(data, dict):
         raise ModelError(f"an entry of 'frames' must be a dict, got {type(data).__name__}")
@@ -182,12 +184,6 @@ def _tool(data: Mapping[str, Any]) -> Tool:
     mass = float(_needed(data, "mass", (), "tool"))
     com, inertia = _needed(data, "com", (3,), "tool"), _needed(data, "inertia", (3, 3), "tool")
     return Tool(mass, com, inertia, data.get("link"))
-
-
-def _source_to_json(source: Source) -> dict[str, Any]:
-    text = None if source.text is None else source.text.splitlines(keepends=True)
-    lam = _numbers(source.lam)
-    return {"format": source.format, "file": source.file, "lambda": lam, "text": text}
 
 
 def _source(data: Mapping[str, Any], n: int) -> Source:

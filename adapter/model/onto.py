@@ -21,7 +21,7 @@ from adapter.model.inertia import (
     theta_from_body,
 )
 from adapter.model.locking import LOCKED
-from adapter.model.robot_file import FileJoint, FileRobot, Merged
+from adapter.model.robot_file import FileRobot, Merged
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz, rot_z, rotation_angle
 from adapter.model.tree import BASE
@@ -70,7 +70,12 @@ def changes_onto(
         warnings.simplefilter("ignore", ModelWarning)  # what is locked was said at reading
         lock = model.provenance.get(LOCKED, {})
         lock = {name: value for name, value in lock.items() if name in robot.joints}
-        robot = _with_fingers(robot, set(model.tree.joint_names))
+        # A simulator moves links that are not in the model, too, which takes a mass: a gram for
+        # those without one, where PyBullet would take 1 kg.
+        own = model.tree.joint_names
+        loose = [j.child for j in robot.joints.values() if j.kind != "fixed" and j.name not in own]
+        bare = {name: FINGER for name in loose if not robot.links[name].any()}
+        robot = replace(robot, links=robot.links | bare)
         merged = Merged(robot, model.tree.joint_names, lock)
     read = merged.model(model.tree.floating, model.gravity)
     found = differences(model, read)
@@ -89,16 +94,6 @@ def changes_onto(
     for (place, k), name in ((key, model.tree.joint_names[key[1]]) for key in sorted(more.told)):
         out.joints.setdefault(name, {})[place] = float(more.joint[place][k])
     return out
-
-
-def _with_fingers(robot: FileRobot, moving: set[str]) -> FileRobot:
-    """The robot with a gram in each link that moves without a mass, but not in the model.
-
-    A simulator moves it, which takes a mass; PyBullet would take 1 kg.
-    """
-    loose = [j.child for j in robot.joints.values() if j.kind != "fixed" and j.name not in moving]
-    bare = {name: FINGER for name in loose if not robot.links[name].any()}
-    return replace(robot, links=robot.links | bare)
 
 
 def differences(model: SelfModel, read: SelfModel) -> list[str]:
@@ -163,13 +158,9 @@ def _joint_places(
             rotation, position = r.T @ turned[k] @ own, r.T @ (model.lam[k, 3:] - p)
         if tilt is not None and joint.parent == merged.base.name:
             rotation, position = tilt @ rotation, tilt @ position
-        if not _same_origin(joint, rotation, position, same):
+        worst = np.abs(rotation - joint.rotation).max(), np.abs(position - joint.position).max()
+        if not max(worst) <= same:
             out.origins[joint.name] = rotation, position
-
-
-def _same_origin(joint: FileJoint, rotation: Array, position: Array, same: float) -> bool:
-    worst = np.abs(rotation - joint.rotation).max(), np.abs(position - joint.position).max()
-    return bool(max(worst) <= same)
 
 
 def _bodies(model: SelfModel, more: Additions, merged: Merged, out: Changes, same: float) -> None:

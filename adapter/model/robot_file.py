@@ -73,10 +73,6 @@ class FileRobot:
         return factor * lock.get(joint.name, 0.0) + offset
 
 
-def _names(joints: dict[str, FileJoint]) -> str:
-    return ", ".join(f"{j.name} ({j.kind})" for j in joints.values()) or "no joints"
-
-
 def _root(robot: FileRobot) -> str:
     """The one link that is nobody's child; every link must hang on it, by one joint."""
     parent_of: dict[str, FileJoint] = {}
@@ -180,13 +176,6 @@ class Merged:
             self.children[joint.parent].append(joint)
         root = _root(robot)
         self.base = Body(root, BASE, None, np.eye(3), np.zeros(3), robot.links[root])
-        self._walk(root)
-        if not self.order:
-            have = _names(robot.joints)
-            raise ModelError(f"{robot.file}: no joint is left to move; have: {have}")
-
-    def _walk(self, root: str) -> None:
-        """Fill `order`, `frames` and `place` from the root link on."""
         eye, zero = np.eye(3), np.zeros(3)
         self.place[root] = BASE, eye, zero
         # Joints still to visit, the number of the body they hang on, and the placement in it of
@@ -199,6 +188,9 @@ class Merged:
             self.place[joint.child] = number, rotation, position
             below = reversed(self.children[joint.child])
             todo += [(child, number, rotation, position) for child in below]
+        if not self.order:
+            have = ", ".join(f"{j.name} ({j.kind})" for j in robot.joints.values()) or "no joints"
+            raise ModelError(f"{robot.file}: no joint is left to move; have: {have}")
 
     def _visit(self, joint: FileJoint, number: int, r: Array, p: Array) -> tuple[int, Array, Array]:
         """Take in the child of a joint at (r, p) in body `number`: its body and placement there."""

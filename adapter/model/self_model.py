@@ -219,7 +219,15 @@ class SelfModel:
         if self.lambda_source not in LAMBDA_SOURCES:
             choices = ", ".join(f"'{s}'" for s in LAMBDA_SOURCES)
             raise ModelError(f"no lambda_source '{self.lambda_source}'; have: {choices}")
-        self._check_names()
+        links = (self.tree.base_name, *self.tree.link_names)
+        riding = [(f"frame '{f.name}'", f.parent) for f in self.frames]
+        if self.tool is not None and self.tool.link is not None:
+            riding.append(("the tool", self.tool.link))
+        for what, link in riding:
+            if link not in links:
+                raise ModelError(f"{what} rides on '{link}'; have: {', '.join(links)}")
+        if self.tool is not None and not self.tool.mass > 0:
+            raise ModelError(f"a tool's mass must be above zero, got {self.tool.mass}")
         if self.source is not None and np.shape(self.source.lam) != (n, 6):
             raise ModelError(f"source.lam must have shape {(n, 6)}, got {self.source.lam.shape}")
 
@@ -266,22 +274,9 @@ class SelfModel:
         for key in LIMITS:
             if np.shape(getattr(self.limits, key)) != (n,):
                 raise ModelError(f"limits.{key} must hold {n} values, one for each joint")
-        for name, *row in zip(self.tree.joint_names, *map(self._limit, LIMITS), strict=True):
-            check_limits(row, f"joint '{name}'")
-
-    def _limit(self, key: str) -> list[float]:
-        return [float(x) for x in getattr(self.limits, key)]
-
-    def _check_names(self) -> None:
-        links = (self.tree.base_name, *self.tree.link_names)
-        riding = [(f"frame '{f.name}'", f.parent) for f in self.frames]
-        if self.tool is not None and self.tool.link is not None:
-            riding.append(("the tool", self.tool.link))
-        for what, link in riding:
-            if link not in links:
-                raise ModelError(f"{what} rides on '{link}'; have: {', '.join(links)}")
-        if self.tool is not None and not self.tool.mass > 0:
-            raise ModelError(f"a tool's mass must be above zero, got {self.tool.mass}")
+        tables = [getattr(self.limits, key) for key in LIMITS]
+        for name, *row in zip(self.tree.joint_names, *tables, strict=True):
+            check_limits([float(x) for x in row], f"joint '{name}'")
 
     @property
     def tool_link(self) -> str:

@@ -47,7 +47,8 @@ class Tree:
                     f"{k - 1} (number the links so that parents come first)"
                 )
         for kind in ("joint", "link"):
-            given = tuple(getattr(self, f"{kind}_names")) or _numbered(kind, n)
+            numbered = tuple(f"{kind}{k + 1}" for k in range(n))
+            given = tuple(getattr(self, f"{kind}_names")) or numbered
             object.__setattr__(self, f"{kind}_names", given)
             if len(given) != n:
                 raise ModelError(f"{n} joints need {n} {kind} names, got {len(given)}")
@@ -92,8 +93,3 @@ class Tree:
         if name not in self.joint_names:
             raise ModelError(f"no joint '{name}'; {choices(name, self.joint_names)}")
         return self.joint_names.index(name)
-
-
-def _numbered(kind: str, n: int) -> tuple[str, ...]:
-    """joint1, joint2, ... or link1, link2, ..."""
-    return tuple(f"{kind}{k + 1}" for k in range(n))

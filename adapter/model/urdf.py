@@ -180,21 +180,16 @@ def _joint(element: ET.Element, links: dict[str, Array], file: str) -> FileJoint
         ends[end] = link
     rotation, position = _origin(element, where)
     axis = _axis(element, where) if kind in (*TURNING, *SLIDING) else np.array([1.0, 0.0, 0.0])
+    limits, followed, mimic = _limits(element, kind, where), element.find("mimic"), None
+    if followed is not None:
+        numbers = {"multiplier": 1.0, "offset": 0.0}
+        for key in numbers:
+            if followed.get(key) is not None:
+                numbers[key] = _number(followed, key, where)
+        mimic = followed.get("joint", ""), numbers["multiplier"], numbers["offset"]
     return FileJoint(
-        name, kind, ends["parent"], ends["child"], rotation, position, axis,
-        _limits(element, kind, where), _mimic(element, where),
-    )  # fmt: skip
-
-
-def _mimic(element: ET.Element, where: str) -> tuple[str, float, float] | None:
-    found = element.find("mimic")
-    if found is None:
-        return None
-    numbers = {"multiplier": 1.0, "offset": 0.0}
-    for key in numbers:
-        if found.get(key) is not None:
-            numbers[key] = _number(found, key, where)
-    return found.get("joint", ""), numbers["multiplier"], numbers["offset"]
+        name, kind, ends["parent"], ends["child"], rotation, position, axis, limits, mimic
+    )
 
 
 def _axis(element: ET.Element, where: str) -> Array:

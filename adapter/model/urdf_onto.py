@@ -37,7 +37,13 @@ def urdf_onto(model: SelfModel, more: Additions, text: str, file: str) -> tuple[
     for name, theta in changes.bodies.items():
         _write_inertial(xml, links[name], theta)
     for name, values in changes.joints.items():
-        _write_dynamics(xml, joints[name], values)
+        dynamics = joints[name].child("dynamics")
+        lost = " ".join(f'{key}="{number_text(x)}"' for key, x in values.items() if x)
+        if dynamics is not None:
+            for key, value in values.items():
+                _put(xml, dynamics, key, value, 0.0)
+        elif lost:
+            xml.insert(joints[name], f"<dynamics {lost}/>")
     ridden = set(links) if model.tree.floating else {j.child for j in robot.joints.values()}
     for name in ridden - set(changes.bodies):
         if links[name].child("inertial") is None:
@@ -85,18 +91,6 @@ def _write_inertial(xml: XmlText, link: Element, theta: Array) -> None:
     _put(xml, weight, "value", mass, float(mass))
     for key, value in six_named(axes.T @ tensor @ axes).items():
         _put(xml, inertia, key, value, float(np.trace(tensor)))
-
-
-def _write_dynamics(xml: XmlText, joint: Element, values: dict[str, float]) -> None:
-    """What a joint loses."""
-    dynamics = joint.child("dynamics")
-    if dynamics is not None:
-        for key, value in values.items():
-            _put(xml, dynamics, key, value, 0.0)
-        return
-    lost = " ".join(f'{key}="{number_text(x)}"' for key, x in values.items() if x)
-    if lost:
-        xml.insert(joint, f"<dynamics {lost}/>")
 
 
 def _put(xml: XmlText, element: Element, key: str, value: ArrayLike, scale: float) -> None:

@@ -94,18 +94,6 @@ class Additions:
             self.dtheta[-1] += theta
         return bool(alone)
 
-    def turn_base(self, turn: Array) -> None:
-        """Turn the base by a rotation (3, 3), in its own axes."""
-        self.tilt = turn if self.tilt is None else self.tilt @ turn
-
-    def without_negative(self, joint_names: tuple[str, ...]) -> None:
-        """Take out what no format takes, negative losses, and say so."""
-        for what, table in self.joint.items():
-            for j in np.flatnonzero(table < 0.0) if what != STIFFNESS else ():
-                name = joint_names[j]
-                self.left_out.append(f"{what} of {name}, which is negative: {table[j]:g}")
-                table[j] = 0.0
-
 
 def urdf_text(model: SelfModel, more: Additions) -> str:
     """URDF text of a model; the inverse of `urdf.read_urdf` up to rounding.

@@ -67,7 +67,15 @@ class XmlText:
     def _start(self, tag: str, attributes: dict[str, str], start: int) -> None:
         parent = self._open[-1] if self._open else None
         element = Element(tag, attributes, start, parent)
-        element.inside = self._head_end(start)
+        at, quote = start, 0  # after the `>` of the start tag; one in a value is none
+        while quote or self._bytes[at] != ord(">"):
+            byte = self._bytes[at]
+            if quote:
+                quote = 0 if byte == quote else quote
+            elif byte in b"\"'":
+                quote = byte
+            at += 1
+        element.inside = at + 1
         if parent is None:
             self.root = element
         else:
@@ -79,18 +87,6 @@ class XmlText:
         element.end = element.inside
         if self._bytes[element.inside - 2 : element.inside] != b"/>":
             element.close, element.end = at, self._bytes.index(b">", at) + 1
-
-    def _head_end(self, start: int) -> int:
-        """After the `>` of the start tag at `start`; one in a value is none."""
-        at, quote = start, 0
-        while quote or self._bytes[at] != ord(">"):
-            byte = self._bytes[at]
-            if quote:
-                quote = 0 if byte == quote else quote
-            elif byte in b"\"'":
-                quote = byte
-            at += 1
-        return at + 1
 
     def set(self, element: Element, key: str, value: str) -> None:
         """Give an attribute a value, in its place or as the last one."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -80,7 +79,6 @@ class FrameObservability:
     Attributes:
         rank: number of observable directions of all joints together.
         ranks: (n,) by joint.
-        bases: for each joint (6, rank_j), orthonormal, spanning its observable directions.
         projectors: (n, 6, 6) onto the observable directions.
         flags: (n, 6) bool, whether the single turn or shift is observable on its own.
         freedom: how far the frames may go and links still move the same.
@@ -88,7 +86,6 @@ class FrameObservability:
 
     rank: int
     ranks: tuple[int, ...]
-    bases: tuple[Array, ...]
     projectors: Array
     flags: np.ndarray
     freedom: Freedom
@@ -118,22 +115,18 @@ def random_motion(tree: Tree, samples: int, seed: int) -> JointMotion:
     return JointMotion(q, rng.normal(size=q.shape), rng.normal(size=q.shape) * 3.0)
 
 
-class RandomRegressor(NamedTuple):
-    """Random motion, and the regressor (samples, rows, 10 bodies) over it."""
-
-    motion: JointMotion
-    matrix: Array
-
-
 def random_regressor(
     tree: Tree, lam: Array, gravity: Array, samples: int, seed: int = 0, wrench: bool = True
-) -> RandomRegressor:
-    """The regressor over `random_motion`; arguments as of `base_parameters`."""
+) -> tuple[JointMotion, Array]:
+    """Random motion, and the regressor (samples, rows, 10 bodies) over it.
+
+    Arguments as of `base_parameters`.
+    """
     motion = random_motion(tree, samples, seed)
     base = _random_base(tree, gravity, samples, seed)
     matrix = np.empty((samples, tree.rows, 10 * tree.bodies))
     regressors(frames_of(tree.parent, lam), motion, base, matrix)
-    return RandomRegressor(motion, matrix if wrench else matrix[:, tree.rows - tree.n :])
+    return motion, matrix if wrench else matrix[:, tree.rows - tree.n :]
 
 
 def base_parameters(
@@ -190,20 +183,14 @@ def frame_observability(
     for j, i in enumerate(tree.parent):
         parent = np.broadcast_to(base, (len(links), 12)) if i == BASE else links[:, i]
         matrix = frame_jacobian(parent, motion.dq[:, j], np.asarray(lam)[j], accelerations)
-        bases.append(_frame_basis(matrix))
+        _, values, rows = np.linalg.svd(matrix, full_matrices=False)
+        shown = values > LEAST_SHOWN * values[0]
+        bases.append(rows[shown].T if values[0] >= 1e-9 else np.zeros((6, 0)))
     projectors = np.stack([b @ b.T for b in bases])
     ranks = tuple(b.shape[1] for b in bases)
     flags = np.diagonal(projectors, axis1=1, axis2=2) > 1.0 - 1e-6
     freedom = Freedom.of(np.eye(6) - projectors, np.asarray(lam)[:, 3:])
-    return FrameObservability(sum(ranks), ranks, tuple(bases), projectors, flags, freedom)
-
-
-def _frame_basis(matrix: Array) -> Array:
-    """Orthonormal (6, rank) of the directions that change the motion."""
-    _, values, rows = np.linalg.svd(matrix, full_matrices=False)
-    if values[0] < 1e-9:
-        return np.zeros((6, 0))
-    return np.asarray(rows[values > LEAST_SHOWN * values[0]].T, dtype=np.float64)
+    return FrameObservability(sum(ranks), ranks, projectors, flags, freedom)
 
 
 def frame_jacobian(parent: Array, dq: Array, lam_j: Array, accelerations: bool) -> Array:

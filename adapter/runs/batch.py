@@ -75,7 +75,7 @@ def learn_batch(
     learner.take_every(waiting.every, waiting.triples)
     _learn_theta(learner, waiting, every, progress)
     for steps, share in THETA_POLISH:
-        learner.set_rate(share * learner.settings.theta.rate)
+        learner.adam.rate = share * learner.settings.theta.rate
         learner.learn_theta(_NO_STATES, steps)
         learner.theta.adapt_prior(None if learner.rates is None else learner.rates.noise)
     learner.follow_convergence()
@@ -148,7 +148,7 @@ def _learn_theta(
     while start < len(torque):
         progress(thin * start)
         batch = torque.rows(start, start + (together if moving else settled))
-        learner.set_rate(FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual)
+        learner.adam.rate = FIRST_RATE * usual if theta.updates < FIRST_STEPS else usual
         learner.learn_theta(batch, together * thin if moving else FEW_STEPS)
         if not moving or theta.updates >= looked_at + GAIN_STEPS:
             moving = theta.updates < FIRST_STEPS or _gain(learner, seen) > GAIN

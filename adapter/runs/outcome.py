@@ -214,8 +214,8 @@ def completed_theta(
         return documented.theta, np.zeros((size, 0)), said
     basis = told_basis(outcome.theta_information, documented.theta)
     wrench, count = outcome.settings.base_wrench, 4 * size
-    shown = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
-    table, notes = shown.matrix.reshape(-1, size), []
+    _, table = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
+    table, notes = table.reshape(-1, size), []
     said = {"theta_source": "learned", "theta_converged": outcome.theta_settled}
     if not outcome.theta_settled:
         notes = [

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adapter.effects.by_joint import smooth_sign
+from adapter.effects.bristle_friction import bending
+from adapter.effects.by_joint import WAYS_RAD, smooth_sign
 from adapter.effects.torque import ModelTorque
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -23,11 +24,11 @@ from adapter.physics.rigid_arm import RigidArm
 
 FLOOR_NM, FLOOR_SHARE = 0.15, 0.1  # where the search for the noise begins: N m, share of the torque
 INERTIA_SHARE, RADIUS_M = 0.4, 0.1  # plausible error of masses; of where they sit
-PAYLOAD = (3.0, 0.3, 0.05)  # kg, kg m, kg m2
+LOAD_STD = np.repeat((3.0, 0.3, 0.05), (1, 3, 6))  # kg, kg m, kg m2
 FRICTION = (1.0, 4.0, 4.0, 0.1)  # std of offset, Coulomb, viscous (N m, N m, N m s/rad), gain
 SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque went through
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
-CORRELATED_S, MOST_SAMPLES = 0.4, 50.0  # an arm's misfit keeps its sign so long; and no more count
+CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
 ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
@@ -43,6 +44,8 @@ LATE_STEPS, LATEST_MS, LATE_S = ((20, 10), (4, 4), (1, 3)), 219, 0.004
 class Rows(NamedTuple):
     """Instants of a recording: q, dq, ddq, tau (m, n); and twice the log of tau's scale.
 
+    `slides` (m, n), -1 to 1, is which way friction acts; the way that joints move where None.
+
     A reading that divides torques makes its misfit smaller by that alone, which counts for nothing.
     """
 
@@ -51,6 +54,7 @@ class Rows(NamedTuple):
     ddq: Array
     tau: Array
     scaled: float = 0.0
+    slides: Array | None = None
 
 
 class Explained(NamedTuple):
@@ -125,7 +129,11 @@ class Telling:
                 sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
             noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
             cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
-            share = 1.0 - left / np.maximum(tau.var(axis=0), floor**2)
+            used = weight * np.tensordot(
+                squares, np.linalg.inv(normal), 2
+            )  # of the samples, to fit
+            honest = left / np.maximum(1.0 - used / self.samples, 1.0 / self.samples)
+            share = 1.0 - honest / np.maximum(tau.var(axis=0), floor**2)
             size = 1.0 + FRICTION[-1] * x[gains]
             return Explained(cost + beyond, share, size, x[: gains.stop])
 
@@ -144,24 +152,33 @@ class Telling:
         friction = own[0] + own[1] * step + own[2] * rows.dq + own[3] * model
         return np.asarray(model + bodies.torque(rows.q, rows.dq, rows.ddq) + friction)
 
-    def apart(self, rows: Rows) -> float:
-        """How far the model without corrections is from rows; a true reading brings it nearer."""
-        apart = np.mean((rows.tau - self.torque(rows)) ** 2, axis=0)[self.alive]
-        return float(np.log(apart + SENSOR_NM**2).sum()) + rows.scaled
+    def apart(self, rows: Rows, loaded: bool) -> float:
+        """How far the model, with any load or bare, is from rows; a true reading is nearer."""
+        model = self.torque(rows)
+        sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(model**2, axis=0))
+        weight = np.sqrt(self.samples / len(model)) * self.alive / sigma
+        load = loaded * self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
+        columns, apart = load * weight[:, None], (rows.tau - model) * weight
+        flat = columns.reshape(-1, 10)
+        x = np.linalg.solve(flat.T @ flat + np.eye(10), flat.T @ apart.ravel())
+        left = np.mean((rows.tau - model - load @ x) ** 2, axis=0)[self.alive]
+        return float(np.log(left + SENSOR_NM**2).sum()) + rows.scaled
 
     def _columns(self, rows: Rows, changed: int | None) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
         model = self.torque(rows)
         m, n = model.shape
-        step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
+        step = rows.slides
+        if step is None:
+            step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
         joint = np.zeros((m, n, len(FRICTION), n))
         for k, column in enumerate((np.ones_like(model), step, rows.dq, model)):
             joint[:, range(n), k, range(n)] = FRICTION[k] * column
         parts = [regressor * inertial_std(self.arm).ravel(), joint.reshape(m, n, -1)]
         if changed is not None:
             later = (np.arange(m) >= changed)[:, None, None]
-            parts.append(later * regressor[:, :, -10:] * np.repeat(PAYLOAD, (1, 3, 6)))
+            parts.append(later * regressor[:, :, -10:] * LOAD_STD)
         return np.concatenate(parts, axis=2), model
 
     def _beyond(self, q: Array) -> float:
@@ -174,6 +191,9 @@ class Telling:
 def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     """How much later than the motion torques come, s, where that is clear; 0 up to `LATE_S`.
 
+    Friction that winds up over a small way comes late, too, where joints move slowly: torques that
+    such friction explains as well are in time.
+
     Args:
         signals: q, dq, ddq, tau (m, n), 1 ms apart.
     """
@@ -181,8 +201,8 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     if len(q) < 2 * LATEST_MS + ROWS:
         return 0.0
     at = np.linspace(LATEST_MS, len(q) - 1 - LATEST_MS, ROWS).astype(int)
-
-    of = telling.explaining(Rows(q[at], dq[at], ddq[at], tau[at]))
+    rows = Rows(q[at], dq[at], ddq[at], tau[at])
+    of = telling.explaining(rows)
 
     def cost(late_ms: int) -> float:
         return of(tau[at + late_ms]).cost
@@ -190,8 +210,11 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
     late_ms = 0
     for step, reach in LATE_STEPS:
         late_ms = min((late_ms + step * k for k in range(-reach, reach + 1)), key=cost)
-    clear = cost(late_ms) < cost(0) - EVIDENCE
-    return 1e-3 * late_ms if clear and abs(late_ms) > 1e3 * LATE_S else 0.0
+    if abs(late_ms) <= 1e3 * LATE_S or cost(late_ms) > cost(0) - EVIDENCE:
+        return 0.0
+    wound = (np.column_stack([bending(x, way)[0][at] for x in q.T]) for way in WAYS_RAD)
+    rival = min(telling.explained(rows._replace(slides=slides)).cost for slides in wound)
+    return 1e-3 * late_ms if cost(late_ms) < rival - EVIDENCE else 0.0
 
 
 def inertial_std(arm: RigidArm) -> Array:
@@ -201,7 +224,7 @@ def inertial_std(arm: RigidArm) -> Array:
     first = INERTIA_SHARE * (np.abs(theta[:, 1:4]) + RADIUS_M * mass)
     second = INERTIA_SHARE * (np.abs(theta[:, 4:]) + RADIUS_M**2 * mass)
     std = np.concatenate([INERTIA_SHARE * mass, first, second], axis=1)
-    std[-1] += np.repeat(PAYLOAD, (1, 3, 6))
+    std[-1] += LOAD_STD
     return np.asarray(std)
 
 

@@ -235,7 +235,7 @@ class Readings:
 
     def _own(self, j: int) -> Iterator[Reading]:
         """Readings of joint j alone."""
-        (q, dq, ddq, tau, scaled), unit = self.rows, np.eye(len(self.names))[j]
+        (q, dq, ddq, tau, scaled, _), unit = self.rows, np.eye(len(self.names))[j]
         turn, name = 1.0 - 2.0 * unit, self.names[j]
         said = f"{name} counts the other way round: --turn {name}"
         yield Reading("joint", said, Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled))
@@ -253,7 +253,7 @@ class Readings:
 
         Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or not.
         """
-        (q, dq, ddq, tau, scaled), names = self.rows, self.names
+        (q, dq, ddq, tau, scaled, _), names = self.rows, self.names
         for sign, word in ((-1.0, "minus"), (1.0, "plus")):
             turn = np.eye(len(names))
             turn[j, i] = sign
@@ -322,8 +322,13 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
     now = telling.explained(rows)
     found: list[Reading] = []
     while len(found) < MOST:
-        far = telling.apart(rows)
-        nearer = [x for x in Readings(rows, telling) if telling.apart(x.rows) < far]
+        # a load bends a joint told otherwise towards the model, too: it is left out there
+        far = {loaded: telling.apart(rows, loaded) for loaded in (True, False)}
+        nearer = [
+            x
+            for x in Readings(rows, telling)
+            if telling.apart(x.rows, x.kind != "joint") < far[x.kind != "joint"]
+        ]
         explained = [telling.explained(x.rows) for x in nearer]
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:

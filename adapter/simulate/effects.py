@@ -255,7 +255,10 @@ class Effects:
             dv, u = speed_change(body + np.diag(asked.armature), push, dq, losses, self.period_s)
             a = dv / self.period_s
         own = carried + body @ a + asked.torque(u, a)
-        return np.asarray(bias + M @ a + self._of_file(q, u, a) - own)
+        # what the simulator takes off at the joints by itself
+        pull = self.held(STIFFNESS) * q + self._holds.pull
+        lost = self.held(DAMPING) * u + self.held(FRICTION) * smooth_sign(u)
+        return np.asarray(bias + M @ a + (pull + lost + self.held(ARMATURE) * a) - own)
 
     def measured(
         self, q: Array, dq: Array, tau: Array, t: float | None = None
@@ -303,7 +306,13 @@ class Effects:
         stages = [self._stage(float(now)) for now in t]
         if all(stage.reads_true for stage in stages) and not self._slow:
             return read
-        read = self._behind_low_pass(t, read)
+        read = read.copy()
+        for active in self._slow:  # torques of which the sensors' low-passes leave these
+            a, b = _low_pass(active) or (0.0, 0.0)
+            rate = np.gradient(read[:, active.joint], t)
+            more = a * rate + b * np.gradient(rate, t)
+            on = active.on(t)
+            read[:, active.joint] += more if on is None else more * on
         at = JointSignals(*np.zeros((3, *read[0].shape)))
         shift = np.array([stage.shifts.torque(at) + self._nothing for stage in stages])
         out = (read - shift) / (1.0 + np.array([stage.sensors.gain for stage in stages]))
@@ -341,12 +350,6 @@ class Effects:
             said += active.effect.torque(motion, load, active.joint, active.values)
         return said
 
-    def _of_file(self, q: Array, u: Array, ddq: Array) -> Array:
-        """Torque (n,) N m that the simulator takes off at the joints by itself."""
-        pull = self.held(STIFFNESS) * q + self._holds.pull
-        lost = self.held(DAMPING) * u + self.held(FRICTION) * smooth_sign(u)
-        return np.asarray(pull + lost + self.held(ARMATURE) * ddq)
-
     def _play(self, half: Array, dq: Array, passed_s: float) -> tuple[Array, Array]:
         """By how much (n,) the motors are ahead of the links, and its rate."""
         if not half.any():
@@ -368,33 +371,17 @@ class Effects:
             times, rows = (np.array(x[::-1]) for x in zip(*self._past, strict=True))
             each = zip(late, rows.T, strict=True)
             tau = np.array([np.interp(now - d, times, x) for d, x in each])
-        tau = self._low_passed(t, tau)
+        tau, clock = tau.copy(), self._clock(t)
+        for k, active in enumerate(self._slow):  # by the implicit Euler method
+            a, b = _low_pass(active) or (0.0, 0.0)
+            before, last = self._read.get(k, (tau[active.joint],) * 2)
+            a, b = a / self.period_s, b / self.period_s**2
+            new = (tau[active.joint] + a * last + b * (2.0 * last - before)) / (1.0 + a + b)
+            self._read[k] = last, new
+            if active.interval_s[0] <= clock < active.interval_s[1]:
+                tau[active.joint] = new
         at = JointSignals(*np.zeros((3, len(tau))))
         return np.asarray((1.0 + stage.sensors.gain) * tau + stage.shifts.torque(at))
-
-    def _low_passed(self, t: float | None, tau: Array) -> Array:
-        """What the sensors' low-passes leave of torques (n,), by the implicit Euler method."""
-        out, now = tau.copy(), self._clock(t)
-        for k, active in enumerate(self._slow):
-            a, b = _low_pass(active) or (0.0, 0.0)
-            before, last = self._read.get(k, (out[active.joint],) * 2)
-            a, b = a / self.period_s, b / self.period_s**2
-            new = (out[active.joint] + a * last + b * (2.0 * last - before)) / (1.0 + a + b)
-            self._read[k] = last, new
-            if active.interval_s[0] <= now < active.interval_s[1]:
-                out[active.joint] = new
-        return out
-
-    def _behind_low_pass(self, t: Array, read: Array) -> Array:
-        """Torques (m, n) of which the sensors' low-passes leave `read` (m, n)."""
-        out = read.copy()
-        for active in self._slow:
-            a, b = _low_pass(active) or (0.0, 0.0)
-            rate = np.gradient(out[:, active.joint], t)
-            more = a * rate + b * np.gradient(rate, t)
-            on = active.on(t)
-            out[:, active.joint] += more if on is None else more * on
-        return out
 
     def _clock(self, t: float | None) -> float:
         """t; without one, steps counted since the last reset."""

@@ -54,7 +54,7 @@ def same_torque() -> str:
     unseen[3, 0] = 1.0  # the part of link 4's mass that no torque shows
     flat = unseen.ravel() - base.basis @ (base.basis.T @ unseen.ravel())
     other = panda.theta + (flat / np.abs(flat.reshape(-1, 10)[:, 0]).max()).reshape(-1, 10)
-    Y = random_regressor(panda.tree, panda.lam, panda.gravity, samples=1000, seed=1).matrix
+    _, Y = random_regressor(panda.tree, panda.lam, panda.gravity, samples=1000, seed=1)
     apart = float(np.abs(Y @ (other - panda.theta).ravel()).max())
     figure, (ax,) = _figure(6.2, 2.6)
     at = np.arange(panda.tree.n) + 1.0

@@ -1,18 +1,22 @@
-"""A load added to pieces of a real Panda's log (Gaz et al. 2019): all else is the real arm's."""
+"""Loads on a real Panda: unknown ones, and known ones added to its log (Gaz et al. 2019)."""
 
 from __future__ import annotations
 
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pybullet_data
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
 from adapter.effects.robots import read_robot
+from adapter.gap.load import find_load
 from adapter.gap.real_arm import RealArm, nominal_fit, real_arm
 from adapter.gap.signals import Recorded
 from adapter.model.self_model import SelfModel
+from adapter.runs.library import make_log
 from adapter.screening.screen import refuse
 from adapter.screening.timing import lateness
 from drivers.files.mcap import Log
@@ -84,3 +88,21 @@ def test_a_load_is_told_from_inertias_that_somebody_made_up(signals: tuple[Array
     arm = weighed(loaded(signals, 4.0, PIECES_S[3]), model)
     assert arm.is_there(0)
     assert abs(arm.fit.named[0].x[0] - 4.0) < 3.0 * arm.mass_std[0] < 2.0
+
+
+def test_unknown_loads_are_those_of_plain_least_squares() -> None:
+    """Every fourth of 40 short logs, against the shared tool: Pinocchio, white noise, no search."""
+    shared = DATA.parents[1]
+    spec = spec_from_file_location("plain_load", shared / "tools" / "plain_load.py")
+    plain = module_from_spec(spec)
+    spec.loader.exec_module(plain)
+    urdf = shared / "models" / "panda_gaz2019_hand.urdf"
+    arm, model = pin.buildModelFromUrdf(str(urdf)), read_robot(str(urdf))
+    for path in sorted((DATA.parent / "panda_unknown_loads").glob("*.npz"))[::4]:
+        t, q, dq, tau = (np.load(path)[key].astype(float) for key in ("time", "q", "dq", "tau"))
+        mass, *_ = plain.load(arm, plain.rows(t, q, dq, tau))
+        later = np.concatenate([[True], np.diff(t) > 0.0])
+        log = make_log(*(x[later] for x in (t, q, dq, tau)), joint_names=model.tree.joint_names)
+        found = find_load(log, model)
+        assert abs(found.mass - mass) < min(0.3, 3.0 * found.mass_std), path.name
+        assert found.mass_std < 0.3

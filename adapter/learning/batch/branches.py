@@ -49,11 +49,13 @@ def branches(tree: Tree) -> tuple[Branch, ...]:
         if i != BASE:
             first[j] = first[i]
     groups = [tuple(j for j in range(tree.n) if first[j] == k) for k in sorted(set(first.values()))]
-    names = _unlike([_name(tree, joints) for joints in groups])
-    return tuple(
-        Branch(name, joints, _alone(tree, joints))
-        for name, joints in zip(names, groups, strict=True)
-    )
+    names = [_name(tree, joints) for joints in groups]
+    found = []
+    for k, (name, joints) in enumerate(zip(names, groups, strict=True)):
+        if name is None or names.count(name) > 1:
+            name = f"branch {k + 1}"
+        found.append(Branch(name, joints, _alone(tree, joints)))
+    return tuple(found)
 
 
 def _alone(tree: Tree, joints: tuple[int, ...]) -> Tree:
@@ -84,11 +86,3 @@ def _words(name: str) -> set[str]:
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()
     words = {word for word in re.split(r"[^a-z]+", spaced) if word}
     return words | {limb for limb in _LIMBS for word in words if word.endswith(limb)}
-
-
-def _unlike(names: list[str | None]) -> list[str]:
-    """Names that differ: "branch k" where there is none, or where two are the same."""
-    return [
-        name if name is not None and names.count(name) == 1 else f"branch {k + 1}"
-        for k, name in enumerate(names)
-    ]

@@ -78,12 +78,10 @@ class TorqueErrors:
     """Errors of joint torques (a base's wrench is not among them).
 
     Attributes:
-        relative: for each joint eq. 20 where the measured torque exceeds 0.1 N m, sorted.
-        median, p99: of all joints together.
+        median, p99: of eq. 20 over all joints where the measured torque exceeds 0.1 N m.
         rmse: (n,) N m.
     """
 
-    relative: tuple[Array, ...]
     median: float
     p99: float
     rmse: Array
@@ -131,10 +129,9 @@ def torque_errors(data: TreeData, lam: Array, theta: Array) -> TorqueErrors:
     measured = data.tau[:, first:]
     predicted = predicted_torques(data, lam, theta)[:, first:]
     error = relative_errors(measured, predicted)
-    by_joint = tuple(np.sort(column[~np.isnan(column)]) for column in error.T)
-    every = np.concatenate(by_joint)
+    every = error[~np.isnan(error)]
     median, p99 = (
         (float(np.quantile(every, q)) for q in (0.5, 0.99)) if len(every) else (np.nan, np.nan)
     )
     rmse = np.sqrt(np.mean((measured - predicted) ** 2, axis=0))
-    return TorqueErrors(by_joint, median, p99, np.asarray(rmse))
+    return TorqueErrors(median, p99, np.asarray(rmse))

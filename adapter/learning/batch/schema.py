@@ -129,10 +129,11 @@ class _Joint:
     ) -> None:
         self.count = moments.count
         self.raw = moments.sums[j]
-        self.noise = settings.noise
         self.used = np.array([True, moments.with_speed, True, True])
         start = Frame(matrix_from_zxz(prior[:3]), prior[3:].copy())
-        given = self._given_variance()
+        noise, given = settings.noise, None
+        if noise is not None:
+            given = np.array([getattr(noise, name) for name in CHANNELS]) ** 2
         self.sums = self.raw if given is None else _without(moments, j, given)
         self.power = np.trace(self.raw[:, :3, :3], axis1=1, axis2=2)
         weights = self._weights(self.power / (3.0 * self.count))
@@ -146,11 +147,6 @@ class _Joint:
         self._judge(clean, weights, settings.largest_std)
         freedom = Freedom.of(np.eye(6)[None] - self.shown, self.frame.p[None])
         self.frame = nearest(self.sums, weights, self.frame, start, freedom)
-
-    def _given_variance(self) -> Array | None:
-        if self.noise is None:
-            return None
-        return np.array([getattr(self.noise, name) for name in CHANNELS]) ** 2
 
     def _left_over(self) -> Array:
         """Mean square (4,) by component of what the fit leaves, with the data's own noise in."""

@@ -110,7 +110,13 @@ def smoothed_data(
             return None
         return BodyMotion(w, a, rate(f"{kind}_w"), smooth.get(f"{kind}_v"))
 
-    base = motion("base") if tree.floating else _at_rest(gravity, m)
+    if tree.floating:
+        base = motion("base")
+    elif gravity is None:
+        raise ModelError("a fixed base needs gravity, the direction of which its rest shows")
+    else:
+        zero = np.zeros((m, 3))
+        base = BodyMotion(zero, zero - np.asarray(gravity, dtype=float), zero, zero)
     if base is None:
         raise ModelError("a floating base needs its own base_w and base_a, and one is missing")
     tau = smooth["tau"]
@@ -118,11 +124,3 @@ def smoothed_data(
         tau = np.concatenate([np.zeros((m, 6)), tau], axis=1)
     data = TreeData(tree, smooth["q"], smooth["dq"], rate("dq"), tau, base, motion("link"))
     return data.take(slice(cut, m - cut))
-
-
-def _at_rest(gravity: Array | None, m: int) -> BodyMotion:
-    """The motion of a fixed base: none, and -gravity for an accelerometer."""
-    if gravity is None:
-        raise ModelError("a fixed base needs gravity, the direction of which its rest shows")
-    zero = np.zeros((m, 3))
-    return BodyMotion(zero, zero - np.asarray(gravity, dtype=float), zero, zero)

@@ -114,7 +114,6 @@ class ThetaResult:
         residual: by name of row, root mean square of what is left, N or N m.
         std: the weights' standard deviations by row.
         min_eigenvalue: smallest of all pseudo-inertias; above zero: every body is possible.
-        factors_s: time that building the factors took.
         converged: whether the last solve of every body did; if not, θ is the best found and may
             be far from what the data say.
     """
@@ -125,7 +124,6 @@ class ThetaResult:
     residual: dict[str, float]
     std: dict[str, float]
     min_eigenvalue: float
-    factors_s: float
     converged: bool
 
 
@@ -149,13 +147,13 @@ def learn_theta(
         ModelError: unknown names, shapes that don't fit, numbers that are not finite.
     """
     settings = settings or BatchThetaSettings()
-    began = time.perf_counter()
     rows = row_factors(data, lam, settings.supervision, wrenches)
     solve = _Solve(data, rows, settings, np.random.default_rng(seed))
-    factors_s = time.perf_counter() - began
     solve.run()
     for _ in range(settings.rounds if settings.std is None else 0):
-        if solve.reweigh() < SETTLED_WEIGHTS:
+        floor, before = RESIDUAL_FLOOR * scales(rows), solve.std
+        solve.std = np.maximum([row.residual(solve.theta) for row in rows], floor)
+        if np.abs(solve.std / before - 1.0).max() < SETTLED_WEIGHTS:
             break
         solve.again()
     names = [row.name for row in rows]
@@ -169,7 +167,6 @@ def learn_theta(
         residual=dict(zip(names, left, strict=True)),
         std=dict(zip(names, solve.std.tolist(), strict=True)),
         min_eigenvalue=least,
-        factors_s=factors_s,
         converged=possible and all(solve.converged.values()),
     )
 
@@ -209,12 +206,6 @@ class _Solve:
         """All bodies together, from where they are."""
         if self.settings.whole:
             self._stage("whole tree", tuple(range(self.tree.bodies)))
-
-    def reweigh(self) -> float:
-        """Weigh every row by what the solution leaves of it; the largest share a weight moved."""
-        floor, before = RESIDUAL_FLOOR * scales(self.rows), self.std
-        self.std = np.maximum([row.residual(self.theta) for row in self.rows], floor)
-        return float(np.abs(self.std / before - 1.0).max())
 
     def rank(self, bodies: tuple[int, ...]) -> int:
         """Base parameters that the rows of these bodies show."""

@@ -9,7 +9,7 @@ furthest from impossible, so that no digit is lost.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
@@ -80,9 +80,11 @@ def consistent_theta(r: Array, b: Array) -> Solution:
     scale, u, values, vt = _decomposed(r)
     shown = (vt[: len(values)].T @ ((u.T @ b) / values)) / scale
     hidden = vt[len(values) :].T / np.where(np.isfinite(scale), scale, 1.0)[:, None]
-    found = possible_theta(r, b, shown, hidden)
-    cost = _cost(r, b, found.theta)
-    return Solution(found.theta, cost, found.steps, len(values), found.solved)
+    theta, steps, solved = _roomiest(shown.reshape(-1, PER_BODY), hidden)
+    if not solved:  # least is left by possible bodies, what does not show near a small one
+        theta, more, solved = _closest(r, b)
+        steps += more
+    return Solution(theta, _cost(r, b, theta), steps, len(values), solved)
 
 
 def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
@@ -94,18 +96,12 @@ def _decomposed(r: Array) -> tuple[Array, Array, Array, Array]:
     """
     scale = np.linalg.norm(r, axis=0)
     scale = np.where(scale > RANK_TOLERANCE * scale.max(initial=1e-300), scale, np.inf)
-    u, values, vt = _svd(r / scale)
+    try:
+        u, values, vt = np.linalg.svd(r / scale, full_matrices=True)
+    except np.linalg.LinAlgError:  # the slower algorithm
+        u, values, vt = scipy.linalg.svd(r / scale, full_matrices=True, lapack_driver="gesvd")
     rank = int(np.count_nonzero(values > RANK_TOLERANCE * values[0]))
     return scale, u[:, :rank], values[:rank], vt
-
-
-def _svd(matrix: Array) -> tuple[Array, Array, Array]:
-    """Full SVD; by the slower algorithm where the fast one does not converge."""
-    try:
-        u, values, vt = np.linalg.svd(matrix, full_matrices=True)
-    except np.linalg.LinAlgError:
-        u, values, vt = scipy.linalg.svd(matrix, full_matrices=True, lapack_driver="gesvd")
-    return u, values, vt
 
 
 _UNITS = np.diag([1.0 / LENGTH] * 3 + [1.0])
@@ -114,41 +110,12 @@ _TO_THETA = np.linalg.inv(_FROM_THETA)
 _ONE = entries(np.eye(4))  # a body of 1 kg whose radius about its origin is `LENGTH` each way
 
 
-@dataclass(frozen=True)
-class Possible:
-    """What was found.
-
-    Attributes:
-        theta: (bodies, 10), every body possible.
-        steps: of the solver.
-        solved: whether nothing better is possible; else it is the best found.
-    """
-
-    theta: Array
-    steps: int
-    solved: bool
-
-
-def possible_theta(r: Array, b: Array, shown: Array, hidden: Array) -> Possible:
-    """The possible bodies that leave least of R θ = b, and what does not show near a small body.
-
-    Args:
-        r: (k, 10 bodies); b: (k,).
-        shown: (10 bodies,) a least-squares solution.
-        hidden: (10 bodies, h) directions of θ that R does not show.
-
-    Raises:
-        ModelError: the solver gave up without an answer.
-    """
-    exact = _roomiest(shown.reshape(-1, PER_BODY), hidden)
-    if exact.solved:
-        return exact
-    found = _closest(r, b)
-    return replace(found, steps=exact.steps + found.steps)
-
-
-def _roomiest(shown: Array, hidden: Array) -> Possible:
+def _roomiest(shown: Array, hidden: Array) -> tuple[Array, int, bool]:
     """Among all least-squares solutions the one whose bodies are furthest from impossible.
+
+    θ, steps, and whether all its bodies are possible.
+
+    `hidden` (10 bodies, h) are directions of θ that R does not show.
 
     Maximised is the least eigenvalue t of all bodies, up to `ROOM`; solved if it is above zero.
     """
@@ -170,13 +137,13 @@ def _roomiest(shown: Array, hidden: Array) -> Possible:
         in_cones,
     )
     if not np.isfinite(x).all():
-        return Possible(shown, steps, False)
+        return shown, steps, False
     theta = (fixed + size * (free @ x[:count])).reshape(bodies, PER_BODY) @ _TO_THETA.T
-    return Possible(theta, steps, bool(min_eigenvalue(theta).min() > 0.0))
+    return theta, steps, bool(min_eigenvalue(theta).min() > 0.0)
 
 
-def _closest(r: Array, b: Array) -> Possible:
-    """Least squares with every eigenvalue at least `EDGE`."""
+def _closest(r: Array, b: Array) -> tuple[Array, int, bool]:
+    """Least squares with every eigenvalue at least `EDGE`: θ, steps, and whether it is the best."""
     bodies = r.shape[1] // PER_BODY
     table = np.einsum("kbe,ef->kbf", r.reshape(len(r), bodies, PER_BODY), _TO_THETA)
     table = table.reshape(len(r), -1)
@@ -197,7 +164,7 @@ def _closest(r: Array, b: Array) -> Possible:
     least = np.linalg.eigvalsh(_UNITS @ pseudo_inertia(theta) @ _UNITS).min(axis=-1)
     # where the solver stopped short of the edge's right side
     lifted = np.maximum(EDGE - least, 0.0)[:, None] * (_ONE @ _TO_THETA.T)
-    return Possible(theta + lifted, steps, solved)
+    return theta + lifted, steps, solved
 
 
 def adam_theta(r: Array, b: Array, start: Array, steps: int = 5000) -> Solution:

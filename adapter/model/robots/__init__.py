@@ -51,15 +51,12 @@ def documented(
         raise ModelError(f"no robot '{text}'; {choices(text, names(), ROBOT_FILES)}")
     if suffix == ".urdf":
         return read_urdf(text, joints, floating, gravity, lock)
-    model = restricted(_sourced(load_model(text)).with_base(floating), joints, lock or {})
-    return model if gravity is None else replace(model, gravity=vector3(gravity))
-
-
-def _sourced(model: SelfModel) -> SelfModel:
-    """The model with the file of the robot that it is, where its own file is older than that."""
+    model = load_model(text)
     if model.source is None and model.name in names():
+        # its own file is older than that of the robot that it is
         known = documented(model.name)
         same = known.tree.joint_names == model.tree.joint_names
         if same and np.allclose(known.lam, model.lam, rtol=0.0, atol=1e-12):
-            return replace(model, source=known.source)
-    return model
+            model = replace(model, source=known.source)
+    model = restricted(model.with_base(floating), joints, lock or {})
+    return model if gravity is None else replace(model, gravity=vector3(gravity))

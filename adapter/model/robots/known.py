@@ -74,12 +74,6 @@ class RobotFacts:
         places = own.lam[1:, 3:] - model.lam[1:, 3:]
         return bool(np.abs(turns).max() < SAME_TURN and np.abs(places).max() < SAME_PLACE_M)
 
-    def has_the_limits_of(self, model: SelfModel) -> bool:
-        """Whether a model documents the same position limits."""
-        own, its = self.model.limits, model.limits
-        apart = np.abs([own.lower - its.lower, own.upper - its.upper])
-        return bool((apart < SAME_LIMIT).all())
-
 
 @cache
 def known_robots() -> tuple[RobotFacts, ...]:
@@ -90,7 +84,11 @@ def known_robots() -> tuple[RobotFacts, ...]:
 def facts_of(model: SelfModel) -> RobotFacts | None:
     """The known arm that a model describes, by its joints and their limits, or else its name."""
     same = [robot for robot in known_robots() if robot.has_the_body_of(model)]
-    limited = [robot for robot in same if robot.has_the_limits_of(model)]
+    its, limited = model.limits, []
+    for robot in same:
+        own = robot.model.limits
+        apart = np.abs([own.lower - its.lower, own.upper - its.upper])
+        limited += [robot] if (apart < SAME_LIMIT).all() else []
     named = [robot for robot in same if model.name.lower().startswith(robot.names)]
     return next(iter(limited or named), None)
 
