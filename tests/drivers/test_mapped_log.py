@@ -51,6 +51,7 @@ def test_a_mapped_recording_is_the_one_in_memory(tmp_path: Path, monkeypatch) ->
     assert_same(long.select(("c", "a")), log.select(("c", "a")))
     for whole in (long, log):
         assert np.array_equal(np.concatenate([p.q for p in whole.pieces(7_000)]), log.q)
+        assert min(len(piece) for piece in whole.pieces(len(log) - 1)) == len(log) // 2
     late = long.changed(lambda piece: piece.take(piece.stamp_ns > 2 * 10**10))
     assert np.array_equal(late.piece(0, 10).q, log.take(log.stamp_ns > 2 * 10**10).q[:10])
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -161,9 +162,10 @@ class Log:
         return replace(piece, commands=commands, warnings=[])
 
     def pieces(self, rows: int = AT_ONCE) -> Iterator[Log]:
-        """All samples, so many at a time."""
-        for start in range(0, len(self), rows):
-            yield self.piece(start, start + rows)
+        """All samples, so many at most at a time, alike many: a rest of a few tells nothing."""
+        edges = np.linspace(0, len(self), -(-len(self) // rows) + 1).astype(int)
+        for start, stop in pairwise(edges.tolist()):
+            yield self.piece(start, stop)
 
     def spread(self, count: int = 64, samples: int = 2000) -> list[Log]:
         """What tells of the whole: all of it; where it is mapped so many stretches of so many
