@@ -25,7 +25,10 @@ from adapter.model.spatial import Array
 from adapter.screening.likelihood import Rows
 from adapter.screening.screen import (
     MOVES_DQ,
+    SHORTEST_S,
     Judged,
+    RecordingFault,
+    RecordingRefused,
     cleaned,
     judged,
     of_this_robot,
@@ -41,6 +44,7 @@ MOVES_S = 1.0  # of motion, or the arm hardly moves
 SHOWN = 3.0  # standard deviations: what is smaller is not there, or not shown
 COM_M, INERTIA_SHARE = 0.05, 0.5  # standard deviations above which a number is not shown
 STEP = 1e-6
+LEAST_S = 0.3  # of rows
 EDGE, EVERY = 60, 10  # ms at either end, where the filter has no neighbours; between rows
 CLEAR, LEAST_CHANGE_KG = 6.0, 0.05  # standard deviations of a change; what is less is not told
 
@@ -113,18 +117,19 @@ def find_load(
     share = inertia_prior or (DOCUMENTED_SHARE if empty is None else SHARED_SHARE)
     taken = [_taken(one, model) for one in logs]
     notes += [note for x in taken for note in x.notes]
-    std, alive = prior_std(model.theta, share), np.any([x.alive for x in taken], axis=0)
-    parts, n = [Part(taken[0].moments, slice(None), np.arange(len(std)))], model.tree.n
+    std, n, whole = prior_std(model.theta, share), model.tree.n, taken[0].moments.together()
+    parts = [Part(whole, np.arange(len(std)), taken[0].alive)]
     if empty is not None:  # the same arm: its load is nothing, its static friction another
         at = np.arange(len(std))
         at[:10], at[-n:] = len(std) + np.arange(10), len(std) + 10 + np.arange(n)
-        parts.append(Part(taken[1].moments, slice(None), at))
+        parts.append(Part(taken[1].moments.together(), at, taken[1].alive))
         std = np.r_[std, np.zeros(10), std[-n:]]
-    found = judge(parts, std, alive)
+    found = judge(parts, std)
     if taken[0].moves:
-        notes += _changed(parts, std, alive, 1e-9 * (log.end_ns - log.begin_ns))
+        notes += _changed(taken[0].moments, parts, std, 1e-9 * (log.end_ns - log.begin_ns))
     load = load_of(found.x[:10], found.covariance[:10, :10], riding)
-    left, before = (alive * x for x in (found.left_nm, taken[0].moments.rms))
+    before = np.sqrt(whole.size / whole.rows)
+    left, before = (taken[0].alive * x for x in (found.left_nm, before))
     return replace(load, left_nm=left, before_nm=before, notes=tuple(dict.fromkeys(notes)))
 
 
@@ -153,8 +158,15 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         more = dead + torque.notes
     alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
     own = torque.in_time(own if survey is None else survey.log)
-    pieces = (_moments(x, model, own) for x in ([own] if survey is None else own.pieces()))
-    return _Taken(reduce(Moments.with_more, pieces), moves, alive, notes)
+    moments = reduce(Moments.with_more, (_moments(x, model, own) for x in own.pieces()))
+    left_s = float(moments.rows.sum()) * moments.period_s
+    if left_s < LEAST_S:
+        raise RecordingRefused(
+            RecordingFault.DATA,
+            f"{log.path}: its pauses leave {left_s:.2g} s to weigh by; record at least "
+            f"{SHORTEST_S:g} s without one.",
+        )
+    return _Taken(moments, moves, alive, notes)
 
 
 def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:
@@ -168,20 +180,22 @@ def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:
     return moments_of(model, Rows(q, dq, ddq, tau), EVERY * GRID_S, at)
 
 
-def _changed(
-    parts: Sequence[Part], std: Array, alive: NDArray[np.bool_], span_s: float
-) -> list[str]:
-    """That the hand's load clearly is another from some time on: it is judged as two."""
+def _changed(segments: Moments, parts: Sequence[Part], std: Array, span_s: float) -> list[str]:
+    """That the hand's load clearly is another from some time on: it is judged as two.
+
+    Args:
+        segments: of the recording that is the first of the parts.
+    """
     whole, found = parts[0], (CLEAR, 0.0, 0.0)
     later = np.r_[len(std) + np.arange(10), whole.at[10:]]
     two, weigh = np.r_[std, std[:10]], np.zeros(len(std) + 10)
     weigh[0], weigh[len(std)] = -1.0, 1.0
     for segment in range(1, SEGMENTS):
-        before = Part(whole.moments, slice(segment), whole.at)
-        after = Part(whole.moments, slice(segment, None), later)
-        if not all(x.moments.rows[x.segments].any() for x in (before, after)):
+        before = whole._replace(moments=segments.together(slice(segment)))
+        after = whole._replace(moments=segments.together(slice(segment, None)), at=later)
+        if not (before.moments.rows and after.moments.rows):
             continue
-        trial = judge([before, after, *parts[1:]], two, alive)
+        trial = judge([before, after, *parts[1:]], two)
         mass = float(weigh @ trial.x)
         clear = abs(mass) / float(np.sqrt(weigh @ trial.covariance @ weigh))
         if abs(mass) > LEAST_CHANGE_KG:

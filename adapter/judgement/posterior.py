@@ -19,17 +19,11 @@ from numpy.typing import NDArray
 
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.torque import ModelTorque
-from adapter.judgement.priors import Place
+from adapter.judgement.priors import positive
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
-from adapter.screening.likelihood import (
-    SENSOR_NM,
-    SENSOR_SHARE,
-    SENSOR_WEIGHT,
-    SMOOTHING_S,
-    Rows,
-)
+from adapter.screening.likelihood import SMOOTHING_S, Rows, by_joint, noise_nm, sensor_nm
 
 ROUNDS = 12  # of noise after fit; it settles in five
 MEMORY_S = (0.1, 0.5)  # of the noise, least and most: the band's 10 Hz, and an arm's misfit
@@ -39,14 +33,14 @@ SEGMENTS = 10  # of a recording, in any of which something may change
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Rows of a recording, by products of their columns.
+    """Rows of a recording, by products of their columns, in segments of its time or in all of it.
 
     Attributes:
-        period_s: between rows; rows: (s,) how many, by segments of time.
+        period_s: between rows; rows: (s,) how many.
         squares, products: (s, n, c, c), (s, n, c) of the columns with one another and with what
             the torque has more than the model; size: (s, n) of that with itself.
         model: (s, n) of the model's torque with itself.
-        last: columns (m, n, c) and torques (m, n) of the last piece.
+        largest: columns (m, n, c) and torques (m, n) of the largest piece.
     """
 
     period_s: float
@@ -55,32 +49,34 @@ class Moments:
     products: Array
     size: Array
     model: Array
-    last: tuple[Array, Array]
+    largest: tuple[Array, Array]
 
     def with_more(self, other: Moments) -> Moments:
         """The same of two pieces."""
-        names = ("rows", "squares", "products", "size", "model")
-        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        return replace(other, **sums)
+        sums = {name: getattr(self, name) + getattr(other, name) for name in _SUMS}
+        largest = max(self.largest, other.largest, key=lambda x: len(x[1]))
+        return replace(self, **sums, largest=largest)
 
-    @property
-    def rms(self) -> Array:
-        """(n,) of what the torque has more than the model, N m."""
-        return np.sqrt(self.size.sum(axis=0) / self.rows.sum())
+    def together(self, segments: slice = slice(None)) -> Moments:
+        """Some segments as one: without their axis."""
+        return replace(self, **{name: getattr(self, name)[segments].sum(axis=0) for name in _SUMS})
+
+    def left(self, x: Array) -> Array:
+        """(n,) mean square of what coefficients x (c,) leave, (N m)²; of segments together."""
+        left = self.size - 2.0 * self.products @ x + (self.squares @ x) @ x
+        return np.asarray(np.maximum(left, 0.0) / self.rows)
+
+
+_SUMS = ("rows", "squares", "products", "size", "model")
 
 
 def moments_of(model: SelfModel, rows: Rows, period_s: float, at: Array) -> Moments:
     """Products of rows, period_s apart; at (m,) from 0 to 1: when in their recording they are."""
-    arm = RigidArm.of(model)
     torque = ModelTorque(model)(rows.q, rows.dq, rows.ddq)
-    (m, n), place = torque.shape, Place(arm.n)
-    columns = np.zeros((m, n, place.size))
-    regressor = arm.regressor(rows.q, rows.dq, rows.ddq)
-    columns[:, :, place.theta], columns[:, :, place.load] = regressor, regressor[:, :, -10:]
+    regressor = RigidArm.of(model).regressor(rows.q, rows.dq, rows.ddq)
     step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
     joint = (np.ones_like(torque), step, rows.dq, rows.ddq, 1.0 - np.abs(step))
-    for k, column in enumerate(joint):
-        columns[:, range(n), np.arange(n) + place.joint(k).start] = column
+    columns = np.concatenate([regressor[:, :, -10:], regressor, by_joint(joint)], axis=2)
     more, segment = rows.tau - torque, np.clip((SEGMENTS * at).astype(int), 0, SEGMENTS - 1)
     x, y = columns.transpose(1, 2, 0), more.T[:, :, None]
     parts = [(x[:, :, on], y[:, on], torque[on]) for on in (segment == s for s in range(SEGMENTS))]
@@ -96,11 +92,17 @@ def moments_of(model: SelfModel, rows: Rows, period_s: float, at: Array) -> Mome
 
 
 class Part(NamedTuple):
-    """Some segments of a recording, and where its coefficients (c,) stand among those of all."""
+    """What one noise is of: all of a recording, or a time of it.
+
+    Attributes:
+        moments: its segments together.
+        at: (c,) where its coefficients stand among those of all.
+        alive: (n,) joints whose torque is measured in it.
+    """
 
     moments: Moments
-    segments: slice
     at: NDArray[np.int64]
+    alive: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,54 +119,37 @@ class Posterior:
     left_nm: Array
 
 
-def judge(parts: Sequence[Part], std: Array, alive: NDArray[np.bool_]) -> Posterior:
+def judge(parts: Sequence[Part], std: Array) -> Posterior:
     """What parts of recordings of one arm say together.
 
     Args:
-        std: (c,) of the prior of all coefficients, the first of them in the order of `Place`;
-            what has none is not there. alive: (n,) joints whose torque is measured.
+        std: (c,) of the prior of all coefficients, the first of them as `priors.prior_std` has
+            them; what has none is not there.
     """
-    place, free = Place(len(alive)), std > 0.0
-    sums = [_sums(part) for part in parts]
-    noise = [np.sqrt(size / rows) + SENSOR_NM for rows, _, _, size, _ in sums]
-    memory = [np.full(len(alive), MEMORY_S[0]) for _ in parts]
+    free, constrained = std > 0.0, positive(len(parts[0].alive))
+    expected = [sensor_nm(part.moments.model / part.moments.rows) for part in parts]
+    noise = [
+        np.sqrt(x.moments.left(np.zeros(len(x.at)))) + y
+        for x, y in zip(parts, expected, strict=True)
+    ]
+    memory = [np.full(len(part.alive), MEMORY_S[0]) for part in parts]
     for turn in range(ROUNDS):
-        information, right = np.diag(np.where(std > 0.0, std, 1.0) ** -2.0), np.zeros(len(std))
-        for part, (_, squares, products, _, _), level, long_s in zip(
-            parts, sums, noise, memory, strict=True
-        ):
-            weight = np.where(alive, part.moments.period_s / long_s / level**2, 0.0)
-            information[np.ix_(part.at, part.at)] += np.tensordot(weight, squares, 1)
-            right[part.at] += weight @ products
+        information, right = np.diag(np.where(free, std, 1.0) ** -2.0), np.zeros(len(std))
+        for (own, at, alive), level, long_s in zip(parts, noise, memory, strict=True):
+            weight = np.where(alive, own.period_s / long_s / level**2, 0.0)
+            information[np.ix_(at, at)] += np.tensordot(weight, own.squares, 1)
+            right[at] += weight @ own.products
         covariance = np.zeros_like(information)
         covariance[np.ix_(free, free)] = np.linalg.inv(information[np.ix_(free, free)])
         x = covariance @ right
-        left = [_left(one, x[part.at]) for part, one in zip(parts, sums, strict=True)]
-        for k, (part, (rows, _, _, _, model)) in enumerate(zip(parts, sums, strict=True)):
-            columns, more = part.moments.last
-            memory[k] = _memory_s(more - columns @ x[part.at], part.moments.period_s)
-            samples = rows * part.moments.period_s / memory[k]
-            floor = SENSOR_NM + SENSOR_SHARE * np.sqrt(model / rows)
-            total = samples * left[k] + SENSOR_WEIGHT * floor**2
-            noise[k] = np.sqrt(total / (samples + SENSOR_WEIGHT))
+        for k, (own, at, _) in enumerate(parts):
+            columns, more = own.largest
+            memory[k] = _memory_s(more - columns @ x[at], own.period_s)
+            samples = own.rows * own.period_s / memory[k]
+            noise[k] = noise_nm(own.left(x[at]), samples, expected[k])
         if turn >= ROUNDS // 2:
-            free[place.positive] &= x[place.positive] >= 0.0
-    return Posterior(x, covariance, np.sqrt(left[0]))
-
-
-def _sums(part: Part) -> tuple[float, Array, Array, Array, Array]:
-    """Rows, squares, products, size and model's size of its segments."""
-    own, on = part.moments, part.segments
-    squares, products, size, model = (
-        x[on].sum(axis=0) for x in (own.squares, own.products, own.size, own.model)
-    )
-    return float(own.rows[on].sum()), squares, products, size, model
-
-
-def _left(sums: tuple[float, Array, Array, Array, Array], x: Array) -> Array:
-    """(n,) mean square of what coefficients x (c,) leave, (N m)²."""
-    rows, squares, products, size, _ = sums
-    return np.asarray(np.maximum(size - 2.0 * products @ x + (squares @ x) @ x, 0.0) / rows)
+            free[constrained] &= x[constrained] >= 0.0
+    return Posterior(x, covariance, np.sqrt(parts[0].moments.left(x[parts[0].at])))
 
 
 def _memory_s(left: Array, period_s: float) -> Array:

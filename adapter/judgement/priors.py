@@ -13,53 +13,30 @@ motor inertia that the model lacks  0.05 kg m²: 5e-6 kg m² at a motor behind g
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from adapter.model.spatial import Array
+from adapter.screening.likelihood import LOAD_STD
 
-LOAD_KG, LOAD_KG_M, LOAD_KG_M2 = 3.0, 0.3, 0.05
 DOCUMENTED_SHARE = 0.05
 OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, STATIC_NM, MOTOR_KG_M2 = 1.0, 2.0, 1.0, 0.5, 0.05
 SPREAD, LIGHT_KG, SMALL_M = 0.25, 0.1, 0.05  # of `theta_prior`
 
 
-class Place(NamedTuple):
-    """Where a parameter of an arm of n joints stands in the vector of all."""
-
-    n: int
-
-    @property
-    def load(self) -> slice:
-        """Ten of the load about the last link's origin."""
-        return slice(0, 10)
-
-    @property
-    def theta(self) -> slice:
-        """10 n of the links."""
-        return slice(10, 10 + 10 * self.n)
-
-    def joint(self, k: int) -> slice:
-        """n of the joints: offset 0, Coulomb 1, viscous 2, motor 3, static friction 4."""
-        return slice(10 + (10 + k) * self.n, 10 + (11 + k) * self.n)
-
-    @property
-    def positive(self) -> slice:
-        """Coulomb and viscous friction and motors: no arm has less than none."""
-        return slice(self.joint(1).start, self.joint(3).stop)
-
-    @property
-    def size(self) -> int:
-        """How many there are."""
-        return 10 + 15 * self.n
-
-
 def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:
-    """(15 n + 10,) in the order of `Place`, of an arm with documented inertias theta (n, 10)."""
-    load = np.repeat((LOAD_KG, LOAD_KG_M, LOAD_KG_M2), (1, 3, 6))
+    """(10 + 15 n,) of all that may be off an arm with documented inertias theta (n, 10).
+
+    Ten of the load about the last link's origin, 10 n of the links, and by joint offset, Coulomb
+    and viscous friction, motor inertia and static friction.
+    """
     joint = (OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, MOTOR_KG_M2, STATIC_NM)
-    return np.concatenate([load, theta_prior(theta, share).ravel(), np.repeat(joint, len(theta))])
+    own = np.repeat(joint, len(theta))
+    return np.concatenate([LOAD_STD, theta_prior(theta, share).ravel(), own])
+
+
+def positive(n: int) -> slice:
+    """Friction and motors of n joints among these: no arm has less than none of them."""
+    return slice(10 + 11 * n, 10 + 14 * n)
 
 
 def theta_prior(theta: Array, share: float) -> Array:

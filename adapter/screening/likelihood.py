@@ -94,6 +94,10 @@ class Telling:
         """Rigid body of the model."""
         return RigidArm.of(self.model)
 
+    @cached_property
+    def _documented(self) -> ModelTorque:
+        return ModelTorque(self.model)
+
     @property
     def samples(self) -> float:
         """Independent samples of a joint."""
@@ -110,14 +114,13 @@ class Telling:
     def explaining(self, rows: Rows, changed: int | None = None) -> Callable[[Array], Explained]:
         """The same of any torques (m, n) of these instants."""
         columns, model = self._columns(rows, changed)
-        m, beyond = len(model), self._beyond(rows.q)
-        usual = np.sqrt(np.mean(model**2, axis=0))
-        floor = SENSOR_NM + SENSOR_SHARE * usual
+        (m, n), beyond = model.shape, self._beyond(rows.q)
+        floor = sensor_nm(np.mean(model**2, axis=0))
         squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
-        gains = slice(13 * len(usual), 14 * len(usual))
+        gains = slice(13 * n, 14 * n)
 
         def of(tau: Array) -> Explained:
-            apart, sigma = tau - model, FLOOR_NM + FLOOR_SHARE * usual
+            apart, sigma = tau - model, plausible_nm(model)
             products = np.einsum("mjk,mj->jk", columns, apart)
             for _ in range(ROUNDS):
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
@@ -125,13 +128,11 @@ class Telling:
                 x = np.linalg.solve(normal, weight @ products)
                 x[gains] = np.clip(x[gains], -HELD, HELD)
                 left = np.mean((apart - columns @ x) ** 2, axis=0)
-                total = self.samples + SENSOR_WEIGHT
-                sigma = np.sqrt((self.samples * left + SENSOR_WEIGHT * floor**2) / total)
+                sigma = noise_nm(left, self.samples, floor)
             noise = self.samples * np.log(sigma**2) + SENSOR_WEIGHT * (floor / sigma) ** 2
             cost = float(noise[self.alive].sum() + x @ x) + self.samples * rows.scaled
-            used = weight * np.tensordot(
-                squares, np.linalg.inv(normal), 2
-            )  # of the samples, to fit
+            # samples that it takes to fit so much explain nothing
+            used = weight * np.tensordot(squares, np.linalg.inv(normal), 2)
             honest = left / np.maximum(1.0 - used / self.samples, 1.0 / self.samples)
             share = 1.0 - honest / np.maximum(tau.var(axis=0), floor**2)
             size = 1.0 + FRICTION[-1] * x[gains]
@@ -141,7 +142,7 @@ class Telling:
 
     def torque(self, rows: Rows) -> Array:
         """(m, n) N m of the model without corrections."""
-        return ModelTorque(self.model)(rows.q, rows.dq, rows.ddq)
+        return self._documented(rows.q, rows.dq, rows.ddq)
 
     def corrected(self, x: Array, rows: Rows) -> Array:
         """(m, n) N m of the model with corrections x, see `Explained`; `rows.tau` is not used."""
@@ -155,29 +156,28 @@ class Telling:
     def apart(self, rows: Rows, loaded: bool) -> float:
         """How far the model, with any load or bare, is from rows; a true reading is nearer."""
         model = self.torque(rows)
-        sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(model**2, axis=0))
-        weight = np.sqrt(self.samples / len(model)) * self.alive / sigma
-        load = loaded * self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
-        columns, apart = load * weight[:, None], (rows.tau - model) * weight
-        flat = columns.reshape(-1, 10)
-        x = np.linalg.solve(flat.T @ flat + np.eye(10), flat.T @ apart.ravel())
-        left = np.mean((rows.tau - model - load @ x) ** 2, axis=0)[self.alive]
+        more = rows.tau - model
+        if loaded:
+            weight = np.sqrt(self.samples / len(model)) * self.alive / plausible_nm(model)
+            load = self.arm.regressor(rows.q, rows.dq, rows.ddq)[:, :, -10:] * LOAD_STD
+            flat = (load * weight[:, None]).reshape(-1, 10)
+            x = np.linalg.solve(flat.T @ flat + np.eye(10), flat.T @ (more * weight).ravel())
+            more = more - load @ x
+        left = np.mean(more**2, axis=0)[self.alive]
         return float(np.log(left + SENSOR_NM**2).sum()) + rows.scaled
 
     def _columns(self, rows: Rows, changed: int | None) -> tuple[Array, Array]:
         """(m, n, c) torque per standard deviation of each correction; (m, n) of the model."""
         regressor = self.arm.regressor(rows.q, rows.dq, rows.ddq)
         model = self.torque(rows)
-        m, n = model.shape
         step = rows.slides
         if step is None:
             step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
-        joint = np.zeros((m, n, len(FRICTION), n))
-        for k, column in enumerate((np.ones_like(model), step, rows.dq, model)):
-            joint[:, range(n), k, range(n)] = FRICTION[k] * column
-        parts = [regressor * inertial_std(self.arm).ravel(), joint.reshape(m, n, -1)]
+        own = (np.ones_like(model), step, rows.dq, model)
+        joint = by_joint([std * column for std, column in zip(FRICTION, own, strict=True)])
+        parts = [regressor * inertial_std(self.arm).ravel(), joint]
         if changed is not None:
-            later = (np.arange(m) >= changed)[:, None, None]
+            later = (np.arange(len(model)) >= changed)[:, None, None]
             parts.append(later * regressor[:, :, -10:] * LOAD_STD)
         return np.concatenate(parts, axis=2), model
 
@@ -186,6 +186,31 @@ class Telling:
         low, high = self.model.limits.lower, self.model.limits.upper
         over = (np.maximum(q - high, low - q) > BEYOND_RAD) & (high > low)
         return BEYOND * float(over.mean(axis=0).sum())
+
+
+def by_joint(columns: Sequence[Array]) -> Array:
+    """(m, n, k n) of what acts on each joint alone, (m, n) each, one after the other."""
+    m, n = columns[0].shape
+    out = np.zeros((m, n, len(columns), n))
+    for k, column in enumerate(columns):
+        out[:, range(n), k, range(n)] = column
+    return out.reshape(m, n, len(columns) * n)
+
+
+def plausible_nm(model: Array) -> Array:
+    """(n,) N m by which torques may be off a model's (m, n), where the search begins."""
+    return np.asarray(FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(model**2, axis=0)))
+
+
+def sensor_nm(square: Array) -> Array:
+    """(n,) N m of noise that is expected where torques have this mean square (n,)."""
+    return np.asarray(SENSOR_NM + SENSOR_SHARE * np.sqrt(square))
+
+
+def noise_nm(left: Array, samples: float | Array, expected: Array) -> Array:
+    """(n,) N m of noise: by the mean square left of so many samples, and by what is expected."""
+    total = samples * left + SENSOR_WEIGHT * expected**2
+    return np.asarray(np.sqrt(total / (samples + SENSOR_WEIGHT)))
 
 
 def lateness_s(signals: Sequence[Array], telling: Telling) -> float:

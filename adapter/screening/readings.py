@@ -22,12 +22,11 @@ from adapter.effects.by_joint import smooth_sign
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import (
     EVIDENCE,
-    FLOOR_NM,
-    FLOOR_SHARE,
     SMOOTHING_S,
     Explained,
     Rows,
     Telling,
+    plausible_nm,
 )
 
 MOST = 3  # readings in one recording
@@ -72,6 +71,14 @@ class Reading(NamedTuple):
     said: str
     rows: Rows
     numbers: int = 0
+
+    @property
+    def with_load(self) -> bool:
+        """Whether it is held against the model with any load.
+
+        A load bends a joint that is told otherwise towards the model, too: it is left out there.
+        """
+        return self.kind != "joint"
 
 
 class TorqueShares(NamedTuple):
@@ -181,8 +188,8 @@ class Readings:
     def _orders(self) -> Iterator[Reading]:
         """The columns in the order that fits best, and two of them swapped."""
         n, alive = len(self.names), np.flatnonzero(self.telling.alive)
-        sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(self.model**2, axis=0))
-        apart = np.abs(self.rows.tau[:, None, :] - self.model[:, :, None]) / sigma[:, None]
+        apart = np.abs(self.rows.tau[:, None, :] - self.model[:, :, None])
+        apart /= plausible_nm(self.model)[:, None]
         misfit = np.mean(np.minimum(apart, 20.0) ** 2, axis=0)[np.ix_(alive, alive)]
         best = np.arange(n)
         best[alive] = alive[linear_sum_assignment(misfit)[1]]
@@ -213,11 +220,10 @@ class Readings:
         )
         yield Reading("gravity", said, rows._replace(tau=tau))
         axes = np.stack([arm.changed(gravity=g).torque(rows.q, still, still) for g in np.eye(3)], 2)
-        sigma = FLOOR_NM + FLOOR_SHARE * np.sqrt(np.mean(self.model**2, axis=0))
-        weight = self.telling.alive / sigma
+        weight = self.telling.alive / plausible_nm(self.model)
         columns = (axes * weight[None, :, None]).reshape(-1, 3)
         apart = (rows.tau - self.model + own) * weight
-        found = np.linalg.lstsq(columns, apart.ravel(), rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(columns, apart.ravel(), rcond=None)[0], dtype=float)
         size = float(np.linalg.norm(found))
         if not size or _angle(found, arm.gravity) < TILT_RAD:
             return
@@ -322,13 +328,9 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
     now = telling.explained(rows)
     found: list[Reading] = []
     while len(found) < MOST:
-        # a load bends a joint told otherwise towards the model, too: it is left out there
         far = {loaded: telling.apart(rows, loaded) for loaded in (True, False)}
-        nearer = [
-            x
-            for x in Readings(rows, telling)
-            if telling.apart(x.rows, x.kind != "joint") < far[x.kind != "joint"]
-        ]
+        every = Readings(rows, telling)
+        nearer = [x for x in every if telling.apart(x.rows, x.with_load) < far[x.with_load]]
         explained = [telling.explained(x.rows) for x in nearer]
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:

@@ -162,6 +162,12 @@ def test_pauses_that_leave_no_second_together_are_told() -> None:
     assert abs(found.mass - LOAD_KG) < 3.0 * found.mass_std < 1.0
 
 
+def test_a_log_of_pauses_leaves_nothing_to_weigh_by() -> None:
+    log = base().take(np.arange(len(base())) % 500 < 300)
+    with pytest.raises(RecordingRefused, match="its pauses leave 0 s to weigh by"):
+        find_load(log, panda_model())
+
+
 WRONG = {
     "sign": lambda tau: tau * np.where(np.arange(7) == 1, -1.0, 1.0),
     "scale": lambda tau: 100.0 * tau,
