@@ -20,7 +20,6 @@ from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, LinearEffect
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE, HELD
-from adapter.gap.evidence import ORDER
 from adapter.gap.fit import EDGE_S, Fit
 from adapter.gap.long_recording import LongRecording, Span
 from adapter.gap.real_arm import load_in, loaded_arm, nominal_fit, real_arm
@@ -70,7 +69,7 @@ class Windows:
         for piece in pieces_of(replace(fit, weights=()), whole):
             own = piece.recordings[0]
             X, data = piece.whiten([_signatures(piece)]), piece.whiten(piece.model.residuals())
-            place = np.repeat((own.t[ORDER:] // every_s).astype(int), fit.n)
+            place = np.repeat((own.t // every_s).astype(int), fit.n)
             for w in np.unique(place):
                 at = place == w
                 G[w] += X[:, at] @ X[:, at].T
@@ -197,7 +196,7 @@ def _dated(fit: Fit, k: int) -> Span:
     for trial in (bare.without(k), with_it):
         white = trial.whiten(trial.model.residuals())
         sizes.append(np.square(white).reshape(-1, fit.n).sum(axis=1))
-    t = fit.recordings[0].t[ORDER:]
+    t = fit.recordings[0].t
     near = np.flatnonzero(np.abs(t - begin) < AROUND_S)
     if not len(near):
         return begin, end

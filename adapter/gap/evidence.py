@@ -9,13 +9,12 @@ eliminated by a Schur complement, which takes away from each signature what thos
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, solve_toeplitz
+from scipy.linalg import cho_factor, cho_solve
 
+from adapter.judgement.noise import MEMORY_S, memory_s
 from adapter.model.spatial import Array
 
 
@@ -138,114 +137,47 @@ class Moments(Normal):
         return Moments(self.folds, prior_std, self.seconds)
 
 
-ORDER = 6  # at 25 Hz
-AT_ONCE = 8  # signatures that are whitened together
-WHITE = 0.02  # share of white noise added: edges of models are not known any better
-NOISE_WINDOW, SHORTEST_WINDOW = 128, 32  # samples, 5 s at most, and the least
-ROBUST, PLAIN = 5, 2  # windows at least: where something may be in a few of them, and else
+BAND_HZ = 25.0  # samples a second
+WINDOW = 50  # samples, 2 s
 LEAST_NM = 1e-4  # N m; no torque sensor is quieter
 
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """What the residual is made of once everything that can be explained is.
+    """What a model leaves, with memory: the sensors' noise, and what it gets wrong for a while.
+
+    Rows are as many as its memory lets be independent, and none is whitened: what an arm's model
+    gets wrong is slow, and under coloured noise it would be the fast rest that weighs a load.
 
     Attributes:
-        ar: (n, p) coefficients; x_t = sum ar_i x_(t-i) + e_t.
-        sigma: (n,) standard deviation of e, N m.
-        level: (n,) standard deviation of x in the band, N m.
+        level: (n,) standard deviation in the band, N m.
+        memory: (n,) samples of the band that say the same.
     """
 
-    ar: Array
-    sigma: Array
     level: Array
-
-    def flat(self) -> Noise:
-        """White noise of the same size in the band."""
-        return Noise(np.zeros_like(self.ar), self.level, self.level)
+    memory: Array
 
     def whiten(self, x: Array) -> Array:
-        """Signals (..., k, n) made white and of unit variance, (..., k - p, n)."""
-        n, p = self.ar.shape
-        k = x.shape[-2] - p
-        flat = x.reshape(-1, (k + p) * n)  # long rows: numpy is slow along a handful of joints
-        ratio = np.tile(np.column_stack([np.ones(n), -self.ar]).T / self.sigma, k)
-        out, part = np.empty((len(flat), k * n)), np.empty((AT_ONCE, k * n))
-        for first in range(0, len(flat), AT_ONCE):  # few enough to stay in the cache
-            rows = flat[first : first + AT_ONCE]
-            mine, scratch = out[first : first + AT_ONCE], part[: len(rows)]
-            np.multiply(rows[:, p * n :], ratio[0], out=mine)
-            for i in range(1, p + 1):
-                np.multiply(rows[:, (p - i) * n : (p - i + k) * n], ratio[i], out=scratch)
-                mine += scratch
-        return np.asarray(out.reshape(*x.shape[:-2], k, n))
+        """Signals (..., k, n) of unit variance for as many rows as are independent."""
+        return np.asarray(x / (self.level * np.sqrt(self.memory)))
 
 
-def noise_of(
-    residual: Array,
-    floor: float = LEAST_NM,
-    windows: int = PLAIN,
-    seams: Sequence[int] = (0,),
-) -> Noise:
-    """Noise model of a residual (k, n), N m.
+def noise_of(residual: Array, weight: Array | None = None) -> Noise:
+    """Noise of a residual (k, n), N m, whose rows count as `weight` (k, n), alike where None."""
+    weight = np.ones_like(residual) if weight is None else weight
+    left = residual * weight
+    rows = np.maximum(np.sum(weight**2, axis=0), 1.0)
+    level = np.sqrt(np.sum(left**2, axis=0) / rows + LEAST_NM**2)
+    return Noise(level, BAND_HZ * memory_s(left, 1.0 / BAND_HZ))
 
-    The spectrum is the median over windows of 5 s, so that what happens but once, a contact or
-    a load that is picked up, does not count as noise.
 
-    Args:
-        floor: least standard deviation, N m.
-        windows: at least so many; the more, the less does slow noise count in short recordings.
-        seams: rows at which stretches begin, between which time is left out.
+def quiet_noise(residual: Array) -> Noise:
+    """Noise of a residual (k, n), N m, as it is in most windows of it, about their means.
+
+    What happens but once, a contact or a load that is picked up, is no noise then, and what comes
+    in at some time and stays is none.
     """
-    power = _spectrum(residual, windows) if len(seams) == 1 else _of_stretches(residual, seams)
-    covariance = np.fft.ifft(power, axis=0).real[: ORDER + 1]
-    covariance[0] += np.maximum(np.square(floor) - covariance[0], 0.0) + WHITE * covariance[0]
-    n = residual.shape[1]
-    ar, sigma = np.zeros((n, ORDER)), np.empty(n)
-    for j in range(n):
-        r = covariance[:, j]
-        ar[j] = solve_toeplitz(r[:-1], r[1:])
-        sigma[j] = np.sqrt(r[0] - ar[j] @ r[1:])
-    return Noise(ar, sigma, np.sqrt(covariance[0]))
-
-
-def _spectrum(residual: Array, windows: int) -> Array:
-    """(f, n) power of a residual (k, n)."""
-    from scipy.signal import welch  # takes a second; the learner's monitor has no use for it
-
-    window = min(NOISE_WINDOW, max(len(residual) // windows, SHORTEST_WINDOW))
-    _, power = welch(
-        residual,
-        window="hann",
-        nperseg=window,
-        axis=0,
-        average="median",
-        detrend="constant",
-        return_onesided=False,
-    )
-    return np.asarray(power)
-
-
-def _of_stretches(residual: Array, seams: Sequence[int]) -> Array:
-    """(f, n) power of a residual (k, n), as Welch has it, by windows within its stretches."""
-    from scipy.signal import spectrogram
-
-    parts = [residual[a:b] for a, b in pairwise([*seams, len(residual)])]
-    window = min(NOISE_WINDOW, *(len(part) for part in parts))
-    powers = [
-        spectrogram(
-            part,
-            window="hann",
-            nperseg=window,
-            noverlap=window // 2,
-            axis=0,
-            detrend="constant",
-            return_onesided=False,
-        )[2]
-        for part in parts
-    ]
-    power = np.concatenate(powers, axis=-1)
-    # what the median of so many exponential variables is to their mean
-    even = 2.0 * np.arange(1.0, (power.shape[-1] - 1) // 2 + 1)
-    bias = 1.0 + float(np.sum(1.0 / (even + 1.0) - 1.0 / even))
-    return np.asarray(np.median(power, axis=-1) / bias)
+    k = max(len(residual) // WINDOW, 1)
+    windows = residual[: k * (len(residual) // k)].reshape(k, -1, residual.shape[1])
+    level = np.sqrt(np.median(windows.var(axis=1), axis=0) + LEAST_NM**2)
+    return Noise(level, np.full(len(level), BAND_HZ * MEMORY_S[0]))

@@ -28,9 +28,9 @@ OPEN_NATS = 3.0  # by which a name may be the better one and leave the other ope
 SINGLED_OUT = 0.9  # probability of a link's correction
 ODD = 4.0  # standard deviations from which on a correction is a finding
 DIFFERENCE = 1e-4  # of a coefficient's prior
-DISCREPANCY = 0.12  # of a finding's torque: a pattern below that is its equation's inexactness
+DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
-SMOOTH = 3.5  # level of a residual over what the samples before it do not foretell
+SMOOTH, BEFORE = 3.5, 6  # level of a residual over what so many samples before do not foretell
 FOLLOWS = 0.05  # share of its power that a signal must explain to be named
 FEW_ROWS, FEW_SPANS = 12, 5
 VISIBLE = 1.05  # by which what is left must exceed the noise to be worth a word
@@ -261,17 +261,21 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
     Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
     """
     out = []
-    noise, residual = fit.noise[0], fit.model.residual(0)
+    level, residual = fit.noise[0].level, fit.model.residual(0)
     motion = fit.recordings[0].motion
     rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
     for j in range(fit.n):
-        surprise = float(noise.sigma[j])
-        if noise.level[j] < SMOOTH * surprise:
+        memory = np.lib.stride_tricks.sliding_window_view(residual[:, j], BEFORE + 1)
+        foretold = np.linalg.lstsq(memory[:, :-1], memory[:, -1], rcond=None)[0]
+        surprise = _rms(memory[:, -1] - memory[:, :-1] @ foretold)
+        if level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
         shares = {name: explained(residual[:, j], x) for name, x in signals.items()}
         follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
         size = _rms(residual[:, j])
+        if size < DISCREPANCY * _idealised(fit, j):
+            continue
         names = tuple(follows) or (f"q{j + 1}", "t")
         out.append(Leftover(j + 1, size, min(surprise, size), names, (0.0, ends[0])))
     return out

@@ -21,7 +21,7 @@ from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
 from adapter.effects.catalogue import CATALOGUE, LATENESS
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Stages, stages_of
-from adapter.gap.evidence import LEAST_NM, ORDER, Carried, Moments, Noise, Score, noise_of
+from adapter.gap.evidence import Carried, Moments, Noise, Score, noise_of
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
@@ -32,10 +32,10 @@ STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump: friction turns round more softly than its equation
 JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
-BAND_HZ = 25.0  # samples a second
 BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
+FAR_STEP = 3.0  # where others stay as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,9 +280,6 @@ class Fit:
         prior: (n, 10) standard deviation of the nominal inertias.
         noise: one model per recording.
         timing_std_s: how far the torques' timing may be off without being an effect.
-        caution: nats that what is rare must be worth beside all else, where the inertias are those
-            of another unit.
-        hand_judged: whether it is settled what the hand held from the first sample on.
         weights: (k, n) by which white rows count, per recording; empty where all count alike.
     """
 
@@ -291,8 +288,6 @@ class Fit:
     noise: tuple[Noise, ...] = ()
     timing_std_s: float = TIMING_STD_S
     weights: tuple[Array, ...] = ()
-    caution: float = 0.0
-    hand_judged: bool = False
 
     @property
     def recordings(self) -> tuple[Signals, ...]:
@@ -358,9 +353,11 @@ class Fit:
         return self.with_named((*self.named[:place], other, *self.named[place + 1 :]))
 
     def own_noise(self) -> tuple[Noise, ...]:
-        """Noise that its residuals show."""
-        parts = zip(self.model.residuals(), self.recordings, strict=True)
-        return tuple(noise_of(r, LEAST_NM, seams=own.seams) for r, own in parts)
+        """Noise that its residuals show where they count."""
+        sliding = [own.sliding for own in self.recordings]
+        if self.weights:
+            sliding = [x * (weight > 0.0) for x, weight in zip(sliding, self.weights, strict=True)]
+        return tuple(map(noise_of, self.model.residuals(), sliding))
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
@@ -372,11 +369,11 @@ class Fit:
 
         They don't count at all around its start and end: nobody picks up a load in no time.
         """
-        level, weight = self.noise[recording].level, self.counted(recording)
+        level, square = self.noise[recording].level, np.zeros(1)
         for k, e in enumerate(self.named):
             if e.candidate.effect.inexact and e.recording in (None, recording):
-                weight /= np.sqrt(1.0 + (unsure(self.model, recording, k) / level) ** 2)
-        return weight
+                square = square + unsure(self.model, recording, k) ** 2
+        return np.asarray(self.counted(recording) / np.sqrt(1.0 + square / level**2))
 
     def counted(self, recording: int) -> Array:
         """(k, n) zero around the start and end of a named effect, else one."""
@@ -384,19 +381,17 @@ class Fit:
         out = np.ones_like(own.tau)
         for e in self.named:
             for edge in e.interval_s if e.recording in (None, recording) else ():
-                after = EDGE_S + ORDER / BAND_HZ
-                out[(own.t > edge - EDGE_S) & (own.t < edge + after)] = 0.0
+                out[(own.t > edge - EDGE_S) & (own.t < edge + EDGE_S)] = 0.0
         return out
 
     def whiten(self, tables: Sequence[Array]) -> Array:
         """Tables (..., k, n), one per recording, white and in one row each (..., r)."""
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
         for x, own in zip(white, self.recordings, strict=True):
-            if not own.all_count:
-                x *= own.counted[ORDER:]
+            x *= own.heard
         if self.weights:
             for x, weight in zip(white, self.weights, strict=True):
-                x *= weight[ORDER:]
+                x *= weight
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
         return flat[0] if len(flat) == 1 else np.concatenate(flat, axis=-1)
 
@@ -409,14 +404,8 @@ class Fit:
 
 
 def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
-    """A fit under the noise that it leaves itself, and what is known of its coefficients.
-
-    That noise is taken from a fit that counts all frequencies alike. Taken from a fit under
-    coloured noise, and again, what a model gets slightly wrong would turn into noise step by
-    step, and the effect with it.
-    """
-    flat = [noise.flat() for noise in fit.own_noise()]
-    fit, _ = refitted(fit.with_noise(flat))
+    """A fit under the noise that it leaves itself, and what is known of its coefficients."""
+    fit, _ = refitted(fit.with_noise())
     return refitted(fit.with_noise())
 
 
@@ -443,7 +432,7 @@ def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
         seconds = known.seconds
     else:
         white = known.data - known.x @ known.N
-        ends = np.cumsum([(len(s.tau) - ORDER) * s.tau.shape[1] for s in fit.recordings])
+        ends = np.cumsum([len(s.tau) * s.tau.shape[1] for s in fit.recordings])
         cuts = [np.arange(a, b, BLOCK * fit.n) for a, b in pairwise([0, *ends])]
         scores = np.add.reduceat(known.N * white, np.concatenate(cuts), axis=1)
         seconds = scores @ scores.T
@@ -547,7 +536,7 @@ def _reshaped(fit: Fit, place: int) -> Fit:
     """The same where its own columns are all that changes; others stay as linear as they are."""
     carried, own = fit.carried(), place_of(fit, place)
     best, named = carried, fit.named[place]
-    for step in SHAPE_STEPS:
+    for step in (FAR_STEP, *SHAPE_STEPS):
         for other in _other_shapes(named, step):
             N = carried.N.copy()
             slopes = [

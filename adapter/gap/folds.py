@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.effects.catalogue import LATENESS
-from adapter.gap.evidence import ORDER, Carried, Moments, Normal
+from adapter.gap.evidence import Carried, Moments, Normal
 from adapter.gap.fit import Fit, beside
 from adapter.model.spatial import Array
 
@@ -43,7 +43,7 @@ def fold_rows(fit: Fit) -> np.ndarray:
     """(r,) fold of each white row."""
     rows = []
     for own in fit.recordings:
-        rows.append(np.repeat(fold_of(own.t[ORDER:], block_s(fit)), fit.n))
+        rows.append(np.repeat(fold_of(own.t, block_s(fit)), fit.n))
     return np.concatenate(rows)
 
 

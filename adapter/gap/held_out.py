@@ -19,7 +19,6 @@ from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, place_of, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.long_recording import LongRecording
-from adapter.gap.refine import refined
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import COMMANDS, ROLLOUT_STEP_S, Recorded
@@ -38,7 +37,6 @@ SMEARED_MS = 101  # about an instant, in which the recipe's filter mixes torques
 NO_PRIOR = 1e-4  # times the prior: inertias that must not be corrected
 ACTS = 0.1  # of an effect's largest torque: a joint that it acts on
 THINNED = 10  # rollout rows kept for a plot: one in so many
-EVEN_ROUNDS = 2  # of a fit and the size of what it leaves
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
@@ -302,7 +300,7 @@ def measure(
     task: GapTask, found: Found, simulate: Simulate | None, progress: Callable[[str], None]
 ) -> HeldOut:
     """Score the nominal model and the new one where the new one was not fitted."""
-    searched, found = found.fit, _paying(task, refined(found))
+    searched, found = found.fit, _paying(task, found)
     whole = task.fitted[0]
     if isinstance(whole, LongRecording) and len(task.fitted) == 1:
         progress("weighing it on the whole recording")
@@ -383,9 +381,7 @@ class _Scored:
 def _paying(task: GapTask, found: Found) -> Found:
     """As it foretells held-out data best: how it is weighed, corrections, single effects."""
     level = noise_floor(found.fit)
-    ways = [found, uncorrected(found)]
-    if found.fit.caution:  # a real arm's: what its model gets wrong is slow, and no noise
-        ways.append(evenly(found))
+    ways = found, uncorrected(found)
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)
     while best.worse.any() and best.found.fit.named:
         fewer = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
@@ -407,7 +403,7 @@ def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
             standings = found.standings[:k] + found.standings[k + 1 :]
             weak = frozenset(i - (i > k) for i in found.weak if i != k)
             less = replace(found, fit=rest, carried=carried, standings=standings, weak=weak)
-            less = replace(less, under=None, even=False)
+            less = replace(less, under=None)
             out.append(uncorrected(less) if not fit.dtheta.any() else replace(less, known=None))
     return out
 
@@ -422,22 +418,6 @@ def uncorrected(found: Found) -> Found:
     model = replace(fit.model, dtheta=np.zeros_like(fit.dtheta))
     kept = replace(fit, model=model, prior=found.fit.prior)
     return replace(found, fit=kept, carried=carried, known=kept.carried(), under=fit)
-
-
-def evenly(found: Found) -> Found:
-    """The same effects fitted with all frequencies counting alike.
-
-    Under coloured noise slow errors count little. Where they are the model's own, and not the
-    sensors', they are what is left in the torque. What is known of the coefficients stays what is
-    known under the noise as it is.
-    """
-    fit = found.fit
-    for _ in range(EVEN_ROUNDS):
-        flat = [noise.flat() for noise in fit.own_noise()]
-        fit, carried = refitted(replace(fit, noise=tuple(flat), weights=()))
-    kept = replace(fit, noise=found.fit.noise, weights=found.fit.weights)
-    known = kept.carried()
-    return replace(found, fit=fit, carried=carried, known=known, under=fit, even=True)
 
 
 def _curves(name: str, found: Found, i: int) -> Curves:

@@ -301,18 +301,14 @@ class LongRecording(Recorded):
         """The stretches as the search sees a recording."""
         return together([self._part(*x, arm) for x in self._samples(self.spans)])
 
-    def pieces(self, like: Signals, before: int) -> Iterator[Signals]:
-        """All of it, piece by piece; each begins so many samples before what is its own.
-
-        Args:
-            like: whose arm and bands these have.
-        """
+    def pieces(self, like: Signals) -> Iterator[Signals]:
+        """All of it, piece by piece, with the arm and bands of others."""
         size = round(PIECE_S * RATE_HZ / DECIMATION)
         for run in self.runs:
             last = min(run.samples, run.sample(self.span[1]))
-            for begin in range(max(before, run.sample(self.span[0])), last, size):
+            for begin in range(max(run.sample(self.span[0]), 0), last, size):
                 end = min(begin + size, last)
-                yield self._part(run, begin - before, end, like.motion.arm, like.motion.bands_hz)
+                yield self._part(run, begin, end, like.motion.arm, like.motion.bands_hz)
 
     def _samples(self, spans: Sequence[Span]) -> list[tuple[Run, int, int]]:
         """Run and samples of stretches; those too near one another to be two are one."""

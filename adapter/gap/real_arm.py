@@ -1,4 +1,4 @@
-"""What comes before any search: the load, and inertias as wrong as the data say they are.
+"""What comes before any search: the load, and beside it what any arm has.
 
 Documented inertias are those of another unit, every joint has friction, every sensor an offset,
 and the commonest thing that a model lacks is what the hand holds. All of these are fitted together
@@ -17,7 +17,7 @@ from adapter.effects.active import active_effects
 from adapter.effects.base import Effect, Template
 from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.gap.candidates import Candidate
-from adapter.gap.evidence import Carried, Moments, score
+from adapter.gap.evidence import Carried, Moments
 from adapter.gap.fit import (
     TIMING_STD_S,
     Fit,
@@ -34,32 +34,30 @@ from adapter.gap.long_recording import LongRecording
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF
 from adapter.gap.signals import Recorded, prepare
-from adapter.judgement.priors import theta_prior
+from adapter.judgement.priors import (
+    COULOMB_NM,
+    MOTOR_KG_M2,
+    OFFSET_NM,
+    VISCOUS_NM_S,
+    theta_prior,
+)
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.timing import TIMING_SHARE
 
-BRISTLES = CATALOGUE["bristle_friction"].templates()[1]  # a Panda's
-WHERE_IT_MOVES = (
-    (CATALOGUE["bristle_friction"], BRISTLES),
-    *(
-        (CATALOGUE[name], CATALOGUE[name].templates()[0])
-        for name in ("viscous_friction", "motor_inertia")
-    ),
-)
 COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
-# Of a real arm: what its torques lack of the motion's band, and a table that is not level
+BRISTLES = CATALOGUE["bristle_friction"]
+WHERE_IT_MOVES = {
+    BRISTLES: COULOMB_NM,
+    CATALOGUE["viscous_friction"]: VISCOUS_NM_S,
+    CATALOGUE["motor_inertia"]: MOTOR_KG_M2,
+}
+USUAL = {BRISTLES: 1}  # of the templates: bristles of a Panda
+# Of the whole arm: what its torques lack of the motion's band, and a table that is not level
 OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
-SHARES = (1.0, 2.0, 4.0, 8.0)  # times the prior of the inertias, that are tried
-MADE_UP, MADE_UP_NATS = 32.0, 20.0  # times the prior of inertias that nobody measured; if so sure
-LAST_SHARE = 2.5  # of the last link at most: an error of it that looks like a load is called one
-OPEN_NATS = 1.5  # by which a narrower prior must be the better one to be believed
-OTHER_UNIT = 4.0  # times the prior from which on these are the inertias of another unit
-CAUTION = 300.0  # nats times seconds: what is rare must show the more, the shorter a log is
 WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
-LARGER = 2.0  # times what is believed of friction: an arm that has it has larger joints
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
 
 
@@ -134,10 +132,10 @@ def real_arm(fit: Fit, joints: Sequence[int], loaded: Sequence[int]) -> RealArm:
 
 def loaded_arm(fit: Fit, joints: Sequence[int], loads: Sequence[Named]) -> RealArm:
     """The nominal model with these loads, and all that any arm may have; see `real_arm`."""
-    trial = _beside(fit.with_named(loads), joints)
+    trial = _as_any_arm(fit.with_named(loads), joints)
     for _ in range(WAY_ROUNDS):
-        found, known = _as_wide_as_open(trial)
-        fitting = [_fitting(fit, e) for e in found.named]
+        found, known = under_own_noise(trial)
+        fitting = [e if e.assumed else fitting_way(fit, e) for e in found.named]
         if list(map(_way, fitting)) == list(map(_way, trial.named)):
             break
         trial = fit.with_named(fitting)
@@ -154,7 +152,7 @@ def as_driven(fit: Fit, joints: Sequence[int], first: Sequence[Named]) -> Fit:
         joints: (from 0) that move.
     """
     fit = _beside(fit.with_named(first), joints)
-    at_once = [_assumed(COULOMB, COULOMB.templates()[0], j) for j in joints]
+    at_once = [_assumed(COULOMB, j, COULOMB_NM) for j in joints]
     return fit.with_named([*fit.named, *at_once])
 
 
@@ -180,78 +178,30 @@ def _way(e: Named) -> tuple[str, tuple[float, ...]]:
     return e.candidate.template.label, tuple(e.candidate.template.prior_std)
 
 
-def _fitting(fit: Fit, e: Named) -> Named:
-    """An effect, looked for as one of about its size: arms are small and large."""
-    if not e.assumed:
-        return fitting_way(fit, e)
-    own, size = np.array(e.candidate.prior_std), np.abs(e.x)
-    if np.all(size < LARGER * own):
-        return e
-    template = replace(e.candidate.template, prior_std=tuple(map(float, np.maximum(own, size))))
-    return replace(e, candidate=replace(e.candidate, template=template))
-
-
-def _as_wide_as_open(fit: Fit) -> tuple[Fit, Carried]:
-    """A fit with the widest prior of the inertias that its data do not speak against."""
-    wide, known = under_own_noise(replace(fit, prior=_shared(fit, SHARES[-1])))
-    std, worths = known.prior_std.copy(), []
-    for share in (*SHARES, MADE_UP):
-        std[: fit.dtheta.size] = _shared(fit, share).ravel()
-        worths.append(score(known.G, known.g, std).log_evidence)
-    *open_to, made_up = worths
-    if made_up > max(open_to) + MADE_UP_NATS:
-        return under_own_noise(replace(fit, prior=_shared(fit, MADE_UP)))
-    share = SHARES[int(np.flatnonzero(np.array(open_to) > max(open_to) - OPEN_NATS)[-1])]
-    return refitted(replace(wide, prior=_shared(fit, share)))
-
-
-def _shared(fit: Fit, share: float) -> Array:
-    """(n, 10) prior of the inertias, so many times as wide."""
-    times = np.full((fit.n, 10), share)
-    times[-1, : 1 if share == MADE_UP else 10] = min(share, LAST_SHARE)
-    return np.asarray(times * fit.prior)
-
-
 def start(fit: Fit, joints: Sequence[int]) -> Fit:
-    """What a search starts from.
+    """What a search starts from: all that any arm has, and the loads that are there.
 
-    That is the nominal model itself, unless the hand holds something or the inertias are those of
-    another unit: then it has all that any arm may have. None of that is dropped for being weak:
-    what all offsets together leave open of a load's mass, they would leave to the inertias alone.
+    None of it is dropped for being weak: what all offsets together leave open of a load's mass,
+    they would leave to the inertias alone.
 
     Args:
         fit: the nominal model on the recordings, with their loads where these are known already.
         joints: (from 0) that move.
     """
-    every = range(len(fit.recordings))
     if fit.named:
-        loaded = list(range(len(fit.named)))
-        arm = RealArm(*_as_wide_as_open(_beside(fit, joints)), len(loaded))
+        begun = under_own_noise(_as_any_arm(fit, joints))[0]
     else:
+        every = range(len(fit.recordings))
         arm = real_arm(fit, joints, every)
-        loaded = [k for k in every if arm.is_there(k)]
-    if len(loaded) < arm.loads:
-        arm = real_arm(fit, joints, loaded)
-    if not loaded and not _is_another_unit(arm, fit):
-        return refitted(fit)[0]
-    begun = arm.fit
-    if _is_another_unit(arm, fit):
-        whole = [_named(effect, effect.templates()[0], -1) for effect in OF_THE_WHOLE]
-        begun = begun.with_named([*begun.named, *whole])
+        there = [k for k in every if arm.is_there(k)]
+        begun = (arm if len(there) == arm.loads else real_arm(fit, joints, there)).fit
     begun = begun.with_noise()
     while True:  # without what came out as no arm has it: friction that drives, a sensor ahead
         begun, _ = refitted(begun)
         kept = [e for e in begun.named if e.possible]
         if len(kept) == len(begun.named):
-            break
+            return begun
         begun = begun.with_named(kept)
-    seconds = sum(float(np.ptp(own.t)) for own in fit.recordings)
-    caution = CAUTION / seconds if _is_another_unit(arm, fit) else 0.0
-    return replace(begun, caution=caution, hand_judged=caution > 0.0)
-
-
-def _is_another_unit(arm: RealArm, fit: Fit) -> bool:
-    return bool(arm.fit.prior[0, 0] >= OTHER_UNIT * fit.prior[0, 0])
 
 
 def _named(effect: Effect, template: Template, joint: int) -> Named:
@@ -259,12 +209,23 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
     return Named(Candidate(effect, template, joint, ()), np.zeros(len(template.prior_std)))
 
 
-def _assumed(effect: Effect, template: Template, joint: int) -> Named:
+def _assumed(effect: Effect, joint: int, std: float | None = None) -> Named:
+    """An effect that any arm has, of a size known to `std`; as its template says where None."""
+    template = effect.templates()[USUAL.get(effect, 0)]
+    if std is not None:
+        template = replace(template, prior_std=(std,))
     return replace(_named(effect, template, joint), assumed=True)
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
     """With friction and motors of joints (from 0) that move and offsets of all torques, at zero."""
-    own = [_assumed(effect, way, j) for effect, way in WHERE_IT_MOVES for j in joints]
-    own += [_assumed(OFFSET, OFFSET.templates()[0], j) for j in sorted(fit.heard)]
+    own = [_assumed(effect, j, std) for effect, std in WHERE_IT_MOVES.items() for j in joints]
+    own += [_assumed(OFFSET, j, OFFSET_NM) for j in sorted(fit.heard)]
     return fit.with_named([*fit.named, *own])
+
+
+def _as_any_arm(fit: Fit, joints: Sequence[int]) -> Fit:
+    """The same, with what the whole arm has."""
+    fit = _beside(fit, joints)
+    whole = [_assumed(effect, -1) for effect in OF_THE_WHOLE]
+    return fit.with_named([*fit.named, *whole])

@@ -16,6 +16,7 @@ from adapter.model.spatial import Array
 
 WIDE = 10.0  # times its prior: what a rival may be when it is asked how far it could go
 DATES = 50.0  # starts that were looked at
+SAME_SHARE = 0.5  # of a signature that another name for it explains
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,11 @@ class Rival:
     x: Array
     credible: bool
 
+    @property
+    def is_alike(self) -> bool:
+        """Whether it is another name for the named effect, and not another effect."""
+        return self.overlap > SAME_SHARE
+
 
 @dataclass(frozen=True, eq=False)
 class Standing:
@@ -46,7 +52,6 @@ class Standing:
         candidate: the named effect.
         log_evidence: nats over nothing, its odds included; chi2: fall of the squared distance.
         rivals: the most credible first.
-        assumed: whether any arm has it: then nothing is better for being simpler.
         tried: keys of effects that gave way to it: no simpler one of them is a rival any more.
     """
 
@@ -54,13 +59,13 @@ class Standing:
     log_evidence: float
     chi2: float
     rivals: tuple[Rival, ...]
-    assumed: bool = False
     tried: frozenset[tuple[str, int]] = frozenset()
 
     @property
     def probability(self) -> float:
         """Posterior probability against the best rival."""
-        behind = max((self.gain(rival) for rival in self.rivals if rival.credible), default=-np.inf)
+        others = (rival for rival in self.rivals if rival.credible and rival.is_alike)
+        behind = max(map(self.gain, others), default=-np.inf)
         return float(1.0 / (1.0 + np.exp(min(behind, 700.0))))
 
     def gain(self, rival: Rival) -> float:
@@ -68,11 +73,13 @@ class Standing:
         mine, other = (self.candidate, self.chi2), (rival.candidate, rival.chi2)
         if simpler_wins(mine, other):
             return -np.inf
-        if rival.candidate.key in self.tried and is_finer(self.candidate, rival.candidate):
+        tried = rival.candidate.key in self.tried
+        if tried and is_finer(self.candidate, rival.candidate):
             return -np.inf
-        if not self.assumed and simpler_wins(other, mine):
+        if simpler_wins(other, mine):
             return np.inf
-        return rival.log_evidence - self.log_evidence
+        better = rival.log_evidence - self.log_evidence
+        return min(better, 0.0) if tried else better  # in its place it explained less
 
 
 def price(named: Named) -> float:
@@ -125,7 +132,7 @@ def _standing(
     taken = {e.candidate.key for e in fit.named}
     rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
     value = mine.log_evidence + price(named)
-    return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.assumed, named.tried)
+    return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.tried)
 
 
 def _rivals(

@@ -29,17 +29,17 @@ from adapter.gap.candidates import (
     simpler_wins,
 )
 from adapter.gap.evidence import (
+    BAND_HZ,
     LEAST_NM,
-    ORDER,
-    ROBUST,
     Carried,
     Noise,
     Score,
     noise_of,
+    quiet_noise,
     score,
     scores,
 )
-from adapter.gap.fit import BAND_HZ, Fit
+from adapter.gap.fit import Fit
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
@@ -93,8 +93,7 @@ def rich_noise(
     Args:
         own: the recording; None where all its samples count.
     """
-    seams, heard = ((0,), 1.0) if own is None else (own.seams, own.heard)
-    counted = 1.0 if own is None else own.counted[ORDER:]
+    heard = np.ones_like(residual) if own is None else own.heard
     prior = np.zeros(len(X))
     for c in candidates:
         # patterns are so many that they would explain noise, but for a line that stands out
@@ -110,13 +109,12 @@ def rich_noise(
         information = white @ white.T
         information[np.diag_indices(len(used))] += prior[used] ** -2.0
         x[used] = cho_solve(cho_factor(information, lower=True), white @ data)
-        noise = noise_of(residual - np.tensordot(x, X, 1), LEAST_NM, ROBUST, seams)
+        noise = quiet_noise(residual - np.tensordot(x, X, 1))
         # some at a time into what is there: tables of a long recording are large
-        data = (counted * noise.whiten(residual)).ravel()
-        white = white[:, : len(data)]
+        data = (heard * noise.whiten(residual)).ravel()
         for first in range(0, len(used), AT_ONCE):
             some = used[first : first + AT_ONCE]
-            part = (counted * noise.whiten(X[some])).reshape(len(some), -1)
+            part = (heard * noise.whiten(X[some])).reshape(len(some), -1)
             white[first : first + AT_ONCE] = part
     return noise
 
@@ -144,8 +142,9 @@ class SignatureTable:
             table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                own = None if fit.recordings[i].all_count else fit.recordings[i]
-                noise.append(rich_noise(table, self.candidates, fit.model.residual(i), own))
+                noise.append(
+                    rich_noise(table, self.candidates, fit.model.residual(i), fit.recordings[i])
+                )
         if kind == PATTERNS:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
         self.fit = fit.with_noise(noise) if rich else fit
@@ -157,7 +156,7 @@ class SignatureTable:
             for r, c in zip(self.fit.model.residuals(), self.carried_tables, strict=True)
         ]
         self.weights = self.fit.weights or tuple(np.ones_like(r.tau) for r in fit.recordings)
-        self.times = [r.t[ORDER:] for r in fit.recordings]
+        self.times = [r.t for r in fit.recordings]
 
     @cached_property
     def X(self) -> Array:
@@ -236,7 +235,7 @@ class SignatureTable:
             base = self._carried_under(fit)
         left = self._left(fit, base, tables, own_std)
         # what other joints lack counts for nothing in the richest noise, and pulls at all of them
-        fit = replace(fit, noise=tuple(x.flat() for x in self._noise(left, weights)))
+        fit = replace(fit, noise=self._noise(left, weights))
         left = self._left(fit, self._carried_under(fit), tables, own_std)
         fit = replace(fit, noise=self._noise(left, weights))
         return score(*self._carried_under(fit).without(fit.whiten(tables)), own_std)
@@ -259,9 +258,9 @@ class SignatureTable:
         ]
 
     def _noise(self, left: Sequence[Array], weights: Sequence[Array]) -> tuple[Noise, ...]:
-        """Noise of what is left, rows that do not count left out."""
+        """Noise of what is left, where rows count."""
         parts = zip(left, weights, self.fit.recordings, strict=True)
-        return tuple(noise_of(r * (w > 0.0), seams=own.seams) for r, w, own in parts)
+        return tuple(noise_of(r, own.sliding * (w > 0.0)) for r, w, own in parts)
 
     def _undated(self, leads: Sequence[Lead]) -> tuple[Array, ...]:
         """Weights (k, n) of the rows: none where a lead's start is not known well enough yet."""
@@ -270,7 +269,7 @@ class SignatureTable:
             weight = weight.copy()
             for lead in leads:
                 for edge in lead.interval_s if lead.recording in (None, i) else ():
-                    near = (own.t > edge - UNSURE_S) & (own.t < edge + UNSURE_S + ORDER / BAND_HZ)
+                    near = (own.t > edge - UNSURE_S) & (own.t < edge + UNSURE_S)
                     weight[near] = 0.0
             out.append(weight)
         return tuple(out)

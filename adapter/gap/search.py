@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +10,8 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, TorqueEffect
 from adapter.effects.catalogue import HELD
-from adapter.gap.candidates import PATTERN_SHARE, Pattern
-from adapter.gap.evidence import ORDER, Carried, Moments, Noise, score
+from adapter.gap.candidates import PATTERN_SHARE, Pattern, is_finer
+from adapter.gap.evidence import LEAST_NM, Carried, Moments, Noise
 from adapter.gap.fit import (
     Fit,
     Named,
@@ -37,19 +37,15 @@ from adapter.gap.scan import (
     honest_moves,
     least_chi2,
 )
-from adapter.model.spatial import Array
 
 TRIED = 3  # moves of a round
 ROUNDS = 24  # some seven are made where every joint has friction of its own
 CURVE_SHARE = 1.1  # of two words for one curve over the angle
 MOST_SWAPS, SWAP_NATS = 8, 0.0  # names that are exchanged for better ones, and by how much
-LOST = 2.0  # times the residual that another name may leave
+LOST = 1.2  # times the residual that a simpler name may leave
 FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction and an offset
-SAME_SHARE = 0.5  # of a signature that another name for it explains
 CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
-TRUSTED_ROUNDS = 3  # in which what was missed must show where inertias are trusted after all
-USUAL = float(np.exp(-0.5))  # weight of a row that does not count, its own squared distance beside
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
@@ -67,7 +63,6 @@ class Found:
         known: what is known of them with the inertias free within their prior, where `carried`
             holds these fast.
         under: the fit whose noise and prior `carried` is of, where these are not those of `fit`.
-        even: whether all frequencies count alike in `carried`.
         rounds: that were made; ran_out: and there was none left where one was wanted.
     """
 
@@ -76,7 +71,6 @@ class Found:
     standings: tuple[Standing, ...]
     known: Carried | Moments | None = None
     under: Fit | None = None
-    even: bool = False
     weak: frozenset[int] = frozenset()
     rounds: int = 0
     ran_out: bool = False
@@ -115,11 +109,9 @@ def search(
         rounds: that may be made, each with the best of what is worth naming.
         progress: hears what is being tried.
     """
-    nominal, budget = fit, Budget(rounds)
+    budget = Budget(rounds)
     progress("a load at the hand")
-    begun = start(fit, joints)
-    found = settled(_extended(begun, joints, CATALOGUED, budget, progress), joints)
-    fit = _unless_trusted(found, begun, nominal.prior, joints, progress).fit
+    fit = settled(_extended(start(fit, joints), joints, CATALOGUED, budget, progress), joints).fit
     if fit.named:  # noise that was taken for the first effect's may have hidden another one
         fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
@@ -144,11 +136,15 @@ def _round(
     """With the best of what pays, and whether more may be found; the rest joins `refused`."""
     table = SignatureTable(fit, joints, kind)
     fit = table.fit
-    # a hand may pick up and put down as often as it likes
-    named = {e.candidate.key for e in fit.named if e.candidate.effect is not HELD}
-    moves = honest_moves(table, refused | named)
-    if fit.hand_judged:
-        moves = [x for x in moves if not any(map(from_the_start, x.leads))]
+    # a hand may pick up and put down as often as it likes, and what any arm has may change
+    once = (e for e in fit.named if not (e.assumed or e.candidate.effect is HELD))
+    moves = honest_moves(table, refused | {e.candidate.key for e in once})
+    there = {e.candidate.key for e in fit.named if e.assumed}
+    moves = [
+        move
+        for move in moves
+        if not any(x.candidate.key in there and x.interval_s == WHOLE for x in move.leads)
+    ]
     for move in moves[:TRIED]:
         again = _dated_anew_beside(fit, move)
         if again is not None:
@@ -164,7 +160,7 @@ def _round(
                     trial = _with(trial, other, table.fit.noise, progress) or trial
             return trial, True
         refused.update(x.candidate.key for x in move.leads if len(move.leads) == 1)
-    return fit, bool(fit.caution and moves)  # those that were refused may have hidden others
+    return fit, False
 
 
 def _dated_anew_beside(fit: Fit, move: Move) -> Fit | None:
@@ -179,41 +175,6 @@ def _dated_anew_beside(fit: Fit, move: Move) -> Fit | None:
     pairs = zip(again.named, fit.named, strict=True)
     moved = any(not np.allclose(a.interval_s, b.interval_s, atol=DATE_S) for a, b in pairs)
     return again if moved else None
-
-
-def _unless_trusted(
-    found: Found, begun: Fit, prior: Array, joints: Sequence[int], progress: Progress
-) -> Found:
-    """What was found with inertias of another unit, or with trusted ones where these say as much.
-
-    An effect that nobody thought of when the inertias were judged makes them look wrong. A load
-    at the hand was thought of.
-
-    Args:
-        begun: what the search began with; prior: (n, 10) of inertias that are trusted.
-    """
-    if not begun.caution or any(map(from_the_start, begun.named)):
-        return found
-    kept = [e for e in begun.named if e.assumed]
-    trusted = refitted(replace(begun, prior=prior, caution=0.0).with_named(kept).with_noise())[0]
-    trusted = _extended(trusted, joints, CATALOGUED, Budget(TRUSTED_ROUNDS), progress)
-    other = settled(trusted, joints)
-    if _total(other) < _total(found):
-        return found
-    named = [replace(e, assumed=False) for e in other.fit.named]
-    return replace(other, fit=other.fit.with_named(named))
-
-
-def _total(found: Found) -> float:
-    """ln of what the data are worth under what was found and its own noise, its names paid."""
-    fit, known, width = found.fit, found.carried, 0.0
-    assert isinstance(known, Carried)  # while it is searched; moments come after it
-    for noise, weight, own in zip(fit.noise, fit.weights, fit.recordings, strict=True):
-        # around dates and seams none counts: as if they were as usual
-        rows = (weight * own.counted)[ORDER:]
-        width += float(np.log(np.where(rows > 0.0, rows, USUAL) / noise.sigma).sum())
-    fits = score(known.G, known.g, known.prior_std).log_evidence - 0.5 * known.data @ known.data
-    return float(width + fits + sum(price(e) for e in fit.named if not e.assumed))
 
 
 def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
@@ -286,6 +247,11 @@ def _puts_down(e: Named | Lead) -> bool:
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
+    for k in range(len(fit.named)):
+        # what was assumed has no shape yet; beside a simpler form by name it would take its place
+        own, *others = fit.named[k].candidate, *(e.candidate for e in fit.without(k).named)
+        if fit.named[k].assumed and not any(is_finer(own, other) for other in others):
+            fit = shaped(fit, k)
     swaps, before = 0, None  # the fit before names were exchanged, until that is judged
     while True:
         fit, carried = under_own_noise(fit)
@@ -305,19 +271,26 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
                     fit = shaped(refitted(fit)[0], k)
             continue
         ranked = standings(fit, carried, SignatureTable(fit, joints, CATALOGUED, rich=False))
-        swapped = _swapped(fit, ranked) if swaps < MOST_SWAPS else None
+        swapped = _swapped(fit, ranked, values) if swaps < MOST_SWAPS else None
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
         before, fit, swaps = fit, dated_anew(swapped), swaps + 1
 
 
 def _lost(before: Fit, fit: Fit) -> bool:
-    """Whether other names leave far more of a joint's torque."""
+    """Whether other names explain less, or far less of a joint's torque where they are simpler."""
+    if len(before.named) != len(fit.named):
+        return False
     a, b = (
         np.sqrt(np.mean(np.concatenate(own.model.residuals()) ** 2, axis=0))
         for own in (before, fit)
     )
-    return len(before.named) == len(fit.named) and bool((b > LOST * a).any())
+    more = np.log(b / np.maximum(a, LEAST_NM))
+    pairs = zip(before.named, fit.named, strict=True)
+    simpler = any(
+        is_finer(x.candidate, y.candidate) for x, y in pairs if x.candidate.key != y.candidate.key
+    )
+    return bool((more > np.log(LOST)).any() or (more.sum() > 0.0 and not simpler))
 
 
 def worst(fit: Fit, values: Mapping[int, float]) -> int | None:
@@ -335,11 +308,10 @@ def weak(fit: Fit, carried: Carried, first: int = 0) -> dict[int, float]:
     for k in range(first, len(fit.named)):
         found, e = worth(fit, carried, k), fit.named[k]
         value = found.log_evidence + price(e) + e.candidate.effect.log_odds_of(e.values)
-        rare = not (_is_common(e.candidate.effect) or e.candidate.columns_are_theta)
         if from_the_start(e) and e.possible and any(map(_puts_down, fit.named)):
             continue  # the hand held what it puts down
         if (
-            value < BELIEF + rare * fit.caution
+            value < BELIEF
             or found.chi2 < least_chi2(e.candidate.effect, e.interval_s)
             or not e.possible
             or (e.candidate.effect.passing and not _stands_out(fit, carried, k))
@@ -381,14 +353,15 @@ def _stands_out(fit: Fit, carried: Carried, k: int) -> bool:
     return square**2 > CLEAR**2 * float(force @ doubt @ force)
 
 
-def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
+def _swapped(fit: Fit, standings: Sequence[Standing], unnamed: Container[int]) -> Fit | None:
     """The model with the worst named effect of each joint under a better name, if there is one.
 
-    What is not of one joint goes alone.
+    What is not of one joint goes alone; what any arm has and is `unnamed` stays.
     """
     best: dict[int, tuple[float, int, Rival]] = {}
     for k, own in enumerate(standings):
-        if isinstance(own.candidate.effect, Pattern) or from_the_start(fit.named[k]):
+        pattern = isinstance(own.candidate.effect, Pattern)
+        if pattern or k in unnamed or from_the_start(fit.named[k]):
             continue
         for rival in own.rivals:
             better, joint = own.gain(rival), own.candidate.joint
@@ -397,8 +370,9 @@ def _swapped(fit: Fit, standings: Sequence[Standing]) -> Fit | None:
                 joint, asked = -1, FAR_NATS
             elif _is_common(own.candidate.effect) and not _is_common(rival.candidate.effect):
                 asked = FAR_NATS
-            alike = rival.overlap > SAME_SHARE  # else it is another effect, no other name
-            if alike and rival.credible and better > max(asked, best.get(joint, (asked,))[0]):
+            better_than = max(asked, best.get(joint, (asked,))[0])
+            again = rival.candidate.key in fit.named[k].tried
+            if rival.is_alike and rival.credible and not again and better > better_than:
                 best[joint] = better, k, rival
     if not best:
         return None

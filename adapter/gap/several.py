@@ -16,16 +16,17 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.effects.catalogue import HELD
-from adapter.gap.evidence import score
+from adapter.gap.evidence import Noise
 from adapter.gap.fit import Fit, place_of
 from adapter.gap.load import SHOWN, HandLoad, load_of
-from adapter.gap.real_arm import SHARES, fitting_way, with_a_load
+from adapter.gap.real_arm import fitting_way, with_a_load
 from adapter.gap.result import Finding, GapResult, LogLoad
 from adapter.gap.together import Part, Together
 from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import Array
 
+SIZES = "level", "memory"  # of noise
 LINK_STD = (5.0, *[0.5] * 3, *[0.15] * 6)  # of what a link may differ by: kg, kg m, kg m2
 FRICTION, OFFSET, LINK = "friction", "offset", "link"
 NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: more is another arm
@@ -71,16 +72,15 @@ class Several:
             frame: in whose axes loads are told.
         """
         fits = [_apart(nominal, i) for i in range(len(nominal.recordings))]
-        for flat in (True, False):  # see `fit.under_own_noise`
-            noises = [fit.own_noise() for fit in fits]
-            fits = [
-                fit.with_noise([x.flat() for x in noise] if flat else noise)
-                for fit, noise in zip(fits, noises, strict=True)
-            ]
+        for first in (True, False):
+            # one arm's noise: its own would hide by how much a recording is of another
+            own = [fit.own_noise()[0] for fit in fits]
+            level, memory = (np.median([getattr(x, key) for x in own], 0) for key in SIZES)
+            fits = [fit.with_noise([Noise(level, memory)]) for fit in fits]
             parts = [Part.of(fit, _own(fit)) for fit in fits]
-            together = _together(parts, nominal.prior.size)
+            together = Together(parts, parts[0].known.prior_std[parts[0].common])
             fits = [fit.at(x.all_at(together.x)) for fit, x in zip(fits, parts, strict=True)]
-            if flat:
+            if first:
                 fits = [fit.instead(0, fitting_way(fit, fit.named[0])) for fit in fits]
         return cls(tuple(names), frame, tuple(fits), together)
 
@@ -180,18 +180,6 @@ def _apart(nominal: Fit, i: int) -> Fit:
     named = with_a_load(nominal)
     model = replace(nominal.model, recordings=(nominal.recordings[i],), named=named)
     return replace(nominal, model=model, noise=(), weights=())
-
-
-def _together(parts: Sequence[Part], inertias: int) -> Together:
-    """With the inertias as wrong as the recordings like best. `inertias`: how many come first."""
-    std = parts[0].known.prior_std[parts[0].common]
-    G, g = (np.sum([getattr(part, key) for part in parts], axis=0) for key in ("G", "g"))
-
-    def wider(share: float) -> Array:
-        return np.concatenate([share * std[:inertias], std[inertias:]])
-
-    best = max(SHARES, key=lambda share: score(G, g, wider(share)).log_evidence)
-    return Together(parts, wider(best))
 
 
 def contradictions(fit: Fit, together: Together) -> list[Difference]:

@@ -27,7 +27,6 @@ from scipy.sparse import diags
 from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
-from adapter.gap.evidence import ORDER
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.rows import pauses, stuck
@@ -51,6 +50,7 @@ MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
+RARELY = 0.1  # of the time
 SLIDE_RAD = 1e-3  # over which a joint winds up before it slides, as on a real Panda
 
 # Splines through a motion.
@@ -141,19 +141,6 @@ class Signals:
         sizes = [_size_of_low(x.stop - x.start) - 2 * self.trim for x in self.stretches]
         return tuple(int(x) for x in np.cumsum([0, *sizes[:-1]]))
 
-    @cached_property
-    def counted(self) -> Array:
-        """(k, n) zero where a torque or what was before it is not known, else one."""
-        out = minimum_filter1d(self.heard, ORDER + 1, axis=0, origin=ORDER // 2)
-        for begin in self.seams[1:]:
-            out[begin : begin + ORDER] = 0.0
-        return np.asarray(out)
-
-    @property
-    def all_count(self) -> bool:
-        """Whether all samples do that the noise's memory reaches."""
-        return bool(self.counted.all())
-
     def low(self, x: Array) -> Array:
         """A torque (m, ...) at the motion's instants in the band (k, ...)."""
         return self.low_of(lambda rows: x[rows])
@@ -195,6 +182,17 @@ class Signals:
             left = self._trimmed(low(shares))
             own[:, begin:end] = left.T[:, :, None] * np.eye(q.shape[1])[:, None]
         return out.reshape(-1, *self.tau.shape)
+
+    @cached_property
+    def sliding(self) -> Array:
+        """(k, n) one where a joint slides and its torque is measured, else zero.
+
+        At rest a joint holds what static friction lets it, which is no noise. Of one that hardly
+        slides all that is measured counts.
+        """
+        slides = self.heard * (np.abs(self.low(self.motion.dq)) > SMOOTHING_DQ)
+        rarely = slides.mean(axis=0) < RARELY
+        return np.asarray(np.where(rarely, self.heard, slides))
 
     @cached_property
     def slowness(self) -> Array:

@@ -41,7 +41,7 @@ from drivers.files.mcap import Log, read_log
 DOCUMENTED_STD, WEIGHED_STD = 0.1, 0.2  # of the inertias: alone, and beside a known mass
 GAIN_STD = 0.5  # of a gain, as a share of what one joint's regression says
 KNOWN_SHARE = 1e-3  # to which a known mass is weighed
-ROUNDS, FLAT_ROUNDS, STEPS = 3, 2, 4  # of the whole; under white noise; of each fit
+ROUNDS, NOISE_ROUNDS, STEPS = 3, 3, 4  # of the whole; of noise after fit; of each fit
 SETTLED = 2e-3  # share of a gain that ends the rounds
 SHOWN_SHARE = 0.25  # one standard deviation, above which a gain is not shown
 LEARNED_SHARE = 2.0 / 3.0  # of every recording, for the check on the rest
@@ -224,10 +224,8 @@ def _fitted(task: _GainTask, gain: Array) -> tuple[Array, Fit, Array]:
         )
         fit = as_driven(start, moving, [*_loads(start, task), *gains])
         fit = fit.with_named([_open(fit, e) if e.assumed else e for e in fit.named])
-        for _ in range(FLAT_ROUNDS):
-            flat = [noise.flat() for noise in fit.own_noise()]
-            fit, _ = _settled(_sliding(fit.with_noise(flat)), known)
-        fit, carried = _settled(_sliding(fit.with_noise()), known)
+        for _ in range(NOISE_ROUNDS):
+            fit, carried = _settled(_sliding(fit.with_noise()), known)
         at, off = _gain_places(fit)
         step = np.zeros(n)
         step[at] = fit.coefficients[off]

@@ -12,11 +12,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigh, solve
 
-from adapter.gap.evidence import ORDER, Moments, Noise
+from adapter.gap.evidence import Moments
 from adapter.gap.fit import BLOCK, Fit
 from adapter.gap.folds import FOLDS, block_s, fold_of
 from adapter.gap.long_recording import LongRecording
-from adapter.gap.refine import DoubtedNoise, doubt_of
 from adapter.gap.search import Found
 from adapter.model.spatial import Array
 
@@ -38,8 +37,6 @@ def weighed(found: Found, whole: LongRecording) -> Found:
         known = moments.under(fit.prior_std)
         if not found.fit.dtheta.any():  # left as documented: the prior is no finding
             fit = replace(fit, model=replace(fit.model, dtheta=np.zeros_like(fit.dtheta)))
-        if found.even:
-            known = moments_of(fit, whole)
     return replace(found, fit=fit, carried=moments, known=known)
 
 
@@ -57,7 +54,7 @@ def moments_of(fit: Fit, whole: LongRecording) -> Moments:
     for part in pieces_of(fit, whole):
         N, data = _without_starts(part)
         data = data + fit.coefficients[rest] @ N
-        fold = np.repeat(fold_of(part.recordings[0].t[ORDER:], block), n)
+        fold = np.repeat(fold_of(part.recordings[0].t, block), n)
         for f in range(FOLDS):
             own = N[:, fold == f]
             G[f][np.ix_(rest, rest)] += own @ own.T
@@ -71,18 +68,11 @@ def moments_of(fit: Fit, whole: LongRecording) -> Moments:
 
 
 def pieces_of(fit: Fit, whole: LongRecording) -> Iterator[Fit]:
-    """A fit on each piece of a recording, under its noise; the first `ORDER` samples are before."""
-    noise = fit.noise[0]
-    doubted = isinstance(noise, DoubtedNoise)
-    plain = Noise(noise.ar, noise.sigma, noise.level)
-    for own in whole.pieces(fit.recordings[0], ORDER):
+    """A fit on each piece of a recording, under its noise."""
+    for own in whole.pieces(fit.recordings[0]):
         model = replace(fit.model, recordings=(own,), start_nm=np.zeros((1, fit.n)))
-        piece = replace(fit, model=model, noise=(plain,), weights=())
-        if doubted:
-            doubt = doubt_of(piece, 0, piece.counted(0))
-            yield replace(piece, noise=(DoubtedNoise.of(plain, doubt),))
-        else:
-            yield piece.with_noise((plain,)) if fit.weights else piece
+        piece = replace(fit, model=model, weights=())
+        yield piece.with_noise(fit.noise) if fit.weights else piece
 
 
 def _without_starts(piece: Fit) -> tuple[Array, Array]:

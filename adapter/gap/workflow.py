@@ -41,7 +41,7 @@ from adapter.gap.search import ROUNDS, Found, search
 from adapter.gap.several import Several
 from adapter.gap.signals import LEAST_S, RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
-from adapter.judgement.priors import theta_prior
+from adapter.judgement.priors import DOCUMENTED_SHARE, theta_prior
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -89,7 +89,7 @@ class GapSettings:
             result says so. Counted, not timed: the same log gives the same result anywhere.
     """
 
-    inertia_prior: float = 0.02
+    inertia_prior: float = DOCUMENTED_SHARE
     validate_from_s: float | None = None
     hold_out: tuple[Path | str | Log, ...] = ()
     rounds: int = ROUNDS

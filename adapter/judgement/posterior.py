@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.torque import ModelTorque
+from adapter.judgement.noise import MEMORY_S, memory_s
 from adapter.judgement.priors import positive
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -26,8 +27,6 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.likelihood import SMOOTHING_S, Rows, by_joint, noise_nm, sensor_nm
 
 ROUNDS = 12  # of noise after fit; it settles in five
-MEMORY_S = (0.1, 0.5)  # of the noise, least and most: the band's 10 Hz, and an arm's misfit
-FADED = 0.1  # of the noise's correlation, which ends its memory
 SEGMENTS = 10  # of a recording, in any of which something may change
 
 
@@ -144,19 +143,9 @@ def judge(parts: Sequence[Part], std: Array) -> Posterior:
         x = covariance @ right
         for k, (own, at, _) in enumerate(parts):
             columns, more = own.largest
-            memory[k] = _memory_s(more - columns @ x[at], own.period_s)
+            memory[k] = memory_s(more - columns @ x[at], own.period_s)
             samples = own.rows * own.period_s / memory[k]
             noise[k] = noise_nm(own.left(x[at]), samples, expected[k])
         if turn >= ROUNDS // 2:
             free[constrained] &= x[constrained] >= 0.0
     return Posterior(x, covariance, np.sqrt(parts[0].moments.left(x[parts[0].at])))
-
-
-def _memory_s(left: Array, period_s: float) -> Array:
-    """(n,) s of noise (m, n) that one independent sample stands for."""
-    centred = left - left.mean(axis=0)
-    power = np.abs(np.fft.rfft(centred, 2 * len(left), axis=0)) ** 2
-    alike = np.fft.irfft(power, axis=0)[: max(round(MEMORY_S[1] / period_s), 1)]
-    alike /= np.maximum(alike[0], 1e-12)
-    until = np.cumprod(alike > FADED, axis=0)
-    return np.clip(period_s * (2.0 * np.sum(alike * until, axis=0) - 1.0), *MEMORY_S)

@@ -24,6 +24,7 @@ POINT_M2 = 1e-8  # inertia per mass, of what a file means as a point
 LIGHT = 1e-3  # of the heaviest link: what changes nothing is not judged
 ROUNDED = 0.05  # of a trace, by which digits left out may make an inertia impossible (2 % seen)
 NEGATIVE, NO_SIZE = 1e-3, 1e-12  # of the largest moment, and kg m²: rounding makes less
+ALIKE, MANY = 1e-6, 3  # of the largest moment; links of an arm
 # What no torque sensor feels: N m to hold a link and turn it at 10 rad/s², with so many kg behind
 UNFELT_NM, TURNED, UNFELT_KG = 1e-4, 10.0, 1e-3
 
@@ -51,6 +52,17 @@ def check_links(file: str, links: Mapping[str, Array]) -> None:
           "none may be larger than the other two together, or below zero")  # fmt: skip
 
 
+def made_up(theta: Array) -> list[int]:
+    """Of bodies (n, 10) those that turn alike about all axes, where several do: nobody measured."""
+    mass = theta[:, 0]
+    moments = [
+        np.linalg.eigvalsh(body_from_theta(x)[2]) if x[0] > 0.0 else np.zeros(3) for x in theta
+    ]
+    balls = np.ptp(moments, axis=1) < ALIKE * np.max(moments, axis=1)
+    found = np.flatnonzero(balls & (mass > LIGHT * mass.max()))
+    return found.tolist() if len(found) >= MANY else []
+
+
 def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array]]) -> None:
     """Judge what moves, with all that is fixed to it.
 
@@ -76,6 +88,10 @@ def check_moving(file: str, bodies: Sequence[tuple[str, str, int, Array]]) -> No
             unfelt.append(f"'{joint}' (link '{link}' of {theta[0]:.3g} kg)")
         if over >= 0:
             behind[over] += behind[k] + theta[0]
+    balls = made_up(np.array([theta for *_, theta in bodies]).reshape(-1, 10))
+    _warn(file, "somebody made up the inertias, those of a ball, of link",
+          [f"'{bodies[k][0]}'" for k in balls],
+          "nothing is known of a load or of the links but what logs tell")  # fmt: skip
     _warn(file, "so little hangs on it that no torque shows it: joint", unfelt[::-1],
           "lock it, or give the link its mass and inertia")  # fmt: skip
 

@@ -243,6 +243,8 @@ def test_what_hides_each_other_in_every_joint_is_named(drives: Any) -> None:
     hidden = {(e.name, e.joints[0]) for e in trial.effects}
     said = {(f["effect"], f["joints"][0]) for f in result["findings"]}
     assert said <= hidden
-    # damping as small as the noise counts to the friction beside it
-    assert {x for x in hidden if x[0] != "viscous_friction"} <= said
+    # damping as small as the noise counts to the friction beside it, and a motor of 0.05 kg m² to
+    # the arm that joint 2 carries, which is documented to 5 % of 1 to 2 kg m²
+    small = {x for x in hidden if x[0] == "viscous_friction"} | {("motor_inertia", 2)}
+    assert hidden - small <= said
     assert not result["unexplained"]

@@ -84,7 +84,7 @@ def nominal_fit(own: Recorded) -> Fit:
     signals = (prepare(own, ARM),)
     level = np.full(N, float(np.std(signals[0].low(np.random.default_rng(0).standard_normal(
         (len(signals[0].motion.t), N))))) * NOISE_NM)  # fmt: skip
-    noise = Noise(np.zeros((N, 6)), level, level)
+    noise = Noise(level, np.ones(N))
     model = Model(signals, np.zeros_like(ARM.theta))
     return Fit(model, theta_prior(ARM.theta, PRIOR)).with_noise([noise])
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from adapter.effects.catalogue import HELD
-from adapter.gap.fit import place_of, refitted
+from adapter.gap.fit import place_of
 from adapter.gap.hand import Hand, hand_of
-from adapter.gap.real_arm import OTHER_UNIT, RealArm, nominal_fit, real_arm, start
+from adapter.gap.real_arm import RealArm, nominal_fit, real_arm, start
 from adapter.gap.signals import Recorded
 from adapter.gap.workflow import find_gap
+from adapter.judgement.priors import DOCUMENTED_SHARE, theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
 from adapter.physics.rigid_arm import RigidArm
@@ -24,7 +25,6 @@ from sim.hidden.twins import Twin, draw_twin
 from tests.helpers.arm_data import panda_model
 from tests.helpers.twin_makers import by_mujoco, by_pinocchio
 
-PRIOR = 0.02
 DRY = ("coulomb_friction", "bristle_friction", "stribeck_friction", "asymmetric_friction")
 TWINS = (700, 701, 702, 703, 704, 705, 706, 707, 708, 709)
 
@@ -41,7 +41,7 @@ def fitted(twin: Twin) -> tuple[RealArm, list[int]]:
     log = (by_mujoco if twin.seed % 2 else by_pinocchio)(twin)
     screened = refuse(log, model)
     own = Recorded.of(screened.log, lateness(screened.timing))
-    fit = nominal_fit([own], model, PRIOR, screened.timing.period_s)
+    fit = nominal_fit([own], model, DOCUMENTED_SHARE, screened.timing.period_s)
     return real_arm(fit, screened.moving, (0,)), list(screened.moving)
 
 
@@ -59,28 +59,17 @@ def test_loads_of_twins_are_weighed_and_bare_hands_are_bare() -> None:
     assert np.max(np.abs(off)) < 6.0 and np.sqrt(np.mean(np.square(off))) < 2.5
 
 
-def test_inertias_are_as_uncertain_as_the_data_allow() -> None:
-    """Another unit's: the prior is widened; the arm itself: it stays."""
-    twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 1.0 and t.kind == "sines")
+def test_priors_are_held_and_what_any_arm_has_is_there_from_the_start() -> None:
+    """Of another unit as well; a bare hand holds nothing, and nothing assumed has a name yet."""
+    twin = next(t for t in map(draw_twin, TWINS) if t.load_kg == 0.0)
     arm, moving = fitted(twin)
-    theta = RigidArm.of(documented()).theta
-    assert arm.fit.prior[0, 0] >= OTHER_UNIT * PRIOR * theta[0, 0]
-    own = arm.fit.recordings[0]
-    same = refitted(replace(arm.fit, model=replace(arm.fit.model, named=())))[0]
-    tau = own.low(own.motion.arm.torque(own.motion.q, own.motion.dq, own.motion.ddq))
-    noise = 0.05 * np.random.default_rng(5).standard_normal(tau.shape)
-    bare = replace(
-        same,
-        prior=arm.fit.prior * (PRIOR * theta[0, 0] / arm.fit.prior[0, 0]),
-        model=replace(
-            same.model,
-            recordings=(replace(own, tau=tau + noise),),
-            dtheta=np.zeros_like(theta),
-            start_nm=np.zeros((1, len(theta))),
-        ),
+    np.testing.assert_array_equal(
+        arm.fit.prior, theta_prior(RigidArm.of(documented()).theta, DOCUMENTED_SHARE)
     )
-    begun = start(bare.with_noise(), moving)
-    assert begun.named == () and begun.prior[0, 0] == pytest.approx(bare.prior[0, 0])
+    begun = start(arm.fit.with_named(()), moving)
+    assert begun.named and all(e.assumed and e.possible for e in begun.named)
+    assert HELD not in {e.candidate.effect for e in begun.named}
+    np.testing.assert_array_equal(begun.prior, arm.fit.prior)
 
 
 def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
