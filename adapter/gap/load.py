@@ -133,6 +133,18 @@ def find_load(
     return replace(load, left_nm=left, before_nm=before, notes=tuple(dict.fromkeys(notes)))
 
 
+def plain_load(log: Log, model: SelfModel, share: float) -> HandLoad:
+    """The load of a screened recording by the posterior alone, without a search.
+
+    Args:
+        share: by which the model's inertias may be off, one standard deviation.
+    """
+    std = prior_std(model.theta, share)
+    whole = reduce(Moments.with_more, (_moments(x, model, log) for x in log.pieces())).together()
+    found = judge([Part(whole, np.arange(len(std)), np.ptp(log.tau, axis=0) > 0.0)], std)
+    return load_of(found.x[:10], found.covariance[:10, :10], hand_frame(model))
+
+
 class _Taken(NamedTuple):
     """A recording as it is judged, whether the arm moves in it, and notes."""
 

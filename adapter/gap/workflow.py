@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import CATALOGUE, HELD
 from adapter.effects.robots import read_robot
 from adapter.gap.changes import loaded, with_changes
 from adapter.gap.findings import ODD, disagreement, findings_of, noise_floor, told_of
@@ -26,6 +26,7 @@ from adapter.gap.fit import Fit, worth
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
+from adapter.gap.load import plain_load
 from adapter.gap.long_recording import (
     LongRecording,
     Survey,
@@ -132,7 +133,7 @@ def find_gap(
     # dates of an earlier recording mean nothing in this one
     nominal = lasting(model if isinstance(model, SelfModel) else read_robot(str(model)))
     try:
-        task, gains = _task(logs, nominal, settings, progress)
+        task, gains, screened = _task(logs, nominal, settings, progress)
     except RecordingRefused as refusal:
         if not refusal.kind.is_an_answer:
             raise
@@ -158,6 +159,8 @@ def find_gap(
     result = replace(_result(task, measured, settings), model_in=name)
     if several is not None:
         result = several.told(result)
+    elif not is_long(screened[0].log):
+        result = beside_plain(result, screened[0], task.model, prior)
     if gains is not None:
         notes = (*gains.words(), *gains.notes, *result.notes)
         result = replace(result, torque_gains=gains.as_dict(), notes=notes)
@@ -196,7 +199,7 @@ def _with_what_is_held(
 
 def _task(
     logs: Sequence[Path | str | Log], model: SelfModel, settings: GapSettings, progress: Progress
-) -> tuple[GapTask, TorqueGains | None]:
+) -> tuple[GapTask, TorqueGains | None, list[Screened]]:
     """Read, convert and screen. Raises Refusal."""
     held = settings.hold_out
     kept = [log for log in logs if not any(_same(log, other) for other in held)]
@@ -239,7 +242,7 @@ def _task(
         one_clock=not held,
         notes=(*dict.fromkeys(locked), *notes, *sampling_words(fitted)),
     )
-    return task, gains
+    return task, gains, screened
 
 
 class _Taken(NamedTuple):
@@ -370,6 +373,24 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
         sampled=sampling(task.fitted),
         in_sample=task.folds and not holds_out(found.fit),
     )
+
+
+def beside_plain(
+    result: GapResult, screened: Screened, model: SelfModel, prior: float
+) -> GapResult:
+    """A result with the load of plain least squares, where the search's is clearly another."""
+    held = [f for f in result.findings if f.effect == HELD.name and f.throughout]
+    if not held:
+        return result
+    plain = plain_load(screened.torque.in_time(screened.log), model, prior)
+    mass, std = held[0].parameters["m"], held[0].std["m"]
+    if abs(mass - plain.mass) < std + plain.mass_std:
+        return result
+    said = (
+        f"the hand holds {mass:.2f} ± {std:.2f} kg beside what was found, and by least squares "
+        f"with friction and offsets alone {plain.mass:.2f} ± {plain.mass_std:.2f} kg"
+    )
+    return replace(result, notes=(said, *result.notes))
 
 
 def unnamed(title: str, joints: Sequence[int]) -> str:

@@ -13,7 +13,7 @@ from adapter.gap.fit import place_of
 from adapter.gap.hand import Hand, hand_of
 from adapter.gap.real_arm import RealArm, nominal_fit, real_arm, start
 from adapter.gap.signals import Recorded
-from adapter.gap.workflow import find_gap
+from adapter.gap.workflow import beside_plain, find_gap
 from adapter.judgement.priors import DOCUMENTED_SHARE, theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.urdf import model_from_urdf
@@ -79,6 +79,19 @@ def test_a_heavy_load_is_named_and_nothing_rare_beside_it() -> None:
     (load,) = (f for f in found.findings if f.effect == HELD.name)
     assert abs(load.parameters["m"] - twin.load_kg) < max(0.1, 4.0 * load.std["m"])
     assert "external_wrench" not in {f.effect for f in found.findings}
+
+
+def test_a_load_that_plain_least_squares_weighs_otherwise_is_told_twice() -> None:
+    twin = next(t for t in map(draw_twin, TWINS) if t.load_kg > 2.0)
+    screened = refuse((by_mujoco if twin.seed % 2 else by_pinocchio)(twin), documented())
+    load = find_gap([screened.log], documented())
+    (held,) = (f for f in load.findings if f.effect == HELD.name)
+    other = replace(held, parameters=dict(held.parameters, m=held.parameters["m"] + 1.0))
+    said = [
+        beside_plain(replace(load, findings=(x,)), screened, documented(), DOCUMENTED_SHARE).notes
+        for x in (held, other)
+    ]
+    assert said[0] == load.notes and "by least squares" in said[1][0]
 
 
 def test_friction_of_large_joints_is_told_once() -> None:
