@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -379,9 +379,12 @@ class _Scored:
 
 
 def _paying(task: GapTask, found: Found) -> Found:
-    """As it foretells held-out data best: how it is weighed, corrections, single effects."""
+    """As it foretells held-out data best: what is assumed, corrections, single effects."""
     level = noise_floor(found.fit)
-    ways = found, uncorrected(found)
+    ways = [found, uncorrected(found)]
+    if not any(map(from_the_start, found.fit.named)):  # a load is weighed beside all of it
+        bare = _without(found, found.weak)
+        ways += [bare, uncorrected(bare)]
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)
     while best.worse.any() and best.found.fit.named:
         fewer = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
@@ -389,6 +392,17 @@ def _paying(task: GapTask, found: Found) -> Found:
             break
         best = min(fewer, key=lambda x: x.cost)
     return best.found
+
+
+def _without(found: Found, places: Collection[int]) -> Found:
+    """What was found less some of its effects."""
+    left = [k for k in range(len(found.fit.named)) if k not in places]
+    fit, carried = refitted(found.fit.with_named([found.fit.named[k] for k in left]))
+    standings = tuple(found.standings[k] for k in left)
+    weak = frozenset(i for i, k in enumerate(left) if k in found.weak)
+    return replace(
+        found, fit=fit, carried=carried, standings=standings, weak=weak, known=None, under=None
+    )
 
 
 def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
@@ -399,12 +413,8 @@ def _without_one(found: Found, joints: NDArray[np.bool_]) -> list[Found]:
             continue
         size = np.abs(fit.model.contribution(fit.named[k].recording or 0, k)).max(axis=0)
         if (size[joints] > ACTS * size.max()).any():
-            rest, carried = refitted(fit.without(k))
-            standings = found.standings[:k] + found.standings[k + 1 :]
-            weak = frozenset(i - (i > k) for i in found.weak if i != k)
-            less = replace(found, fit=rest, carried=carried, standings=standings, weak=weak)
-            less = replace(less, under=None)
-            out.append(uncorrected(less) if not fit.dtheta.any() else replace(less, known=None))
+            less = _without(found, (k,))
+            out.append(less if fit.dtheta.any() else uncorrected(less))
     return out
 
 

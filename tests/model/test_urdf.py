@@ -102,7 +102,8 @@ def test_pybullets_panda_has_its_fingers_locked() -> None:
     with pytest.warns(ModelWarning) as caught:
         model = read_urdf(path)
     said = [str(w.message) for w in caught]
-    assert len(said) == 2 and all("prismatic" in s and "locked at zero" in s for s in said)
+    assert all("prismatic" in s and "locked at zero" in s for s in said[:2])
+    assert len(said) == 3 and "made up" in said[2] and "'panda_link1'" in said[2]
     assert "panda_finger_joint1" in said[0] and "panda_finger_joint2" in said[1]
     assert model.tree.joint_names == tuple(f"panda_joint{k}" for k in range(1, 8))
     assert model.theta[6, 0] == pytest.approx(0.2 + 0.81 + 0.1 + 0.1)
