@@ -16,7 +16,7 @@ import numpy as np
 from adapter.effects.active import active_effects
 from adapter.effects.base import Effect, Template
 from adapter.effects.catalogue import CATALOGUE, HELD
-from adapter.gap.candidates import Candidate
+from adapter.gap.candidates import Candidate, is_finer
 from adapter.gap.evidence import Carried, Moments
 from adapter.gap.fit import (
     TIMING_STD_S,
@@ -26,6 +26,7 @@ from adapter.gap.fit import (
     honest_covariance,
     place_of,
     refitted,
+    shaped,
     under_own_noise,
     worth,
 )
@@ -48,8 +49,8 @@ from adapter.screening.timing import TIMING_SHARE
 
 COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
 BRISTLES = CATALOGUE["bristle_friction"]
+EVERYWHERE = {BRISTLES: COULOMB_NM, OFFSET: OFFSET_NM}
 WHERE_IT_MOVES = {
-    BRISTLES: COULOMB_NM,
     CATALOGUE["viscous_friction"]: VISCOUS_NM_S,
     CATALOGUE["motor_inertia"]: MOTOR_KG_M2,
 }
@@ -200,8 +201,20 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         begun, _ = refitted(begun)
         kept = [e for e in begun.named if e.possible]
         if len(kept) == len(begun.named):
-            return begun
+            return usually_shaped(begun)
         begun = begun.with_named(kept)
+
+
+def usually_shaped(fit: Fit) -> Fit:
+    """A fit in which what any arm has is of the shape (bristles of the way) that data like best.
+
+    Beside a simpler form by name it would take that one's place.
+    """
+    for k in range(len(fit.named)):
+        own, *others = fit.named[k].candidate, *(e.candidate for e in fit.without(k).named)
+        if fit.named[k].assumed and not any(is_finer(own, other) for other in others):
+            fit = shaped(fit, k)
+    return fit
 
 
 def _named(effect: Effect, template: Template, joint: int) -> Named:
@@ -218,9 +231,13 @@ def _assumed(effect: Effect, joint: int, std: float | None = None) -> Named:
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
-    """With friction and motors of joints (from 0) that move and offsets of all torques, at zero."""
-    own = [_assumed(effect, j, std) for effect, std in WHERE_IT_MOVES.items() for j in joints]
-    own += [_assumed(OFFSET, j, OFFSET_NM) for j in sorted(fit.heard)]
+    """With dry friction and offsets of all torques and what joints (from 0) that move have."""
+    own = [
+        _assumed(effect, j, std)
+        for effects, where in ((EVERYWHERE, sorted(fit.heard)), (WHERE_IT_MOVES, joints))
+        for effect, std in effects.items()
+        for j in where
+    ]
     return fit.with_named([*fit.named, *own])
 
 

@@ -25,7 +25,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.real_arm import start
+from adapter.gap.real_arm import start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
     BELIEF,
@@ -247,11 +247,7 @@ def _puts_down(e: Named | Lead) -> bool:
 
 def settled(fit: Fit, joints: Sequence[int]) -> Found:
     """Without what no longer pays beside the others, each by its best name, under its own noise."""
-    for k in range(len(fit.named)):
-        # what was assumed has no shape yet; beside a simpler form by name it would take its place
-        own, *others = fit.named[k].candidate, *(e.candidate for e in fit.without(k).named)
-        if fit.named[k].assumed and not any(is_finer(own, other) for other in others):
-            fit = shaped(fit, k)
+    fit = usually_shaped(fit)
     swaps, before = 0, None  # the fit before names were exchanged, until that is judged
     while True:
         fit, carried = under_own_noise(fit)
