@@ -382,7 +382,8 @@ def _paying(task: GapTask, found: Found) -> Found:
     """As it foretells held-out data best: what is assumed, corrections, single effects."""
     level = noise_floor(found.fit)
     ways = [found, uncorrected(found)]
-    if not any(map(from_the_start, found.fit.named)):  # a load is weighed beside all of it
+    loaded = any(map(from_the_start, found.fit.named))  # it is weighed beside all of the rest
+    if found.weak and not loaded:
         bare = _without(found, found.weak)
         ways += [bare, uncorrected(bare)]
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)

@@ -40,7 +40,6 @@ from adapter.gap.evidence import (
     scores,
 )
 from adapter.gap.fit import Fit
-from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
 CATALOGUED, PATTERNS = "catalogued", "patterns"
@@ -85,15 +84,12 @@ class Lead:
     odds: float = 0.0
 
 
-def rich_noise(
-    X: Array, candidates: Sequence[Candidate], residual: Array, own: Signals | None = None
-) -> Noise:
+def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard: Array) -> Noise:
     """Noise of a residual (k, n) without what all signatures X (c, k, n) at once explain of it.
 
     Args:
-        own: the recording; None where all its samples count.
+        heard: (k, n) one where the torque was measured, else zero.
     """
-    heard = np.ones_like(residual) if own is None else own.heard
     prior = np.zeros(len(X))
     for c in candidates:
         # patterns are so many that they would explain noise, but for a line that stands out
@@ -142,9 +138,8 @@ class SignatureTable:
             table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
             tables.append(table)
             if rich:
-                noise.append(
-                    rich_noise(table, self.candidates, fit.model.residual(i), fit.recordings[i])
-                )
+                own, heard = fit.model.residual(i), fit.recordings[i].heard
+                noise.append(rich_noise(table, self.candidates, own, heard))
         if kind == PATTERNS:
             self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
         self.fit = fit.with_noise(noise) if rich else fit

@@ -281,7 +281,7 @@ def _lost(before: Fit, fit: Fit) -> bool:
         np.sqrt(np.mean(np.concatenate(own.model.residuals()) ** 2, axis=0))
         for own in (before, fit)
     )
-    more = np.log(b / np.maximum(a, LEAST_NM))
+    more = np.log(np.maximum(b, LEAST_NM) / np.maximum(a, LEAST_NM))
     pairs = zip(before.named, fit.named, strict=True)
     simpler = any(
         is_finer(x.candidate, y.candidate) for x, y in pairs if x.candidate.key != y.candidate.key

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from adapter.gap import workflow
 from adapter.gap.fit import Fit, Model, place_of
 from adapter.gap.load import hand_frame
 from adapter.gap.several import Several
@@ -119,6 +120,13 @@ def test_pairs_of_twins_of_real_logs_agree() -> None:
     std = np.array([load.mass_std for load in found.loads])
     assert (np.abs(mass.ravel() - true) < 4.0 * std).all()
     assert found.odd == []
+
+
+def test_of_many_those_in_which_most_moves_are_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workflow, "SEARCHED_S", 5.0)
+    found = workflow.find_gap(logs()[1:4], panda_model())
+    assert sum("searched, and scored by blocks" in note for note in found.notes) == 1
+    assert len(found.loads) == 3 and len(found.recordings) == 2
 
 
 def test_names_tell_recordings_apart() -> None:
