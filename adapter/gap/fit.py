@@ -1,7 +1,7 @@
 """The model as it stands: nominal, its small inertial corrections, and the effects named so far.
 
 Everything is refitted together and exactly: Gauss and Newton on the torque that the stages of
-`adapter.effects.torque` predict, with the inertias held to their prior and the noise coloured.
+`adapter.effects.torque` predict, with the inertias held to their prior and noise with a memory.
 `Model` is what predicts, and remembers what it predicted; `Fit` adds priors and noise.
 """
 

@@ -42,7 +42,7 @@ from adapter.gap.search import ROUNDS, Found, search
 from adapter.gap.several import Several
 from adapter.gap.signals import LEAST_S, RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
-from adapter.judgement.priors import DOCUMENTED_SHARE, theta_prior
+from adapter.judgement.priors import DOCUMENTED_SHARE, documented_std
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
 from adapter.physics.rigid_arm import RigidArm
@@ -342,7 +342,7 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     """All that was found and measured."""
     found, floor = measured.found, noise_floor(measured.found.fit)
     ends = {r.name: r.end_s for r in task.fitted}
-    trusted = theta_prior(RigidArm.of(task.model).theta, settings.inertia_prior)
+    trusted = documented_std(RigidArm.of(task.model).theta, settings.inertia_prior)
     told, left = told_of(found, ends, trusted)
     findings = tuple(f for f in told if f.evidence >= NO_NAME)
     notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]

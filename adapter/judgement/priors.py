@@ -22,7 +22,7 @@ from adapter.screening.likelihood import LOAD_STD
 
 DOCUMENTED_SHARE, MADE_UP_SHARE = 0.05, 0.3
 OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, STATIC_NM, MOTOR_KG_M2 = 1.0, 5.0, 1.0, 0.5, 0.1
-SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `theta_prior`
+SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
 
 
 def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:
@@ -42,13 +42,25 @@ def positive(n: int) -> slice:
 
 
 def theta_prior(theta: Array, share: float) -> Array:
-    """(n, 10) standard deviation of inertial parameters that are known to a `share` of their size.
+    """(n, 10) standard deviation of inertial parameters that are documented to a `share`.
+
+    Of bodies that somebody made up little is known but the last one's mass, for which a load would
+    be taken.
+    """
+    std = documented_std(theta, share)
+    if made_up(theta):
+        mass, std = std[-1, 0], np.maximum(std, documented_std(theta, MADE_UP_SHARE))
+        std[-1, 0] = mass
+    return std
+
+
+def documented_std(theta: Array, share: float) -> Array:
+    """(n, 10) of inertial parameters that are known to a `share` of their size.
 
     A parameter that happens to be near zero is no better known than its like: to a moment of
     inertia's own size a quarter of the mean one's is added, to a first moment's that of a centre
     0.1 m away, so that centres are known to 5 mm where masses are to 5 %. No body is lighter than
-    0.1 kg or smaller than 5 cm for that. Of bodies that somebody made up little is known but the
-    last one's mass, which a load would be taken for.
+    0.1 kg or smaller than 5 cm for that.
     """
     like = np.zeros_like(theta)
     mass = np.maximum(theta[:, :1], LIGHT_KG)
@@ -56,8 +68,4 @@ def theta_prior(theta: Array, share: float) -> Array:
     like[:, 1:4] = CENTRE_M * mass
     second = np.abs(theta[:, [4, 7, 9]].mean(axis=1))[:, None]
     like[:, 4:] = SPREAD * np.maximum(second, SMALL_M**2 * mass)
-    shares = np.full_like(theta, share)
-    if made_up(theta):
-        shares[:] = max(share, MADE_UP_SHARE)
-        shares[-1, 0] = share
-    return np.asarray(shares * np.hypot(theta, like))
+    return np.asarray(share * np.hypot(theta, like))
