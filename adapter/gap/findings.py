@@ -24,6 +24,7 @@ from adapter.model.spatial import Array
 OVERLAP = 0.9
 OFFSET = "torque_offset"
 MOST_RIVALS = 3
+SHOWN_CHI2 = 4.0  # of an offset: two standard deviations
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
 SINGLED_OUT = 0.9  # probability of a link's correction
 ODD = 4.0  # standard deviations from which on a correction is a finding
@@ -169,10 +170,11 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     """Every named effect of the catalogue. `ends`: recordings by name -> s, when each ends."""
     fit = found.fit
     covariance = honest_covariance(fit, found.known or found.carried)
+    # of an offset that is there but has no name, its friction may be asymmetric in its place
     shifted = {
         e.candidate.joint
-        for k, e in enumerate(fit.named)
-        if e.candidate.effect.name == OFFSET and k not in found.weak
+        for e, standing in zip(fit.named, found.standings, strict=True)
+        if e.candidate.effect.name == OFFSET and standing.chi2 > SHOWN_CHI2
     }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
