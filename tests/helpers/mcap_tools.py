@@ -1,5 +1,6 @@
 """Recordings for tests: ours, and such as other people's tools write."""
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -50,6 +51,7 @@ def samples(count: int, links: bool = False, seed: int = 0) -> list[JointSample]
 def record(path: Path, items: list[JointSample], every: int = 100, **options) -> Path:
     """Our own recording, a chunk every `every` samples."""
     links = LINKS if items and items[0].links is not None else ()
+    options = {"flush_s": math.inf, **options}  # a busy machine would write a chunk of its own
     with McapWriter(path, JOINTS, links, overwrite=True, **options) as writer:
         for i, sample in enumerate(items, 1):
             writer.write(sample)
