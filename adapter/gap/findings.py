@@ -267,9 +267,9 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
     motion = fit.recordings[0].motion
     rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
     for j in range(fit.n):
-        memory = np.lib.stride_tricks.sliding_window_view(residual[:, j], BEFORE + 1)
-        foretold = np.linalg.lstsq(memory[:, :-1], memory[:, -1], rcond=None)[0]
-        surprise = _rms(memory[:, -1] - memory[:, :-1] @ foretold)
+        lagged = np.lib.stride_tricks.sliding_window_view(residual[:, j], BEFORE + 1)
+        before, now = lagged[:, :-1], lagged[:, -1]
+        surprise = _rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
         if level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}

@@ -140,7 +140,7 @@ def plain_load(log: Log, model: SelfModel, share: float) -> HandLoad:
         share: by which the model's inertias may be off, one standard deviation.
     """
     std = prior_std(model.theta, share)
-    whole = reduce(Moments.with_more, (_moments(x, model, log) for x in log.pieces())).together()
+    whole = _of_all(log, model).together()
     found = judge([Part(whole, np.arange(len(std)), np.ptp(log.tau, axis=0) > 0.0)], std)
     return load_of(found.x[:10], found.covariance[:10, :10], hand_frame(model))
 
@@ -170,7 +170,7 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
         more = dead + torque.notes
     alive, notes = np.ptp(own.tau, axis=0) > 0.0, own.warnings + said + more
     own = torque.in_time(own if survey is None else survey.log)
-    moments = reduce(Moments.with_more, (_moments(x, model, own) for x in own.pieces()))
+    moments = _of_all(own, model)
     left_s = float(moments.rows.sum()) * moments.period_s
     if left_s < LEAST_S:
         raise RecordingRefused(
@@ -179,6 +179,11 @@ def _taken(log: Log, model: SelfModel) -> _Taken:
             f"{SHORTEST_S:g} s without one.",
         )
     return _Taken(moments, moves, alive, notes)
+
+
+def _of_all(log: Log, model: SelfModel) -> Moments:
+    """What a recording tells, piece by piece."""
+    return reduce(Moments.with_more, (_moments(x, model, log) for x in log.pieces()))
 
 
 def _moments(piece: Log, model: SelfModel, whole: Log) -> Moments:

@@ -112,8 +112,8 @@ def search(
     budget = Budget(rounds)
     progress("a load at the hand")
     fit = settled(_extended(start(fit, joints), joints, CATALOGUED, budget, progress), joints).fit
-    if fit.named:  # noise that was taken for the first effect's may have hidden another one
-        fit = _extended(fit, joints, CATALOGUED, budget, progress)
+    # noise that was taken for the first effect's may have hidden another one
+    fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
     found = settled(_renamed(fit, joints), joints)
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)

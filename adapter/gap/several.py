@@ -26,7 +26,6 @@ from adapter.model.inertia import six_from_tensor
 from adapter.model.self_model import FixedFrame
 from adapter.model.spatial import Array
 
-SIZES = "level", "memory"  # of noise
 LINK_STD = (5.0, *[0.5] * 3, *[0.15] * 6)  # of what a link may differ by: kg, kg m, kg m2
 FRICTION, OFFSET, LINK = "friction", "offset", "link"
 NOISE, OTHERS = 4.5, 2.5  # of the noise, and of the largest among all others: more is another arm
@@ -75,7 +74,7 @@ class Several:
         for first in (True, False):
             # one arm's noise: its own would hide by how much a recording is of another
             own = [fit.own_noise()[0] for fit in fits]
-            level, memory = (np.median([getattr(x, key) for x in own], 0) for key in SIZES)
+            level, memory = np.median([(x.level, x.memory) for x in own], axis=0)
             fits = [fit.with_noise([Noise(level, memory)]) for fit in fits]
             parts = [Part.of(fit, _own(fit)) for fit in fits]
             together = Together(parts, parts[0].known.prior_std[parts[0].common])
