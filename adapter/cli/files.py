@@ -11,7 +11,9 @@ import numpy as np
 from adapter.effects.active import check_effects
 from adapter.effects.base import with_squares
 from adapter.effects.robots import read_robot
+from adapter.judgement.priors import is_shown
 from adapter.model.model_file import load_model
+from adapter.model.numbers import plus_minus
 from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.runs.terminal import show, warn, write_json
 from adapter.signals.importer import ImportSpec, import_file, recording_log, table_log
@@ -133,17 +135,18 @@ def _model_lines(model: SelfModel) -> list[str]:
 
 def _effect_lines(model: SelfModel) -> list[str]:
     """Each effect with its parameters, those of joints side by side."""
-    found: dict[tuple[str, str, str], dict[int, float]] = {}
+    found: dict[tuple[str, str, str], dict[int, str]] = {}
     for entry in model.effects:
         for key, value in entry["parameters"].items():
             if np.ndim(value) == 0:
-                name = str(entry["effect"]).replace("_", " ")
-                at = found.setdefault((name, key, str(entry["units"][key])), {})
-                at |= dict.fromkeys(entry["joints"] or [0], float(value))
+                name, std = str(entry["effect"]), (entry.get("std") or {}).get(key)
+                at = found.setdefault((name.replace("_", " "), key, str(entry["units"][key])), {})
+                said = plus_minus(float(value), std) if is_shown(name, std) else "not shown"
+                at |= dict.fromkeys(entry["joints"] or [0], said)
     lines = []
     for (name, key, unit), at in found.items():
         joints = [0] if 0 in at else range(1, model.tree.n + 1)
-        values = ", ".join(f"{at[j]:.3g}" if j in at else "-" for j in joints)
+        values = ", ".join(at.get(j, "-") for j in joints)
         where = " at the flange" if 0 in at else ""
         lines.append(f"{name} {key}{where}: {values} {with_squares(unit)}".rstrip())
     return lines

@@ -512,10 +512,14 @@ class LearnedEffect(Effect):
         parts = zip(self.shares(shape), self.basis(at), strict=True)
         return np.asarray(sum(share * column for share, column in parts))
 
-    def numbers(self, value: float, shape: float) -> dict[str, float]:
-        """All parameters, of what was learned."""
+    def learned_from(self, values: Values) -> dict[str, float]:
+        """Which effects' learned parameters, by name, start from what a model tells of this one."""
+        return {self.name: float(values[self.key])}
+
+    def learned_as(self, value: float, shape: float) -> tuple[str, dict[str, float]]:
+        """Name and all parameters of what was learned."""
         known = {self.key: value, self.shape_key: shape}
-        return {p.key: known.get(p.key, 0.0) for p in self.parameters}
+        return self.name, {p.key: known.get(p.key, 0.0) for p in self.parameters}
 
 
 class LinearEffect(LearnedEffect, JointTorque):

@@ -81,8 +81,8 @@ class BristleFriction(LearnedEffect, JointTorque):
     shows = ((STILL, "fades or changes sign"), (TURNS, "turns over gradually"))
 
     def templates(self) -> tuple[Template, ...]:
-        """The level, at several ways."""
-        return tuple(map(_template, WAYS_RAD))
+        """The level, at several ways; at once it is Coulomb friction."""
+        return tuple(map(_template, WAYS_RAD[1:]))
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another s0."""
@@ -91,6 +91,12 @@ class BristleFriction(LearnedEffect, JointTorque):
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""
         return np.asarray(values["Fc"] * self.torque_per_unit(at, values["s0"]))
+
+    def learned_as(self, value: float, shape: float) -> tuple[str, dict[str, float]]:
+        """Coulomb friction where it slides at once."""
+        if shape <= self.shapes[0]:
+            return "coulomb_friction", {"Fc": value}
+        return super().learned_as(value, shape)
 
     def basis(self, at: JointSignals) -> tuple[Array, ...]:
         """z of each of the ways."""

@@ -19,7 +19,8 @@ from adapter.model.spatial import Array
 
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1; static friction acts below it
-WAYS_RAD = (3e-4, 1e-3, 3e-3, 1e-2)  # over which bristles wind up that somebody remembers
+# Over which bristles wind up that somebody remembers; those of the first one slide at once.
+WAYS_RAD = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 
 
 def shares_of_ways(way: Array | float) -> Array:

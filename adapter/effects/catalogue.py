@@ -74,7 +74,7 @@ LEARNED: dict[str, LearnedEffect] = {
 # do not show fade.
 REAL_ARM_EFFECTS = (
     *("viscous_friction", "bristle_friction", "torque_offset", "motor_inertia"),
-    "torque_filter",
+    *("torque_filter", "joint_spring"),
 )
 
 # Effects that parts of the program need as such.

@@ -10,6 +10,7 @@ from adapter.effects.base import (
     Array,
     JointSignals,
     JointTorque,
+    LearnedEffect,
     Parameter,
     Values,
 )
@@ -18,8 +19,11 @@ from adapter.effects.splits import TURN
 from adapter.model.urdf_text import STIFFNESS, Additions
 
 
-class JointSpring(JointTorque):
-    """A spring between a joint's two sides."""
+class JointSpring(LearnedEffect, JointTorque):
+    """A spring between a joint's two sides.
+
+    The learner has one that rests at zero; where it rests is in the offset that it learns beside.
+    """
 
     name = "joint_spring"
     title = "joint spring"
@@ -41,6 +45,15 @@ class JointSpring(JointTorque):
     def columns(self, at: JointSignals) -> tuple[Array, ...]:
         """q and q - 1 rad."""
         return at.q, at.q - 1.0
+
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """q."""
+        return (at.q,)
+
+    def learned_from(self, values: Values) -> dict[str, float]:
+        """k, and the offset that a spring has which rests elsewhere."""
+        k = float(values["k"])
+        return {self.name: k, "torque_offset": -k * float(values["q0"])}
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """k (q - q0)."""

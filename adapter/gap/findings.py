@@ -22,7 +22,7 @@ from adapter.gap.search import Found, from_the_start
 from adapter.model.spatial import Array
 
 OVERLAP = 0.9
-OFFSET = "torque_offset"
+OFFSET, SPRING = "torque_offset", "joint_spring"
 MOST_RIVALS = 3
 SHOWN_CHI2 = 4.0  # of an offset: two standard deviations
 OPEN_NATS = 3.0  # by which a name may be the better one and leave the other open
@@ -43,16 +43,20 @@ def _joints(named: Named) -> list[int]:
     return [named.candidate.joint + 1] if own else []
 
 
-def entries(fit: Fit, recording: int | None = None) -> list[dict[str, Any]]:
+def entries(
+    fit: Fit, recording: int | None = None, known: Carried | Moments | None = None
+) -> list[dict[str, Any]]:
     """Entries of a model file for the named effects of the catalogue.
 
     What was assumed and is as no arm has it (without some blocks of the data, say) is not there.
 
     Args:
         recording: of several, whose own effects are among them; None: what is common alone.
+        known: of the coefficients, for standard deviations.
     """
     out, alone = [], len(fit.recordings) == 1
-    for named in fit.named:
+    covariance = None if known is None else honest_covariance(fit, known)
+    for k, named in enumerate(fit.named):
         here = alone or named.recording in (None, recording)
         here &= not named.assumed or named.possible
         if here and not isinstance(named.candidate.effect, Pattern):
@@ -66,6 +70,8 @@ def entries(fit: Fit, recording: int | None = None) -> list[dict[str, Any]]:
                     "units": named.candidate.effect.units(),
                 }
             )
+            if covariance is not None:
+                out[-1]["std"] = parameter_std(fit, covariance, k)
     return out
 
 
@@ -209,7 +215,35 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 recording=name if own and len(ends) > 1 else "",
             )
         )
-    return tuple(sorted(out, key=lambda f: -f.detectability))
+    return tuple(sorted(_with_rests(fit, out), key=lambda f: -f.detectability))
+
+
+def _with_rests(fit: Fit, findings: list[Finding]) -> list[Finding]:
+    """Springs that rest where the offset of their joint says, which is not told beside them.
+
+    What any arm has are springs that rest at zero, and offsets (`real_arm`).
+    """
+    springs = {(f.joints, f.interval_s): f for f in findings if f.effect == SPRING}
+    offsets = {
+        (f.joints, f.interval_s): f
+        for f in findings
+        if f.effect == OFFSET and (f.joints, f.interval_s) in springs
+    }
+    springs_at = [e.candidate for e in fit.named if e.assumed and e.candidate.effect.name == SPRING]
+    assumed = {candidate.joint + 1 for candidate in springs_at}
+    out = []
+    for f in findings:
+        at = f.joints, f.interval_s
+        if at in offsets and f.joints[0] in assumed:
+            if f.effect == OFFSET:
+                continue
+            if f.effect == SPRING:
+                k, o = f.parameters["k"], offsets[at].parameters["o"]
+                std = math.hypot(offsets[at].std["o"], o / k * f.std["k"]) / abs(k)
+                parameters = {**f.parameters, "q0": f.parameters["q0"] - o / k}
+                f = replace(f, parameters=parameters, std={**f.std, "q0": std})
+        out.append(f)
+    return out
 
 
 def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, float]:

@@ -19,6 +19,7 @@ from adapter.gap.findings import entries, noise_floor
 from adapter.gap.fit import Fit, Model, place_of, refitted
 from adapter.gap.folds import FOLD_S, Folds, block_s, fold_of, holds_out
 from adapter.gap.long_recording import LongRecording
+from adapter.gap.real_arm import SPRING
 from adapter.gap.result import WORSE, Curves, RolloutCurves, Shortfall
 from adapter.gap.search import Found, from_the_start
 from adapter.gap.signals import COMMANDS, ROLLOUT_STEP_S, Recorded
@@ -40,14 +41,16 @@ THINNED = 10  # rollout rows kept for a plot: one in so many
 WORST = 100.0  # rad, rad/s: a simulation that runs away
 
 
-def model_of(model: SelfModel, fit: Fit, recording: int | None = None) -> SelfModel:
-    """The self model with the corrections and the named effects of a fit.
-
-    Of several recordings those that are common, and the own ones of the one that is asked for.
-    """
+def model_of(
+    model: SelfModel,
+    fit: Fit,
+    recording: int | None = None,
+    known: Carried | Moments | None = None,
+) -> SelfModel:
+    """The self model with the corrections and the named effects of a fit; see `entries`."""
     theta = model.theta.copy()
     theta[len(theta) - len(fit.dtheta) :] += fit.dtheta  # a floating base comes before the links
-    return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording)))
+    return replace(model, theta=theta, effects=(*model.effects, *entries(fit, recording, known)))
 
 
 def held_out_models(
@@ -383,16 +386,22 @@ def _paying(task: GapTask, found: Found) -> Found:
     level = noise_floor(found.fit)
     ways = [found, uncorrected(found)]
     loaded = any(map(from_the_start, found.fit.named))  # it is weighed beside all of the rest
-    if found.weak and not loaded:
-        bare = _without(found, found.weak)
-        ways += [bare, uncorrected(bare)]
+    for places in (found.weak, _springs(found)) if not loaded else ():
+        if places:
+            fewer = _without(found, places)
+            ways += [fewer, uncorrected(fewer)]
     best = min((_Scored.of(task, x, level) for x in ways), key=lambda x: x.cost)
     while best.worse.any() and best.found.fit.named:
-        fewer = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
-        if not fewer or min(x.cost for x in fewer) > best.cost:
+        less = [_Scored.of(task, x, level) for x in _without_one(best.found, best.worse)]
+        if not less or min(x.cost for x in less) > best.cost:
             break
-        best = min(fewer, key=lambda x: x.cost)
+        best = min(less, key=lambda x: x.cost)
     return best.found
+
+
+def _springs(found: Found) -> frozenset[int]:
+    """Places of springs that any arm may have and these data do not single out."""
+    return frozenset(k for k in found.weak if found.fit.named[k].candidate.effect is SPRING)
 
 
 def _without(found: Found, places: Collection[int]) -> Found:

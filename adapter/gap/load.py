@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from adapter.gap.hand import hand_frame
 from adapter.gap.long_recording import Survey, is_long
 from adapter.judgement.posterior import SEGMENTS, Moments, Part, judge, moments_of
-from adapter.judgement.priors import DOCUMENTED_SHARE, prior_std
+from adapter.judgement.priors import DOCUMENTED_SHARE, positive, prior_std
 from adapter.model.inertia import body_from_theta, move_theta, six_from_tensor, tensor_from_six
 from adapter.model.self_model import FixedFrame, SelfModel
 from adapter.model.spatial import Array
@@ -124,7 +124,7 @@ def find_load(
         at[:10], at[-n:] = len(std) + np.arange(10), len(std) + 10 + np.arange(n)
         parts.append(Part(taken[1].moments.together(), at, taken[1].alive))
         std = np.r_[std, np.zeros(10), std[-n:]]
-    found = judge(parts, std)
+    found = judge(parts, std, positive(std, n))
     if taken[0].moves:
         notes += _changed(taken[0].moments, parts, std, 1e-9 * (log.end_ns - log.begin_ns))
     load = load_of(found.x[:10], found.covariance[:10, :10], riding)
@@ -140,8 +140,8 @@ def plain_load(log: Log, model: SelfModel, share: float) -> HandLoad:
         share: by which the model's inertias may be off, one standard deviation.
     """
     std = prior_std(model.theta, share)
-    whole = _of_all(log, model).together()
-    found = judge([Part(whole, np.arange(len(std)), np.ptp(log.tau, axis=0) > 0.0)], std)
+    whole, held = _of_all(log, model).together(), positive(std, model.tree.n)
+    found = judge([Part(whole, np.arange(len(std)), np.ptp(log.tau, axis=0) > 0.0)], std, held)
     return load_of(found.x[:10], found.covariance[:10, :10], hand_frame(model))
 
 
@@ -212,7 +212,7 @@ def _changed(segments: Moments, parts: Sequence[Part], std: Array, span_s: float
         after = whole._replace(moments=segments.together(slice(segment, None)), at=later)
         if not (before.moments.rows and after.moments.rows):
             continue
-        trial = judge([before, after, *parts[1:]], two)
+        trial = judge([before, after, *parts[1:]], two, positive(two, len(whole.alive)))
         mass = float(weigh @ trial.x)
         clear = abs(mass) / float(np.sqrt(weigh @ trial.covariance @ weigh))
         if abs(mass) > LEAST_CHANGE_KG:

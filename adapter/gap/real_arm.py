@@ -35,13 +35,7 @@ from adapter.gap.long_recording import LongRecording
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF
 from adapter.gap.signals import Recorded, prepare
-from adapter.judgement.priors import (
-    COULOMB_NM,
-    MOTOR_KG_M2,
-    OFFSET_NM,
-    VISCOUS_NM_S,
-    theta_prior,
-)
+from adapter.judgement.priors import EFFECT_STD, theta_prior
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -49,14 +43,13 @@ from adapter.screening.timing import TIMING_SHARE
 
 COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
 BRISTLES = CATALOGUE["bristle_friction"]
-EVERYWHERE = {BRISTLES: COULOMB_NM, OFFSET: OFFSET_NM}
-WHERE_IT_MOVES = {
-    CATALOGUE["viscous_friction"]: VISCOUS_NM_S,
-    CATALOGUE["motor_inertia"]: MOTOR_KG_M2,
-}
+EVERYWHERE = (BRISTLES, OFFSET)
+SPRING = CATALOGUE["joint_spring"]
+WHERE_IT_MOVES = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"], SPRING)
 USUAL = {BRISTLES: 1}  # of the templates: bristles of a Panda
 # Of the whole arm: what its torques lack of the motion's band, and a table that is not level
 OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
+AT_ZERO = 1e-3  # N m/rad: where a spring rests is in the offset beside it
 WAY_ROUNDS = 3
 LIGHTEST_KG = 0.1
 SHOWN, SURE = 2.5, 3.0  # standard deviations of its mass: a load is there if believed; anyway
@@ -147,14 +140,15 @@ def as_driven(fit: Fit, joints: Sequence[int], first: Sequence[Named]) -> Fit:
     """A fit with these effects first, and beside them friction, motors and offsets at zero.
 
     Gearboxes rub much more than a Panda's joints, so that it counts how soon a joint slides:
-    Coulomb friction is beside that of bristles.
+    Coulomb friction is beside that of bristles. Beside springs gravity would not tell the gains.
 
     Args:
         joints: (from 0) that move.
     """
     fit = _beside(fit.with_named(first), joints)
-    at_once = [_assumed(COULOMB, j, COULOMB_NM) for j in joints]
-    return fit.with_named([*fit.named, *at_once])
+    at_once = [_assumed(COULOMB, j) for j in joints]
+    own = [e for e in fit.named if e.candidate.effect is not SPRING or not e.assumed]
+    return fit.with_named([*own, *at_once])
 
 
 def load_in(fit: Fit, recording: int | None) -> Named:
@@ -222,20 +216,21 @@ def _named(effect: Effect, template: Template, joint: int) -> Named:
     return Named(Candidate(effect, template, joint, ()), np.zeros(len(template.prior_std)))
 
 
-def _assumed(effect: Effect, joint: int, std: float | None = None) -> Named:
-    """An effect that any arm has, of a size known to `std`; as its template says where None."""
+def _assumed(effect: Effect, joint: int) -> Named:
+    """An effect that any arm has, of its usual size (`priors`, or as its template says)."""
     template = effect.templates()[USUAL.get(effect, 0)]
-    if std is not None:
-        template = replace(template, prior_std=(std,))
+    if effect.name in EFFECT_STD:
+        std = EFFECT_STD[effect.name], *[AT_ZERO] * (len(template.prior_std) - 1)
+        template = replace(template, prior_std=std)
     return replace(_named(effect, template, joint), assumed=True)
 
 
 def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
     """With dry friction and offsets of all torques and what joints (from 0) that move have."""
     own = [
-        _assumed(effect, j, std)
+        _assumed(effect, j)
         for effects, where in ((EVERYWHERE, sorted(fit.heard)), (WHERE_IT_MOVES, joints))
-        for effect, std in effects.items()
+        for effect in effects
         for j in where
     ]
     return fit.with_named([*fit.named, *own])

@@ -231,22 +231,21 @@ def _differences(fit: Fit, rest: Together) -> dict[str, list[Difference]]:
 def _directions(fit: Fit, x: Array) -> Iterator[tuple[str, str, Array]]:
     """Kind, words, and directions (k, c) in the common coefficients, of about unit deviation."""
     unit, own = np.eye(len(x)), [e.candidate for e in fit.named[1:]]
-    first = len(x) - len(own)
+    widths = [len(e.x) for e in fit.named[1:]]
+    at = len(x) - sum(widths) + np.cumsum([0, *widths[:-1]])  # where those of each begin
     rubs = np.array(["friction" in c.effect.name for c in own])
     reads = np.array([c.effect.name == "torque_offset" for c in own])
     joints = np.array([c.joint for c in own])
-    yield FRICTION, "the friction of all joints", _together_in(unit, first, rubs, x)
+    yield FRICTION, "the friction of all joints", _together_in(unit, at[rubs], x)
     for j in range(fit.n):
-        at_joint = _together_in(unit, first, rubs & (joints == j), x)
+        at_joint = _together_in(unit, at[rubs & (joints == j)], x)
         yield FRICTION, f"the friction of joint {j + 1}", at_joint
-        places = first + np.flatnonzero(reads & (joints == j))
-        yield OFFSET, f"the offset of joint {j + 1}'s torque", unit[places]
+        yield OFFSET, f"the offset of joint {j + 1}'s torque", unit[at[reads & (joints == j)]]
     for k in range(1, fit.n - 1):
         moved = np.array(LINK_STD)[:, None] * unit[10 * k : 10 * k + 10]
         yield LINK, f"the inertia of link {k + 1}, or of one beside it,", moved
 
 
-def _together_in(unit: Array, first: int, chosen: Array, x: Array) -> Array:
-    """(1, c) coefficients from `first` on that are chosen, in the proportion that they have."""
-    places = first + np.flatnonzero(chosen)
+def _together_in(unit: Array, places: Array, x: Array) -> Array:
+    """(1, c) coefficients at these places, in the proportion that they have."""
     return np.asarray((x[places] @ unit[places])[None])

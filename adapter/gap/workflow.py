@@ -165,7 +165,9 @@ def find_gap(
         notes = (*gains.words(), *gains.notes, *result.notes)
         result = replace(result, torque_gains=gains.as_dict(), notes=notes)
     if model_out is not None:
-        save_model(model_of(task.model, measured.found.fit), model_out)
+        found = measured.found
+        known = found.known or found.carried
+        save_model(model_of(task.model, found.fit, known=known), model_out)
         result = replace(result, model_out=str(model_out))
     return replace(result, wall_s=time.monotonic() - begun)
 

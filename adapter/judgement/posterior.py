@@ -1,6 +1,6 @@
 """What rows of recordings say of an arm: a Gaussian posterior under held priors.
 
-    tau = model + Y dθ + Y_n load + offset + Fc s(dq) + Fv dq + B ddq + static + noise
+    tau = model + Y dθ + Y_n load + offset + Fc s(dq) + Fv dq + B ddq + k q + static + noise
 
 The noise is what the model leaves: the sensors' and a misfit that keeps its sign for a while. Its
 size and memory come from the data, by joint, so that a model that fits badly says so by its
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.torque import ModelTorque
 from adapter.judgement.noise import MEMORY_S, memory_s
-from adapter.judgement.priors import positive
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -74,7 +73,7 @@ def moments_of(model: SelfModel, rows: Rows, period_s: float, at: Array) -> Mome
     torque = ModelTorque(model)(rows.q, rows.dq, rows.ddq)
     regressor = RigidArm.of(model).regressor(rows.q, rows.dq, rows.ddq)
     step = smooth_sign(rows.dq, rows.ddq, SMOOTHING_S)
-    joint = (np.ones_like(torque), step, rows.dq, rows.ddq, 1.0 - np.abs(step))
+    joint = (np.ones_like(torque), step, rows.dq, rows.ddq, rows.q, 1.0 - np.abs(step))
     columns = np.concatenate([regressor[:, :, -10:], regressor, by_joint(joint)], axis=2)
     more, segment = rows.tau - torque, np.clip((SEGMENTS * at).astype(int), 0, SEGMENTS - 1)
     x, y = columns.transpose(1, 2, 0), more.T[:, :, None]
@@ -97,11 +96,13 @@ class Part(NamedTuple):
         moments: its segments together.
         at: (c,) where its coefficients stand among those of all.
         alive: (n,) joints whose torque is measured in it.
+        memory_s: (n,) of its noise; found in the largest piece where None.
     """
 
     moments: Moments
     at: NDArray[np.int64]
     alive: NDArray[np.bool_]
+    memory_s: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,34 +119,49 @@ class Posterior:
     left_nm: Array
 
 
-def judge(parts: Sequence[Part], std: Array) -> Posterior:
+def judge(
+    parts: Sequence[Part],
+    std: Array,
+    positive: NDArray[np.bool_],
+    before: tuple[Array, Array] | None = None,
+) -> Posterior:
     """What parts of recordings of one arm say together.
 
     Args:
-        std: (c,) of the prior of all coefficients, the first of them as `priors.prior_std` has
-            them; what has none is not there.
+        std: (c,) of the prior of all coefficients; what has none is not there.
+        positive: (c,) those of which no arm has less than nothing.
+        before: information (c, c) and its right side (c,) from before, beside the prior.
     """
-    free, constrained = std > 0.0, positive(len(parts[0].alive))
+    own = std > 0.0
+    free = own.copy()
     expected = [sensor_nm(part.moments.model / part.moments.rows) for part in parts]
     noise = [
         np.sqrt(x.moments.left(np.zeros(len(x.at)))) + y
         for x, y in zip(parts, expected, strict=True)
     ]
-    memory = [np.full(len(part.alive), MEMORY_S[0]) for part in parts]
+    memory = [
+        np.full(len(part.alive), MEMORY_S[0]) if part.memory_s is None else part.memory_s
+        for part in parts
+    ]
     for turn in range(ROUNDS):
-        information, right = np.diag(np.where(free, std, 1.0) ** -2.0), np.zeros(len(std))
-        for (own, at, alive), level, long_s in zip(parts, noise, memory, strict=True):
-            weight = np.where(alive, own.period_s / long_s / level**2, 0.0)
-            information[np.ix_(at, at)] += np.tensordot(weight, own.squares, 1)
-            right[at] += weight @ own.products
+        information, right = np.diag(np.where(own, std, 1.0) ** -2.0), np.zeros(len(std))
+        if before is not None:
+            information, right = information + before[0], right + before[1]
+        for (sums, at, alive, _), level, long_s in zip(parts, noise, memory, strict=True):
+            weight = np.where(alive, sums.period_s / long_s / level**2, 0.0)
+            information[np.ix_(at, at)] += np.tensordot(weight, sums.squares, 1)
+            right[at] += weight @ sums.products
         covariance = np.zeros_like(information)
         covariance[np.ix_(free, free)] = np.linalg.inv(information[np.ix_(free, free)])
         x = covariance @ right
-        for k, (own, at, _) in enumerate(parts):
-            columns, more = own.largest
-            memory[k] = memory_s(more - columns @ x[at], own.period_s)
-            samples = own.rows * own.period_s / memory[k]
-            noise[k] = noise_nm(own.left(x[at]), samples, expected[k])
+        for k, (sums, at, _, told_s) in enumerate(parts):
+            columns, more = sums.largest
+            if told_s is None:
+                memory[k] = memory_s(more - columns @ x[at], sums.period_s)
+            samples = sums.rows * sums.period_s / memory[k]
+            noise[k] = noise_nm(sums.left(x[at]), samples, expected[k])
         if turn >= ROUNDS // 2:
-            free[constrained] &= x[constrained] >= 0.0
+            free &= ~positive | (x >= 0.0)
+    held = own & ~free  # at nothing, within what they could be else
+    covariance[held, held] = np.diagonal(np.linalg.inv(information[np.ix_(own, own)]))[held[own]]
     return Posterior(x, covariance, np.sqrt(parts[0].moments.left(x[parts[0].at])))

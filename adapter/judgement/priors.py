@@ -9,12 +9,15 @@ torque offset                       1 N m: of real Pandas 0.2 to 1 N m
 Coulomb, viscous friction           5 N m, 1 N m s/rad: a Panda's 0.2 to 0.5 and 0.03 to 0.09,
                                     gearboxes of a UR10 3 to 8
 static friction at rest             0.5 N m: a Panda's; a rest holds whatever lies within it
+spring of cables along the arm      0.1 N m/rad: a Panda's 0.01 to 0.2; without it motors would
+                                    have less than no inertia
 motor inertia that the model lacks  0.1 kg m²: 5e-6 to 3e-5 kg m² at a motor behind gears of 1:100
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.model.link_checks import made_up
 from adapter.model.spatial import Array
@@ -22,23 +25,39 @@ from adapter.screening.likelihood import LOAD_STD
 
 DOCUMENTED_SHARE, MADE_UP_SHARE = 0.05, 0.3
 OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, STATIC_NM, MOTOR_KG_M2 = 1.0, 5.0, 1.0, 0.5, 0.1
+SPRING_NM_RAD = 0.1
+EFFECT_STD = {  # the same, of the effects' parameters
+    "torque_offset": OFFSET_NM,
+    "coulomb_friction": COULOMB_NM,
+    "bristle_friction": COULOMB_NM,
+    "viscous_friction": VISCOUS_NM_S,
+    "motor_inertia": MOTOR_KG_M2,
+    "joint_spring": SPRING_NM_RAD,
+}
+SHOWN_SHARE = 0.5  # of its prior's standard deviation: what is known no better was not shown
 SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
 
 
+def is_shown(effect: str, std: float | None) -> bool:
+    """Whether data told an effect's parameter, and not its prior alone."""
+    return std is None or std < SHOWN_SHARE * EFFECT_STD.get(effect, np.inf)
+
+
 def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:
-    """(10 + 15 n,) of all that may be off an arm with documented inertias theta (n, 10).
+    """(10 + 16 n,) of all that may be off an arm with documented inertias theta (n, 10).
 
     Ten of the load about the last link's origin, 10 n of the links, and by joint offset, Coulomb
-    and viscous friction, motor inertia and static friction.
+    and viscous friction, motor inertia, spring and static friction.
     """
-    joint = (OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, MOTOR_KG_M2, STATIC_NM)
+    joint = (OFFSET_NM, COULOMB_NM, VISCOUS_NM_S, MOTOR_KG_M2, SPRING_NM_RAD, STATIC_NM)
     own = np.repeat(joint, len(theta))
     return np.concatenate([LOAD_STD, theta_prior(theta, share).ravel(), own])
 
 
-def positive(n: int) -> slice:
-    """Friction and motors of n joints among these: no arm has less than none of them."""
-    return slice(10 + 11 * n, 10 + 14 * n)
+def positive(std: Array, n: int) -> NDArray[np.bool_]:
+    """(c,) where friction and motors of n joints are among these: no arm has less than none."""
+    at = np.arange(len(std))
+    return (at >= 10 + 11 * n) & (at < 10 + 14 * n)
 
 
 def theta_prior(theta: Array, share: float) -> Array:

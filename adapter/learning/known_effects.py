@@ -73,8 +73,18 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
 
 def learnable(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
     """Effects to learn: these, and after them what the model has that can be learned further."""
-    told = {a.effect.name for a in lasting_effects(model.effects, model.tree.n)}
+    lasting = lasting_effects(model.effects, model.tree.n)
+    told = {name for active in lasting for name in starts_from(active, tuple(LEARNED))}
     return (*names, *(name for name in LEARNED if name in told and name not in names))
+
+
+def starts_from(active: Active, names: Sequence[str]) -> dict[str, float]:
+    """Which of the learned effects, by name, start from what of an effect of a model; or none."""
+    if active.effect.name not in names:
+        return {}
+    parts = LEARNED[active.effect.name].learned_from(active.values)
+    parts = {name: value for name, value in parts.items() if value or name == active.effect.name}
+    return parts if set(parts) <= set(names) else {}
 
 
 def not_taken_off(model: SelfModel) -> tuple[str, ...]:
@@ -92,15 +102,14 @@ def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Arr
     effects = effects_by_name(names)
     total, variance = np.zeros((len(effects), n)), np.full((len(effects), n), np.nan)
     for active in known:
-        if active.effect.name not in names:
-            continue
-        effect = LEARNED[active.effect.name]
-        at = names.index(effect.name), active.joint
-        std = active.std.get(effect.key)
-        widest = effect.learned_std
-        spread = widest if std is None or not np.isfinite(std) else max(std, SMALLEST_STD * widest)
-        total[at] += float(active.values[effect.key])
-        variance[at] = np.nan_to_num(variance[at]) + spread**2
+        for name, value in starts_from(active, names).items():
+            effect, at = LEARNED[name], (names.index(name), active.joint)
+            std = active.std.get(effect.key) if effect is active.effect else None
+            widest = effect.learned_std
+            known_to = None if std is None or not np.isfinite(std) else float(std)
+            spread = widest if known_to is None else max(known_to, SMALLEST_STD * widest)
+            total[at] += value
+            variance[at] = np.nan_to_num(variance[at]) + spread**2
     told = np.isfinite(variance)
     return (np.where(told, total, np.nan), np.sqrt(variance)) if told.any() else None
 

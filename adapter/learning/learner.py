@@ -15,10 +15,12 @@ import numpy as np
 from adapter.effects.active import Active
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError, SettingsError
+from adapter.judgement.noise import memory_s
 from adapter.learning.adam import FlatAdam, same_bits
 from adapter.learning.change import ChangeDetector, explained_share, is_new
 from adapter.learning.imu_schema import ImuSchema
-from adapter.learning.known_effects import KnownEffects, believed, told_shapes
+from adapter.learning.known_effects import KnownEffects, believed, starts_from, told_shapes
+from adapter.learning.posterior import LearnedPosterior, learned_posterior
 from adapter.learning.schema import RestingBase, Schema
 from adapter.learning.settings import LearnerSettings, Mode
 from adapter.learning.steps import Done, steps
@@ -30,9 +32,10 @@ from adapter.model.spatial import Array
 from adapter.model.tree import Tree
 from adapter.physics.kernels import Frames, JointMotion, base_at_rest, jit, regressors
 from adapter.physics.rigid_arm import RigidArm
-from adapter.signals.records import StateLayout, stamp_of
+from adapter.signals.records import StateLayout, stamp_of, stamps_of
 
 JUDGE_THETA_EVERY, ADAPT_EVERY = 100, 1000  # updates
+NOISE_STATES = 5000  # newest ones, whose errors tell for how long the noise keeps its sign
 AHEAD = 100  # states that are looked at for one call of `steps`
 CONVERGED_EXCESS = 1.2  # mean over joints of predicted over fitted error, squares
 RATES_FROM = 1500  # samples behind θ before its torque is good enough for rates of it
@@ -54,10 +57,12 @@ class Filtered:
         noise_gain: correlated samples that one independent sample is worth
             (`JointFilter.noise_gain`).
         delay_s: of the filter (`JointFilter.delay_s`).
+        state_s: between filtered states.
     """
 
     noise_gain: float = 1.0
     delay_s: float = 0.0
+    state_s: float = 1e-3
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,8 @@ class KnownArm:
             torques and measured link motion show; where the base is tilted it is not that of
             the documentation, which synthesized link motion is made with.
         lam: (n, 6) documented λ, which sensors mounted anyhow start from; nobody else looks at it.
+        theta: (n, 10) documented θ of the links, which the posterior is about; ADAM knows nothing
+            of it.
     """
 
     hand: int | None = None
@@ -80,6 +87,7 @@ class KnownArm:
     effects: Sequence[Active] = ()
     arm: RigidArm | None = None
     lam: Array | None = None
+    theta: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -136,6 +144,7 @@ class OnlineLearner:
     Attributes:
         schema, theta: λ and θ, with what is known of them.
         base: (12,) motion of a base that rests, as sensors feel it; empty where it floats.
+        documented: (n, 10) θ of the links that the posterior tells loads by; None where unknown.
         learned, refused: states taken, and states refused for numbers that are not finite or
             that no robot shows.
         theta_started_ns: stamp at which θ began; None before.
@@ -196,7 +205,8 @@ class OnlineLearner:
             column += len(effect.shapes) or 1
         self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
-        self.given = tuple(known.effects)
+        self.given, self.documented = tuple(known.effects), known.theta
+        self._filtered = filtered
         self.known = _taken_off(known, s.effects, self.theta.smoothing_s, tree.floating)
         self.change = ChangeDetector(tree.n, s.change)
         rate = s.theta.sample_rate if each_sample else s.theta.rate
@@ -415,6 +425,17 @@ class OnlineLearner:
         blank = table.copy()
         blank[:, self.layout.tau] = 0.0
         return -self.theta.errors(self.frames, blank)
+
+    def posterior(self) -> LearnedPosterior:
+        """What is known of θ and the effects by all states so far."""
+        rows = np.arange(max(self._held_from, self._held_to - NOISE_STATES), self._held_to)
+        held, memory = self._held[rows % len(self._held)], None
+        if len(held) > 1:
+            apart_s = 1e-9 * float(np.median(np.diff(stamps_of(held))))
+            memory = memory_s(self.theta.errors(self.frames, held)[:, -self.tree.n :], apart_s)
+        # what is counted as a sample: a state, or (in moments from elsewhere) an independent one
+        period_s = self._filtered.state_s * self._filtered.noise_gain / self.theta.noise_gain
+        return learned_posterior(self.theta, self.documented, period_s, memory)
 
     def without_known(self, table: Array) -> Array:
         """Filtered states (m, size), which follow those before, without known effects."""
@@ -639,7 +660,7 @@ def _taken_off(
     known: KnownArm, learned: Sequence[str], smoothing_s: float, floating: bool
 ) -> KnownEffects | None:
     """What takes the known effects off that nobody learns; None where there are none."""
-    fixed = [active for active in known.effects if active.effect.name not in learned]
+    fixed = [active for active in known.effects if not starts_from(active, learned)]
     if not fixed:
         return None
     names = ", ".join(dict.fromkeys(active.effect.name for active in fixed))

@@ -58,7 +58,7 @@ REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
 SPREAD_STEPS = 50  # at each look at how large the effects are
 # Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
 # what another must be better, in squares of standard deviations.
-FIRST_SHAPE, SHAPES_TRIED, SHAPE_EVIDENCE = 1, 25, 2.0
+FIRST_SHAPE, SHAPES_TRIED, SHAPE_EVIDENCE = 2, 25, 2.0
 # Effects of the torque's rates must explain so many times the variance that noise of the motion
 # puts on the model's torque, which is the most that they could explain of that alone.
 RATES_OVER_NOISE, TINY = 4.0, 1e-30
@@ -129,6 +129,7 @@ class Theta:
             change, when `spare_in_use`.
         shapes: (e, n) of the effects that have several columns, chosen between their shapes by what
             the data say; NaN for the others.
+        believed: (e, n) of effects before any torque, see `ThetaKnowledge`; NaN without belief.
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
@@ -167,11 +168,11 @@ class Theta:
         self.body_spread = np.ones(self.bodies)
         self.effect_spread = np.array([effect.learned_std for effect in self.effects])
         nothing: Array = np.full((e, n), np.nan)
-        self._believed, self._belief_std = known.believed or (nothing, nothing)
+        self.believed = known.believed or (nothing, nothing)
         self._set_prior(*self._neutral_prior())
         self.x, self.gradient = np.zeros((2, self.P))
         self.x[: self._effects_from] = np.tile(log_cholesky_from_theta(neutral_body()), self.bodies)
-        self.x[self._effects_from :] = np.nan_to_num(self._believed).ravel() / self.rows.steps
+        self.x[self._effects_from :] = np.nan_to_num(self.believed[0]).ravel() / self.rows.steps
         self.mean, self.th = self.x.copy(), np.zeros(self.P)
         values(self.mean, self.rows.steps, self.th)
         if known.base is None and not tree.floating:
@@ -196,12 +197,12 @@ class Theta:
         """Information of the prior: bodies and effects; the spare body waits without one."""
         std = np.full(self.P, np.inf)
         std[: self.spare.start] = np.outer(self.body_spread[:-1], PRIOR_STD).ravel()
-        told = np.isfinite(self._believed)
-        spread = np.where(told, self._belief_std, self.effect_spread[:, None])
+        told = np.isfinite(self.believed[0])
+        spread = np.where(told, self.believed[1], self.effect_spread[:, None])
         std[self._effects_from :] = spread.ravel()
         mean = np.zeros(self.P)
         mean[: self.spare.start] = np.tile(neutral_body(), self.bodies - 1)
-        mean[self._effects_from :] = np.nan_to_num(self._believed).ravel()
+        mean[self._effects_from :] = np.nan_to_num(self.believed[0]).ravel()
         information = 1.0 / std**2
         return np.diag(information), information * mean
 
@@ -407,6 +408,11 @@ class Theta:
             rhs[:10] += wrench[:, -1] - wrench[:, 10:-1] @ self.th[self.rows.base_place[10:]]
         return H, rhs
 
+    def told_before(self) -> tuple[Array, Array]:
+        """Information (P, P), right side (P,) of data from before the last change at the hand."""
+        neutral, neutral_rhs = self._neutral_prior()
+        return self.prior - neutral, self.prior_rhs - neutral_rhs
+
     def data_information(self, A: Array, weights: Array) -> tuple[Array, Array]:
         """(P, P) and (P,) of what joints' torques alone tell.
 
@@ -477,7 +483,7 @@ class Theta:
         n = self.tree.n
         variance = diagonal[self._effects_from :].reshape(-1, n)
         widest = np.array([effect.learned_std for effect in self.effects])
-        values, free = self.effect_values, np.isnan(self._believed)
+        values, free = self.effect_values, np.isnan(self.believed[0])
         shares = [
             self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
         ]
@@ -664,6 +670,21 @@ class Theta:
         """(bodies, 10) inertial parameters in use, the base first if it floats; the hand's with
         whatever it carries."""
         return self.th[: self._effects_from].reshape(-1, 10)[self.in_use]
+
+    def theta_given(self, effects: Array) -> tuple[Array, Array]:
+        """The bodies in use that go with other parameters (e, n) of the effects.
+
+        They take over what the effects say less, as far as data do not tell the two apart.
+
+        Returns:
+            θ (bodies, 10), which need not be possible, and their information (10 bodies, 10 bodies)
+            where all else stands still.
+        """
+        H, own = self.information()[0], slice(self._effects_from, None)
+        at = (10 * self.in_use[:, None] + np.arange(10)).ravel()
+        less, H_own = self.th[own] - effects.ravel(), H[np.ix_(at, at)]
+        bodies = self.th[at] + np.linalg.solve(H_own, H[at, own] @ less)
+        return bodies.reshape(-1, 10), H_own
 
     @property
     def payload(self) -> tuple[Array, Array] | None:

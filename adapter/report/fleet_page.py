@@ -11,7 +11,6 @@ from adapter.effects.catalogue import CATALOGUE
 from adapter.report.fleet_words import (
     EPOCH_S,
     HEADS,
-    effect_std,
     log_cells,
     sentences,
     summary,
@@ -56,7 +55,7 @@ def _parameters(arm: FleetArm) -> Table:
     """What is learned of each joint and of the link that it moves; θ whole is in the model file."""
     heads = ["joint", "mass of its link", *(CATALOGUE[name].title for name in arm.effects)]
     units = ["", "kg", *(CATALOGUE[name].parameters[0].written for name in arm.effects)]
-    std = effect_std(arm)
+    std = arm.outcome.effects_std
     links = len(arm.model.theta) - arm.model.tree.n  # a base that floats comes first
     rows = []
     for j, name in enumerate(arm.model.tree.joint_names):

@@ -12,7 +12,6 @@ import numpy as np
 
 from adapter.effects.catalogue import CATALOGUE
 from adapter.model.numbers import plus_minus
-from adapter.model.spatial import Array
 from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift, StandsOut
 from adapter.runs.fleet.fleet import Fleet
@@ -132,7 +131,7 @@ def as_json(found: Fleet) -> dict[str, Any]:
 
 
 def _arm_json(arm: FleetArm) -> dict[str, Any]:
-    std = effect_std(arm)
+    std = arm.outcome.effects_std
     return {
         "name": arm.name,
         "theta": arm.model.theta,
@@ -163,9 +162,3 @@ def _arm_json(arm: FleetArm) -> dict[str, Any]:
         ],
         "notes": sentences(arm),
     }
-
-
-def effect_std(arm: FleetArm) -> Array:
-    """(e, n) standard deviations of what is learned beside θ."""
-    effects = arm.outcome.effects
-    return np.asarray(arm.std[len(arm.std) - effects.size :].reshape(effects.shape))

@@ -34,7 +34,7 @@ def headline(data: RunData, worth: Worth) -> list[str]:
     found = [
         *_tracking(worth),
         *_torque(data, worth),
-        *_loads(worth),
+        *_loads(data, worth),
         *_hand(data, worth),
         *_trouble(data.figures),
     ]
@@ -97,12 +97,16 @@ def _all_joints(values: Any, std: Any) -> str:
     return f"{with_doubt(size, spread)} N m".replace(" ", NARROW)
 
 
-def _loads(worth: Worth) -> list[str]:
+def _loads(data: RunData, worth: Worth) -> list[str]:
     said = [
         f"A load of {with_doubt(mass, std)} kg was noticed at the hand "
-        f"{quantity(at_s, 's')} after the first motion.".replace(" kg", f"{NARROW}kg")
+        f"{quantity(at_s, 's')} after the first motion."
         for at_s, mass, std in worth.loads
     ]
+    if held := data.figures["theta"].get("held"):
+        mass = with_doubt(held["m"], held["m_std"])
+        said.insert(0, f"The hand carries {mass} kg beside the documented arm from the start.")
+    said = [text.replace(" kg", f"{NARROW}kg") for text in said]
     more = len(said) - MANY_LOADS
     return [*said[:MANY_LOADS], *([f"{more} more changes of load follow."] if more > 0 else [])]
 

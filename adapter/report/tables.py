@@ -12,6 +12,7 @@ import numpy as np
 from adapter.effects.active import active_effects
 from adapter.effects.base import ALL
 from adapter.gap.phrases import SHOWN_UNITS
+from adapter.judgement.priors import is_shown
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH
 from adapter.report.torque_panels import SHARE_ALONE, theta_started
@@ -129,7 +130,9 @@ def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
             head = effect.name.replace("_", " ").capitalize()
             column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * data.n)
             std = active.std.get(key)
-            shown = with_doubt(factor * value, None if std is None else factor * std)
+            shown = "not shown"
+            if is_shown(effect.name, std):
+                shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown
     return [(head, unit, cells) for (head, unit), cells in columns.items()]

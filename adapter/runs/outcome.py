@@ -9,11 +9,17 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
-from adapter.effects.catalogue import effects_by_name
+from adapter.effects.catalogue import CATALOGUE, effects_by_name
 from adapter.errors import ModelError
-from adapter.learning.batch.theta_filling import filled_theta, filled_words, told_basis
+from adapter.learning.batch.theta_filling import (
+    filled_theta,
+    filled_words,
+    possible_theta,
+    told_basis,
+)
 from adapter.learning.frame_fit import Frame, nearest, profiled_weights
 from adapter.learning.learner import NOT_ASKED, OnlineLearner, TorqueVerdict
+from adapter.learning.posterior import Load
 from adapter.learning.settings import LearnerSettings
 from adapter.model.inertia import body_from_theta, min_eigenvalue
 from adapter.model.self_model import LAMBDA_MEASURED, LAMBDA_REPRODUCED, SelfModel
@@ -22,7 +28,6 @@ from adapter.model.tree import Tree
 from adapter.physics.freedom import Freedom
 from adapter.physics.identifiability import (
     BaseParameters,
-    base_parameters,
     random_regressor,
 )
 from adapter.signals.records import LinkMotionKind
@@ -43,15 +48,18 @@ class Outcome:
         lam_restarts: joints that λ was started anew for, out of a wrong valley.
         lam_notes: what is wrong with sensors on links, a sentence each.
         lam_moments: (n, 3, 15, 15) that λ was learned from, of lam_count samples.
-        theta: (bodies, 10), the base first if it floats; effects: (e, n).
+        theta: (bodies, 10) as learned, the base first if it floats, with these effects.
+        effects, effects_std: (e, n) as the posterior has them.
         shapes: (e, n) of the effects that have several (`LearnedEffect`), NaN for the others.
         variance: (n,) of the residual torque, (N m)².
         theta_started_ns: stamp of the first state θ learned from, None before.
         theta_excess: torque error of θ over that of batch least squares on the same data, rms over
             the joints; theta_settled: it is inside the goal, or the learner says so.
         theta_information: (10 bodies, 10 bodies) that data have on θ, see `Theta.told_by_data`.
-        covariance, least_squares: (P, P), (P,) of the flat parameters; `spare_in_use` as there.
-        payload: (theta (10,), covariance (10, 10)) of what the hand carries since a change.
+        covariance: (10 bodies, 10 bodies) of θ by the posterior.
+        least_squares: (P,) of the learner's flat parameters.
+        held: (theta (10,), covariance (10, 10)) of what the hand carries from the first sample on,
+            beside the documented arm; payload: since a change.
         schema_trace: rows [stamp ns, λ]; theta_trace: rows [stamp ns, θ and effects].
         schema_known: (k, n + 1) of the rows of schema_trace: directions known by joint, and
             whether λ was said to have converged. lam_information: (n, 6, 6) at last.
@@ -80,6 +88,7 @@ class Outcome:
     lam_count: float
     theta: Array
     effects: Array
+    effects_std: Array
     shapes: Array
     variance: Array
     theta_started_ns: int | None
@@ -88,8 +97,8 @@ class Outcome:
     theta_information: Array
     covariance: Array
     least_squares: Array
-    spare_in_use: bool
-    payload: tuple[Array, Array] | None
+    held: Load
+    payload: Load | None
     changes_ns: tuple[int, ...]
     rebuilds: int
     schema_trace: Array
@@ -118,6 +127,8 @@ def collect(learner: OnlineLearner) -> Outcome:
     eigenvalues = min_eigenvalue(np.concatenate([traced, theta.theta]))
     batch, started = theta.least_squares(), learner.theta_started_ns is not None
     excess = float(np.sqrt(np.mean(theta.variance() / theta.variance(batch))))
+    known = learner.posterior()
+    bodies, information = theta.theta_given(known.effects)
     return Outcome(
         learned=learner.learned,
         updates=schema.updates,
@@ -132,18 +143,19 @@ def collect(learner: OnlineLearner) -> Outcome:
         lam_notes=tuple(schema.notes),
         lam_moments=schema.moments.M.copy(),
         lam_count=schema.count,
-        theta=theta.theta,
-        effects=theta.effect_values.copy(),
+        theta=possible_theta(bodies, theta.theta, information),
+        effects=known.effects,
+        effects_std=known.std,
         shapes=theta.shapes.copy(),
         variance=theta.variance(),
         theta_started_ns=learner.theta_started_ns,
         theta_excess=excess,
         theta_settled=started and (learner.theta_converged or excess <= TORQUE_GOAL),
         theta_information=theta.told_by_data(),
-        covariance=theta.covariance(),
+        covariance=known.covariance,
         least_squares=batch,
-        spare_in_use=theta.spare_in_use,
-        payload=theta.payload,
+        held=known.held,
+        payload=known.payload,
         changes_ns=tuple(change.stamp_ns for change in learner.changes),
         rebuilds=learner.rebuilds,
         schema_trace=_course_of_lam(learner),
@@ -208,11 +220,10 @@ def completed_theta(
         θ, (10 bodies, rank) the basis of what is learned of it, and what is to be said of it, for
         the model's provenance.
     """
-    size = documented.theta.size
+    size, basis = documented.theta.size, told_parameters(outcome, documented).basis
     if outcome.theta_started_ns is None:
         said = {"theta_source": "documentation: λ had not converged", "theta_converged": False}
-        return documented.theta, np.zeros((size, 0)), said
-    basis = told_basis(outcome.theta_information, documented.theta)
+        return documented.theta, basis, said
     wrench, count = outcome.settings.base_wrench, 4 * size
     _, table = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
     table, notes = table.reshape(-1, size), []
@@ -237,6 +248,18 @@ def completed_theta(
     return theta, basis, said | ({"theta_note": "; ".join(notes)} if notes else {})
 
 
+def told_parameters(outcome: Outcome, documented: SelfModel) -> BaseParameters:
+    """The combinations of θ that these data told, see `told_basis`; none before θ was learned.
+
+    What the page, the figures and the model file call learned is in them.
+    """
+    theta = with_bodies(documented).theta
+    if outcome.theta_started_ns is None:
+        return BaseParameters(0, np.zeros((theta.size, 0)))
+    basis = told_basis(outcome.theta_information, theta)
+    return BaseParameters(basis.shape[1], basis)
+
+
 def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) -> SelfModel:
     """The self model a run ends with, as it leaves the house: what was learned, and what no data
     showed as the documentation has it, which is said.
@@ -252,7 +275,6 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     variance = np.einsum("jaa->ja", outcome.lam_covariance)
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
     lam, filled = completed_lambda(outcome, documented)
-    base = shown_parameters(outcome, documented, lam)
     known = outcome.theta_started_ns is not None
     theta, basis, said = completed_theta(outcome, documented, lam)
     share = np.einsum("ab,ab->a", basis, basis).reshape(-1, 10)
@@ -264,7 +286,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
-        theta_std=_shown_std(outcome, base) if known else np.full((bodies, 10), np.nan),
+        theta_std=_shown_std(outcome, documented) if known else np.full((bodies, 10), np.nan),
         theta_identifiable=share > SHOWN_SHARE,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
@@ -277,37 +299,27 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     )
 
 
-def _shown_std(outcome: Outcome, base: BaseParameters) -> Array:
-    """Standard deviations (bodies, 10) of what torques show of θ; the rest is documentation."""
-    used = np.arange(len(base.basis) // 10)
-    used[-1] += outcome.spare_in_use
-    at = (10 * used[:, None] + np.arange(10)).ravel()
-    shown = base.shown_map()
-    variance = np.einsum("ai,ij,aj->a", shown, outcome.covariance[np.ix_(at, at)], shown)
+def _shown_std(outcome: Outcome, documented: SelfModel) -> Array:
+    """Standard deviations (bodies, 10) of what torques told of θ; the rest is documentation."""
+    shown = told_parameters(outcome, documented).shown_map()
+    variance = np.einsum("ai,ij,aj->a", shown, outcome.covariance, shown)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))).reshape(-1, 10)
-
-
-def shown_parameters(outcome: Outcome, documented: SelfModel, lam: Array) -> BaseParameters:
-    """What of θ the torques that were learned from can show."""
-    wrench = outcome.settings.base_wrench
-    return base_parameters(documented.tree, lam, documented.gravity, wrench=wrench)
 
 
 def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
     """Entries of the model file, one per effect and joint."""
     entries, n = [], tree.n
-    std = np.sqrt(outcome.covariance.diagonal()[10 * (tree.bodies + 1) :]).reshape(-1, n)
     for k, effect in enumerate(effects_by_name(outcome.settings.effects)):
         for j in range(n):
+            value, shape = float(outcome.effects[k, j]), float(outcome.shapes[k, j])
+            name, parameters = effect.learned_as(value, shape)
             entries.append(
                 {
-                    "effect": effect.name,
+                    "effect": name,
                     "joints": [j + 1],
-                    "parameters": effect.numbers(
-                        float(outcome.effects[k, j]), float(outcome.shapes[k, j])
-                    ),
-                    "std": {effect.key: float(std[k, j])},
-                    "units": effect.units(),
+                    "parameters": parameters,
+                    "std": {effect.key: float(outcome.effects_std[k, j])},
+                    "units": CATALOGUE[name].units(),
                 }
             )
     return entries
@@ -323,18 +335,22 @@ def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, An
     return found
 
 
-def changes_at(
-    stamps_ns: Sequence[int], payload: tuple[Array, Array] | None
-) -> list[dict[str, Any]]:
-    """Changes at the hand, with what the last one brought (payload in the last link's frame)."""
+def changes_at(stamps_ns: Sequence[int], payload: Load | None) -> list[dict[str, Any]]:
+    """Changes at the hand, with what the last one brought."""
     found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in stamps_ns]
     if found and payload is not None:
-        theta, covariance = payload
-        found[-1]["payload"] = {"m": float(theta[0]), "m_std": float(np.sqrt(covariance[0, 0]))}
-        if theta[0] > 0.0:
-            _, centre, _ = body_from_theta(theta)
-            found[-1]["payload"].update(zip(("cx", "cy", "cz"), map(float, centre), strict=True))
+        found[-1]["payload"] = told_load(payload)
     return found
+
+
+def told_load(load: Load) -> dict[str, float]:
+    """Mass, kg, and centre, m, of a load in the last link's frame."""
+    theta, covariance = load
+    told = {"m": float(theta[0]), "m_std": float(np.sqrt(covariance[0, 0]))}
+    if theta[0] > 0.0:
+        _, centre, _ = body_from_theta(theta)
+        told.update(zip(("cx", "cy", "cz"), map(float, centre), strict=True))
+    return told
 
 
 def frame_errors(lam: Array, reference: Array, freedom: Freedom) -> tuple[Array, Array]:

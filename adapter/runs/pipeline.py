@@ -45,6 +45,7 @@ def make_front_end(documented: SelfModel, settings: PipelineSettings) -> FrontEn
 def make_learner(documented: SelfModel, settings: PipelineSettings) -> OnlineLearner:
     """The learner of a pipeline with these settings; it takes over the effects of the model."""
     front_end = make_front_end(documented, settings)
+    own = front_end.filter.settings
     whole = with_bodies(documented)
     known = lasting_effects(whole.effects, whole.tree.n)
     tool = documented.tool
@@ -52,11 +53,14 @@ def make_learner(documented: SelfModel, settings: PipelineSettings) -> OnlineLea
         documented.tree,
         documented.gravity,
         settings.learner,
-        Filtered(front_end.filter.noise_gain, front_end.delay_s),
+        Filtered(
+            front_end.filter.noise_gain, front_end.delay_s, own.step_s * own.samples_per_state
+        ),
         KnownArm(
             tool_theta=None if tool is None else tool.theta(),
             effects=known,
             arm=None if whole is documented and not known else RigidArm.of(whole),
             lam=documented.lam,
+            theta=whole.theta[-documented.tree.n :],
         ),
     )

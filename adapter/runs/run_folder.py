@@ -17,7 +17,7 @@ from adapter.errors import ModelError
 from adapter.model.model_file import load_model, save_model, whole_file
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.runs.outcome import Outcome, learned_model, shown_parameters
+from adapter.runs.outcome import Outcome, learned_model, told_parameters
 from adapter.runs.score import Reference, ScoreRows, course_errors, stamps_s
 from adapter.runs.terminal import json_text
 from drivers.files.bounded import parse_json, read_arrays, read_text
@@ -181,7 +181,7 @@ def run_data(
     if reference is not None:
         errors[:] = course_errors(outcome, documented, reference)
     model = learned_model(outcome, documented)
-    basis = shown_parameters(outcome, documented, model.lam).basis
+    basis = told_parameters(outcome, documented).basis
     shown, first = np.einsum("ab,ab->a", basis, basis), int(documented.tree.floating)
     return RunData(
         figures=dict(figures),

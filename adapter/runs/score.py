@@ -26,12 +26,14 @@ from adapter.runs.outcome import (
     changes_at,
     completed_lambda,
     frame_errors,
-    shown_parameters,
+    told_load,
+    told_parameters,
 )
 from drivers.files.bounded import parse_json, read_text
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_WINDOW_S = 2.0
+SHOWN_STDS = 3.0  # standard deviations of its mass: a load is there
 
 
 @dataclass(frozen=True)
@@ -227,13 +229,12 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
     Convergence is judged up to the first change at the hand: prequential torque error against
     the batch solution's on the same samples, joints in units of their noise.
     """
-    lam, _ = completed_lambda(outcome, documented)
-    base = shown_parameters(outcome, documented, lam)
+    held = told_load(outcome.held)
     score: dict[str, Any] = {
         "converged_s": None,
         "settled": outcome.theta_settled,
         "excess": outcome.theta_excess,
-        "base_parameters": base.rank,
+        "base_parameters": told_parameters(outcome, documented).rank,
         "torque_rmse_nm": [],
         "validation_torque_rmse_nm": None,
         "min_pseudo_inertia_eigenvalue": outcome.min_eigenvalue,
@@ -242,6 +243,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
             for k, effect in enumerate(effects_by_name(outcome.settings.effects))
         },
         "changes": changes_at(outcome.changes_ns, outcome.payload),
+        "held": held if held["m"] > SHOWN_STDS * held["m_std"] else None,
         "rebuilds": outcome.rebuilds,
         "started_s": None,
         "values": outcome.theta.tolist(),

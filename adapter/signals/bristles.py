@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.effects.by_joint import WAYS_RAD
+from adapter.effects.by_joint import SMOOTHING_DQ, WAYS_RAD
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 
@@ -29,7 +29,7 @@ class Bristles(NamedTuple):
     Attributes:
         place: (n,) rad, of now; NaN before the first sample.
         edge, direction: (n,) rad, and -1, 0 or 1: the farthest place on the way that it goes.
-        held: (K, n) how far they are bent at the edge.
+        held: (K, n) how far they are bent at the edge; nobody asks for those that slide at once.
     """
 
     place: Array
@@ -56,7 +56,8 @@ def wind(dt_s, q, dq, bristles, bent):
         place[j] = went + follow * (q[j] - went)
         way = place[j] - edge[j]
         to = np.sign(way)
-        for k in range(held.shape[0]):
+        bent[j] = math.tanh(dq[j] / SMOOTHING_DQ)
+        for k in range(1, held.shape[0]):
             bent[k * n + j] = to + (held[k, j] - to) * math.exp(-abs(way) / WAYS_RAD[k])
         if to == direction[j] or abs(way) > BACK_RAD:
             edge[j], direction[j] = place[j], to

@@ -414,7 +414,7 @@ def test_columns_are_the_laws_derivative(name: str) -> None:
     column = effect.torque_per_unit(at, shape)
     np.testing.assert_allclose(column, effect.basis(at)[2 if effect.shapes else 0])
     if isinstance(effect, JointTorque):
-        values = {effect.key: np.full(N, 2.0), effect.shape_key: shape}
+        values = {**effect.absent(N), effect.key: np.full(N, 2.0), effect.shape_key: shape}
         np.testing.assert_allclose(effect.law(at, values), 2.0 * column)
 
 

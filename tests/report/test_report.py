@@ -86,13 +86,14 @@ def with_figures(data: RunData, **more) -> RunData:
     return replace(data, figures={**data.figures, **more})
 
 
-def test_page_has_all_sections_and_is_small(page: str) -> None:
+def test_page_has_all_sections_and_is_small(page: str, data: RunData) -> None:
     assert re.findall(r'<(?:section|footer) id="(\w+)"', page) == SECTIONS.split()
     assert len(page.encode()) < MOST_BYTES
     # what it is worth; 4 of λ, 3 views, 7 bodies and 1 effect, 2 prequential, 7 joints
     assert page.count("<svg") == 1 + 4 + 3 + 7 + 1 + 2 + 7
     assert "36 of 42 directions" in page
-    assert "43 combinations of 70 parameters" in page
+    rank = data.figures["theta"]["base_parameters"]  # 43 can be told by any motion
+    assert 30 <= rank <= 43 and f"{rank} combinations of 70 parameters" in page
 
 
 def test_page_fetches_nothing(page: str) -> None:

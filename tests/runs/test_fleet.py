@@ -93,8 +93,10 @@ def the_arm(found: Fleet, name: str = "A-1") -> FleetArm:
 
 def off(ours: FleetArm, theirs: FleetArm) -> float:
     """Largest difference of two solutions in standard deviations."""
-    known = theirs.std > 0.0
-    return float(np.max(np.abs(ours.solution - theirs.solution)[known] / theirs.std[known]))
+    outcome = theirs.outcome
+    std = np.r_[np.sqrt(outcome.covariance.diagonal()), np.zeros(10), outcome.effects_std.ravel()]
+    known = std > 0.0
+    return float(np.max(np.abs(ours.solution - theirs.solution)[known] / std[known]))
 
 
 def test_logs_are_told_apart_and_broken_ones_said(fleet: Fleet) -> None:
@@ -161,7 +163,8 @@ def test_sums_are_those_of_one_pass(fleet: Fleet, logs: Path, tmp_path: Path) ->
     basis = base_parameters(model.tree, model.lam, model.gravity).basis
     of_effects = np.eye(len(ours.solution))[:, 80:]
     shown = np.column_stack([np.vstack([basis, np.zeros((len(of_effects) - 70, 43))]), of_effects])
-    std = np.sqrt(np.einsum("ab,ac,cb->b", shown, ours.outcome.covariance, shown))
+    of_basis = np.sqrt(np.einsum("ab,ac,cb->b", basis, ours.outcome.covariance, basis))
+    std = np.concatenate([of_basis, ours.outcome.effects_std.ravel()])
     apart = np.abs(shown.T @ (ours.solution - once.solution)) / std
     assert np.max(apart) < 1e-9
     sure = ours.model.theta_std > 1e-6  # below that is what rounding leaves of a zero

@@ -22,7 +22,12 @@ from adapter.learning.batch.conic import (
     nonnegative,
     solve_conic,
 )
-from adapter.model.inertia import PARAMETERS, pseudo_inertia, theta_from_pseudo_inertia
+from adapter.model.inertia import (
+    PARAMETERS,
+    is_consistent,
+    pseudo_inertia,
+    theta_from_pseudo_inertia,
+)
 from adapter.model.spatial import Array
 
 KEPT = 0.05  # of a documented body that is left of it at least, where what was learned allows it
@@ -89,6 +94,20 @@ def filled_theta(learned: Array, told: Array, basis: Array, regressor: Array) ->
     if least <= 0.0:
         raise ModelError(UNSOLVED)
     return FilledTheta(measure.theta(share), least, True)
+
+
+def possible_theta(learned: Array, told: Array, information: Array) -> Array:
+    """θ (bodies, 10) itself if its bodies are possible, else the nearest ones by what data tell.
+
+    Args:
+        learned: (bodies, 10); told: some that are possible, by which nearness is measured.
+        information: (10 bodies, 10 bodies) that data have on θ.
+    """
+    if is_consistent(learned):
+        return learned
+    worth, ways = np.linalg.eigh(information)
+    root, measure = (ways * np.sqrt(np.maximum(worth, 0.0))).T, Measure(told)
+    return _nearest_by_torque(measure, measure.of(learned), root).theta
 
 
 def told_basis(information: Array, told: Array) -> Array:

@@ -78,7 +78,7 @@ class FleetArm:
         name: of the arm.
         model: learned from all recordings that agree, where these are the most.
         outcome: of the learner, for whatever reads those.
-        solution, std: (P,) (θ, effects) and standard deviations, before bodies are made possible.
+        solution: (P,) (θ, effects), before bodies are made possible.
         effects: names of what was learned beside θ.
         logs: in the order of their begin.
         drifts: the clearest first.
@@ -89,7 +89,6 @@ class FleetArm:
     model: SelfModel
     outcome: Outcome
     solution: Array
-    std: Array
     effects: tuple[str, ...]
     logs: tuple[OfLog, ...]
     drifts: tuple[Drift, ...]
@@ -159,9 +158,9 @@ def learn_arm(
     learner.learned = sum(x.samples for x in used)
     theta, outcome, effects = learner.theta, collect(learner), effects_for(documented)
     model = learned_model(outcome, documented, fleet=[x.path for x in used])
-    solution, std = theta.th.copy(), np.sqrt(np.diagonal(theta.covariance()))
     drifts, out = courses(_series(logs, effects), _columns(logs, told or {}))
-    return FleetArm(name, model, outcome, solution, std, effects, logs, tuple(drifts), tuple(out))
+    solution = theta.th.copy()
+    return FleetArm(name, model, outcome, solution, effects, logs, tuple(drifts), tuple(out))
 
 
 def _learned(
