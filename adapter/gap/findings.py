@@ -223,27 +223,27 @@ def _with_rests(fit: Fit, findings: list[Finding]) -> list[Finding]:
 
     What any arm has are springs that rest at zero, and offsets (`real_arm`).
     """
-    springs = {(f.joints, f.interval_s): f for f in findings if f.effect == SPRING}
-    offsets = {
-        (f.joints, f.interval_s): f
-        for f in findings
-        if f.effect == OFFSET and (f.joints, f.interval_s) in springs
-    }
-    springs_at = [e.candidate for e in fit.named if e.assumed and e.candidate.effect.name == SPRING]
-    assumed = {candidate.joint + 1 for candidate in springs_at}
-    out = []
-    for f in findings:
-        at = f.joints, f.interval_s
-        if at in offsets and f.joints[0] in assumed:
-            if f.effect == OFFSET:
-                continue
-            if f.effect == SPRING:
-                k, o = f.parameters["k"], offsets[at].parameters["o"]
-                std = math.hypot(offsets[at].std["o"], o / k * f.std["k"]) / abs(k)
-                parameters = {**f.parameters, "q0": f.parameters["q0"] - o / k}
-                f = replace(f, parameters=parameters, std={**f.std, "q0": std})
-        out.append(f)
-    return out
+    named = [e.candidate for e in fit.named if e.assumed]
+    at_zero = {(c.joint + 1,) for c in named if c.effect.name == SPRING}
+    springs = {_where(f) for f in findings if f.effect == SPRING and f.joints in at_zero}
+    offsets = {_where(f): f for f in findings if f.effect == OFFSET and _where(f) in springs}
+    rest = [f for f in findings if f.effect != OFFSET or _where(f) not in offsets]
+    return [
+        _resting(f, offsets[_where(f)]) if f.effect == SPRING and _where(f) in offsets else f
+        for f in rest
+    ]
+
+
+def _where(finding: Finding) -> tuple[tuple[int, ...], tuple[float, float]]:
+    return finding.joints, finding.interval_s
+
+
+def _resting(spring: Finding, offset: Finding) -> Finding:
+    """A spring and an offset as one spring."""
+    k, o = spring.parameters["k"], offset.parameters["o"]
+    std = math.hypot(offset.std["o"], o / k * spring.std["k"]) / abs(k)
+    parameters = {**spring.parameters, "q0": spring.parameters["q0"] - o / k}
+    return replace(spring, parameters=parameters, std={**spring.std, "q0": std})
 
 
 def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, float]:

@@ -45,7 +45,8 @@ COULOMB, OFFSET = CATALOGUE["coulomb_friction"], CATALOGUE["torque_offset"]
 BRISTLES = CATALOGUE["bristle_friction"]
 EVERYWHERE = (BRISTLES, OFFSET)
 SPRING = CATALOGUE["joint_spring"]
-WHERE_IT_MOVES = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"], SPRING)
+DRIVEN = (CATALOGUE["viscous_friction"], CATALOGUE["motor_inertia"])
+WHERE_IT_MOVES = (*DRIVEN, SPRING)
 USUAL = {BRISTLES: 1}  # of the templates: bristles of a Panda
 # Of the whole arm: what its torques lack of the motion's band, and a table that is not level
 OF_THE_WHOLE = (CATALOGUE["torque_filter"], CATALOGUE["base_tilt"])
@@ -145,10 +146,9 @@ def as_driven(fit: Fit, joints: Sequence[int], first: Sequence[Named]) -> Fit:
     Args:
         joints: (from 0) that move.
     """
-    fit = _beside(fit.with_named(first), joints)
+    fit = _beside(fit.with_named(first), joints, DRIVEN)
     at_once = [_assumed(COULOMB, j) for j in joints]
-    own = [e for e in fit.named if e.candidate.effect is not SPRING or not e.assumed]
-    return fit.with_named([*own, *at_once])
+    return fit.with_named([*fit.named, *at_once])
 
 
 def load_in(fit: Fit, recording: int | None) -> Named:
@@ -225,11 +225,11 @@ def _assumed(effect: Effect, joint: int) -> Named:
     return replace(_named(effect, template, joint), assumed=True)
 
 
-def _beside(fit: Fit, joints: Sequence[int]) -> Fit:
+def _beside(fit: Fit, joints: Sequence[int], moving: Sequence[Effect] = WHERE_IT_MOVES) -> Fit:
     """With dry friction and offsets of all torques and what joints (from 0) that move have."""
     own = [
         _assumed(effect, j)
-        for effects, where in ((EVERYWHERE, sorted(fit.heard)), (WHERE_IT_MOVES, joints))
+        for effects, where in ((EVERYWHERE, sorted(fit.heard)), (moving, joints))
         for effect in effects
         for j in where
     ]

@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.catalogue import LEARNED
 from adapter.model.link_checks import made_up
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import LOAD_STD
@@ -38,9 +39,10 @@ SHOWN_SHARE = 0.5  # of its prior's standard deviation: what is known no better 
 SPREAD, LIGHT_KG, SMALL_M, CENTRE_M = 0.25, 0.1, 0.05, 0.1  # of `documented_std`
 
 
-def is_shown(effect: str, std: float | None) -> bool:
-    """Whether data told an effect's parameter, and not its prior alone."""
-    return std is None or std < SHOWN_SHARE * EFFECT_STD.get(effect, np.inf)
+def is_shown(effect: str, key: str, std: float | None) -> bool:
+    """Whether data told a parameter of an effect, and not its prior alone."""
+    known = effect in EFFECT_STD and key == LEARNED[effect].key
+    return std is None or not known or std < SHOWN_SHARE * EFFECT_STD[effect]
 
 
 def prior_std(theta: Array, share: float = DOCUMENTED_SHARE) -> Array:

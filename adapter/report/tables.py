@@ -131,7 +131,7 @@ def _effect_columns(data: RunData) -> list[tuple[str, str, list[str]]]:
             column = columns.setdefault((head, f"{key}, {unit}"), [DASH] * data.n)
             std = active.std.get(key)
             shown = "not shown"
-            if is_shown(effect.name, std):
+            if is_shown(effect.name, key, std):
                 shown = with_doubt(factor * value, None if std is None else factor * std)
             for j in joints:
                 column[j] = shown

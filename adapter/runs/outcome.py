@@ -56,7 +56,7 @@ class Outcome:
         theta_excess: torque error of θ over that of batch least squares on the same data, rms over
             the joints; theta_settled: it is inside the goal, or the learner says so.
         theta_information: (10 bodies, 10 bodies) that data have on θ, see `Theta.told_by_data`.
-        covariance: (10 bodies, 10 bodies) of θ by the posterior.
+        covariance: (10 bodies, 10 bodies) of θ, see `LearnedPosterior`.
         least_squares: (P,) of the learner's flat parameters.
         held: (theta (10,), covariance (10, 10)) of what the hand carries from the first sample on,
             beside the documented arm; payload: since a change.
@@ -206,24 +206,23 @@ def completed_lambda(outcome: Outcome, documented: SelfModel) -> tuple[Array, li
 
 
 def completed_theta(
-    outcome: Outcome, documented: SelfModel, lam: Array
-) -> tuple[Array, Array, dict[str, Any]]:
+    outcome: Outcome, documented: SelfModel, lam: Array, basis: Array
+) -> tuple[Array, dict[str, Any]]:
     """The learned θ (bodies, 10) with what torques did not show taken from the documentation.
 
     Torques over the motion that was learned from stay what they were but for noise, unless no
     possible bodies have them.
 
     Args:
-        lam: (n, 6) λ as it leaves the house.
+        lam: (n, 6) λ as it leaves the house; basis: of what data told, see `told_parameters`.
 
     Returns:
-        θ, (10 bodies, rank) the basis of what is learned of it, and what is to be said of it, for
-        the model's provenance.
+        θ, and what is to be said of it, for the model's provenance.
     """
-    size, basis = documented.theta.size, told_parameters(outcome, documented).basis
     if outcome.theta_started_ns is None:
         said = {"theta_source": "documentation: λ had not converged", "theta_converged": False}
-        return documented.theta, basis, said
+        return documented.theta, said
+    size = documented.theta.size
     wrench, count = outcome.settings.base_wrench, 4 * size
     _, table = random_regressor(documented.tree, lam, documented.gravity, count, wrench=wrench)
     table, notes = table.reshape(-1, size), []
@@ -245,7 +244,7 @@ def completed_theta(
             why = "no possible bodies have what was learned; the nearest are off by"
             notes.append(f"{why} {off:.2g} N m rms")
         theta = found.theta
-    return theta, basis, said | ({"theta_note": "; ".join(notes)} if notes else {})
+    return theta, said | ({"theta_note": "; ".join(notes)} if notes else {})
 
 
 def told_parameters(outcome: Outcome, documented: SelfModel) -> BaseParameters:
@@ -276,8 +275,9 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     shown = np.einsum("jaa->ja", outcome.lam_identifiable) > SHOWN_SHARE
     lam, filled = completed_lambda(outcome, documented)
     known = outcome.theta_started_ns is not None
-    theta, basis, said = completed_theta(outcome, documented, lam)
-    share = np.einsum("ab,ab->a", basis, basis).reshape(-1, 10)
+    told = told_parameters(outcome, documented)
+    theta, said = completed_theta(outcome, documented, lam, told.basis)
+    share = np.einsum("ab,ab->a", told.basis, told.basis).reshape(-1, 10)
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -286,7 +286,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
-        theta_std=_shown_std(outcome, documented) if known else np.full((bodies, 10), np.nan),
+        theta_std=_shown_std(outcome, told) if known else np.full((bodies, 10), np.nan),
         theta_identifiable=share > SHOWN_SHARE,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
@@ -299,9 +299,9 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     )
 
 
-def _shown_std(outcome: Outcome, documented: SelfModel) -> Array:
+def _shown_std(outcome: Outcome, told: BaseParameters) -> Array:
     """Standard deviations (bodies, 10) of what torques told of θ; the rest is documentation."""
-    shown = told_parameters(outcome, documented).shown_map()
+    shown = told.shown_map()
     variance = np.einsum("ai,ij,aj->a", shown, outcome.covariance, shown)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0))).reshape(-1, 10)
 

@@ -14,6 +14,7 @@ from adapter.effects.active import with_bodies
 from adapter.effects.by_joint import WAYS_RAD, JointSignals
 from adapter.effects.catalogue import effects_by_name
 from adapter.errors import ModelError
+from adapter.gap.load import SHOWN
 from adapter.model.model_file import load_model
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
@@ -33,7 +34,6 @@ from drivers.files.bounded import parse_json, read_text
 
 ROTATION_GOAL_RAD, POSITION_GOAL_M = 0.01, 0.005
 TORQUE_WINDOW_S = 2.0
-SHOWN_STDS = 3.0  # standard deviations of its mass: a load is there
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
             for k, effect in enumerate(effects_by_name(outcome.settings.effects))
         },
         "changes": changes_at(outcome.changes_ns, outcome.payload),
-        "held": held if held["m"] > SHOWN_STDS * held["m_std"] else None,
+        "held": held if held["m"] > SHOWN * held["m_std"] else None,
         "rebuilds": outcome.rebuilds,
         "started_s": None,
         "values": outcome.theta.tolist(),
