@@ -184,7 +184,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     }
     out = []
     for k, (named, standing) in enumerate(zip(fit.named, found.standings, strict=True)):
-        effect = named.candidate.effect
+        effect = standing.candidate.effect
         if isinstance(effect, Pattern) or k in found.weak:
             continue
         recording = named.recording or 0
@@ -194,7 +194,10 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
         t = fit.recordings[recording].t
         on = (t >= begin) & (t < end)
         overlaps = _overlaps(standing, named, named.candidate.joint in shifted)
+        keys = [p.key for p in effect.parameters]
+        values = {key: x for key, x in named.values.items() if key in keys}
         spread, evidence = parameter_std(fit, covariance, k), standing.probability
+        spread = {key: std for key, std in spread.items() if key in keys}
         if from_the_start(named):  # that it is there, whatever else could stand for it
             evidence = math.erf(named.values["m"] / spread["m"] / math.sqrt(2.0))
         out.append(
@@ -204,7 +207,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 joints=tuple(_joints(named)),
                 interval_s=(max(begin, 0.0), min(end, last)),
                 lasting=not np.isfinite(end),
-                parameters=named.values,
+                parameters=values,
                 std=spread,
                 units=effect.units(),
                 evidence=evidence,
@@ -254,7 +257,7 @@ def _overlaps(standing: Standing, named: Named, shifted: bool) -> dict[str, floa
     best: dict[str, float] = {}
     for rival in standing.rivals:
         effect = rival.candidate.effect
-        if isinstance(effect, Pattern) or effect.name == named.candidate.effect.name:
+        if isinstance(effect, Pattern) or effect.name == standing.candidate.effect.name:
             continue
         if rival.overlap >= OVERLAP and _is_open(standing, rival, named, shifted):
             best[effect.name] = max(best.get(effect.name, 0.0), min(rival.overlap, 1.0))
@@ -269,7 +272,7 @@ def _is_open(standing: Standing, rival: Rival, named: Named, shifted: bool) -> b
 
     Friction and an offset of the same joint are asymmetric friction in other words.
     """
-    mine, other = named.candidate.effect, rival.candidate.effect
+    mine, other = standing.candidate.effect, rival.candidate.effect
     nested = mine.form in dict(other.simpler) or other.form in dict(mine.simpler)
     if not nested or (shifted and other.form == TWO_LEVELS):
         return True
@@ -297,19 +300,23 @@ def _too_smooth(fit: Fit, ends: Sequence[float]) -> list[Leftover]:
     Disturbances are slow too, but not by so much; memory, as hysteresis has it, is.
     """
     out = []
-    level, residual = fit.noise[0].level, fit.model.residual(0)
+    level, residual, slides = fit.noise[0].level, fit.model.residual(0), fit.recordings[0].slides
     motion = fit.recordings[0].motion
     rows = np.searchsorted(motion.t, fit.recordings[0].t - 1e-9)
     for j in range(fit.n):
         lagged = np.lib.stride_tricks.sliding_window_view(residual[:, j], BEFORE + 1)
-        before, now = lagged[:, :-1], lagged[:, -1]
+        throughout = np.lib.stride_tricks.sliding_window_view(slides[:, j], BEFORE + 1).all(axis=1)
+        if throughout.sum() < FEW_ROWS:
+            continue
+        before, now = lagged[throughout, :-1], lagged[throughout, -1]
         surprise = _rms(now - before @ np.linalg.lstsq(before, now, rcond=None)[0])
         if level[j] < SMOOTH * surprise:
             continue
         signals = {f"{key}{j + 1}": getattr(motion, key)[rows, j] for key in ("q", "dq", "ddq")}
-        shares = {name: explained(residual[:, j], x) for name, x in signals.items()}
+        on = slides[:, j]
+        shares = {name: explained(residual[on, j], x[on]) for name, x in signals.items()}
         follows = sorted((x for x in shares if shares[x] > FOLLOWS), key=lambda x: -shares[x])
-        size = _rms(residual[:, j])
+        size = _rms(residual[on, j])
         if size < DISCREPANCY * _idealised(fit, j):
             continue
         names = tuple(follows) or (f"q{j + 1}", "t")
@@ -321,7 +328,8 @@ def _outbursts(fit: Fit) -> list[Leftover]:
     """Joints whose residual is much larger for a while than it is usually."""
     out = []
     t, residual = fit.recordings[0].t, fit.model.residual(0)
-    counted = fit.weights[0] > 0.0 if fit.weights else np.ones_like(residual, dtype=bool)
+    counted = fit.recordings[0].slides
+    counted = counted & (fit.weights[0] > 0.0) if fit.weights else counted
     window = (t // OUTBURST_S).astype(int)
     for j in range(fit.n):
         rows = counted[:, j]

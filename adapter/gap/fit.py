@@ -354,10 +354,12 @@ class Fit:
 
     def own_noise(self) -> tuple[Noise, ...]:
         """Noise that its residuals show where they count."""
+        every = zip(self.recordings, self.model.residuals(), strict=True)
+        left = [own.beside_rests(x) for own, x in every]
         sliding = [own.sliding for own in self.recordings]
         if self.weights:
             sliding = [x * (weight > 0.0) for x, weight in zip(sliding, self.weights, strict=True)]
-        return tuple(map(noise_of, self.model.residuals(), sliding))
+        return tuple(map(noise_of, left, sliding))
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
@@ -534,22 +536,37 @@ def _other_shapes(named: Named, step: float) -> list[Named]:
 
 def _reshaped(fit: Fit, place: int) -> Fit:
     """The same where its own columns are all that changes; others stay as linear as they are."""
-    carried, own = fit.carried(), place_of(fit, place)
+    carried = fit.carried()
     best, named = carried, fit.named[place]
     for step in (FAR_STEP, *SHAPE_STEPS):
         for other in _other_shapes(named, step):
-            N = carried.N.copy()
-            slopes = [
-                fit.model.torque_slopes(other, fit.model.stages(i))
-                if other.recording in (None, i)
-                else np.zeros((len(other.x), *x.tau.shape))
-                for i, x in enumerate(fit.recordings)
-            ]
-            N[own] = fit.whiten(slopes)
-            trial = Carried(N, carried.prior_std, carried.data)
+            trial = _with_shape(fit, carried, place, other)
             if trial.g @ trial.x > best.g @ best.x:
                 best, named = trial, other
     return fit.instead(place, named).at(best.x)
+
+
+def _with_shape(fit: Fit, carried: Carried, place: int, other: Named) -> Carried:
+    """What is known where a named effect's columns are those of another shape."""
+    N = carried.N.copy()
+    slopes = [
+        fit.model.torque_slopes(other, fit.model.stages(i))
+        if other.recording in (None, i)
+        else np.zeros((len(other.x), *x.tau.shape))
+        for i, x in enumerate(fit.recordings)
+    ]
+    N[place_of(fit, place)] = fit.whiten(slopes)
+    return Carried(N, carried.prior_std, carried.data)
+
+
+def lost_at_once(fit: Fit, carried: Carried, place: int) -> float:
+    """By how much less a fit explains (chi2) if bristles wind up over no way."""
+    named = fit.named[place]
+    at_once = named.candidate.effect.reshaped(named.values, 0.0)
+    assert at_once is not None
+    other = replace(named, candidate=replace(named.candidate, template=at_once))
+    trial = _with_shape(fit, carried, place, other)
+    return float(carried.g @ carried.x - trial.g @ trial.x)
 
 
 def _moved(fit: Fit, place: int, side: int, t: float) -> Fit:

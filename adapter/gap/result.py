@@ -138,6 +138,24 @@ class Leftover:
 
 
 @dataclass(frozen=True)
+class Unseen:
+    """How large an effect would have been named.
+
+    Attributes:
+        effect: canonical name; joint: from 1, 0 for the whole arm.
+        parameter, size, unit: the least that would have been, or the largest where `above`: what
+            is stiffer than that does not show.
+    """
+
+    effect: str
+    joint: int
+    parameter: str
+    size: float
+    unit: str
+    above: bool
+
+
+@dataclass(frozen=True)
 class LogLoad:
     """What the hand carries in one of several recordings, fitted together.
 
@@ -214,6 +232,7 @@ class GapResult:
         findings, unexplained: see there.
         corrections: (n, 10) the small correction of the inertias; corrections_prior: (n, 10)
             what was allowed a priori, one standard deviation each.
+        unseen: of effects that were not named, how large they would have been.
         loads: of several recordings, what the hand carries in each; empty for one.
         contradictions: of several recordings, which are not of the arm of the others, a sentence
             each.
@@ -241,6 +260,7 @@ class GapResult:
     after: Shortfall
     findings: tuple[Finding, ...] = ()
     unexplained: tuple[Leftover, ...] = ()
+    unseen: tuple[Unseen, ...] = ()
     corrections: Array | None = None
     corrections_prior: Array | None = None
     notes: tuple[str, ...] = ()
@@ -301,7 +321,8 @@ class GapResult:
             own[key] = asdict(own[key])
         own["findings"] = [finding.as_dict() for finding in self.findings]
         own["loads"] = [asdict(load) for load in self.loads]
-        own["unexplained"] = [asdict(leftover) for leftover in self.unexplained]
+        for key in ("unexplained", "unseen"):
+            own[key] = [asdict(entry) for entry in getattr(self, key)]
         return {**own, "inertial_correction": self._correction()}
 
     def _correction(self) -> dict[str, Any] | None:

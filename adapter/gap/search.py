@@ -18,6 +18,7 @@ from adapter.gap.fit import (
     dated,
     dated_anew,
     honest_covariance,
+    lost_at_once,
     place_of,
     refitted,
     shaped,
@@ -25,7 +26,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.real_arm import start, usually_shaped
+from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
     BELIEF,
@@ -47,6 +48,7 @@ FAR_NATS = 5.0  # for one of another joint, and for what is rarer than friction 
 CLEAR = 3.0  # standard deviations of a force
 WEIGHTLESS = 1e-9  # m/s², least gravity
 SAME_TIME_S, DATE_S = 0.5, 1e-3  # between two dates that may be one; within which one stays
+RESOLVED_CHI2 = 4.0  # that bristles must be better than friction that slides at once
 SURE_NATS = 20.0  # beyond belief: a move that may be taken along with another joint's
 
 Progress = Callable[[str], None]
@@ -115,7 +117,7 @@ def search(
     # noise that was taken for the first effect's may have hidden another one
     fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
-    found = settled(_renamed(fit, joints), joints)
+    found = _as_resolved(settled(_renamed(fit, joints), joints))
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)
 
 
@@ -271,6 +273,23 @@ def settled(fit: Fit, joints: Sequence[int]) -> Found:
         if swapped is None:
             return Found(fit, carried, ranked, weak=frozenset(values))
         before, fit, swaps = fit, dated_anew(swapped), swaps + 1
+
+
+def _as_resolved(found: Found) -> Found:
+    """Bristles over a way that these data do not tell from none are told as Coulomb friction.
+
+    The model keeps them: they know what a joint that rests holds.
+    """
+    fit, standings = found.fit, list(found.standings)
+    carried = fit.carried()
+    for k, e in enumerate(fit.named):
+        if e.candidate.effect is not BRISTLES or k in found.weak:
+            continue
+        if lost_at_once(fit, carried, k) < RESOLVED_CHI2:
+            told = replace(e.candidate, effect=COULOMB)
+            rivals = tuple(r for r in standings[k].rivals if r.candidate.key != told.key)
+            standings[k] = replace(standings[k], candidate=told, rivals=rivals)
+    return replace(found, standings=tuple(standings))
 
 
 def _lost(before: Fit, fit: Fit) -> bool:

@@ -26,7 +26,7 @@ from scipy.sparse import diags
 
 from adapter.effects.base import Motion
 from adapter.effects.bristle_friction import bending
-from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED
+from adapter.effects.by_joint import SMOOTHING_DQ, slowness
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.rows import pauses, stuck
@@ -50,7 +50,7 @@ MOTION = ("t", "q", "dq", "ddq")
 _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
-RARELY = 0.1  # of the time
+RARELY = 25  # rows of the band, a second
 SLIDE_RAD = 1e-3  # over which a joint winds up before it slides, as on a real Panda
 
 # Splines through a motion.
@@ -184,28 +184,41 @@ class Signals:
         return out.reshape(-1, *self.tau.shape)
 
     @cached_property
-    def sliding(self) -> Array:
-        """(k, n) one where a joint slides and its torque is measured, else zero.
+    def rests(self) -> list[tuple[int, slice]]:
+        """Joints (from 0) at rest, and the rows of the band in which each is, rest by rest."""
+        still = np.abs(self.low(self.motion.dq)) < SMOOTHING_DQ
+        edges = np.diff(still.astype(int), axis=0, prepend=0, append=0)
+        cuts = (np.flatnonzero(column).reshape(-1, 2) for column in edges.T)
+        return [(j, slice(*cut)) for j, own in enumerate(cuts) for cut in own.tolist()]
 
-        At rest a joint holds what static friction lets it, which is no noise. Of one that hardly
-        slides all that is measured counts.
+    @cached_property
+    def slides(self) -> NDArray[np.bool_]:
+        """(k, n) where a joint slides and its torque is measured.
+
+        At rest it holds what static friction lets it: that is neither noise nor unexplained.
         """
-        slides = self.heard * (np.abs(self.low(self.motion.dq)) > SMOOTHING_DQ)
-        rarely = slides.mean(axis=0) < RARELY
-        return np.asarray(np.where(rarely, self.heard, slides))
+        return (self.heard > 0.0) & (np.abs(self.low(self.motion.dq)) > SMOOTHING_DQ)
+
+    @property
+    def sliding(self) -> Array:
+        """(k, n) one there, else zero; of a joint that hardly slides all that is measured counts,
+        see `beside_rests`.
+        """
+        return np.where(self.slides.sum(axis=0) < RARELY, self.heard, self.slides)
+
+    def beside_rests(self, x: Array) -> Array:
+        """A torque (k, n) less its mean over each rest: what a joint holds there is no noise."""
+        out = x.copy()
+        for j, rows in self.rests:
+            out[rows, j] -= x[rows, j].mean()
+        return out
 
     @cached_property
     def slowness(self) -> Array:
-        """(k, n) 1 where a joint is slow, near 0 where it slides; the root of its rows at a rest.
-
-        What static friction holds at a rest is one unknown value, however long the rest lasts.
-        """
-        dq = np.abs(self.low(self.motion.dq))
-        out = np.exp(-np.square(dq / STRIBECK_SPEED))
-        for j, rests in enumerate(dq.T < SMOOTHING_DQ):
-            begins = np.flatnonzero(np.diff(rests, prepend=not rests[0]))
-            rows = np.diff(begins, append=len(rests))
-            out[:, j] *= np.sqrt(np.repeat(np.where(rests[begins], rows, 1), rows))
+        """(k, n) how unsure friction is; of a rest, which holds one unknown value, so is a row."""
+        out = slowness(self.low(self.motion.dq))
+        for j, rows in self.rests:
+            out[rows, j] *= math.sqrt(rows.stop - rows.start)
         return out
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from rich.markup import escape
 
+from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.phrases import (
     listed,
@@ -150,9 +151,22 @@ def data_words(result: GapResult) -> str:
 
 
 def noise_times(result: GapResult) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) torque errors before and after in units of the noise; NaN where that is not known."""
+    """(n,) torque errors before and after in units of the noise; NaN where that is not known.
+
+    In the band that the noise is of, and of a joint that slides: what it holds at a rest is what
+    static friction lets it.
+    """
     noise = np.where(result.noise_floor_nm > 0.0, result.noise_floor_nm, np.nan)
-    return result.before.torque_rmse_nm / noise, result.after.torque_rmse_nm / noise
+    if not result.curves:
+        return result.before.torque_rmse_nm / noise, result.after.torque_rmse_nm / noise
+    dq, before, after = (
+        np.concatenate([getattr(x, key) for x in result.curves])
+        for key in ("dq", "before", "after")
+    )
+    slides = np.abs(dq) > SMOOTHING_DQ
+    rows = np.where(slides.any(axis=0), slides, True)
+    sizes = (np.sqrt(np.sum(rows * x**2, axis=0) / rows.sum(axis=0)) for x in (before, after))
+    return tuple(size / noise for size in sizes)
 
 
 def left_above_noise(result: GapResult) -> str:

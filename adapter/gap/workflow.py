@@ -42,6 +42,7 @@ from adapter.gap.search import ROUNDS, Found, search
 from adapter.gap.several import Several
 from adapter.gap.signals import LEAST_S, RATE_HZ, Recorded
 from adapter.gap.torque_gains import TorqueGains, as_told
+from adapter.gap.unseen import unseen
 from adapter.judgement.priors import DOCUMENTED_SHARE, documented_std
 from adapter.model.model_file import save_model
 from adapter.model.self_model import SelfModel
@@ -155,8 +156,10 @@ def find_gap(
         fit = loaded(fit, task.moving[0], task.fitted[0].loads_s)
     progress("searching")
     moving = sorted({j for joints in task.moving for j in joints} & fit.heard)
-    measured = measure(task, search(fit, moving, settings.rounds, progress), simulate, progress)
-    result = replace(_result(task, measured, settings), model_in=name)
+    found = search(fit, moving, settings.rounds, progress)
+    hidden = unseen(found, moving)
+    measured = measure(task, found, simulate, progress)
+    result = replace(_result(task, measured, settings), model_in=name, unseen=hidden)
     if several is not None:
         result = several.told(result)
     elif not is_long(screened[0].log):

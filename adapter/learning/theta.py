@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import STRIBECK_SPEED, JointSignals
+from adapter.effects.by_joint import JointSignals, slowness
 from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
@@ -702,7 +702,7 @@ class Theta:
         return self.th[self._effects_from :].reshape(len(self.effects), self.tree.n)
 
     def static_friction(self, dq: Array) -> Array:
-        """(m, n) N m that friction may hold otherwise where a joint is slow (`Effect.band`).
+        """(m, n) N m that friction may hold otherwise where a joint is slow or rests.
 
         Args:
             dq: (m, n) rad/s.
@@ -710,7 +710,7 @@ class Theta:
         held = np.zeros(self.tree.n)
         for effect, value in zip(self.effects, self.effect_values, strict=True):
             held = np.hypot(held, effect.band * value)
-        return np.asarray(held * np.exp(-0.5 * np.square(dq / STRIBECK_SPEED)))
+        return held * slowness(dq)
 
     def start_change(self) -> None:
         """Something at the hand changed: keep what is known, open the spare body for the rest."""

@@ -30,6 +30,7 @@ from adapter.report.gap_tables import (
     joint_matrix,
     rival_rows,
     tied,
+    unseen_table,
 )
 from adapter.report.gap_trust import gap_checks, gap_steps
 from adapter.report.html import fill, write_whole
@@ -103,6 +104,7 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
         "rivals": rival_rows(result),
         "unexplained": [_leftover(item) for item in result.unexplained],
         "unexplained_panels": unexplained_panels(result),
+        "unseen": unseen_table(result),
         "correction": correction if told else None,
         "correction_words": ""
         if ratio is None or not told

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from adapter.gap.phrases import parameter_lines, shown_unit, who
-from adapter.gap.result import Finding, GapResult
+from adapter.gap.result import Finding, GapResult, Unseen
 from adapter.gap.words import alike, by_kind, carried_words, percent, shares_of, span, title_of
 from adapter.model.inertia import PARAMETERS, UNITS
 from adapter.model.numbers import DASH, plain, plus_minus
@@ -157,6 +157,22 @@ def carried_table(result: GapResult) -> Table | None:
     """What each of several recordings carries; None for one."""
     rows = [[load.recording, *map(tied, carried_words(load))] for load in result.loads]
     return Table(["Recording", "Load", "Where"], rows) if rows else None
+
+
+def unseen_table(result: GapResult) -> Table | None:
+    """Sizes that effects would have needed to be named, a row each; None where nothing is known."""
+    rows: dict[str, list[Unseen]] = {}
+    for own in result.unseen:
+        rows.setdefault(own.effect, []).append(own)
+    heads = ["Effect", "Arm", *(f"Joint {j + 1}" for j in range(len(result.joint_names)))]
+    body = []
+    for effect, every in rows.items():
+        factor, unit = shown_unit(min(x.size for x in every), every[0].unit)
+        of = {x.joint: plain(factor * x.size, 2) for x in every}
+        cells = [of.get(j, DASH) for j in range(len(heads) - 1)]
+        way = "above" if every[0].above else "below"
+        body.append([f"{capital(title_of(effect))} {way}, {unit}", *cells])
+    return Table(heads, body) if body else None
 
 
 def error_table(result: GapResult) -> Table:

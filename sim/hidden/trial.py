@@ -22,12 +22,14 @@ from sim.hidden.bristles import Bristles, draw_bristles
 from sim.hidden.motion import DrawnMotion, draw_motion
 from sim.hidden.sizes import (
     CATALOGUE,
+    COULOMB,
     OUTSIDE,
     SECONDS,
     WRIST,
     WRIST_SHARE,
     draw_effect,
     log_uniform,
+    torque_size,
 )
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
@@ -142,7 +144,12 @@ class Trial:
 
 
 def draw(
-    seed: int, kind: str | None = None, effect: str | None = None, rubs: bool | None = None
+    seed: int,
+    kind: str | None = None,
+    effect: str | None = None,
+    rubs: bool | None = None,
+    motion: str | None = None,
+    sticks: bool = False,
 ) -> Trial:
     """The trial of a seed.
 
@@ -157,6 +164,8 @@ def draw(
         kind: one of `KINDS`; drawn by `SHARES` where None.
         effect: name of the single effect; drawn where None.
         rubs: whether there is friction in every joint; drawn by `FRICTION_SHARE` where None.
+        motion: one of `motion.KINDS`; drawn where None.
+        sticks: every joint has Coulomb friction beside what is hidden, for names as well.
 
     Raises:
         ValueError: unknown kind or effect; the message has the choices.
@@ -169,12 +178,12 @@ def draw(
     if effect is not None and effect not in {**CATALOGUE, **OUTSIDE}:
         raise ValueError(f"no effect {effect!r}; have: {', '.join((*CATALOGUE, *OUTSIDE))}")
     rubbed = bool(rng.random() < FRICTION_SHARE)
-    rubs = (rubbed and effect not in RUBS) if rubs is None else rubs
+    rubs = (rubbed and effect not in RUBS and not sticks) if rubs is None else rubs
     nominal = panda()
     model_error = log_uniform(rng, MODEL_ERROR)
     arm = nominal.with_changes(theta=wrong_bodies(nominal.theta, model_error, rng))
-    motion = draw_motion(rng, arm.limits, arm.ready)
-    arm = arm.with_changes(ready=motion.middle)
+    path = draw_motion(rng, arm.limits, arm.ready, motion)
+    arm = arm.with_changes(ready=path.middle)
     share = np.where(np.arange(1, arm.n + 1) >= WRIST, WRIST_SHARE, 1.0)
     return Trial(
         seed=seed,
@@ -182,13 +191,22 @@ def draw(
         disturbance_nm=share * rng.uniform(*DISTURBANCE_NM, arm.n),
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
         commands=bool(rng.random() < COMMANDS_SHARE),
-        effects=_effects(rng, kind, arm, effect, RUBS if rubs else ()),
+        effects=_effects(rng, kind, arm, effect, RUBS if rubs or sticks else ())
+        + (_dry(rng, arm.n) if sticks else ()),
         friction=draw_bristles(rng, arm.n) if rubs else None,
         arm=arm,
         nominal=nominal,
         model_error=model_error,
-        motion=motion,
+        motion=path,
         noise=levels_of("real"),
+    )
+
+
+def _dry(rng: np.random.Generator, n: int) -> tuple[Effect, ...]:
+    """Coulomb friction of every joint."""
+    return tuple(
+        Effect("coulomb_friction", (j,), {"Fc": torque_size(rng, j, COULOMB)})
+        for j in range(1, n + 1)
     )
 
 

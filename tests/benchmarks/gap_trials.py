@@ -21,6 +21,7 @@ from typing import Any
 
 from drivers.files.mcap import Log
 from sim.hidden import Trial, draw, unseal
+from sim.hidden.motion import KINDS
 from sim.hidden.record import pybullet_recording, write
 from tests.helpers.gap_judges import torque_judge
 from tests.helpers.gap_mujoco import mujoco_recording
@@ -68,12 +69,15 @@ def run_trial(trial: Trial, simulator: str, find_gap: Analyse, judges: Sequence[
     return row
 
 
-def _job(job: tuple[int, str | None, str | None, str | None, bool]) -> Row:
-    seed, kind, effect, simulator, judged = job
+Job = tuple[int, str | None, str | None, str | None, bool, str | None, bool]
+
+
+def _job(job: Job) -> Row:
+    seed, kind, effect, simulator, judged, motion, sticks = job
     judges = (torque_judge,) if judged else ()
     maker = simulator or BY_SEED[seed % len(BY_SEED)]
     try:
-        return run_trial(draw(seed, kind, effect), maker, workflow(), judges)
+        return run_trial(draw(seed, kind, effect, None, motion, sticks), maker, workflow(), judges)
     except Exception:
         return {"seed": seed, "failed": traceback.format_exc()}
 
@@ -103,6 +107,8 @@ def main() -> None:
     parser.add_argument("--simulator", choices=sorted(SIMULATORS), help="default: see BY_SEED")
     parser.add_argument("--kind", choices=("null", "single", "pair", "outside"))
     parser.add_argument("--effect", help="of all trials, instead of a drawn one")
+    parser.add_argument("--motion", choices=KINDS, help="of all trials, instead of a drawn one")
+    parser.add_argument("--sticks", action="store_true", help="Coulomb friction in every joint")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--judge", action="store_true", help="torque error against the oracle's")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="stop after so long")
@@ -110,7 +116,7 @@ def main() -> None:
     asked = parser.parse_args()
     os.environ["OMP_NUM_THREADS"] = "1"
     seeds = range(asked.first, asked.first + asked.trials)
-    same = asked.kind, asked.effect, asked.simulator, asked.judge
+    same = asked.kind, asked.effect, asked.simulator, asked.judge, asked.motion, asked.sticks
     jobs = [(seed, *same) for seed in seeds]
     rows = []
     begun = time.monotonic()

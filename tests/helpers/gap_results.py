@@ -61,6 +61,13 @@ def curves(n: int = 7, seconds: float = LONG_S, name: str = "shelf.mcap") -> Cur
     return Curves(name, t, q, dq, ddq, tau, before, after)
 
 
+def leaving(before: float, after: Any) -> tuple[Curves, ...]:
+    """Curves of which the models leave that much throughout, N m."""
+    own = curves()
+    levels = (x * np.ones_like(own.tau) for x in (before, after))
+    return (replace(own, **dict(zip(("before", "after"), levels, strict=True))),)
+
+
 def rollout(shown: Curves) -> RolloutCurves:
     """Half-second segments that drift away, less so after; the first sample of each is NaN."""
     n = shown.q.shape[1]
@@ -129,6 +136,7 @@ def nothing() -> GapResult:
     level = errors([NOISE_NM] * 7)
     return replace(
         one_finding(), findings=(), before=level, after=level, rollouts=(), corrections=None,
+        curves=leaving(NOISE_NM, NOISE_NM),
         what_next=(), notes=(), model_out=None,
     )  # fmt: skip
 

@@ -139,8 +139,8 @@ def test_findings_of_one_effect_are_one_row_and_one_line(pages: dict[str, str]) 
 
 def test_what_is_many_times_the_noise_is_not_called_explained(pages: dict[str, str]) -> None:
     """12 times the noise on a joint is said, though nothing of it was listed as unexplained."""
-    after = made_up.errors([0.02] * 6 + [12.0 * made_up.NOISE_NM])
-    result = replace(result_of("one_finding"), after=after)
+    left = made_up.leaving(1.0, [0.02] * 6 + [12.0 * made_up.NOISE_NM])
+    result = replace(result_of("one_finding"), curves=left)
     text = text_of(render_gap_page(result))
     assert "12 times the noise stays on joint 7" in text
     assert "nothing above the noise" not in text and "nothing unexplained" not in text
@@ -301,10 +301,9 @@ def test_what_follows_nothing_is_said_so() -> None:
 
 
 def test_nothing_found_is_not_called_noise_where_more_is_left() -> None:
-    high = made_up.errors([0.1] * 7)
-    result = replace(result_of("nothing"), before=high, after=high)
+    result = replace(result_of("nothing"), curves=made_up.leaving(0.1, 0.1))
     assert "to within 5 times the noise" in headline(result)
-    corrected = replace(result_of("nothing"), before=high)
+    corrected = replace(result, curves=made_up.leaving(0.1, 0.02))
     assert "once its inertias are corrected" in headline(corrected)
 
 

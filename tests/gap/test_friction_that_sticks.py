@@ -1,0 +1,54 @@
+"""Arms that stop and start: what rests say of friction, and what they don't."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from adapter.gap.result import GapResult
+from adapter.gap.workflow import find_gap
+from adapter.model.urdf import model_from_urdf
+from drivers.files.mcap import Log
+from sim.hidden.trial import Trial, draw, nominal_urdf
+from tests.helpers.gap_mujoco import mujoco_recording
+
+SEEDS = (73000, 73001)
+BOTH_WAYS_S, MOVES = 0.5, 0.05  # that a joint must move each way, and how fast, rad/s
+
+
+@cache
+def judged(
+    seed: int, kind: str = "null", effect: str | None = None
+) -> tuple[Trial, Log, GapResult]:
+    """An arm whose joints truly stick, from point to point, and what is said of it."""
+    trial = draw(seed, "null", motion="points", sticks=True)
+    log = mujoco_recording(trial)
+    return trial, log, find_gap([log], model_from_urdf(nominal_urdf(trial.nominal)))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_friction_of_each_joint_that_turned_both_ways_is_named_and_sized(seed: int) -> None:
+    trial, log, result = judged(seed)
+    hidden = {e.joints: e.number("Fc") for e in trial.effects}
+    found = {f.joints: f for f in result.findings}
+    ways = [1e-3 * np.sum(way * log.dq > MOVES, axis=0) for way in (1, -1)]
+    turned = [(int(j) + 1,) for j in np.flatnonzero(np.min(ways, axis=0) > BOTH_WAYS_S)]
+    assert len(turned) > 2
+    for joints in turned:
+        f, Fc = found[joints], hidden[joints]
+        assert f.effect == "coulomb_friction"
+        assert abs(f.parameters["Fc"] - Fc) < max(0.1 * Fc, 4.0 * f.std["Fc"])
+    assert not result.unexplained
+    assert {f.effect for f in result.findings} == {"coulomb_friction"}
+
+
+def test_what_would_not_have_been_seen_is_told_of_all_joints_that_move() -> None:
+    """The smallest friction that is named grows with a joint's noise, and is told in N m."""
+    _, _, result = judged(SEEDS[0])
+    told = {(x.effect, x.joint): x for x in result.unseen}
+    assert told["signal_delay", 0].unit == "s" and 5e-4 < told["signal_delay", 0].size < 0.05
+    assert told["joint_elasticity", 2].above and not told["torque_gain", 2].above
+    assert ("coulomb_friction", 2) not in told or result.findings[0].joints != (2,)
+    assert result.as_dict()["unseen"][0]["size"] > 0.0
