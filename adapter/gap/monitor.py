@@ -10,13 +10,15 @@ An arm at rest shows nothing: the front end passes on states of motion only.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.by_joint import SMOOTHING_DQ
+from adapter.effects.base import LearnedEffect
+from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED, slowness
+from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
@@ -26,12 +28,14 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
+OFFSET = CATALOGUE["torque_offset"]
 BLOCK_NS = 40_000_000  # states averaged to one row
 ROWS_PER_S = 1e9 / BLOCK_NS
 HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
 ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
 KEEP = 1.0 - 0.2 / 120.0  # of the belief, from one group to the next
+KNOWN_SHARE = 0.2  # of a new velocity, from a group in which it was seen: it takes a second
 MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
 START_INFLATION = 2.0  # of sums of rows, before it is measured
 
@@ -169,12 +173,42 @@ class Monitor:
             rest = np.r_[: 10 * n, 10 * n + 10 : len(rhs)]
             H, rhs = H[np.ix_(rest, rest)], rhs[rest]
         self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
+        self._speeds = extremes(learner.speeds_seen)
+        self._belief.widen(self._one_way(learner.theta.effects))
         R0, p = learner.frames
         self._frames = LearnedFrames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
         self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
-        self._speeds = extremes(learner.speeds_seen)
+
+    def _one_way(self, effects: Sequence[LearnedEffect]) -> Array:
+        """(D, k) how far joints that turned one way only take friction for an offset.
+
+        Which of the two a joint has shows when it turns the other way, and is nothing new then.
+        """
+        n, out = self._n, []
+        values = self._belief.mean()[10 * n :].reshape(len(effects), n)
+        own = [bool(effect.band) or effect is OFFSET for effect in effects]
+        sizes = np.abs(values[np.array(own, dtype=bool)])
+        way = np.where(self._speeds[1] > -self._speeds[0], 1.0, -1.0)
+        for j in np.flatnonzero(np.abs(self._speeds).min(axis=0) < STRIBECK_SPEED):
+            change = np.zeros((len(effects), n))
+            for k, effect in enumerate(effects):
+                change[k, j] = 1.0 if effect is OFFSET else -way[j] if effect.band else 0.0
+            out.append(np.append(np.zeros(10 * n), sizes[:, j].sum() * change))
+        return np.reshape(out, (-1, self._size)).T
+
+    def _unsure(self, effects: Sequence[LearnedEffect], dq: Array) -> Array:
+        """(m, n) variance of what friction holds at velocities dq (m, n), (N m)².
+
+        At a rest static friction is one unknown value however many rows the rest lasts; those of
+        a second tell then as much as one.
+        """
+        n, std = self._n, self._belief.std()[10 * self._n : self._size]
+        sizes = np.hypot(self._belief.mean()[10 * n : self._size], std).reshape(len(effects), n)
+        bands = np.array([effect.band for effect in effects])
+        held = np.square(slowness(dq)) * (np.square(bands) @ np.square(sizes))
+        return np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0) * held
 
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
         """A group is full: judge the window with it, and let the oldest group into the belief."""
@@ -202,10 +236,9 @@ class Monitor:
             Z[:, joints, links + k * self._n + joints] = column
         model = Z @ self._belief.mean()[: self._size] + tool
         signatures = frames.signatures(q, dq, ddq, model, Y)
-        # at a rest static friction is one unknown value however many rows the rest lasts; those
-        # of a second tell then as much as one
-        rows = np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0)
-        unsure = rows * np.square(learner.theta.static_friction(dq))
+        # a joint that comes to a rest or leaves one within a row rests in it
+        slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
+        unsure = self._unsure(learner.theta.effects, slowest)
         new = is_new(dq, self._speeds).astype(float)
         return RowGroup(t, Z, signatures, tau - tool, unsure, dq, new)
 
@@ -220,4 +253,5 @@ class Monitor:
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
         self._found.forget_before(float(group.t[0]), self._belief)
-        self._speeds = extremes(np.concatenate([self._speeds, group.dq]))
+        further = extremes(np.concatenate([self._speeds, group.dq]))
+        self._speeds += KNOWN_SHARE * (further - self._speeds)

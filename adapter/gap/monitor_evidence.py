@@ -64,6 +64,17 @@ class Belief:
             self._mean = np.asarray(np.linalg.solve(self.H, self.rhs))
         return self._mean
 
+    def std(self) -> Array:
+        """(D,) standard deviations."""
+        return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(self.H))))
+
+    def widen(self, by: Array) -> None:
+        """Add the covariance `by by^T`, by (D, k), about the same mean."""
+        mean, across = self.mean(), self.H @ by
+        known = np.linalg.solve(np.eye(by.shape[1]) + by.T @ across, across.T)
+        self.H = self.H - across @ known
+        self.rhs, self._floor = self.H @ mean, 1e-3 * self.H.diagonal()
+
     def extend(self, std: Array) -> None:
         """New coefficients behind the others: zero give or take std (k,)."""
         size, k = len(self.rhs), len(std)

@@ -63,7 +63,8 @@ class DisagreementDetector:
         scores = self._all.evidence(G, b)
         left = evidence.residual - evidence.rows.Z @ evidence.shift
         left *= np.sqrt(self._level.share(evidence.rows.doubt))
-        power = np.mean(left[-POWER_ROWS:] ** 2, axis=0) / self._level.row
+        each = np.reshape(left[-POWER_ROWS:] ** 2, (-1, ROWS_PER_GROUP, left.shape[1])).mean(axis=1)
+        power = np.median(each, axis=0) / self._level.row  # most of a second, not one jump in it
         ended = False
         for found in self._found.active:
             over_s = self._end_of(found, evidence, scores, power) if found.lasts else None
@@ -186,6 +187,7 @@ class DisagreementDetector:
         return [int(j) for j in np.flatnonzero(much & (evidence.weight[-1] > 0.0))]
 
 
+SAME_S, WIDER = 0.5, 3.0  # of one thing that is larger than its prior: told since; times that prior
 EDGE_S = 0.1  # around starts and ends, where the filter is between two states
 MUTED = 1e-3  # weight of a joint with something unexplained
 
@@ -249,8 +251,18 @@ class DisagreementList:
         self._say = say or (lambda line: None)
 
     def name(self, belief: Belief, told: Report) -> None:
-        """Report an effect; the belief gets its coefficients."""
+        """Report an effect; the belief gets its coefficients.
+
+        What began when the same was reported is larger than believed, and not another one.
+        """
         candidate = told.candidate
+        for found in self.active:
+            same = found.lasts and found.candidate is candidate
+            if same and abs(found.since_s - told.since_s) < SAME_S:
+                wider = np.zeros((len(belief.rhs), len(candidate.std)))
+                wider[found.at : found.at + len(candidate.std)] = WIDER * np.diag(candidate.std)
+                belief.widen(wider)
+                return
         entry = self._entry(candidate.name, candidate.joints, told.since_s, told.now_s, told.score)
         entry["size"] = dict(told.size)
         entry["ambiguous_with"] = [{"what": c.name, "joints": c.joints} for c in told.close]

@@ -20,7 +20,7 @@ from adapter.model.model_file import whole_file
 from adapter.signals.records import LinkMotionKind
 from drivers.files.bounded import read_arrays
 
-VERSION = 7
+VERSION = 8
 MORE = "schema.more."  # before the names of what some kinds of schema hold
 
 # What each part would not be the same learner without. Everything else follows from the settings.
@@ -50,11 +50,12 @@ _STATE = {
     "theta": (
         *("x", "mean", "th", "count", "prior", "prior_rhs", "_ranges", "floor", "floor_count"),
         *("spare_in_use", "updates", "effect_spread", "body_spread", "model_variance", "shapes"),
+        "rests",
     ),
     "theta.rows": ("place", "share", "base_place"),
     "theta.moments": Moments._fields,
     "theta.newest": ("A", "C"),
-    "_shadow": ("A", "C"),
+    "_shadow": ("A", "C", "counts"),
     "adam": ("first", "second", "rate"),
     "known": ("clock", "memory"),
     "rates": ("rows", "tau", "stamps", "marks", "bends"),

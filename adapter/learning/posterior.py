@@ -78,10 +78,10 @@ def learned_posterior(
     way[theta.spare, 10:20] = np.eye(10)
     way[theta.spare.stop :, effects] = np.eye(own.size)
     memory = np.full(n, MEMORY_S[0]) if memory_s is None else memory_s
-    sums, count = _sums(theta, way, way @ start), np.array(max(theta.count, 1.0))
+    sums, counts = _sums(theta, way, way @ start), np.maximum(theta.moments.counts, 1.0)
     nowhere = np.zeros((0, n, len(std))), np.zeros((0, n))
     part = Part(
-        Moments(period_s, count, *sums, nowhere),
+        Moments(period_s, counts, *sums, nowhere),
         np.arange(len(std)),
         np.ones(n, dtype=bool),
         memory,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adapter.learning.adam import adam_step
 from adapter.learning.change import compare
 from adapter.learning.schema_kernels import Count, MotionMoments, absorb, descend, retract
-from adapter.learning.theta_kernels import Rows, Weighing, gradient
+from adapter.learning.theta_kernels import Rows, gradient
 from adapter.learning.theta_kernels import absorb as absorb_torque
 from adapter.learning.theta_kernels import follow as follow_mean
 from adapter.learning.torque_rates import follow as follow_rates
@@ -151,7 +151,7 @@ def steps(table, parts, done):
     schema, theta, rates = SchemaParts(*parts[0]), ThetaParts(*parts[1]), RateParts(*parts[2])
     change, adam, out = ChangeParts(*parts[3]), AdamParts(*parts[4]), Done(*done)
     parent, R0, p = schema.frames
-    weigh, known = Weighing(*theta.weighing), MotionMoments(*schema.moments)
+    known = MotionMoments(*schema.moments)
     sizes, n, begin = Rows(*theta.rows).steps, parent.shape[0], 0
     data = theta.sums[0][0], theta.sums[0][1]
     pace = schema.pace[0], schema.pace[1], adam.pace[0]
@@ -185,11 +185,7 @@ def steps(table, parts, done):
             ratios = compare(error, 1, change.speeds, change.samples + end, *levels)
             out.ratios[m, 0], out.ratios[m, 1] = ratios
             suspect = ratios[0] > change.most[0] or ratios[1] > change.most[1]
-        count = weigh.samples + theta.sums[2] * end
-        now = count, weigh.noise_gain, weigh.floor, weigh.floor_count, weigh.error
-        gradient(
-            theta.x, theta.rows, data, theta.prior, (*now, weigh.base, weigh.share), theta.work
-        )
+        gradient(theta.x, theta.rows, data, theta.prior, theta.weighing, theta.work)
         moved = adam.parameters, adam.gradient, adam.first, adam.second
         adam_step(*moved, adam.steps + m + 1, adam.pace)
         retract(schema.frames, schema.tangent, schema.may_move, schema.distance, pace)

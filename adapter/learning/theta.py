@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import JointSignals, slowness
+from adapter.effects.by_joint import HELD, JointSignals, slowness
 from adapter.errors import SettingsError
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
@@ -55,6 +55,7 @@ REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
+REST_SAMPLES = 10.0  # independent ones a second: noise has a memory of a tenth
 SPREAD_STEPS = 50  # at each look at how large the effects are
 # Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
 # what another must be better, in squares of standard deviations.
@@ -133,6 +134,7 @@ class Theta:
         effect_spread: (e,) of each effect's prior over the joints; body_spread: (bodies,) of each
             body's, in `PRIOR_STD`; see `adapt_prior`.
         smoothing_s: how long the filter takes a step of torque.
+        rests: (n,) what is left of a sample of a joint at rest.
     """
 
     def __init__(
@@ -188,6 +190,8 @@ class Theta:
         self.model_variance = error**2
         self.floor, self.floor_count = np.full(n, self.model_variance), 1.0
         self.spare_in_use = False
+        self.rests = np.ones(n)
+        self._weigh_rests(np.repeat(np.square(self.effect_spread), n))
 
     @property
     def _effects_from(self) -> int:
@@ -226,7 +230,8 @@ class Theta:
         A = np.zeros(int((widths * (widths + 1) // 2).sum()))
         floating = int(self.tree.floating)
         C = np.zeros((2 * floating, len(self.rows.near), len(self.rows.base_place) + 1))
-        return Moments(A, C, np.zeros(6 * floating), np.array([0.0, BASE_LEVEL_SAMPLES]))
+        level = np.zeros(6 * floating), np.array([0.0, BASE_LEVEL_SAMPLES])
+        return Moments(A, C, *level, np.zeros(self.tree.n))
 
     def absorb(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Add samples to the moments.
@@ -243,23 +248,24 @@ class Theta:
         if self.each_sample:
             newest = self.newest
             newest.A[:], newest.C[:] = 0.0, 0.0
-            self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL))
+            self._absorb(frames, table[-1:], Moments(newest.A, newest.C, *_NO_LEVEL, _NOTHING))
         self.count += self.weight * len(table)
         return error
 
     def absorb_again(self, frames: tuple[Array, Array], table: Array, into: Moments) -> None:
         """Add samples seen before to other moments, see `replace_moments`."""
-        self._absorb(frames, table, Moments(into.A, into.C, *_NO_LEVEL))
+        self._absorb(frames, table, Moments(into.A, into.C, *_NO_LEVEL, into.counts))
 
     def errors(self, frames: tuple[Array, Array], table: Array) -> Array:
         """Torque errors (m, rows) of the parameters in use; nothing is learned."""
-        return self._absorb(frames, table, Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL))
+        nowhere = Moments(_NOTHING, self.moments.C[:0], *_NO_LEVEL, _NOTHING)
+        return self._absorb(frames, table, nowhere)
 
     def _absorb(
         self, frames: tuple[Array, Array], table: Array, into: Moments, weight: float = 1.0
     ) -> Array:
         columns, placed = self.effect_columns(table), (self._parent, *frames)
-        sums = tuple(into), self._forgetting, weight
+        sums = tuple(into), self._forgetting, weight, self.rests
         return absorb(placed, self._rows, self._given, table, columns, sums)
 
     @property
@@ -274,6 +280,7 @@ class Theta:
         What was folded into the prior at a change cannot be rebuilt; it counts half from here on.
         """
         self.moments.A[:], self.moments.C[:], self.count = moments.A, moments.C, count
+        self.moments.counts[:] = moments.counts
         if self.spare_in_use:
             neutral, neutral_rhs = self._neutral_prior()
             self._set_prior(0.5 * (self.prior + neutral), 0.5 * (self.prior_rhs + neutral_rhs))
@@ -290,9 +297,10 @@ class Theta:
     def parts(self, frames: tuple[Array, Array], settled: bool) -> tuple[Any, ...]:
         """What `steps` needs of it; `settled` as for `after_step`."""
         s = self.settings
-        into = tuple(self.moments), self._forgetting, self.weight
+        into = tuple(self.moments), self._forgetting, self.weight, self.rests
         span = float(s.settled_average if settled else s.average)
-        weighing = self.count, self.noise_gain, self.floor, self.floor_count, self.model_variance
+        counts = self.moments.counts
+        weighing = counts, self.noise_gain, self.floor, self.floor_count, self.model_variance
         return (
             (self._parent, *frames),
             self._rows,
@@ -320,16 +328,16 @@ class Theta:
         if self.count < self.settings.warm_up and not self.spare_in_use:
             self.gradient[:] = 0.0
             return False
-        data, count = self.moments[:2], self.count
+        data, counts = self.moments[:2], self.moments.counts
         floor, floor_count, least = self.floor, self.floor_count, self.model_variance
         prior = self._before
         if self.each_sample:  # plain squared error of the newest sample, priors next to none
-            data, count = self.newest[:2], 1.0
+            data, counts = self.newest[:2], np.ones(self.tree.n)
             floor, floor_count = np.ones_like(floor), 1e9
             H, rhs = 1e-6 * self.prior, 1e-6 * self.prior_rhs
             prior = tuple(Prior(H, rhs, self._ranges, 1e-6))
         base = self.base_weights()
-        weighing = Weighing(count, self.noise_gain, floor, floor_count, least, base, self.share)
+        weighing = Weighing(counts, self.noise_gain, floor, floor_count, least, base, self.share)
         out = *self._work, self.gradient
         gradient(self.x, self._rows, data, prior, tuple(weighing), out)
         return True
@@ -383,7 +391,7 @@ class Theta:
         The residual is that of the parameters in use, or of others, th (P,).
         """
         cost = joint_costs(self._rows, self.th if th is None else th, self.moments.A)
-        own = (cost + self.floor_count * self.floor) / (self.count + self.floor_count)
+        own = (cost + self.floor_count * self.floor) / (self.moments.counts + self.floor_count)
         return np.asarray(own + self.model_variance)
 
     def joint_moments(self, j: int, A: Array | None = None) -> Array:
@@ -448,6 +456,7 @@ class Theta:
         diagonal = self.covariance().diagonal()
         self._adapt_bodies(diagonal)
         self._adapt_effects(diagonal)
+        self._weigh_rests(diagonal[self._effects_from :])
 
     def _adapt_bodies(self, diagonal: Array) -> None:
         """Let the data say how heavy each body may be; the prior only ever gets wider.
@@ -506,6 +515,17 @@ class Theta:
             real = bool((np.where(free.all(axis=1), spread, size) > REAL_EFFECT).any())
             self.model_variance = (REAL_MODEL_ERROR if real else IDEAL_MODEL_ERROR) ** 2
 
+    def _weigh_rests(self, variance: Array) -> None:
+        """What is left of a sample of a joint at rest, by what its static friction may hold.
+
+        That is one unknown value a rest, of which a second's samples tell as much as one that is
+        known no better; `variance` (e n,) is of the effects' parameters.
+        """
+        squares = np.square(self.effect_values) + variance.reshape(len(self.effects), self.tree.n)
+        bands = np.array([effect.band for effect in self.effects])
+        held, own = HELD**2 * np.square(bands) @ squares, self.variance()
+        self.rests[:] = own / (own + REST_SAMPLES * held)
+
     def _choose_shapes(self, shapes: Array | None) -> None:
         """Let effects act with shapes (e, n) from now on; with their first where there are none."""
         for k, effect in enumerate(self.effects):
@@ -556,7 +576,8 @@ class Theta:
         for k, effect in enumerate(self.effects):
             for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
                 S, y = self._reduced(j, k, slice(first, first + 1), weights[j], known)
-                explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / (weights[j] * self.count)
+                told = weights[j] * max(self.moments.counts[j], 1.0)
+                explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / told
                 there = explained > RATES_OVER_NOISE * motion_noise[j] + REAL_MODEL_ERROR**2
                 self.rows.share[j, size - self.columns + first] = float(there)
                 if not there:
@@ -732,6 +753,7 @@ class Theta:
         self.floor, self.floor_count = self.variance() - self.model_variance, 500.0
         self._set_prior(H, rhs)
         self.moments.A[:], self.moments.C[:], self.count = 0.0, 0.0, 0.0
+        self.moments.counts[:] = 0.0
         self.x[spare] = self.mean[spare] = self.mean[hand]
         values(self.mean, self.rows.steps, self.th)
         # columns of the hand are the spare body's from here on

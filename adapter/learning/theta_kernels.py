@@ -28,6 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adapter.effects.by_joint import SMOOTHING_DQ
 from adapter.model.spatial import Array
 from adapter.physics.kernels import (
     Frames,
@@ -101,12 +102,14 @@ class Moments(NamedTuple):
             force, then of its moment.
         base_level: (6,) running mean of the squared prediction errors of the base's wrench.
         span: (2,) samples that it has seen, and at most how many it spans.
+        counts: (n,) samples of each joint's torque, rests at their weight.
     """
 
     A: Array
     C: Array
     base_level: Array
     span: Array
+    counts: Array
 
 
 class Prior(NamedTuple):
@@ -128,7 +131,7 @@ class Weighing(NamedTuple):
     """How the moments count.
 
     Attributes:
-        samples: in them.
+        counts: (n,) samples of each joint's torque in them.
         noise_gain: correlated samples that one independent sample is worth.
         floor: (n,) variance that `floor_count` samples would have shown before.
         error: variance that the model is not trusted to explain, (N m)².
@@ -136,7 +139,7 @@ class Weighing(NamedTuple):
         share: (K,) how far the base's rows count for each of their columns `near`.
     """
 
-    samples: float
+    counts: Array
     noise_gain: float
     floor: Array
     floor_count: float
@@ -385,8 +388,8 @@ def absorb(frames, rows, given, table, effects, moments):
 
     Args:
         frames, rows, given, moments: `Frames`, `Rows`, `Given`, and `Moments` with a rate of
-            directional forgetting per sample (0 for none) and the weight of a sample, as plain
-            tuples.
+            directional forgetting per sample (0 for none), the weight of a sample and (n,) what is
+            left of it of a joint at rest, as plain tuples.
         table: (m, size) states, or their part up to the base's motion.
         effects: (m, e, n) columns of the effects.
 
@@ -395,9 +398,10 @@ def absorb(frames, rows, given, table, effects, moments):
     """
     frames, rows, given, moments, table = borrowed((frames, rows, given, moments, table))
     tree, at, use = Frames(*frames), Rows(*rows), Given(*given)
-    into, rate, weight = Moments(*moments[0]), moments[1], moments[2]
+    into, rate, weight, rests = Moments(*moments[0]), moments[1], moments[2], moments[3]
     m, n = table.shape[0], tree.parent.shape[0]
     six = 0 if use.base.shape[0] else 6
+    dq = columns(n, six > 0).dq
     error = np.empty((m, six + n))
     z = np.zeros((min(m, TOGETHER), n, at.place.shape[1] + 1))
     base_z = np.zeros((six, 10 * (n + 1) + 1))
@@ -406,8 +410,14 @@ def absorb(frames, rows, given, table, effects, moments):
         sample_rows(tree, at, use, table[k], effects[k], (own, base_z))
         row_errors(at, use.th, own, base_z, error[k])
         if weight != 1.0:
-            own *= math.sqrt(weight)
             base_z *= math.sqrt(weight)
+        for j in range(n):
+            moves = abs(table[k, dq + j]) > SMOOTHING_DQ
+            counts = weight if moves else weight * rests[j]
+            if counts != 1.0:
+                own[j] *= math.sqrt(counts)
+            if into.counts.shape[0]:
+                into.counts[j] += counts
         if into.A.shape[0]:
             if rate > 0.0:
                 forget_along(at, own, rate, into.A)
@@ -494,7 +504,7 @@ def add_joint_slopes(rows, A, weighing, th, g):
     w = weighing
     for j in range(n):
         cost = _times_row(rows, j, th, A, t, v)
-        variance = (cost + w.floor_count * w.floor[j]) / (w.samples + w.floor_count)
+        variance = (cost + w.floor_count * w.floor[j]) / (w.counts[j] + w.floor_count)
         weight = 1.0 / (w.noise_gain * (variance + w.error))
         for k in range(rows.sizes[j]):
             g[rows.place[j, k]] += weight * rows.share[j, k] * v[k]
@@ -544,4 +554,4 @@ def gradient(x, rows, moments, prior, weighing, out):
             away = x[10 * b + i] - LOG_RADIUS
             gx[10 * b + i] += before.radius * away / LOG_RADIUS_STD**2
     gx[effects:] = at.steps * g[effects:]
-    gx *= 1.0 / max(weigh.samples, 1.0)
+    gx *= 1.0 / max(weigh.counts.max(), 1.0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from adapter.effects import effects_by_name
-from adapter.effects.by_joint import JointSignals
+from adapter.effects.by_joint import SMOOTHING_DQ, JointSignals
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta import HANGING_SHARE, PRIOR_STD, Theta, ThetaKnowledge
 from adapter.learning.theta_kernels import body_from_log_cholesky, forget_along, pull_back
@@ -21,6 +21,7 @@ from adapter.physics.networks import (
     theta_from_log_cholesky,
     theta_from_log_cholesky_torch,
 )
+from adapter.signals.records import StateLayout
 
 SEEDS = range(3)
 EFFECTS = ("viscous_friction", "coulomb_friction", "torque_offset")
@@ -97,7 +98,9 @@ def make(of: Case, effects: tuple[str, ...] = EFFECTS, tool: np.ndarray | None =
     """θ of a tree; the hand is the last but one link, so that no place is taken by accident."""
     base = base_at_rest(np.array([-0.1, 0.2, -9.8]))
     known = ThetaKnowledge(base, GAIN, hand=of.tree.n - 2, tool_theta=tool)
-    return Theta(of.tree, known, effects_by_name(effects), ThetaSettings(**settings))
+    theta = Theta(of.tree, known, effects_by_name(effects), ThetaSettings(**settings))
+    theta.rests[:] = 1.0
+    return theta
 
 
 def somewhere(theta: Theta, seed: int = 7) -> Theta:
@@ -493,3 +496,32 @@ def test_an_effect_that_no_data_show_may_still_be_there() -> None:
         theta.adapt_prior()
     widest = [effect.prior_std for effect in theta.effects]
     assert np.allclose(theta.effect_spread, widest, rtol=1e-6)
+
+
+def test_a_rest_counts_by_what_static_friction_may_hold() -> None:
+    """A joint at rest counts at a share, in its moments and in its number of samples."""
+    of = case(0, False)
+    states, rests = of.states(), slice(None, None, 2)
+    states[rests, StateLayout(of.tree.n).dq.start] = 0.0
+    theta, whole, alone = make(of), make(of), make(of)
+    theta.rests[0] = 0.25
+    theta.absorb(of.frames, states)
+    whole.absorb(of.frames, states)
+    alone.absorb(of.frames, states[rests])
+    for j, share in enumerate([0.75, *[0.0] * (of.tree.n - 1)]):
+        less = whole.joint_moments(j) - share * alone.joint_moments(j)
+        np.testing.assert_allclose(theta.joint_moments(j), less, rtol=1e-9, atol=1e-9)
+        moves = np.abs(states[:, StateLayout(of.tree.n).dq.start + j]) > SMOOTHING_DQ
+        assert theta.moments.counts[j] == moves.sum() + (1.0 - share) * (~moves).sum()
+    assert theta.count == len(states)
+
+
+def test_rests_say_less_the_more_friction_there_is() -> None:
+    theta = make(case(0, False), ("coulomb_friction",))
+    small = np.full(theta.tree.n, 1e-6)
+    theta.effect_values[0] = 0.0
+    theta._weigh_rests(small)
+    assert (theta.rests > 0.5).all()
+    theta.effect_values[0] = 1.0
+    theta._weigh_rests(small)
+    assert (theta.rests < 0.01).all()

@@ -184,7 +184,8 @@ def _pool(theta: Theta, found: Sequence[LogMoments], loads: Mapping[str, Array])
     # one after the other, so that no more than two are made at once
     A = reduce(np.add, (_without(theta, log.A, loads.get(log.content)) for log in found))
     count = sum(log.count for log in found)
-    theta.replace_moments(Moments(A, theta.moments.C, *theta.moments[2:]), count)
+    counts = np.full(theta.tree.n, count)
+    theta.replace_moments(Moments(A, *theta.moments[1:4], counts), count)
     for _ in range(FITS):
         theta.th[:] = theta.least_squares()
         theta.adapt_prior()

@@ -173,6 +173,7 @@ def taken(log: Log, model: SelfModel, content: str, path: str) -> LogMoments:
     front_end, learner = make_front_end(model, both), make_learner(model, both)
     frames = model.joint_rotation(), model.lam[:, 3:]
     into, samples = learner.theta.empty_moments(), 0
+    learner.theta.rests[:] = 1.0  # how friction holds is told by all logs together
     for table in filtered_tables(log, len(log), front_end):
         states = learner.without_known(learner.sound(table))
         if len(states):
