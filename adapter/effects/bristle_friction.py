@@ -50,17 +50,12 @@ def bend(steps, s0, z, bent):
             bent[i, j] = z[j]
 
 
-def bending(q: Array, s0: float) -> tuple[Array, Array]:
-    """Bristles along the way of a joint q (m,), rad.
-
-    Returns:
-        z (m,) that starts at zero, and the share (m,) of an unknown start that is left: bristles
-        that began at z0 are at z + z0 share.
-    """
+def bending(q: Array, s0: float) -> Array:
+    """z (m,) of bristles along the way of a joint q (m,), rad, that starts at zero."""
     steps = np.diff(q, prepend=q[:1])
     z = np.empty((len(q), 1))
     bend(steps[:, None], np.array([s0]), np.zeros(1), z)
-    return z[:, 0], np.exp(-np.cumsum(np.abs(steps)) / s0)
+    return z[:, 0]
 
 
 class BristleFriction(LearnedEffect, JointTorque):
@@ -111,7 +106,7 @@ class BristleFriction(LearnedEffect, JointTorque):
         if motion.apart:
             z = smooth_sign(motion.dq[:, joint])
         else:
-            z, _ = bending(motion.q[:, joint], float(values["s0"]))
+            z = bending(motion.q[:, joint], float(values["s0"]))
         return on_joint(motion, joint, float(values["Fc"]) * z)
 
     def bristles(self, values: Values) -> tuple[float, float]:

@@ -26,7 +26,6 @@ from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
 from adapter.model.spatial import Array
 
-START_NM = 0.5  # static friction holds at the first sample of a stretch; a Panda's is 0.2 to 0.5
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
 EDGE = 0.3  # of a jump: friction turns round more softly than its equation
@@ -100,8 +99,6 @@ class Model:
         named: effects named so far.
         known: effects that the nominal model has already.
         hand: where a load is.
-        start_nm: (stretches, n) friction that each joint held at the first sample of each stretch
-            of each recording, N m.
     """
 
     recordings: tuple[Signals, ...]
@@ -110,13 +107,7 @@ class Model:
     named: tuple[Named, ...] = ()
     known: tuple[Active, ...] = ()
     hand: Hand = ANYWHERE
-    start_nm: Array = field(default_factory=lambda: np.zeros((0, 0)))
     _kept: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        if not self.start_nm.size:
-            size = sum(len(r.begins) for r in self.recordings), len(self.dtheta)
-            object.__setattr__(self, "start_nm", np.zeros(size))
 
     @cached_property
     def arm(self) -> ArmDynamics:
@@ -124,29 +115,21 @@ class Model:
         nominal = self.recordings[0].motion.arm
         return nominal.changed(nominal.theta + self.dtheta)
 
-    def starts(self, recording: int) -> slice:
-        """Rows of `start_nm` that are a recording's."""
-        begin = sum(len(r.begins) for r in self.recordings[:recording])
-        return slice(begin, begin + len(self.recordings[recording].begins))
-
     @property
     def coefficients(self) -> Array:
-        """All that is fitted: corrections, delay, starts, coefficients of the named effects."""
-        always = self.dtheta.ravel(), [self.delay_s], self.start_nm.ravel()
+        """All that is fitted: corrections, delay, coefficients of the named effects."""
+        always = self.dtheta.ravel(), [self.delay_s]
         return np.concatenate([*always, *(e.x for e in self.named)])
 
     def at(self, x: Array) -> Model:
         """The same model with other coefficients."""
         size = self.dtheta.size
-        named, k = [], size + 1 + self.start_nm.size
-        start = x[size + 1 : k].reshape(self.start_nm.shape)
+        named, k = [], size + 1
         for e in self.named:
             named.append(e.at(x[k : k + len(e.x)]))
             k += len(e.x)
         dtheta = x[:size].reshape(self.dtheta.shape)
-        return replace(
-            self, dtheta=dtheta, delay_s=float(x[size]), start_nm=start, named=tuple(named)
-        )
+        return replace(self, dtheta=dtheta, delay_s=float(x[size]), named=tuple(named))
 
     def actives(self, recording: int, but: int | None = None) -> tuple[Active, ...]:
         """Effects at work in a recording, the timing's error among them; one may be left out."""
@@ -172,12 +155,8 @@ class Model:
 
     def predicted(self, recording: int) -> Array:
         """(k, n) torque in the band, N m."""
-        own, held = self.recordings[recording], self.start_nm[self.starts(recording)].ravel()
-
-        def made() -> Array:
-            return own.low(self.stages(recording).sensed) + np.tensordot(held, own.low_start, 1)
-
-        return np.asarray(self._once(("low", recording), made))
+        own, key = self.recordings[recording], ("low", recording)
+        return np.asarray(self._once(key, lambda: own.low(self.stages(recording).sensed)))
 
     def residual(self, recording: int) -> Array:
         """(k, n) measured less predicted, N m; zero where nothing was measured."""
@@ -212,10 +191,7 @@ class Model:
 
     def _signatures(self, recording: int) -> Array:
         own, at = self.recordings[recording], self.stages(recording)
-        starts = np.zeros((*self.start_nm.shape, *own.tau.shape))
-        starts[self.starts(recording)] = own.low_start.reshape(len(own.begins), -1, *own.tau.shape)
         tables = [at.low_regressor(), -own.low(own.motion.rate(at.sensed))[None]]
-        tables.append(starts.reshape(-1, *own.tau.shape))
         for place, e in enumerate(self.named):
             if e.recording not in (None, recording):
                 tables.append(np.zeros((len(e.x), *own.tau.shape)))
@@ -333,8 +309,7 @@ class Fit:
     def prior_std(self) -> Array:
         """Of the coefficients."""
         own = [e.candidate.prior_std for e in self.named]
-        held = np.full(self.model.start_nm.size, START_NM)
-        return np.concatenate([self.prior.ravel(), [self.timing_std_s], held, *own])
+        return np.concatenate([self.prior.ravel(), [self.timing_std_s], *own])
 
     def at(self, x: Array) -> Fit:
         """The same with other coefficients."""
@@ -354,12 +329,10 @@ class Fit:
 
     def own_noise(self) -> tuple[Noise, ...]:
         """Noise that its residuals show where they count."""
-        every = zip(self.recordings, self.model.residuals(), strict=True)
-        left = [own.beside_rests(x) for own, x in every]
         sliding = [own.sliding for own in self.recordings]
         if self.weights:
             sliding = [x * (weight > 0.0) for x, weight in zip(sliding, self.weights, strict=True)]
-        return tuple(map(noise_of, left, sliding))
+        return tuple(map(noise_of, self.model.residuals(), sliding))
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
@@ -463,7 +436,7 @@ def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
 
 def place_of(fit: Fit, k: int) -> np.ndarray:
     """Where the coefficients of the k-th named effect are among all."""
-    begin = fit.dtheta.size + 1 + fit.model.start_nm.size + sum(len(e.x) for e in fit.named[:k])
+    begin = fit.dtheta.size + 1 + sum(len(e.x) for e in fit.named[:k])
     return np.arange(begin, begin + len(fit.named[k].x))
 
 

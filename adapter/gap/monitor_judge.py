@@ -253,16 +253,16 @@ class DisagreementList:
     def name(self, belief: Belief, told: Report) -> None:
         """Report an effect; the belief gets its coefficients.
 
-        What began when the same was reported is larger than believed, and not another one.
+        What began in one place when something was reported there is that, larger than believed.
         """
         candidate = told.candidate
         for found in self.active:
-            same = found.lasts and found.candidate is candidate
-            if same and abs(found.since_s - told.since_s) < SAME_S:
-                wider = np.zeros((len(belief.rhs), len(candidate.std)))
-                wider[found.at : found.at + len(candidate.std)] = WIDER * np.diag(candidate.std)
-                belief.widen(wider)
-                return
+            there = found.candidate
+            at_once = found.lasts and abs(found.since_s - told.since_s) < SAME_S
+            if there is not None and there.joint == candidate.joint and at_once:
+                wider = np.zeros((len(belief.rhs), len(there.std)))
+                wider[found.at : found.at + len(there.std)] = WIDER * np.diag(there.std)
+                return belief.widen(wider)
         entry = self._entry(candidate.name, candidate.joints, told.since_s, told.now_s, told.score)
         entry["size"] = dict(told.size)
         entry["ambiguous_with"] = [{"what": c.name, "joints": c.joints} for c in told.close]

@@ -18,6 +18,7 @@ from adapter.effects.catalogue import CATALOGUE
 from adapter.gap.evidence import score, scores
 from adapter.model.spatial import Array
 from adapter.physics import kernels
+from adapter.screening.likelihood import LOAD_STD
 
 SMALLEST_MASS = 0.02  # kg; below it a load has no centre
 
@@ -43,7 +44,7 @@ class Signature:
     @property
     def std(self) -> Array:
         """(k,) of its coefficients before any data."""
-        return np.array(self.effect.templates()[0].prior_std)
+        return LOAD_STD if self.effect.is_theta else np.array(self.effect.templates()[0].prior_std)
 
     @property
     def log_odds(self) -> float:

@@ -25,7 +25,6 @@ from scipy.signal import firwin, oaconvolve, periodogram, upfirdn
 from scipy.sparse import diags
 
 from adapter.effects.base import Motion
-from adapter.effects.bristle_friction import bending
 from adapter.effects.by_joint import SMOOTHING_DQ, slowness
 from adapter.model.spatial import Array
 from adapter.physics.rigid_arm import RigidArm
@@ -51,7 +50,6 @@ _LOW = firwin(TAPS, CUT_HZ, window=("kaiser", 4.0), fs=RATE_HZ)
 _ANTI_ALIAS = firwin(33, 0.4 * RATE_HZ, fs=RAW_HZ)
 
 RARELY = 25  # rows of the band, a second
-SLIDE_RAD = 1e-3  # over which a joint winds up before it slides, as on a real Panda
 
 # Splines through a motion.
 SPLINE_DEGREE = 5
@@ -168,22 +166,6 @@ class Signals:
         return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
 
     @cached_property
-    def low_start(self) -> Array:
-        """(s n, k, n) what is left of a unit of friction that a joint held at the first sample.
-
-        Of each joint in each of s stretches. A joint that rests holds what static friction lets
-        it, and forgets it as it slides.
-        """
-        q = self.motion.q
-        out = np.zeros((len(self.begins), q.shape[1], *self.tau.shape))
-        cuts = pairwise((*self.seams, len(self.tau)))
-        for own, rows, (begin, end) in zip(out, self.stretches, cuts, strict=True):
-            shares = np.column_stack([bending(column, SLIDE_RAD)[1] for column in q[rows].T])
-            left = self._trimmed(low(shares))
-            own[:, begin:end] = left.T[:, :, None] * np.eye(q.shape[1])[:, None]
-        return out.reshape(-1, *self.tau.shape)
-
-    @cached_property
     def rests(self) -> list[tuple[int, slice]]:
         """Joints (from 0) at rest, and the rows of the band in which each is, rest by rest."""
         still = np.abs(self.low(self.motion.dq)) < SMOOTHING_DQ
@@ -201,17 +183,8 @@ class Signals:
 
     @property
     def sliding(self) -> Array:
-        """(k, n) one there, else zero; of a joint that hardly slides all that is measured counts,
-        see `beside_rests`.
-        """
+        """(k, n) one there, else zero; where a joint hardly slides, all that is measured."""
         return np.where(self.slides.sum(axis=0) < RARELY, self.heard, self.slides)
-
-    def beside_rests(self, x: Array) -> Array:
-        """A torque (k, n) less its mean over each rest: what a joint holds there is no noise."""
-        out = x.copy()
-        for j, rows in self.rests:
-            out[rows, j] -= x[rows, j].mean()
-        return out
 
     @cached_property
     def slowness(self) -> Array:

@@ -314,8 +314,7 @@ def _on_the_rest(task: _GainTask, fit: Fit, gain: Array) -> tuple[Array, Array]:
     step = np.ones(len(gain))
     at, off = _gain_places(fit)
     step[at] = 1.0 + fit.coefficients[off]
-    held = np.zeros((sum(len(x.begins) for x in rest), len(gain)))
-    model = replace(fit.model, recordings=tuple(rest), start_nm=held)
+    model = replace(fit.model, recordings=tuple(rest))
     errors = [own.tau - model.predicted(i) / step for i, own in enumerate(rest)]
     return _rms(errors), _rms([own.tau for own in rest])
 

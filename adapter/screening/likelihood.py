@@ -237,7 +237,7 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
         late_ms = min((late_ms + step * k for k in range(-reach, reach + 1)), key=cost)
     if abs(late_ms) <= 1e3 * LATE_S or cost(late_ms) > cost(0) - EVIDENCE:
         return 0.0
-    wound = (np.column_stack([bending(x, way)[0][at] for x in q.T]) for way in WAYS_RAD[1:])
+    wound = (np.column_stack([bending(x, way)[at] for x in q.T]) for way in WAYS_RAD[1:])
     rival = min(telling.explained(rows._replace(slides=slides)).cost for slides in wound)
     return 1e-3 * late_ms if cost(late_ms) < rival - EVIDENCE else 0.0
 

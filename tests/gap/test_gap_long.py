@@ -68,14 +68,8 @@ def test_moments_of_pieces_are_those_of_the_whole_within_a_fraction_of_a_deviati
     one = at_once()
     model = Model((one,), fit.dtheta, named=fit.named, hand=fit.model.hand)
     exact = Fit(model, fit.prior, fit.noise, fit.timing_std_s).with_noise(fit.noise).carried()
-    of_sample, of_whole = fit.model.start_nm.size, model.start_nm.size
-    first = fit.dtheta.size + 1
-    x = np.delete(known.x, np.s_[first : first + of_sample])
-    std = np.delete(known.std(), np.s_[first : first + of_sample])
-    true = np.delete(exact.x, np.s_[first : first + of_whole])
-    true_std = np.delete(exact.std(), np.s_[first : first + of_whole])
-    assert np.abs((x - true) / true_std).max() < 0.5
-    np.testing.assert_allclose(std, true_std, rtol=0.1)
+    assert np.abs((known.x - exact.x) / exact.std()).max() < 0.5
+    np.testing.assert_allclose(known.std(), exact.std(), rtol=0.1)
 
 
 def test_what_was_left_out_does_not_pass_for_motion() -> None:
@@ -86,7 +80,6 @@ def test_what_was_left_out_does_not_pass_for_motion() -> None:
     np.testing.assert_array_equal(both.tau, np.concatenate([x.tau for x in single]))
     regressors = np.concatenate([x.low_regressor for x in single], axis=1)
     np.testing.assert_array_equal(both.low_regressor, regressors)
-    assert len(both.low_start) == 3 * 7
 
 
 def test_stretches_are_spread_and_move() -> None:

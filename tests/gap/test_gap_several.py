@@ -76,12 +76,11 @@ def test_recording_by_recording_is_what_all_at_once_gives() -> None:
     load, *beside = fits[0].named
     named = (load, replace(fits[1].named[0], recording=1), *beside)
     recordings = tuple(fit.recordings[0] for fit in fits)
-    start = np.concatenate([fit.model.start_nm for fit in fits])
-    model = replace(fits[0].model, recordings=recordings, named=named, start_nm=start)
+    model = replace(fits[0].model, recordings=recordings, named=named)
     whole = replace(fits[0], model=model)
     whole = replace(whole, noise=tuple(fit.noise[0] for fit in fits))
     carried = replace(whole, weights=tuple(fit.weights[0] for fit in fits)).carried()
-    held, last = fits[0].dtheta.size + 1, place_of(fits[0], 0)[-1]  # starts, then the load
+    held, last = fits[0].dtheta.size + 1, place_of(fits[0], 0)[-1]  # then the load
     parts = [Part.of(fit, np.arange(held, last + 1)) for fit in fits]
     together = Together(
         parts, np.delete(whole.prior_std, np.arange(held, place_of(whole, 1)[-1] + 1))
@@ -111,14 +110,15 @@ def test_a_recording_of_another_arm_is_named(change: dict[str, float], what: str
 
 
 def test_pairs_of_twins_of_real_logs_agree() -> None:
-    """Two motions, five loads: each weighed twice."""
+    """Two motions, five loads: each weighed twice, up to what wrong links shift all of them by."""
     twins = [draw_twin(1, motion, load) for motion in range(2) for load in range(5)]
     found = several([by_pinocchio(twin) for twin in twins])
     mass = np.array([load.mass for load in found.loads]).reshape(2, 5)
     assert np.median(np.abs(mass[0] - mass[1])) < 0.2
     true = np.array([twin.load_kg for twin in twins])
     std = np.array([load.mass_std for load in found.loads])
-    assert (np.abs(mass.ravel() - true) < 4.0 * std).all()
+    off = mass.ravel() - true
+    assert (np.abs(off - np.median(off)) < 4.0 * std).all() and abs(np.median(off)) < 0.5
     assert found.odd == []
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from adapter.effects.catalogue import HELD
-from adapter.gap.fit import place_of
 from adapter.gap.hand import Hand, hand_of
 from adapter.gap.real_arm import RealArm, nominal_fit, real_arm, start
 from adapter.gap.signals import Recorded
@@ -133,16 +132,6 @@ def test_where_a_load_is_likely_to_be() -> None:
     values = hand.templates()[0].decode(x)
     assert values["m"] == 2.0
     assert np.allclose([values[key] for key in ("cx", "cy", "cz")], hand.centre)
-
-
-def test_friction_held_at_the_first_sample_is_forgotten_as_a_joint_slides() -> None:
-    twin = draw_twin(TWINS[0])
-    arm, moving = fitted(twin)
-    held = arm.fit.recordings[0].low_start
-    for j in moving:
-        assert np.abs(held[j, -1]).max() < 1e-3
-        assert np.abs(np.delete(held[j], j, axis=1)).max() == 0.0
-    assert len(place_of(arm.fit, 0)) == 10
 
 
 @pytest.mark.timeout(300)

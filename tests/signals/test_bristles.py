@@ -29,7 +29,7 @@ def bent_along(t: np.ndarray, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
 
 def expected(q: np.ndarray, dq: np.ndarray) -> np.ndarray:
     """(m, K, n) by the equation, without noise; the first ones slide at once."""
-    z = [[bending(x, s0)[0] for x in q.T] for s0 in WAYS_RAD[1:]]
+    z = [[bending(x, s0) for x in q.T] for s0 in WAYS_RAD[1:]]
     return np.array([smooth_sign(dq.T), *z]).transpose(2, 0, 1)
 
 
@@ -48,7 +48,7 @@ def test_noise_is_no_way() -> None:
     assert np.sqrt(np.mean((noisy - true)[1000:4000] ** 2)) < 0.02
     held = np.mean(noisy[-200:], axis=0) / true[-1]
     assert (held[1:] > [[0.6], [0.8], [0.9]]).all(), held
-    plain = np.array([bending(x, 1e-3)[0] for x in read[0].T])
+    plain = np.array([bending(x, 1e-3) for x in read[0].T])
     assert (np.abs(np.mean(plain[:, -200:], axis=1)) < 0.3).all()  # what noise makes of it
 
 
