@@ -17,6 +17,7 @@ from adapter.gap.scan import BELIEF, SignatureTable, least_chi2
 from adapter.gap.search import Found
 from adapter.model.spatial import Array
 
+WIDEST = 20.0  # times its prior: nothing is so large
 SURELY = 1.3  # standard deviations: of effects so much larger noise hides one in ten
 STEP, OPEN = 1e-3, 100.0  # of a coefficient's prior: for slopes; how wide it is taken here
 
@@ -31,7 +32,8 @@ def unseen(found: Found, joints: Sequence[int]) -> tuple[Unseen, ...]:
         joints: (from 0) that move.
     """
     fit = found.fit
-    named = {e.candidate.key for k, e in enumerate(fit.named) if k not in found.weak}
+    told = [k for k in range(len(fit.named)) if k not in found.weak]
+    named = {x.candidate.key for k in told for x in (fit.named[k], found.standings[k])}
     table, carried = SignatureTable(fit, joints, rich=False), fit.carried()
     best: dict[tuple[str, int], Unseen] = {}
     for c in table.candidates:
@@ -39,14 +41,19 @@ def unseen(found: Found, joints: Sequence[int]) -> tuple[Unseen, ...]:
         if c.effect.simpler or c.effect.passing or whole_body or c.key in named:
             continue
         own = _least(c, table.X[list(c.columns)], fit, carried)
+        if own is None:
+            continue
         other = best.setdefault(c.key, own)
         if (own.size > other.size) == own.above:
             best[c.key] = own
     return tuple(best.values())
 
 
-def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen:
-    """The least size of an effect with white signatures X (k, r) that is named, all else free."""
+def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen | None:
+    """The least size of an effect with white signatures X (k, r) that is named, all else free.
+
+    None where no size would be that an arm may have.
+    """
     rest = _beside(c, fit)
     G, _ = carried.part(rest).reduced(X @ X.T, X @ carried.N[rest].T, X @ carried.data)
     std, effect = c.prior_std, CATALOGUE[c.effect.name]
@@ -62,6 +69,8 @@ def _least(c: Candidate, X: Array, fit: Fit, carried: Carried) -> Unseen:
     at = std / np.arange(1, len(std) + 1)
     slope = np.array([value(at + x) - value(at) for x in STEP * np.diag(std)]) / (STEP * std)
     size = (np.sqrt(asked) + SURELY) * np.sqrt(slope @ covariance @ slope)
+    if size > WIDEST * np.linalg.norm(slope * std):
+        return None
     above = len(std) == 1 and slope[0] < 0.0  # what is stiff does not show
     if above:
         size = value((np.sqrt(asked) + SURELY) * np.sqrt(covariance[0]))
