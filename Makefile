@@ -77,6 +77,7 @@ trials: $(WARM)
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/imu_trials.py --json runs/imu_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/gap_trials.py --judge --json runs/gap_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/simulate_trials.py --json runs/simulate_trials.json
+	PYTHONPATH=. $(BIN)/python tests/benchmarks/live_trials.py
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/twin_trials.py --json runs/twin_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/contact_trials.py --json runs/contact_trials.json
 	PYTHONPATH=. OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/rate_trials.py --json runs/rate_trials.json

@@ -24,6 +24,7 @@ from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, Disagreement
 from adapter.gap.monitor_signatures import LearnedFrames
 from adapter.learning.change import extremes, is_new
 from adapter.learning.learner import OnlineLearner
+from adapter.learning.theta import Theta
 from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
@@ -198,16 +199,15 @@ class Monitor:
             out.append(np.append(np.zeros(10 * n), sizes[:, j].sum() * change))
         return np.reshape(out, (-1, self._size)).T
 
-    def _unsure(self, effects: Sequence[LearnedEffect], dq: Array) -> Array:
+    def _unsure(self, theta: Theta, dq: Array) -> Array:
         """(m, n) variance of what friction holds at velocities dq (m, n), (N m)².
 
         At a rest static friction is one unknown value however many rows the rest lasts; those of
         a second tell then as much as one.
         """
-        n, std = self._n, self._belief.std()[10 * self._n : self._size]
-        sizes = np.hypot(self._belief.mean()[10 * n : self._size], std).reshape(len(effects), n)
-        bands = np.array([effect.band for effect in effects])
-        held = np.square(slowness(dq)) * (np.square(bands) @ np.square(sizes))
+        own = slice(10 * self._n, self._size)
+        squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
+        held = np.square(slowness(dq)) * theta.banded(squares.reshape(-1, self._n))
         return np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0) * held
 
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
@@ -238,7 +238,7 @@ class Monitor:
         signatures = frames.signatures(q, dq, ddq, model, Y)
         # a joint that comes to a rest or leaves one within a row rests in it
         slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
-        unsure = self._unsure(learner.theta.effects, slowest)
+        unsure = self._unsure(learner.theta, slowest)
         new = is_new(dq, self._speeds).astype(float)
         return RowGroup(t, Z, signatures, tau - tool, unsure, dq, new)
 

@@ -522,8 +522,7 @@ class Theta:
         known no better; `variance` (e n,) is of the effects' parameters.
         """
         squares = np.square(self.effect_values) + variance.reshape(len(self.effects), self.tree.n)
-        bands = np.array([effect.band for effect in self.effects])
-        held, own = HELD**2 * np.square(bands) @ squares, self.variance()
+        held, own = HELD**2 * self.banded(squares), self.variance()
         self.rests[:] = own / (own + REST_SAMPLES * held)
 
     def _choose_shapes(self, shapes: Array | None) -> None:
@@ -728,10 +727,11 @@ class Theta:
         Args:
             dq: (m, n) rad/s.
         """
-        held = np.zeros(self.tree.n)
-        for effect, value in zip(self.effects, self.effect_values, strict=True):
-            held = np.hypot(held, effect.band * value)
-        return held * slowness(dq)
+        return np.sqrt(self.banded(np.square(self.effect_values))) * slowness(dq)
+
+    def banded(self, squares: Array) -> Array:
+        """(n,) variance of slow joints' friction, (N m)², by squares (e, n) of the parameters."""
+        return np.asarray(np.square([effect.band for effect in self.effects]) @ squares)
 
     def start_change(self) -> None:
         """Something at the hand changed: keep what is known, open the spare body for the rest."""

@@ -62,7 +62,11 @@ class DrawnMotion:
 
 
 def draw_motion(
-    rng: np.random.Generator, limits: Limits, ready: Array, kind: str | None = None
+    rng: np.random.Generator,
+    limits: Limits,
+    ready: Array,
+    kind: str | None = None,
+    pace: Array | None = None,
 ) -> DrawnMotion:
     """A random motion around the ready posture (n,) rad that keeps all limits.
 
@@ -71,12 +75,14 @@ def draw_motion(
         limits: of the joints.
         ready: (n,) rad.
         kind: one of `KINDS`; drawn by `SHARES` where None.
+        pace: (m,) s, where in the motion the arm is, each `STEP_S`; slow or not throughout where
+            None.
     """
     n = len(ready)
     kind = kind or str(rng.choice(KINDS, p=SHARES))
-    slow = bool(rng.random() < SLOW_SHARE)
+    slow = bool(rng.random() < SLOW_SHARE) and pace is None
     middle = ready + rng.uniform(-POSTURE_RAD, POSTURE_RAD, n)
-    t: Array = np.arange(0.0, SPAN_S, STEP_S)
+    t: Array = np.arange(0.0, SPAN_S, STEP_S) if pace is None else pace
     drawn = {"sines": _sines, "points": points, "hand": hand}[kind]
     paced = drawn(rng, SLOW_FACTOR * t if slow else t, n)
     shape = paced if kind == "points" else _fade_in(t)[:, None] * paced
