@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.bristle_friction import bending
-from adapter.effects.by_joint import WAYS_RAD, smooth_sign
+from adapter.effects.by_joint import SMOOTHING_DQ, WAYS_RAD, smooth_sign
 from adapter.effects.torque import ModelTorque
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -30,6 +30,7 @@ SMOOTHING_S = 0.018  # of a step by the 10 Hz low-pass that motion and torque we
 SENSOR_NM, SENSOR_SHARE, SENSOR_WEIGHT = 0.03, 0.01, 4.0  # prior of a joint's noise; in samples
 CORRELATED_S, MOST_SAMPLES = 0.15, 50.0  # a misfit keeps its sign so long; and no more count
 HELD = 3.0  # standard deviations of a gain at most: what is further off is no gain
+REST = 0.1  # of a joint's row at rest, root of its weight: static friction holds what it may
 ROUNDS = 6  # of noise after fit; it settles in three
 EVIDENCE = 40.0  # twice the log-likelihood that a reading must gain: odds of 1 to 500 million
 ROWS = 100  # instants that are judged
@@ -115,12 +116,15 @@ class Telling:
         """The same of any torques (m, n) of these instants."""
         columns, model = self._columns(rows, changed)
         (m, n), beyond = model.shape, self._beyond(rows.q)
+        counts = np.where(np.abs(rows.dq) < SMOOTHING_DQ, REST, 1.0)  # as roots of weights
+        counts /= np.sqrt(np.mean(np.square(counts), axis=0))
+        columns *= counts[:, :, None]
         floor = sensor_nm(np.mean(model**2, axis=0))
         squares = np.einsum("mjk,mjl->jkl", columns, columns, optimize=True)
         gains = slice(13 * n, 14 * n)
 
         def of(tau: Array) -> Explained:
-            apart, sigma = tau - model, plausible_nm(model)
+            apart, sigma = counts * (tau - model), plausible_nm(model)
             products = np.einsum("mjk,mj->jk", columns, apart)
             for _ in range(ROUNDS):
                 weight = np.where(self.alive, self.samples / m / sigma**2, 0.0)
