@@ -19,7 +19,7 @@ from adapter.model.spatial import Array
 
 SMOOTHING_DQ = 0.01  # rad/s; below it the sign of a measured velocity is noise
 STRIBECK_SPEED = 0.05  # rad/s, published ones are 0.02 to 0.1; static friction acts below it
-HELD = 3.0  # times what static friction is above Coulomb's: a rest holds anything up to all of it
+AT_REST = 3.0  # times what static friction is above Coulomb's: a rest holds up to all of it
 # Over which bristles wind up that somebody remembers; those of the first one slide at once.
 WAYS_RAD = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)
 
@@ -49,7 +49,7 @@ def smooth_sign(dq: Array, ddq: Array | None = None, smoothing_s: float = 0.0) -
 def slowness(dq: Array) -> Array:
     """How unsure friction is at velocities dq, rad/s, in parts of `Effect.band`."""
     rests = np.abs(dq) < SMOOTHING_DQ
-    return np.asarray(np.where(rests, HELD, np.exp(-np.square(dq / STRIBECK_SPEED))))
+    return np.asarray(np.where(rests, AT_REST, np.exp(-np.square(dq / STRIBECK_SPEED))))
 
 
 class JointSignals(NamedTuple):

@@ -189,14 +189,13 @@ class Monitor:
         """
         n, out = self._n, []
         values = self._belief.mean()[10 * n :].reshape(len(effects), n)
-        own = [bool(effect.band) or effect is OFFSET for effect in effects]
-        sizes = np.abs(values[np.array(own, dtype=bool)])
+        signs = np.array([1.0 if x is OFFSET else -1.0 if x.band else 0.0 for x in effects])
+        sizes = np.abs(values[signs != 0.0]).sum(axis=0)
         way = np.where(self._speeds[1] > -self._speeds[0], 1.0, -1.0)
         for j in np.flatnonzero(np.abs(self._speeds).min(axis=0) < STRIBECK_SPEED):
             change = np.zeros((len(effects), n))
-            for k, effect in enumerate(effects):
-                change[k, j] = 1.0 if effect is OFFSET else -way[j] if effect.band else 0.0
-            out.append(np.append(np.zeros(10 * n), sizes[:, j].sum() * change))
+            change[:, j] = sizes[j] * np.where(signs < 0.0, -way[j], signs)
+            out.append(np.append(np.zeros(10 * n), change))
         return np.reshape(out, (-1, self._size)).T
 
     def _unsure(self, theta: Theta, dq: Array) -> Array:

@@ -262,7 +262,8 @@ class DisagreementList:
             if there is not None and there.joint == candidate.joint and at_once:
                 wider = np.zeros((len(belief.rhs), len(there.std)))
                 wider[found.at : found.at + len(there.std)] = WIDER * np.diag(there.std)
-                return belief.widen(wider)
+                belief.widen(wider)
+                return
         entry = self._entry(candidate.name, candidate.joints, told.since_s, told.now_s, told.score)
         entry["size"] = dict(told.size)
         entry["ambiguous_with"] = [{"what": c.name, "joints": c.joints} for c in told.close]

@@ -166,9 +166,14 @@ class Signals:
         return np.ascontiguousarray(np.moveaxis(whole, 2, 0))
 
     @cached_property
+    def low_dq(self) -> Array:
+        """(k, n) rad/s velocities in the band."""
+        return self.low(self.motion.dq)
+
+    @cached_property
     def rests(self) -> list[tuple[int, slice]]:
         """Joints (from 0) at rest, and the rows of the band in which each is, rest by rest."""
-        still = np.abs(self.low(self.motion.dq)) < SMOOTHING_DQ
+        still = np.abs(self.low_dq) < SMOOTHING_DQ
         edges = np.diff(still.astype(int), axis=0, prepend=0, append=0)
         cuts = (np.flatnonzero(column).reshape(-1, 2) for column in edges.T)
         return [(j, slice(*cut)) for j, own in enumerate(cuts) for cut in own.tolist()]
@@ -179,7 +184,7 @@ class Signals:
 
         At rest it holds what static friction lets it: that is neither noise nor unexplained.
         """
-        return (self.heard > 0.0) & (np.abs(self.low(self.motion.dq)) > SMOOTHING_DQ)
+        return (self.heard > 0.0) & (np.abs(self.low_dq) > SMOOTHING_DQ)
 
     @property
     def sliding(self) -> Array:
@@ -189,7 +194,7 @@ class Signals:
     @cached_property
     def slowness(self) -> Array:
         """(k, n) how unsure friction is; of a rest, which holds one unknown value, so is a row."""
-        out = slowness(self.low(self.motion.dq))
+        out = slowness(self.low_dq)
         for j, rows in self.rests:
             out[rows, j] *= math.sqrt(rows.stop - rows.start)
         return out

@@ -34,13 +34,13 @@ def unseen(found: Found, joints: Sequence[int]) -> tuple[Unseen, ...]:
     fit = found.fit
     told = [k for k in range(len(fit.named)) if k not in found.weak]
     named = {x.candidate.key for k in told for x in (fit.named[k], found.standings[k])}
-    table, carried = SignatureTable(fit, joints, rich=False), fit.carried()
+    table = SignatureTable(fit, joints, rich=False)
     best: dict[tuple[str, int], Unseen] = {}
     for c in table.candidates:
         whole_body = c.columns_are_theta and c.template.theta is None
         if c.effect.simpler or c.effect.passing or whole_body or c.key in named:
             continue
-        own = _least(c, table.X[list(c.columns)], fit, carried)
+        own = _least(c, table.X[list(c.columns)], fit, table.carried)
         if own is None:
             continue
         other = best.setdefault(c.key, own)

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import HELD, JointSignals, slowness
+from adapter.effects.by_joint import AT_REST, JointSignals, slowness
 from adapter.errors import SettingsError
+from adapter.judgement.noise import MEMORY_S
 from adapter.learning.settings import ThetaSettings
 from adapter.learning.theta_kernels import (
     Given,
@@ -55,7 +56,6 @@ REAL_MODEL_ERROR, IDEAL_MODEL_ERROR = 0.01, 0.001  # N m
 # An effect of this size in its unit (N m, N m s/rad, kg m²) is that of a real arm; one whose spread
 # has fallen to this share of what it may be is not there.
 REAL_EFFECT, SMALLEST_SPREAD = 0.05, 1e-3
-REST_SAMPLES = 10.0  # independent ones a second: noise has a memory of a tenth
 SPREAD_STEPS = 50  # at each look at how large the effects are
 # Of an effect that has several shapes: the first one in use, how many are tried at a look, and by
 # what another must be better, in squares of standard deviations.
@@ -522,8 +522,8 @@ class Theta:
         known no better; `variance` (e n,) is of the effects' parameters.
         """
         squares = np.square(self.effect_values) + variance.reshape(len(self.effects), self.tree.n)
-        held, own = HELD**2 * self.banded(squares), self.variance()
-        self.rests[:] = own / (own + REST_SAMPLES * held)
+        held, own = AT_REST**2 * self.banded(squares), self.variance()
+        self.rests[:] = own / (own + held / MEMORY_S[0])  # a second has so many independent ones
 
     def _choose_shapes(self, shapes: Array | None) -> None:
         """Let effects act with shapes (e, n) from now on; with their first where there are none."""

@@ -17,7 +17,7 @@ from scipy.stats import multivariate_normal
 from adapter.effects import CATALOGUE
 from adapter.effects.active import WHOLE, Active
 from adapter.effects.base import LINK, Motion
-from adapter.effects.by_joint import HELD
+from adapter.effects.by_joint import AT_REST
 from adapter.effects.payload import theta_of
 from adapter.effects.torque import sensed_torque
 from adapter.gap.candidates import (
@@ -580,7 +580,7 @@ def test_a_rest_is_one_unknown_value_however_long_it_lasts():
     dq[:, RUBS] = np.where(moves, 0.2 * np.pi * np.sin(0.4 * np.pi * t), 0.0)
     own = prepare(recorded(noisy(np.zeros_like(q), TAU_NOISE, 1), t, q, dq), ARM)
     slowness = own.slowness[:, RUBS]
-    rest = HELD * np.sqrt(5.0 * 25.0)
+    rest = AT_REST * np.sqrt(5.0 * 25.0)
     assert slowness[(own.t > 6.0) & (own.t < 9.0)] == pytest.approx(rest, rel=0.1)
     sliding = np.abs(own.low(own.motion.dq)[:, RUBS]) > 0.2
     assert sliding.sum() > 50 and slowness[sliding].max() < 1e-3
