@@ -18,7 +18,7 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import FLANK
 
 MOVES = 0.9  # of the smoothed direction, from which a joint is on its way
-SIZES_RAD = (1.5e-3, 5e-3, 15e-3)  # to look for: when a play is crossed hangs on its width
+SIZES_RAD = (1.5e-3, 3e-3, 6e-3, 12e-3)  # to look for: when a play is crossed hangs on its width
 NARROW = -40.0  # ln of the odds that a play narrower than these shows
 
 

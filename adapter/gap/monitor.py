@@ -10,15 +10,15 @@ An arm at rest shows nothing: the front end passes on states of motion only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import LearnedEffect
-from adapter.effects.by_joint import SMOOTHING_DQ, STRIBECK_SPEED, slowness
+from adapter.effects.by_joint import SMOOTHING_DQ, slowness
 from adapter.effects.catalogue import CATALOGUE
+from adapter.gap.evidence import LEAST_NM
 from adapter.gap.monitor_evidence import ROWS_PER_GROUP, Belief, Level, RowGroup
 from adapter.gap.monitor_judge import GROUPS, DisagreementDetector, DisagreementList, sentence
 from adapter.gap.monitor_signatures import LearnedFrames
@@ -29,14 +29,16 @@ from adapter.model.spatial import Array
 from adapter.physics.kernels import jit
 from adapter.signals.records import StateLayout, stamp_of
 
-OFFSET = CATALOGUE["torque_offset"]
+VISCOUS = CATALOGUE["viscous_friction"]
 BLOCK_NS = 40_000_000  # states averaged to one row
 ROWS_PER_S = 1e9 / BLOCK_NS
 HOLE_NS = 20_000_000  # a longer hole between two states ends a block without a row
 ENOUGH = 3000  # states behind θ before its least squares is taken over
 TRUST = 4.0  # the learner's information counts one in so many
 KEEP = 1.0 - 0.2 / 120.0  # of the belief, from one group to the next
-KNOWN_SHARE = 0.2  # of a new velocity, from a group in which it was seen: it takes a second
+STRIBECK_SPEEDS = (0.03, 0.1)  # rad/s; between them, static friction's shape is a sum of theirs
+DRIFT = 0.2  # of friction: no law of it is better from one move to the next
+KNOWN_SHARE = 0.2  # of a new rate, from a group in which it was seen: it takes a second
 MOVED = 1e-3  # rad and m; frames that moved less make no torque of interest
 START_INFLATION = 2.0  # of sums of rows, before it is measured
 
@@ -174,29 +176,23 @@ class Monitor:
             rest = np.r_[: 10 * n, 10 * n + 10 : len(rhs)]
             H, rhs = H[np.ix_(rest, rest)], rhs[rest]
         self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
-        self._speeds = extremes(learner.speeds_seen)
-        self._belief.widen(self._one_way(learner.theta.effects))
+        speeds = extremes(learner.speeds_seen)
+        self._rates = np.hstack([speeds, np.zeros_like(speeds)])  # how it sped up, nobody kept
+        squares, rubs = self._squares(), [x.band > 0.0 or x is VISCOUS for x in theta.effects]
+        self._belief.drift[10 * n :] = DRIFT**2 * (np.array(rubs)[:, None] * squares).ravel()
+        more = np.sqrt(theta.banded(squares) + LEAST_NM**2)  # static friction above Coulomb's
+        self._belief.extend(np.tile(more, len(STRIBECK_SPEEDS)))
         R0, p = learner.frames
         self._frames = LearnedFrames(learner.tree.parent, R0, p, learner.base, theta.smoothing_s)
         self._level = Level(theta.variance(theta.least_squares()), START_INFLATION)
         self._detector = DisagreementDetector(n, self._belief, self._level, self._found)
         self._groups, self._rows = [], []
 
-    def _one_way(self, effects: Sequence[LearnedEffect]) -> Array:
-        """(D, k) how far joints that turned one way only take friction for an offset.
-
-        Which of the two a joint has shows when it turns the other way, and is nothing new then.
-        """
-        n, out = self._n, []
-        values = self._belief.mean()[10 * n :].reshape(len(effects), n)
-        signs = np.array([1.0 if x is OFFSET else -1.0 if x.band else 0.0 for x in effects])
-        sizes = np.abs(values[signs != 0.0]).sum(axis=0)
-        way = np.where(self._speeds[1] > -self._speeds[0], 1.0, -1.0)
-        for j in np.flatnonzero(np.abs(self._speeds).min(axis=0) < STRIBECK_SPEED):
-            change = np.zeros((len(effects), n))
-            change[:, j] = sizes[j] * np.where(signs < 0.0, -way[j], signs)
-            out.append(np.append(np.zeros(10 * n), change))
-        return np.reshape(out, (-1, self._size)).T
+    def _squares(self) -> Array:
+        """(e, n) mean squares of the learned effects' parameters."""
+        own = slice(10 * self._n, self._size)
+        squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
+        return np.asarray(squares.reshape(-1, self._n))
 
     def _unsure(self, theta: Theta, dq: Array) -> Array:
         """(m, n) variance of what friction holds at velocities dq (m, n), (N m)².
@@ -204,9 +200,7 @@ class Monitor:
         At a rest static friction is one unknown value however many rows the rest lasts; those of
         a second tell then as much as one.
         """
-        own = slice(10 * self._n, self._size)
-        squares = np.square(self._belief.mean()[own]) + np.square(self._belief.std()[own])
-        held = np.square(slowness(dq)) * theta.banded(squares.reshape(-1, self._n))
+        held = np.square(slowness(dq)) * theta.banded(self._squares())
         return np.where(np.abs(dq) < SMOOTHING_DQ, ROWS_PER_S, 1.0) * held
 
     def _take(self, learner: OnlineLearner, frames: LearnedFrames) -> None:
@@ -228,18 +222,21 @@ class Monitor:
         q, dq, ddq, tau = (np.ascontiguousarray(x) for x in at[:4])
         Y = frames.regressor(q, dq, ddq)
         tool = Y[:, :, -10:] @ self._tool
-        Z = np.zeros((len(t), self._n, self._size))
+        columns = list(learner.theta.torque_per_unit(at))
+        columns += [at.direction * np.exp(-np.square(dq / speed)) for speed in STRIBECK_SPEEDS]
         links, joints = Y.shape[2], np.arange(self._n)
+        Z = np.zeros((len(t), self._n, links + len(columns) * self._n))
         Z[:, :, :links] = Y
-        for k, column in enumerate(learner.theta.torque_per_unit(at)):
+        for k, column in enumerate(columns):
             Z[:, joints, links + k * self._n + joints] = column
-        model = Z @ self._belief.mean()[: self._size] + tool
+        model = Z @ self._belief.mean()[: Z.shape[2]] + tool
         signatures = frames.signatures(q, dq, ddq, model, Y)
         # a joint that comes to a rest or leaves one within a row rests in it
         slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
         unsure = self._unsure(learner.theta, slowest)
-        new = is_new(dq, self._speeds).astype(float)
-        return RowGroup(t, Z, signatures, tau - tool, unsure, dq, new)
+        rates = np.hstack([dq, ddq])
+        new = is_new(rates, self._rates).reshape(len(t), 2, -1).any(axis=1)
+        return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new.astype(float))
 
     def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""
@@ -252,5 +249,5 @@ class Monitor:
         flat = Z.reshape(-1, Z.shape[2])
         self._belief.absorb(flat, weight.ravel(), group.tau.ravel(), KEEP)
         self._found.forget_before(float(group.t[0]), self._belief)
-        further = extremes(np.concatenate([self._speeds, group.dq]))
-        self._speeds += KNOWN_SHARE * (further - self._speeds)
+        further = extremes(np.concatenate([self._rates, group.rates]))
+        self._rates += KNOWN_SHARE * (further - self._rates)

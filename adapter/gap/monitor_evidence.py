@@ -34,12 +34,16 @@ class Belief:
 
     Args:
         H: (D, D); rhs: (D,).
+
+    Attributes:
+        drift: (D,) variance by which a coefficient differs from one window to the next.
     """
 
     def __init__(self, H: Array, rhs: Array) -> None:
         self.H, self.rhs = H.copy(), rhs.copy()
         self._floor = 1e-3 * H.diagonal()
         self._mean: Array | None = None
+        self.drift = np.zeros(len(rhs))
 
     def absorb(self, Z: Array, weight: Array, tau: Array, keep: float) -> None:
         """Add rows Z (r, D), tau (r,) of these weights; `keep` is the share of the old kept.
@@ -75,6 +79,13 @@ class Belief:
         self.H = self.H - across @ known
         self.rhs, self._floor = self.H @ mean, 1e-3 * self.H.diagonal()
 
+    def loosened(self) -> Array:
+        """(D, D) information on the coefficients of one window, by their `drift`."""
+        at = np.flatnonzero(self.drift)
+        across = self.H[:, at]
+        own = np.diag(1.0 / self.drift[at]) + across[at]
+        return np.asarray(self.H - across @ np.linalg.solve(own, across.T))
+
     def extend(self, std: Array) -> None:
         """New coefficients behind the others: zero give or take std (k,)."""
         size, k = len(self.rhs), len(std)
@@ -82,6 +93,7 @@ class Belief:
         H[:size, :size] = self.H
         H[np.arange(size, size + k), np.arange(size, size + k)] = 1.0 / std**2
         self.H, self.rhs, self._mean = H, np.r_[self.rhs, np.zeros(k)], None
+        self.drift = np.r_[self.drift, np.zeros(k)]
 
     def drop(self, at: slice) -> None:
         """Integrate out the coefficients there."""
@@ -89,7 +101,7 @@ class Belief:
         rest = np.r_[: at.start, at.stop : size]
         gain = np.linalg.solve(self.H[at, at], np.c_[self.H[at, rest], self.rhs[at]])
         cross = self.H[np.ix_(rest, np.arange(size)[at])]
-        self.rhs = self.rhs[rest] - cross @ gain[:, -1]
+        self.rhs, self.drift = self.rhs[rest] - cross @ gain[:, -1], self.drift[rest]
         self.H = self.H[np.ix_(rest, rest)] - cross @ gain[:, :-1]
         self._mean = None
 
@@ -103,7 +115,8 @@ class RowGroup:
         Z: (r, n, D) regressor and columns of the learned effects.
         S: (r, n, K) signatures; tau: (r, n) N m.
         unsure: (r, n) variance that no model of these rows can do without, (N m)².
-        dq: (r, n) rad/s; new: (r, n) 1 where that is beyond what the belief has seen, else 0.
+        rates: (r, 2 n) velocities and accelerations, rad/s and rad/s².
+        new: (r, n) 1 where one of a joint's is beyond what the belief has seen, else 0.
     """
 
     t: Array
@@ -111,7 +124,7 @@ class RowGroup:
     S: Array
     tau: Array
     unsure: Array
-    dq: Array
+    rates: Array
     new: Array
 
     @property
@@ -144,7 +157,7 @@ class Evidence:
         self._r = self.residual * root
         D = len(mean)
         flat = self._Z.reshape(-1, D)
-        self.factor = np.linalg.cholesky(belief.H + flat.T @ flat)
+        self.factor = np.linalg.cholesky(belief.loosened() + flat.T @ flat)
         # well enough conditioned for its inverse, and products are much faster than solutions
         self._inverse = solve_triangular(self.factor, np.eye(D), lower=True, check_finite=False)
         self._pull = self._inverse @ (flat.T @ self._r.ravel())

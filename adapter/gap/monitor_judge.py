@@ -23,9 +23,7 @@ SOONEST_S = 0.7  # after its start: before, all names look alike
 LATEST_S = 1.4  # after its start the best name is told even if another is close
 OVER_THRESHOLD = 10.0
 OVER_SHARE = 0.7  # of the best new name's evidence, which has more freedom around the edge
-PEAK_FACTOR = 2.0  # a report needs so many times the evidence that came and went before
-PEAK_KEEP = 0.997  # of such a peak, from one group to the next: a minute
-QUIET_GROUPS = 30  # after the start, while the window fills and peaks are learned
+QUIET_GROUPS = 30  # after the start, while the window fills
 REST_S = 0.9  # after a report before the next one
 EDGE_ROWS, HALF_ROW_S = 3, 0.02
 LEFT_RATIO, LEFT_SHARE = 4.0, 0.15  # of the level, of the residual: more is left unexplained
@@ -46,9 +44,6 @@ class DisagreementDetector:
         self._candidates = candidates(n)
         self._all = Candidates(self._candidates)
         self._belief, self._level, self._found = belief, level, found
-        self._peaks, self._power_peak = np.zeros(len(self._candidates)), np.ones(n)
-        self._recent: list[Array] = []
-        self._powers: list[Array] = []
         self._groups: Sequence[RowGroup] = ()
         self._judged, self._now_s = GROUPS, 0.0
         self._quiet_until_s, self._began_s = -np.inf, np.inf
@@ -75,20 +70,8 @@ class DisagreementDetector:
         ready = self._judged >= QUIET_GROUPS and now_s >= self._quiet_until_s
         if not ended and ready and len(self._found.active) < MOST:
             self._report_something(evidence, scores, power)
-        best = scores.max(axis=1)  # that leaves the window without a report raises the bar
-        quiet = not self._found.active and now_s > self._quiet_until_s
-        self._recent.append(best if quiet else np.zeros_like(best))
-        self._powers.append(power if quiet else np.ones_like(power))
-        self._peaks *= PEAK_KEEP
-        self._power_peak = np.maximum(PEAK_KEEP * self._power_peak, 1.0)
-        if len(self._recent) > GROUPS:
-            self._peaks = np.maximum(self._peaks, self._recent.pop(0))
-            self._power_peak = np.maximum(self._power_peak, self._powers.pop(0))
         if ended or len(self._found.reports) > before:
-            # what led to a report was no burst that passed; what follows it has to wait
             self._quiet_until_s, self._began_s = now_s + REST_S, np.inf
-            self._recent = [np.zeros_like(x) for x in self._recent]
-            self._powers = [np.ones_like(x) for x in self._powers]
         self._found.refresh(self._belief, evidence)
 
     def _evidence(self, weight: Array | None = None) -> Evidence:
@@ -127,12 +110,11 @@ class DisagreementDetector:
     def _report_something(self, evidence: Evidence, scores: Array, power: Array) -> None:
         """Tell the best candidate if it leads, or that nothing explains what is new."""
         best = scores.max(axis=1)
-        bar = np.maximum(THRESHOLD, PEAK_FACTOR * self._peaks)
-        which = int(np.argmax(np.where(best > bar, best, -np.inf)))
-        if best[which] <= bar[which]:
+        which = int(np.argmax(best))
+        if best[which] <= THRESHOLD:
             self._began_s = np.inf  # but that no candidate looks like may be there for a second
             known = {j for found in self._found.active for j in found.joints if found.lasts}
-            loud = np.flatnonzero(power > np.maximum(POWER, PEAK_FACTOR * self._power_peak))
+            loud = np.flatnonzero(power > POWER)
             joints = [int(j) for j in loud if int(j) not in known]
             if joints:
                 score = float(np.sqrt(power[joints].max()))

@@ -446,11 +446,14 @@ def least_chi2(effect: Effect, interval_s: tuple[float, float]) -> float:
 
 
 def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
-    """The best leads of each joint and the best of all."""
+    """The best leads of each joint and the best of all.
+
+    Noise is still what they explain as well: under its own, one may be worth far more.
+    """
     seen: dict[int, int] = {}
     chosen = []
     for place, lead in enumerate(leads):
-        if lead.log_evidence < BELIEF:
+        if lead.log_evidence < 0.0:
             break
         joint = lead.candidate.joint
         plain = lead.candidate.effect.bundled and lead.interval_s == WHOLE

@@ -335,14 +335,19 @@ def otherwise_told(rows: Rows, telling: Telling) -> tuple[list[Reading], Explain
         costs = [x.cost + NUMBER * y.numbers for x, y in zip(explained, nearer, strict=True)]
         if min(costs, default=np.inf) > now.cost - EVIDENCE:
             break
-        dates = (np.array(DATES) * len(rows.q)).astype(int).tolist()
-        held = min((telling.explained(rows, date) for date in dates), key=lambda x: x.cost)
-        if held.cost + NUMBER < min(costs):  # the hand takes or leaves something
+        held = other_hand(rows, telling)
+        if held.cost + NUMBER < min(costs):
             return found, held
         best = int(np.argmin(costs))
         found.append(nearer[best])
         now, rows = explained[best], nearer[best].rows
     return found, now
+
+
+def other_hand(rows: Rows, telling: Telling) -> Explained:
+    """How well the model explains rows where the hand takes or leaves something half way."""
+    dates = (np.array(DATES) * len(rows.q)).astype(int).tolist()
+    return min((telling.explained(rows, date) for date in dates), key=lambda x: x.cost)
 
 
 def _swapped(n: int, i: int, j: int) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
 from adapter.screening.likelihood import ROWS, Rows, Telling, explains_nothing, lateness_s
-from adapter.screening.readings import otherwise_told
+from adapter.screening.readings import other_hand, otherwise_told
 from adapter.screening.rows import pauses, stuck
 from adapter.screening.timing import (
     RecordingClock,
@@ -431,9 +431,9 @@ def _judged(
         late_s = late_s if then.cost < now.cost else 0.0
         if late_s:
             found, now = found_then, then
-    moving = moving_joints(*smoothed[:2])
-    share = now.share[[j for j in moving if telling.alive[j]]]
-    if explains_nothing(share):
+    moving = [j for j in moving_joints(*smoothed[:2]) if telling.alive[j]]
+    share = now.share[moving]
+    if explains_nothing(share) and explains_nothing(other_hand(rows, telling).share[moving]):
         if renamed:
             why = "the joints are named otherwise and its torques are not those of such an arm"
             raise _another_robot(log, model, renamed, why)

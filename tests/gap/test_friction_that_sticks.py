@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,19 +12,19 @@ from adapter.gap.result import GapResult
 from adapter.gap.workflow import find_gap
 from adapter.model.urdf import model_from_urdf
 from drivers.files.mcap import Log
+from sim.effects import Effect
 from sim.hidden.trial import Trial, draw, nominal_urdf
 from tests.helpers.gap_mujoco import mujoco_recording
 
-SEEDS = (73000, 73001)
+SEEDS, PLAY_RAD = (73000, 73001), 8e-3
 BOTH_WAYS_S, MOVES = 0.5, 0.05  # that a joint must move each way, and how fast, rad/s
 
 
 @cache
-def judged(
-    seed: int, kind: str = "null", effect: str | None = None
-) -> tuple[Trial, Log, GapResult]:
+def judged(seed: int, *beside: Effect) -> tuple[Trial, Log, GapResult]:
     """An arm whose joints truly stick, from point to point, and what is said of it."""
     trial = draw(seed, "null", motion="points", sticks=True)
+    trial = replace(trial, effects=(*trial.effects, *beside))
     log = mujoco_recording(trial)
     return trial, log, find_gap([log], model_from_urdf(nominal_urdf(trial.nominal)))
 
@@ -42,6 +43,14 @@ def test_friction_of_each_joint_that_turned_both_ways_is_named_and_sized(seed: i
         assert abs(f.parameters["Fc"] - Fc) < max(0.1 * Fc, 4.0 * f.std["Fc"])
     assert not result.unexplained
     assert {f.effect for f in result.findings} == {"coulomb_friction"}
+
+
+def test_play_that_is_crossed_a_few_times_is_named_beside_it() -> None:
+    """As noise it hides itself: the joint's residual is mostly what the crossings make."""
+    _, _, result = judged(SEEDS[1], Effect("backlash", (4,), {"b": PLAY_RAD}))
+    play = next(f for f in result.findings if f.effect == "backlash")
+    assert play.joints == (4,) and abs(play.parameters["b"] - PLAY_RAD) < 0.1 * PLAY_RAD
+    assert {f.effect for f in result.findings} == {"coulomb_friction", "backlash"}
 
 
 def test_what_would_not_have_been_seen_is_told_of_all_joints_that_move() -> None:

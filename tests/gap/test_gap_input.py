@@ -14,8 +14,9 @@ from adapter.physics.rigid_arm import RigidArm
 from adapter.screening.screen import RecordingRefused, Screened, moving_joints, refuse
 from drivers.files.mcap import Log, read_log
 from sim.effects import payload
-from sim.hidden import draw
+from sim.hidden import Trial, draw
 from sim.hidden.record import write
+from tests.benchmarks.live_trials import trial_of
 from tests.helpers.arm_data import ArmData, Motion, arm, panda_model, pin_model, record, rnea
 from tests.helpers.gap_tools import pinocchio_recording
 
@@ -203,9 +204,9 @@ def test_a_few_poses_are_no_other_order(tmp_path: Path) -> None:
     taken(read_log(log), documented(model))
 
 
-def test_what_the_hand_takes_half_way_is_no_other_arm(tmp_path: Path) -> None:
+@pytest.mark.parametrize("trial", [replace(draw(31019), seconds=15.0), trial_of(77013)])
+def test_what_the_hand_takes_half_way_is_no_other_arm(trial: Trial, tmp_path: Path) -> None:
     """5 kg from some time on, which no load that is there from the start explains."""
-    trial = replace(draw(31019), seconds=15.0)
     log, model, _ = write(trial, tmp_path, pinocchio_recording(trial), "pinocchio")
     taken(read_log(log), documented(model))
 

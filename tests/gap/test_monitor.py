@@ -11,6 +11,7 @@ import pytest
 from adapter.cli.results import disagreement_lines
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.gap.monitor import Blocks, Monitor
+from adapter.gap.monitor_evidence import Belief
 from adapter.physics.rigid_arm import RigidArm
 from adapter.realtime.run_messages import RunMessages
 from adapter.runs.config import PipelineSettings
@@ -208,6 +209,15 @@ def test_without_a_monitor_nothing_is_claimed() -> None:
     learner = learner_for(seed=1)
     learner.step_table(states_of(disturbed("nothing", 20))[:ROWS])
     assert collect(learner).disagreements is None
+
+
+def test_within_a_window_friction_differs_by_its_drift_and_no_more_is_known() -> None:
+    """Covariances add, whatever else is known: by the inverse of their sum."""
+    root = np.random.default_rng(3).normal(size=(4, 4))
+    belief = Belief(root @ root.T + np.eye(4), np.zeros(4))
+    belief.drift[1:3] = 0.5, 2.0
+    own = np.linalg.inv(np.linalg.inv(belief.H) + np.diag(belief.drift))
+    assert np.allclose(belief.loosened(), own)
 
 
 def test_a_hole_ends_a_block() -> None:
