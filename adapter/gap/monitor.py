@@ -150,11 +150,12 @@ class Monitor:
         rows = self._blocks.add(table)
         if not rows:
             return
-        outdated = self._frames is None  # or λ was learned further while nothing else was new
+        # or λ or the hand's load was learned anew while nothing else was new
+        outdated = self._frames is None
         if self._frames is not None and not self._found.active:
             R0, p = learner.frames
             moved = max(np.abs(R0 - self._frames.R0).max(), np.abs(p - self._frames.p).max())
-            outdated = moved > MOVED
+            outdated = moved > MOVED or self._changes < len(learner.changes)
         if learner.theta.count >= ENOUGH and outdated:
             self._take_over(learner)
         if self._frames is None:
@@ -166,7 +167,7 @@ class Monitor:
 
     def _take_over(self, learner: OnlineLearner) -> None:
         """Start from what the learner knows."""
-        theta, n = learner.theta, self._n
+        theta, n, self._changes = learner.theta, self._n, len(learner.changes)
         H, rhs = theta.information()
         if theta.spare_in_use:  # it stands behind the last link, whose place it takes
             before = Belief(H, rhs)

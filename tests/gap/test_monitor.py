@@ -24,7 +24,7 @@ from sim.hidden.bristles import draw_bristles
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
 
-AT_S, SECONDS, CONTACT_S = 15.0, 18.0, 1.5
+AT_S, EARLY_S, SECONDS, CONTACT_S = 15.0, 6.0, 18.0, 1.5
 FORCE_N = np.array([-6.0, 3.0, 7.4])  # 10 N in all
 FRICTION_NM = np.array([0.27, 0.20, 0.14, 0.45, 0.30, 0.15, 0.25])
 ROWS = 10  # states at a time where ADAM's path does not matter
@@ -35,7 +35,8 @@ QUIET = [20, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(21, 
 
 def disturbed(kind: str, seed: int) -> ArmData:
     """A recording with something new at 15 s; torques made here, not by the catalogue."""
-    truth = build("payload_at_20s", mass=0.5, t_s=AT_S).truth if kind == "payload" else arm()
+    at_s = {"payload": AT_S, "early_payload": EARLY_S}.get(kind)
+    truth = build("payload_at_20s", mass=0.5, t_s=at_s).truth if at_s else arm()
     data = record(truth, Motion(SECONDS, seed))
     q, dq, _, tau = data.true
     t = 1e-9 * data.stamp_ns
@@ -141,6 +142,12 @@ def test_what_is_in_no_catalogue_is_unexplained(seed: int) -> None:
 @pytest.mark.parametrize("seed", QUIET)
 def test_nothing_new_nothing_said(seed: int) -> None:
     assert not watch("nothing", seed).reports
+
+
+@pytest.mark.slow
+def test_a_load_that_the_learner_saw_before_the_watch_began_is_told_once() -> None:
+    found = watch("early_payload", 1, rows=1)
+    assert found.changes == 1 and not found.reports
 
 
 @pytest.mark.parametrize(
