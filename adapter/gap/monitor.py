@@ -177,8 +177,7 @@ class Monitor:
             rest = np.r_[: 10 * n, 10 * n + 10 : len(rhs)]
             H, rhs = H[np.ix_(rest, rest)], rhs[rest]
         self._belief, self._size = Belief(H / TRUST, rhs / TRUST), len(rhs)
-        speeds = extremes(learner.speeds_seen)
-        self._rates = np.hstack([speeds, np.zeros_like(speeds)])  # how it sped up, nobody kept
+        self._rates = extremes(learner.rates_seen)
         squares, rubs = self._squares(), [x.band > 0.0 or x is VISCOUS for x in theta.effects]
         self._belief.drift[10 * n :] = DRIFT**2 * (np.array(rubs)[:, None] * squares).ravel()
         more = np.sqrt(theta.banded(squares) + LEAST_NM**2)  # static friction above Coulomb's
@@ -236,8 +235,8 @@ class Monitor:
         slowest = np.maximum(np.abs(dq) - 1e-9 * BLOCK_NS * np.abs(ddq), 0.0)
         unsure = self._unsure(learner.theta, slowest)
         rates = np.hstack([dq, ddq])
-        new = is_new(rates, self._rates).reshape(len(t), 2, -1).any(axis=1)
-        return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new.astype(float))
+        new = is_new(rates, self._rates).astype(float)
+        return RowGroup(t, Z, signatures, tau - tool, unsure, rates, new)
 
     def _absorb(self, group: RowGroup) -> None:
         """Learn from a group that left the window, and its noise."""

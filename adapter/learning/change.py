@@ -51,19 +51,24 @@ def explained_share(columns: Array, error: Array) -> float:
     return 1.0 - float(rest @ rest) / max(float(left @ left), 1e-300)
 
 
-def is_new(dq: Array, seen: Array) -> NDArray[np.bool_]:
-    """(m, n) where velocities dq (m, n) are beyond those seen (k, n), all in rad/s.
+def is_new(rates: Array, seen: Array) -> NDArray[np.bool_]:
+    """(m, n) where a joint's velocity or acceleration is beyond those seen.
 
     Friction of a joint that has turned one way only is told from nothing else; what it does the
-    other way, or much faster, is foretold wrong without anything having changed.
+    other way, or much faster, is foretold wrong without anything having changed. So are inertias
+    of an arm that has hardly sped up.
+
+    Args:
+        rates: (m, 2 n) velocities and accelerations, rad/s and rad/s²; seen: (k, 2 n).
     """
     low, high = extremes(seen)
-    return np.asarray((dq < BEYOND * low) | (dq > BEYOND * high))
+    new = (rates < BEYOND * low) | (rates > BEYOND * high)
+    return np.asarray(new.reshape(len(rates), 2, -1).any(axis=1))
 
 
-def extremes(dq: Array) -> Array:
-    """(2, n) least and largest of velocities (k, n) and of rest, rad/s."""
-    return np.array([dq.min(axis=0, initial=0.0), dq.max(axis=0, initial=0.0)])
+def extremes(rates: Array) -> Array:
+    """(2, n) least and largest of rates (k, n) and of rest."""
+    return np.array([rates.min(axis=0, initial=0.0), rates.max(axis=0, initial=0.0)])
 
 
 class ChangeDetector:

@@ -600,18 +600,19 @@ class OnlineLearner:
         Y = np.zeros((m, n, 10 * n))
         regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
-        power, seen = np.square(error / size), self.speeds_seen
-        if len(seen) and power[is_new(motion.dq, seen)].sum() > NEW_SHARE * power.sum():
+        power, seen = np.square(error / size), self.rates_seen
+        new = is_new(np.hstack([motion.dq, motion.ddq]), seen)
+        if len(seen) and power[new].sum() > NEW_SHARE * power.sum():
             return False
         begin = self.theta.hand.start
         load = Y[:, :, begin : begin + 4] / size[:, :, None]  # mass and its moments
         return explained_share(load, error / size) > LOAD_SHARE
 
     @property
-    def speeds_seen(self) -> Array:
-        """(k, n) velocities of the states still held, rad/s."""
-        rows = np.arange(self._held_from, self._held_to) % len(self._held)
-        return np.asarray(self._held[rows, self.layout.dq])
+    def rates_seen(self) -> Array:
+        """(k, 2 n) velocities and accelerations of the states still held, rad/s and rad/s²."""
+        held = self._held[np.arange(self._held_from, self._held_to) % len(self._held)]
+        return np.hstack([held[:, self.layout.dq], held[:, self.layout.ddq]])
 
     def _start_change(self, stamp_ns: int) -> None:
         self.changes.append(Change(stamp_ns))
