@@ -72,19 +72,17 @@ class Belief:
         """(D,) standard deviations."""
         return np.asarray(np.sqrt(np.diagonal(np.linalg.inv(self.H))))
 
-    def widen(self, by: Array) -> None:
-        """Add the covariance `by by^T`, by (D, k), about the same mean."""
-        mean, across = self.mean(), self.H @ by
-        known = np.linalg.solve(np.eye(by.shape[1]) + by.T @ across, across.T)
-        self.H = self.H - across @ known
-        self.rhs, self._floor = self.H @ mean, 1e-3 * self.H.diagonal()
-
-    def loosened(self) -> Array:
-        """(D, D) information on the coefficients of one window, by their `drift`."""
-        at = np.flatnonzero(self.drift)
+    def widened(self, variance: Array) -> Array:
+        """(D, D) information where coefficients vary by so much (D,) beyond what is known."""
+        at = np.flatnonzero(variance)
         across = self.H[:, at]
-        own = np.diag(1.0 / self.drift[at]) + across[at]
+        own = np.diag(1.0 / variance[at]) + across[at]
         return np.asarray(self.H - across @ np.linalg.solve(own, across.T))
+
+    def widen(self, variance: Array) -> None:
+        """Know coefficients by a variance (D,) less, about the same mean."""
+        mean, self.H = self.mean(), self.widened(variance)
+        self.rhs, self._floor = self.H @ mean, 1e-3 * self.H.diagonal()
 
     def extend(self, std: Array) -> None:
         """New coefficients behind the others: zero give or take std (k,)."""
@@ -157,7 +155,7 @@ class Evidence:
         self._r = self.residual * root
         D = len(mean)
         flat = self._Z.reshape(-1, D)
-        self.factor = np.linalg.cholesky(belief.loosened() + flat.T @ flat)
+        self.factor = np.linalg.cholesky(belief.widened(belief.drift) + flat.T @ flat)
         # well enough conditioned for its inverse, and products are much faster than solutions
         self._inverse = solve_triangular(self.factor, np.eye(D), lower=True, check_finite=False)
         self._pull = self._inverse @ (flat.T @ self._r.ravel())

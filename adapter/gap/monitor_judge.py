@@ -242,8 +242,8 @@ class DisagreementList:
             there = found.candidate
             at_once = found.lasts and abs(found.since_s - told.since_s) < SAME_S
             if there is not None and there.joint == candidate.joint and at_once:
-                wider = np.zeros((len(belief.rhs), len(there.std)))
-                wider[found.at : found.at + len(there.std)] = WIDER * np.diag(there.std)
+                wider = np.zeros(len(belief.rhs))
+                wider[found.at : found.at + len(there.std)] = np.square(WIDER * there.std)
                 belief.widen(wider)
                 return
         entry = self._entry(candidate.name, candidate.joints, told.since_s, told.now_s, told.score)

@@ -21,7 +21,7 @@ from adapter.physics import kernels
 from adapter.screening.likelihood import LOAD_STD
 
 SMALLEST_MASS = 0.02  # kg; below it a load has no centre
-CHANGES = -6.0  # ln of how much more rarely than a hand grips or lets go a joint changes
+JOINT_ODDS = -6.0  # ln of how much more rarely than a hand grips or lets go a joint changes
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Signature:
     @property
     def log_odds(self) -> float:
         """ln of how much more often it begins, while one watches, than loads and pushes do."""
-        rarer = self.effect.log_odds_of_start - START_ODDS + (0.0 if self.joint < 0 else CHANGES)
+        rarer = self.effect.log_odds_of_start - START_ODDS + (0.0 if self.joint < 0 else JOINT_ODDS)
         return self.effect.log_odds + rarer
 
     @property

@@ -601,7 +601,7 @@ class OnlineLearner:
         regressors(Frames(np.array(self.tree.parent), *self.frames), motion, self.base[None], Y)
         size = np.hypot(np.sqrt(self.change.level), self.theta.static_friction(motion.dq))
         power, seen = np.square(error / size), self.rates_seen
-        new = is_new(np.hstack([motion.dq, motion.ddq]), seen)
+        new = is_new(table[:, at.dq.start : at.ddq.stop], seen)
         if len(seen) and power[new].sum() > NEW_SHARE * power.sum():
             return False
         begin = self.theta.hand.start
@@ -611,8 +611,8 @@ class OnlineLearner:
     @property
     def rates_seen(self) -> Array:
         """(k, 2 n) velocities and accelerations of the states still held, rad/s and rad/s²."""
-        held = self._held[np.arange(self._held_from, self._held_to) % len(self._held)]
-        return np.hstack([held[:, self.layout.dq], held[:, self.layout.ddq]])
+        rows = np.arange(self._held_from, self._held_to) % len(self._held)
+        return np.asarray(self._held[rows, self.layout.dq.start : self.layout.ddq.stop])
 
     def _start_change(self, stamp_ns: int) -> None:
         self.changes.append(Change(stamp_ns))
