@@ -158,20 +158,39 @@ class Motion:
         return x if self.smooth_hz is None else self._below(self.smooth_hz, x)
 
     def _below(self, band_hz: float, x: Array) -> Array:
+        from scipy.signal import sosfiltfilt  # long to load; no loop needs it
+
+        def below(even: Array, step: float) -> Array:
+            if not band_hz * step < 0.5:
+                return even
+            low_pass = _low_pass(band_hz, round(1.0 / step, RATE_DIGITS))
+            return np.asarray(sosfiltfilt(low_pass, even))
+
+        return self._evenly(x, below)
+
+    def lagged(self, x: Array, a: float, b: float) -> Array:
+        """y (m,) of b y'' + a y' + y = x (m,), settled at the first instant."""
+        from scipy.signal import cont2discrete, lfilter, lfilter_zi
+
+        def lag(even: Array, step: float) -> Array:
+            poles = np.trim_zeros(np.array([b, a, 1.0]), "f")
+            up, down, _ = cont2discrete((np.ones(1), poles), step, "foh")
+            start = lfilter_zi(up[0], down) * even[0]
+            return np.asarray(lfilter(up[0], down, even, zi=start)[0])
+
+        return self._evenly(x, lag) if a > 0.0 else x
+
+    def _evenly(self, x: Array, made: Callable[[Array, float], Array]) -> Array:
+        """A signal x (m,) as a filter makes it of even samples and their step (s)."""
         if self.apart or len(x) < FEWEST_TO_FILTER:
             return x
         steps = np.diff(self.t)
         step = float(np.median(steps))
-        if not band_hz * step < 0.5:
-            return x
-        from scipy.signal import sosfiltfilt  # long to load; no loop needs it
-
-        low_pass = _low_pass(band_hz, round(1.0 / step, RATE_DIGITS))
         if np.ptp(steps) < EVEN * step:
-            return np.asarray(sosfiltfilt(low_pass, x, axis=0))
+            return made(x, step)
         at = np.append(0.0, np.cumsum(np.minimum(steps, PAUSE_STEPS * step)))
         even = np.arange(0.0, at[-1] + step, step)
-        return np.interp(at, even, sosfiltfilt(low_pass, np.interp(even, at, x)))
+        return np.interp(at, even, made(np.interp(even, at, x), step))
 
     def rate(self, x: Array) -> Array:
         """Time derivative of x (m, ...); zero where rows are `apart`."""

@@ -29,6 +29,7 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL, TURNS
 from adapter.model.urdf_text import FRICTION, Additions
 
+USUAL_RAD, TIMES = 1.5e-3, 3.0  # ways of a real Panda and a KUKA: 0.3 to 5 mrad
 WAY = Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
 
 
@@ -82,6 +83,10 @@ class BristleFriction(LearnedEffect, JointTorque):
     def reshaped(self, values: Values, ratio: float) -> Template | None:
         """Another s0."""
         return _template(WAY.nearest(ratio * float(values["s0"])))
+
+    def log_odds_of(self, values: Values) -> float:
+        """Ways that joints have."""
+        return float(-0.5 * (np.log(values["s0"] / USUAL_RAD) / np.log(TIMES)) ** 2)
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """Fc z."""

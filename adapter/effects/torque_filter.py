@@ -1,8 +1,8 @@
-"""Torque sensor's low-pass: measured = tau - d dtau/dt + c d2tau/dt2.
+"""Torque sensor's low-pass: (d² - c) measured'' + d measured' + measured = tau.
 
-The start of the series of any low-pass that is fast against the motion: d is its mean delay, 2 c
-the mean square of its delays. A pure delay has c = d^2 / 2, one pole c = d^2, and no sensor has
-more; one without phase, by which a log was filtered after it was recorded, has d = 0.
+Its series begins with tau - d dtau/dt + c d2tau/dt2, that of any low-pass does: d is its mean
+delay, 2 c the mean square of its delays. A pure delay has c = d^2 / 2, one pole c = d^2, and no
+sensor has more; one without phase, by which a log was filtered afterwards, has d = 0.
 """
 
 from __future__ import annotations
@@ -63,19 +63,21 @@ class TorqueFilter(LearnedEffect, SensorEffect):
     def low_pass(self, values: Values) -> tuple[float, float]:
         """The one whose series begins so; without phase there is none, and the nearest is taken."""
         d = max(float(values["d"]), 0.0)
-        return d, max(d * d - float(values["c"]), 0.0)
+        return d, min(max(d * d - float(values["c"]), 0.0), d * d)
 
     def measured(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """tau, its rate and the rate of that, on the joint or all of them.
+        """The low-pass of tau, on the joint or all of them; by the series what none of them is.
 
         Fourth derivatives of q are nothing but noise above a band; noise in there would make any
         measured torque look smoother than the one that the motion asks for.
         """
-        own = list(range(tau.shape[1]) if joint < 0 else (joint,))
-        inside = np.stack([motion.inside_band(tau[:, j], j) for j in own], axis=1)
-        bend = motion.rate(motion.rate(inside))
+        d, b = self.low_pass(values)
+        early, more = min(float(values["d"]), 0.0), float(values["c"]) - (d * d - b)
         out = tau.copy()
-        out[:, own] += values["c"] * bend - values["d"] * motion.rate(tau[:, own])
+        for j in range(tau.shape[1]) if joint < 0 else (joint,):
+            own = tau[:, j]
+            bend = motion.rate(motion.rate(motion.inside_band(own, j)))
+            out[:, j] = motion.lagged(own, d, b) + more * bend - early * motion.rate(own)
         return np.asarray(out)
 
     def basis(self, at: JointSignals) -> tuple[Array, ...]:

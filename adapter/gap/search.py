@@ -285,7 +285,7 @@ def _as_resolved(found: Found) -> Found:
     for k, e in enumerate(fit.named):
         if e.candidate.effect is not BRISTLES or k in found.weak:
             continue
-        if lost_at_once(fit, carried, k) < RESOLVED_CHI2:
+        if lost_at_once(fit, carried, k) + 2.0 * BRISTLES.log_odds_of(e.values) < RESOLVED_CHI2:
             told = replace(e.candidate, effect=COULOMB)
             rivals = tuple(r for r in standings[k].rivals if r.candidate.key != told.key)
             standings[k] = replace(standings[k], candidate=told, rivals=rivals)
