@@ -29,7 +29,7 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import STILL, TURNS
 from adapter.model.urdf_text import FRICTION, Additions
 
-USUAL_RAD, TIMES = 1.5e-3, 3.0  # ways of a real Panda and a KUKA: 0.3 to 5 mrad
+USUAL_RAD, TIMES = 1.5e-3, 3.0  # and by what factor it is off: a real Panda, a KUKA LWR4
 WAY = Parameter("s0", "rad", lower=1e-6, upper=0.3, grid_share=0.1)
 
 
@@ -85,7 +85,7 @@ class BristleFriction(LearnedEffect, JointTorque):
         return _template(WAY.nearest(ratio * float(values["s0"])))
 
     def log_odds_of(self, values: Values) -> float:
-        """Ways that joints have."""
+        """Friction that slides at once looks like bristles over a way that no joint has."""
         return float(-0.5 * (np.log(values["s0"] / USUAL_RAD) / np.log(TIMES)) ** 2)
 
     def law(self, at: JointSignals, values: Values) -> Array:

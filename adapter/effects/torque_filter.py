@@ -61,7 +61,7 @@ class TorqueFilter(LearnedEffect, SensorEffect):
         return AFTERWARDS if float(values["c"]) > most else 0.0
 
     def low_pass(self, values: Values) -> tuple[float, float]:
-        """The one whose series begins so; without phase there is none, and the nearest is taken."""
+        """The one whose series begins so; where there is none (see `measured`), the nearest."""
         d = max(float(values["d"]), 0.0)
         return d, min(max(d * d - float(values["c"]), 0.0), d * d)
 
