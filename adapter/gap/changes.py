@@ -66,7 +66,7 @@ class Windows:
         std = np.concatenate([HELD.templates()[0].prior_std, np.repeat(own_std, fit.n)])
         G, g = np.zeros((count, len(std), len(std))), np.zeros((count, len(std)))
         power, rows = np.zeros(count), np.zeros(count)
-        for piece in pieces_of(replace(fit, weights=()), whole):
+        for piece in pieces_of(fit, whole):
             own = piece.recordings[0]
             X, data = piece.whiten([_signatures(piece)]), piece.whiten(piece.model.residuals())
             place = np.repeat((own.t // every_s).astype(int), fit.n)
@@ -190,7 +190,7 @@ def _dated(fit: Fit, k: int) -> Span:
     if not np.isfinite(begin):
         return begin, end
     named = fit.named[k]
-    bare = replace(fit, weights=())
+    bare = replace(fit, doubts=())
     with_it = bare.instead(k, replace(named, interval_s=WHOLE))
     sizes = []
     for trial in (bare.without(k), with_it):

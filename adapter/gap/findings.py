@@ -329,7 +329,7 @@ def _outbursts(fit: Fit) -> list[Leftover]:
     out = []
     t, residual = fit.recordings[0].t, fit.model.residual(0)
     counted = fit.recordings[0].slides
-    counted = counted & (fit.weights[0] > 0.0) if fit.weights else counted
+    counted = counted & np.isfinite(fit.doubts[0]) if fit.doubts else counted
     window = (t // OUTBURST_S).astype(int)
     for j in range(fit.n):
         rows = counted[:, j]

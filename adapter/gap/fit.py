@@ -256,14 +256,15 @@ class Fit:
         prior: (n, 10) standard deviation of the nominal inertias.
         noise: one model per recording.
         timing_std_s: how far the torques' timing may be off without being an effect.
-        weights: (k, n) by which white rows count, per recording; empty where all count alike.
+        doubts: (k, n) variance beside the noise, N^2 m^2, per recording: what named effects may be
+            otherwise, infinite where rows count for nothing; empty where all count alike.
     """
 
     model: Model
     prior: Array
     noise: tuple[Noise, ...] = ()
     timing_std_s: float = TIMING_STD_S
-    weights: tuple[Array, ...] = ()
+    doubts: tuple[Array, ...] = ()
 
     @property
     def recordings(self) -> tuple[Signals, ...]:
@@ -327,36 +328,46 @@ class Fit:
         """The same with another effect in the place of one."""
         return self.with_named((*self.named[:place], other, *self.named[place + 1 :]))
 
-    def own_noise(self) -> tuple[Noise, ...]:
-        """Noise that its residuals show where they count."""
+    @cached_property
+    def weights(self) -> tuple[Array, ...]:
+        """(k, n) share of its noise in what a row may be off by, per recording."""
+        parts = zip(self.noise, self.doubts, strict=True)
+        return tuple(own.level / np.sqrt(own.level**2 + doubt) for own, doubt in parts)
+
+    def noise_of(self, left: Sequence[Array]) -> tuple[Noise, ...]:
+        """Noise that what is left (k, n), N m, of each recording shows where it counts.
+
+        What an effect leaves where its equation is an idealisation, friction where it turns round,
+        is that one's, and is no noise elsewhere.
+        """
         sliding = [own.sliding for own in self.recordings]
-        if self.weights:
-            sliding = [x * (weight > 0.0) for x, weight in zip(sliding, self.weights, strict=True)]
-        return tuple(map(noise_of, self.model.residuals(), sliding))
+        if self.doubts and self.noise:
+            sliding = [x * weight**2 for x, weight in zip(sliding, self.weights, strict=True)]
+        return tuple(map(noise_of, left, sliding))
+
+    def own_noise(self) -> tuple[Noise, ...]:
+        """Noise that its residuals show."""
+        return self.noise_of(self.model.residuals())
 
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
-        fit = replace(self, noise=self.own_noise() if noise is None else tuple(noise))
-        return replace(fit, weights=tuple(fit._weights(i) for i in range(len(fit.recordings))))
+        fit = replace(self, doubts=tuple(self._doubt(i) for i in range(len(self.recordings))))
+        return replace(fit, noise=fit.own_noise() if noise is None else tuple(noise))
 
-    def _weights(self, recording: int) -> Array:
+    def _doubt(self, recording: int) -> Array:
         """Rows count less where a named effect is strong, for its equation is an idealisation.
 
         They don't count at all around its start and end: nobody picks up a load in no time.
         """
-        level, square = self.noise[recording].level, np.zeros(1)
-        for k, e in enumerate(self.named):
-            if e.candidate.effect.inexact and e.recording in (None, recording):
-                square = square + unsure(self.model, recording, k) ** 2
-        return np.asarray(self.counted(recording) / np.sqrt(1.0 + square / level**2))
-
-    def counted(self, recording: int) -> Array:
-        """(k, n) zero around the start and end of a named effect, else one."""
         own = self.recordings[recording]
-        out = np.ones_like(own.tau)
-        for e in self.named:
-            for edge in e.interval_s if e.recording in (None, recording) else ():
-                out[(own.t > edge - EDGE_S) & (own.t < edge + EDGE_S)] = 0.0
+        out = np.zeros_like(own.tau)
+        for k, e in enumerate(self.named):
+            if e.recording not in (None, recording):
+                continue
+            if e.candidate.effect.inexact:
+                out += unsure(self.model, recording, k) ** 2
+            for edge in e.interval_s:
+                out[(own.t > edge - EDGE_S) & (own.t < edge + EDGE_S)] = np.inf
         return out
 
     def whiten(self, tables: Sequence[Array]) -> Array:
@@ -364,7 +375,7 @@ class Fit:
         white = [noise.whiten(x) for noise, x in zip(self.noise, tables, strict=True)]
         for x, own in zip(white, self.recordings, strict=True):
             x *= own.heard
-        if self.weights:
+        if self.doubts:
             for x, weight in zip(white, self.weights, strict=True):
                 x *= weight
         flat = [x.reshape(*x.shape[:-2], -1) for x in white]
@@ -393,7 +404,8 @@ def unsure(model: Model, recording: int, place: int) -> Array:
     jumps = maximum_filter1d(torque, size, axis=0, origin=shift)
     jumps -= minimum_filter1d(torque, size, axis=0, origin=shift)
     band = effect.band * np.abs(torque).max(axis=0) * own.slowness
-    return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, EDGE * jumps)))
+    edge = EDGE if isinstance(effect, TorqueEffect) else 0.0
+    return np.asarray(np.hypot(band, np.hypot(effect.inexact * torque, edge * jumps)))
 
 
 def honest_covariance(fit: Fit, known: Carried | Moments) -> Array:
@@ -459,7 +471,7 @@ def dated(fit: Fit, place: int) -> Fit:
 
     All rows count here, those around the dates above all.
     """
-    fit = replace(fit, weights=())
+    fit = replace(fit, doubts=())
     for reach in DATE_REACHES_S:
         for side in (0, 1):
             centre = fit.named[place].interval_s[side]

@@ -309,7 +309,7 @@ def measure(
         progress("weighing it on the whole recording")
         found = weighed(found, whole)
     fit = possible(found.fit, found.carried)
-    found = replace(found, fit=replace(fit, noise=searched.noise, weights=searched.weights))
+    found = replace(found, fit=replace(fit, noise=searched.noise, doubts=searched.doubts))
     block = block_s(found.fit)
     if task.folds and holds_out(found.fit):
         after = held_out_models(task.model, found.fit, found.carried)

@@ -195,8 +195,10 @@ def start(fit: Fit, joints: Sequence[int]) -> Fit:
         begun, _ = refitted(begun)
         kept = [e for e in begun.named if e.possible]
         if len(kept) == len(begun.named):
-            return usually_shaped(begun)
+            break
         begun = begun.with_named(kept)
+    begun = usually_shaped(begun)
+    return begun.with_named([e for e in begun.named if e.possible])
 
 
 def usually_shaped(fit: Fit) -> Fit:

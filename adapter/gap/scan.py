@@ -34,7 +34,6 @@ from adapter.gap.evidence import (
     Carried,
     Noise,
     Score,
-    noise_of,
     quiet_noise,
     score,
     scores,
@@ -150,7 +149,6 @@ class SignatureTable:
             r + np.tensordot(self.fit.coefficients, c, 1)
             for r, c in zip(self.fit.model.residuals(), self.carried_tables, strict=True)
         ]
-        self.weights = self.fit.weights or tuple(np.ones_like(r.tau) for r in fit.recordings)
         self.times = [r.t for r in fit.recordings]
 
     @cached_property
@@ -224,15 +222,14 @@ class SignatureTable:
         parts = [self.gated(lead) for lead in leads]
         tables = [np.concatenate(x) for x in zip(*parts, strict=True)]
         own_std = np.concatenate([lead.candidate.prior_std for lead in leads])
-        weights = self._undated(leads)
-        fit, base = replace(self.fit, weights=weights), self.carried
+        fit, base = replace(self.fit, doubts=self._undated(leads)), self.carried
         if any(lead.interval_s != WHOLE for lead in leads):  # other rows count than in the table
             base = self._carried_under(fit)
         left = self._left(fit, base, tables, own_std)
         # what other joints lack counts for nothing in the richest noise, and pulls at all of them
-        fit = replace(fit, noise=self._noise(left, weights))
+        fit = replace(fit, noise=fit.noise_of(left))
         left = self._left(fit, self._carried_under(fit), tables, own_std)
-        fit = replace(fit, noise=self._noise(left, weights))
+        fit = replace(fit, noise=fit.noise_of(left))
         return score(*self._carried_under(fit).without(fit.whiten(tables)), own_std)
 
     def _carried_under(self, fit: Fit) -> Carried:
@@ -252,21 +249,16 @@ class SignatureTable:
             for target, N, table in zip(self.targets, self.carried_tables, tables, strict=True)
         ]
 
-    def _noise(self, left: Sequence[Array], weights: Sequence[Array]) -> tuple[Noise, ...]:
-        """Noise of what is left, where rows count."""
-        parts = zip(left, weights, self.fit.recordings, strict=True)
-        return tuple(noise_of(r, own.sliding * (w > 0.0)) for r, w, own in parts)
-
     def _undated(self, leads: Sequence[Lead]) -> tuple[Array, ...]:
-        """Weights (k, n) of the rows: none where a lead's start is not known well enough yet."""
+        """Doubts (k, n) of the rows: infinite where a lead's start is not known well enough yet."""
         out = []
-        for i, (own, weight) in enumerate(zip(self.fit.recordings, self.weights, strict=True)):
-            weight = weight.copy()
+        for i, own in enumerate(self.fit.recordings):
+            doubt = self.fit.doubts[i].copy() if self.fit.doubts else np.zeros_like(own.tau)
             for lead in leads:
                 for edge in lead.interval_s if lead.recording in (None, i) else ():
                     near = (own.t > edge - UNSURE_S) & (own.t < edge + UNSURE_S)
-                    weight[near] = 0.0
-            out.append(weight)
+                    doubt[near] = np.inf
+            out.append(doubt)
         return tuple(out)
 
     def lead_of(self, candidate: Candidate) -> Lead:

@@ -178,7 +178,7 @@ def _apart(nominal: Fit, i: int) -> Fit:
     """One recording alone, with a load, and all that may be beside it."""
     named = with_a_load(nominal)
     model = replace(nominal.model, recordings=(nominal.recordings[i],), named=named)
-    return replace(nominal, model=model, noise=(), weights=())
+    return replace(nominal, model=model, noise=(), doubts=())
 
 
 def contradictions(fit: Fit, together: Together) -> list[Difference]:

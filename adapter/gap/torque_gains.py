@@ -268,13 +268,13 @@ def _sliding(fit: Fit) -> Fit:
 
     What it gets wrong then goes with the acceleration, and would make gains 2 % too small.
     """
-    weights = []
-    for own, weight in zip(fit.recordings, fit.weights, strict=True):
+    doubts = []
+    for own, doubt in zip(fit.recordings, fit.doubts, strict=True):
         slow = np.abs(own.motion.dq) < SLIDES_RAD_S
-        near = maximum_filter1d(slow.astype(float), 2 * round(AROUND_S * RATE_HZ) + 1, axis=0)
+        near = maximum_filter1d(slow, 2 * round(AROUND_S * RATE_HZ) + 1, axis=0)
         at = np.searchsorted(own.motion.t, own.t)
-        weights.append(weight * (1.0 - near[np.minimum(at, len(near) - 1)]))
-    return replace(fit, weights=tuple(weights))
+        doubts.append(np.where(near[np.minimum(at, len(near) - 1)], np.inf, doubt))
+    return replace(fit, doubts=tuple(doubts))
 
 
 def _settled(fit: Fit, known_kg: float | None) -> tuple[Fit, Carried]:
@@ -310,7 +310,7 @@ def _on_the_rest(task: _GainTask, fit: Fit, gain: Array) -> tuple[Array, Array]:
     ends = (float(r.t[int(LEARNED_SHARE * len(r.t))]) for r in task.recordings)
     parts = (r.between(end_s, np.inf) for r, end_s in zip(task.recordings, ends, strict=True))
     rest = [prepare(replace(part, tau=part.tau * gain), arm) for part in parts]
-    fit, _ = _settled(replace(fit, weights=()), task.load_kg if any(task.loaded) else None)
+    fit, _ = _settled(replace(fit, doubts=()), task.load_kg if any(task.loaded) else None)
     step = np.ones(len(gain))
     at, off = _gain_places(fit)
     step[at] = 1.0 + fit.coefficients[off]

@@ -65,5 +65,5 @@ def pieces_of(fit: Fit, whole: LongRecording) -> Iterator[Fit]:
     """A fit on each piece of a recording, under its noise."""
     for own in whole.pieces(fit.recordings[0]):
         model = replace(fit.model, recordings=(own,))
-        piece = replace(fit, model=model, weights=())
-        yield piece.with_noise(fit.noise) if fit.weights else piece
+        piece = replace(fit, model=model, doubts=())
+        yield piece.with_noise(fit.noise) if fit.doubts else piece

@@ -340,7 +340,7 @@ def _searched(task: GapTask, fit: Fit, odd: Sequence[int]) -> tuple[GapTask, Fit
         moving=tuple(task.moving[i] for i in chosen),
         notes=(*task.notes, note),
     )
-    return task, replace(fit, model=model, weights=()).with_noise()
+    return task, replace(fit, model=model, noise=(), doubts=()).with_noise()
 
 
 def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResult:

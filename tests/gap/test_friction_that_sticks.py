@@ -11,6 +11,7 @@ import pytest
 from adapter.gap.result import GapResult
 from adapter.gap.workflow import find_gap
 from adapter.model.urdf import model_from_urdf
+from adapter.screening.screen import refuse
 from drivers.files.mcap import Log
 from sim.effects import Effect
 from sim.hidden.trial import Trial, draw, nominal_urdf
@@ -51,6 +52,15 @@ def test_play_that_is_crossed_a_few_times_is_named_beside_it() -> None:
     play = next(f for f in result.findings if f.effect == "backlash")
     assert play.joints == (4,) and abs(play.parameters["b"] - PLAY_RAD) < 0.1 * PLAY_RAD
     assert {f.effect for f in result.findings} == {"coulomb_friction", "backlash"}
+
+
+def test_a_late_torque_sensor_of_one_joint_is_no_coupled_axis() -> None:
+    """Friction that holds through rests, late: as sign(dq) a reading of joints 6 and 7 together."""
+    trial = draw(53008, "single", motion="points", sticks=True)
+    log = mujoco_recording(trial)
+    screened = refuse(log, model_from_urdf(nominal_urdf(trial.nominal)))
+    assert trial.effects[0].name == "torque_filter"
+    np.testing.assert_array_equal(screened.log.tau, log.tau)
 
 
 def test_what_would_not_have_been_seen_is_told_of_all_joints_that_move() -> None:

@@ -37,6 +37,7 @@ from adapter.gap.fit import (
     place_of,
     refitted,
     under_own_noise,
+    unsure,
     worth,
 )
 from adapter.gap.folds import Folds, fold_rows, pays_held_out
@@ -449,6 +450,7 @@ NAMED = {  # effect -> joint (from 0) and coefficients about which it is differe
     "encoder_offset": (3, [0.01]),
     "payload": (-1, [1.0, 0.02, -0.01, 0.15, 0.03, 0.0, 0.0, 0.03, 0.0, 0.01]),
     "base_tilt": (-1, [0.02, -0.03]),
+    "torque_filter": (-1, [3e-3, 1e-5]),
     "external_wrench": (-1, [5.0, -3.0, 8.0, 0.1, 0.2, 0.0]),
 }
 
@@ -522,6 +524,21 @@ def test_a_refit_finds_what_was_planted():
         assert std < 0.05 * FC
     assert np.abs(pulls).max() < 4.5
     assert np.sqrt(np.mean(np.square(pulls))) < 2.5
+
+
+def test_what_friction_lacks_where_it_turns_round_is_no_noise():
+    """And a sensor's low-pass, which smooths those jumps, is not in doubt for it."""
+    fit = fit_of(SHORT)
+    there = next(c for c in _frictions(fit) if c.joint == RUBS)
+    fit, _ = refitted(fit.with_named([Named(there, np.array([FC]))]))
+    fit = fit.with_noise().with_noise()
+    level, lacks = fit.noise[0].level[RUBS], np.sqrt(fit.doubts[0])
+    turns = lacks > 5.0 * level
+    (found,) = fit.noise_of([fit.model.residual(0) + turns * lacks])
+    assert turns.sum() > 20 and found.level[RUBS] == pytest.approx(level, rel=0.3)
+    filtered = fit.with_named([*fit.named, named(fit, "torque_filter")]).model
+    own = filtered.named[1].candidate.effect.inexact * np.abs(filtered.contribution(0, 1))
+    np.testing.assert_allclose(unsure(filtered, 0, 1), own)
 
 
 def test_bodies_that_cannot_exist_give_way_where_torques_do_not_show_it():

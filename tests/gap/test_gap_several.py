@@ -79,7 +79,7 @@ def test_recording_by_recording_is_what_all_at_once_gives() -> None:
     model = replace(fits[0].model, recordings=recordings, named=named)
     whole = replace(fits[0], model=model)
     whole = replace(whole, noise=tuple(fit.noise[0] for fit in fits))
-    carried = replace(whole, weights=tuple(fit.weights[0] for fit in fits)).carried()
+    carried = replace(whole, doubts=tuple(fit.doubts[0] for fit in fits)).carried()
     held, last = fits[0].dtheta.size + 1, place_of(fits[0], 0)[-1]  # then the load
     parts = [Part.of(fit, np.arange(held, last + 1)) for fit in fits]
     together = Together(
