@@ -57,6 +57,15 @@ class Rows(NamedTuple):
     scaled: float = 0.0
     slides: Array | None = None
 
+    def turned(self, turn: Array) -> Rows:
+        """Of joints whose angles are `turn` (n, n) times these; torques as they are."""
+        q, dq, ddq = (x @ turn.T for x in (self.q, self.dq, self.ddq))
+        slides = None
+        if self.slides is not None:
+            several = np.count_nonzero(turn, axis=1) > 1  # nobody knows how far these are wound
+            slides = np.where(several, smooth_sign(dq, ddq, SMOOTHING_S), self.slides @ turn.T)
+        return self._replace(q=q, dq=dq, ddq=ddq, slides=slides)
+
 
 class Explained(NamedTuple):
     """How well rows are explained.
@@ -103,6 +112,16 @@ class Telling:
     def samples(self) -> float:
         """Independent samples of a joint."""
         return min(MOST_SAMPLES, self.span_s / CORRELATED_S)
+
+    def rubbing(self, rows: Rows, q: Array, at: slice | NDArray[np.int64]) -> Rows:
+        """Rows at instants of q (m, n), 1 ms apart, with the friction that explains them best.
+
+        Of each joint it turns round at once, or winds up over a way and holds through rests.
+        """
+        wound = [np.column_stack([bending(x, way)[at] for x in q.T]) for way in WAYS_RAD]
+        every = np.array([smooth_sign(rows.dq, rows.ddq, SMOOTHING_S), *wound])
+        best = np.argmax([self.explained(rows._replace(slides=x)).share for x in every], axis=0)
+        return rows._replace(slides=every[best, :, range(len(best))].T)
 
     def explained(self, rows: Rows, changed: int | None = None) -> Explained:
         """How well the model explains rows, after corrections of a plausible size.
@@ -241,8 +260,7 @@ def lateness_s(signals: Sequence[Array], telling: Telling) -> float:
         late_ms = min((late_ms + step * k for k in range(-reach, reach + 1)), key=cost)
     if abs(late_ms) <= 1e3 * LATE_S or cost(late_ms) > cost(0) - EVIDENCE:
         return 0.0
-    wound = (np.column_stack([bending(x, way)[at] for x in q.T]) for way in WAYS_RAD[1:])
-    rival = min(telling.explained(rows._replace(slides=slides)).cost for slides in wound)
+    rival = telling.explained(telling.rubbing(rows, q, at)).cost
     return 1e-3 * late_ms if cost(late_ms) < rival - EVIDENCE else 0.0
 
 

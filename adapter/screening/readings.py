@@ -140,8 +140,8 @@ class Readings:
         for i, j in combinations(range(len(names)), 2):
             order = _swapped(len(names), i, j)
             said = f"{names[i]} and {names[j]} are swapped: give each its own name in the recording"
-            q, dq, ddq, tau = (x[:, order] for x in self.rows[:4])
-            yield Reading("joint", said, Rows(q, dq, ddq, tau, self.rows.scaled))
+            rows = self.rows.turned(np.eye(len(names))[order])
+            yield Reading("joint", said, rows._replace(tau=rows.tau[:, order]))
             if j - i <= NEAR:
                 yield from self._coupled(i, j)
         if not self.telling.unit_known:
@@ -241,10 +241,10 @@ class Readings:
 
     def _own(self, j: int) -> Iterator[Reading]:
         """Readings of joint j alone."""
-        (q, dq, ddq, tau, scaled, _), unit = self.rows, np.eye(len(self.names))[j]
+        rows, unit = self.rows, np.eye(len(self.names))[j]
         turn, name = 1.0 - 2.0 * unit, self.names[j]
         said = f"{name} counts the other way round: --turn {name}"
-        yield Reading("joint", said, Rows(q * turn, dq * turn, ddq * turn, tau * turn, scaled))
+        yield Reading("joint", said, rows.turned(np.diag(turn))._replace(tau=rows.tau * turn))
         for zero in ZEROS:
             way = "more" if zero > 0.0 else "less"
             said = (
@@ -252,14 +252,14 @@ class Readings:
                 f"{abs(np.degrees(zero)):.0f} degrees {way} than what is recorded: "
                 f"--zero {name}={-zero:.6g}"
             )
-            yield Reading("joint", said, self.rows._replace(q=q + zero * unit))
+            yield Reading("joint", said, rows._replace(q=rows.q + zero * unit))
 
     def _coupled(self, i: int, j: int) -> Iterator[Reading]:
         """Joint j told against what carries joint i: its own angle is the sum, or what is left.
 
         Its drive then sits on that carrier too, and joint i's torque lacks what it holds, or not.
         """
-        (q, dq, ddq, tau, scaled, _), names = self.rows, self.names
+        names = self.names
         for sign, word in ((-1.0, "minus"), (1.0, "plus")):
             turn = np.eye(len(names))
             turn[j, i] = sign
@@ -267,9 +267,9 @@ class Readings:
                 f"{names[j]} is told together with {names[i]} (coupled axes): its angle is what is "
                 f"recorded {word} that of {names[i]}; record each joint's own angle and torque"
             )
-            own = Rows(q @ turn.T, dq @ turn.T, ddq @ turn.T, tau, scaled)
+            own = self.rows.turned(turn)
             yield Reading("joint", said, own)
-            yield Reading("joint", said, own._replace(tau=tau @ np.linalg.inv(turn)))
+            yield Reading("joint", said, own._replace(tau=own.tau @ np.linalg.inv(turn)))
 
     def _units(self) -> Iterator[Reading]:
         """All torques in another unit: a known one, or each joint its own (motor currents)."""

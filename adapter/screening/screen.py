@@ -463,7 +463,7 @@ def judged_rows(
     at = slice(None, None, max(EVERY, len(q) // ROWS))
     alive = np.ptp(log.tau, axis=0) > 0.0
     telling = Telling(model, alive, GRID_S * len(q), unit_known)
-    return Rows(q[at], dq[at], ddq[at], tau[at]), telling
+    return telling.rubbing(Rows(q[at], dq[at], ddq[at], tau[at]), q, at), telling
 
 
 def smoothed_rows(log: Log) -> tuple[Array, Array, Array, Array]:
