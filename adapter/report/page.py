@@ -96,8 +96,7 @@ def _warnings(figures: dict[str, Any]) -> list[str]:
     fault = figures.get("fault")
     ended = [f"The run ended early: {fault}"] if fault else []
     start_s = figures.get("start_s") or 0.0
-    reports = figures.get("disagreements") or []
-    new = [f"New disagreement: {sentence(report, start_s)}" for report in reports]
+    new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
     return [*ended, *new, *map(str, figures.get("warnings") or [])]
 
 

@@ -94,15 +94,11 @@ def missed_words(figures: Mapping[str, Any]) -> str:
     )
 
 
-LEARNED_WITHIN_S = 2.0  # a load that was noticed so soon after it began is the same one
-
-
 def not_learned(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Disagreements that the learned model does not hold: a load that it noticed is in it."""
     noticed = [change["stamp_s"] for change in figures["theta"].get("changes") or []]
 
     def held(report: Mapping[str, Any]) -> bool:
-        near = any(abs(at - report["since_s"]) <= LEARNED_WITHIN_S for at in noticed)
-        return report["what"] == "payload" and near
+        return report["what"] == "payload" and report["since_s"] in noticed
 
     return [report for report in figures.get("disagreements") or [] if not held(report)]

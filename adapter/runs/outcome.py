@@ -34,6 +34,7 @@ from adapter.signals.records import LinkMotionKind
 
 TORQUE_GOAL = 1.1  # times the final batch least squares
 SHOWN_SHARE = 0.99  # of a single direction that must lie in the observable space to be called so
+SAME_LOAD_S = 2.0  # a load that learner and watch date so near each other is one
 
 
 @dataclass(frozen=True)
@@ -294,7 +295,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
             **provenance,
             "lambda_filled": filled,
             **said,
-            "changes": changes_at(outcome.changes_ns, outcome.payload),
+            "changes": changes_at(outcome.changes_ns, outcome.payload, outcome.disagreements),
         },
     )
 
@@ -335,9 +336,19 @@ def _kept(documented: SelfModel, learned: Sequence[str]) -> list[Mapping[str, An
     return found
 
 
-def changes_at(stamps_ns: Sequence[int], payload: Load | None) -> list[dict[str, Any]]:
-    """Changes at the hand, with what the last one brought."""
-    found: list[dict[str, Any]] = [{"stamp_s": 1e-9 * stamp} for stamp in stamps_ns]
+def changes_at(
+    stamps_ns: Sequence[int], payload: Load | None, reports: Sequence[Mapping[str, Any]] | None
+) -> list[dict[str, Any]]:
+    """Changes at the hand, with what the last one brought; since when one is, the watch knows best.
+
+    Args:
+        reports: of the watch; None where nothing watched.
+    """
+    watched = [x["since_s"] for x in reports or () if x["what"] == "payload"]
+    found: list[dict[str, Any]] = []
+    for at_s in (1e-9 * stamp for stamp in stamps_ns):
+        near = [x for x in watched if abs(x - at_s) <= SAME_LOAD_S]
+        found.append({"stamp_s": near[0] if near else at_s})
     if found and payload is not None:
         found[-1]["payload"] = told_load(payload)
     return found

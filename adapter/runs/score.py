@@ -242,7 +242,7 @@ def theta_score(outcome: Outcome, documented: SelfModel, start_s: float | None) 
             effect.name: outcome.effects[k].tolist()
             for k, effect in enumerate(effects_by_name(outcome.settings.effects))
         },
-        "changes": changes_at(outcome.changes_ns, outcome.payload),
+        "changes": changes_at(outcome.changes_ns, outcome.payload, outcome.disagreements),
         "held": held if held["m"] > SHOWN * held["m_std"] else None,
         "rebuilds": outcome.rebuilds,
         "started_s": None,

@@ -81,8 +81,10 @@ def test_the_load_is_weighed(mass: float) -> None:
         assert theta[0] == pytest.approx(mass, abs=slack)
         assert abs(theta[0] - mass) < 4.0 * np.sqrt(covariance[0, 0]) + 0.01 * mass
         assert np.abs(theta[1:4] / theta[0] - com).max() < (0.02 if mass >= 0.3 else 0.06)
-    told = changes_at(outcome.changes_ns, outcome.payload)
-    assert len(told) == 1 and told[0]["payload"]["m"] == outcome.payload[0][0]
+    since = {"what": "payload", "since_s": AT_S + 0.05}
+    (told,) = changes_at(outcome.changes_ns, outcome.payload, [since])  # one load, one date
+    assert told == {"stamp_s": since["since_s"], "payload": told["payload"]}
+    assert told["payload"]["m"] == outcome.payload[0][0]
 
 
 @pytest.mark.parametrize("mass", MASSES)
