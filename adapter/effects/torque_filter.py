@@ -7,6 +7,8 @@ sensor has more; one without phase, by which a log was filtered afterwards, has 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from adapter.effects.base import (
@@ -18,6 +20,7 @@ from adapter.effects.base import (
     Motion,
     Parameter,
     SensorEffect,
+    Template,
     Values,
 )
 from adapter.effects.phrases import Phrase
@@ -25,7 +28,12 @@ from adapter.effects.splits import LOADS, SPEEDS, STILL, SWINGS
 
 MOST_AHEAD_S, MOST_S = 3e-3, 0.06  # velocities that come late make torque look early
 AFTERWARDS = -40.0  # ln of the odds that only the torques of a log were filtered without phase
+SLOW_S = 0.02  # of sensors whose low-pass is there to be seen: 5 to 20 Hz
 LEAST_C_S2 = 5e-5  # that noise of the motion does not look like
+
+
+def _of_first_order(x: Array) -> dict[str, Any]:
+    return {"d": float(x[0]), "c": float(x[0]) ** 2}
 
 
 class TorqueFilter(LearnedEffect, SensorEffect):
@@ -50,6 +58,11 @@ class TorqueFilter(LearnedEffect, SensorEffect):
         (STILL, "is gone"),
         (SWINGS, "makes the torque smaller"),
     )
+
+    def templates(self) -> tuple[Template, ...]:
+        """Of a motor's or a sensor's electronics; and a slow one of one time constant."""
+        slow = Template((SLOW_S,), _of_first_order, "of first order", chord=True)
+        return (*super().templates(), slow)
 
     def possible(self, values: Values) -> bool:
         """Smoother, and not much earlier."""

@@ -54,6 +54,16 @@ def test_play_that_is_crossed_a_few_times_is_named_beside_it() -> None:
     assert {f.effect for f in result.findings} == {"coulomb_friction", "backlash"}
 
 
+def test_a_slow_low_pass_of_one_joint_is_named_beside_it() -> None:
+    """Sought as one of 3 ms it was told as a delay."""
+    trial = draw(95009, "single", "torque_filter", sticks=True)
+    result = find_gap([mujoco_recording(trial)], model_from_urdf(nominal_urdf(trial.nominal)))
+    assert ("torque_filter", trial.effects[0].joints) in {
+        (f.effect, f.joints) for f in result.findings
+    }
+    assert {f.effect for f in result.findings} == {"coulomb_friction", "torque_filter"}
+
+
 def test_a_late_torque_sensor_of_one_joint_is_no_coupled_axis() -> None:
     """Friction that holds through rests, late: as sign(dq) a reading of joints 6 and 7 together."""
     trial = draw(53008, "single", motion="points", sticks=True)
