@@ -338,12 +338,19 @@ class Fit:
         """Noise that what is left (k, n), N m, of each recording shows where it counts.
 
         What an effect leaves where its equation is an idealisation, friction where it turns round,
-        is that one's, and is no noise elsewhere.
+        is that one's, and is no noise elsewhere; but where next to no row is certain, all that is
+        left says as much as one row that is.
         """
         sliding = [own.sliding for own in self.recordings]
-        if self.doubts and self.noise:
-            sliding = [x * weight**2 for x, weight in zip(sliding, self.weights, strict=True)]
-        return tuple(map(noise_of, left, sliding))
+        if not (self.doubts and self.noise):
+            return tuple(map(noise_of, left, sliding))
+        out = []
+        for x, rows, weight in zip(left, sliding, self.weights, strict=True):
+            certain, every = noise_of(x, rows * weight**2), noise_of(x, rows * (weight > 0.0))
+            told, one = np.sum(rows * weight**4, axis=0), every.memory
+            square = (told * certain.level**2 + one * every.level**2) / (told + one)
+            out.append(replace(certain, level=np.sqrt(square)))
+        return tuple(out)
 
     def own_noise(self) -> tuple[Noise, ...]:
         """Noise that its residuals show."""
