@@ -28,7 +28,7 @@ from adapter.model.spatial import Array
 
 TIMING_STD_S = 2.5e-4  # half a sample of hold, two of these, is no effect of the arm
 STEP = 0.01  # of a coefficient's prior, for differences
-EDGE = 0.3  # of a jump: friction turns round more softly than its equation
+EDGE = 0.3  # of a jump of added torque: friction turns round more softly than its equation
 JUMP_ROWS = (4, 2)  # before and after a row, in which a jump concerns it
 EDGE_S = 0.06  # a change takes so long, and its date is no better known
 BLOCK = 25  # samples: errors of the model last so long, noise does not

@@ -7,6 +7,7 @@ from typing import Any
 
 from adapter.model.numbers import plain, plus_minus
 from adapter.model.spatial import Array
+from adapter.runs.outcome import SAME_LOAD_S
 from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
@@ -99,6 +100,7 @@ def not_learned(figures: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     noticed = [change["stamp_s"] for change in figures["theta"].get("changes") or []]
 
     def held(report: Mapping[str, Any]) -> bool:
-        return report["what"] == "payload" and report["since_s"] in noticed
+        near = any(abs(at - report["since_s"]) <= SAME_LOAD_S for at in noticed)
+        return report["what"] == "payload" and near
 
     return [report for report in figures.get("disagreements") or [] if not held(report)]

@@ -347,8 +347,8 @@ def changes_at(
     watched = [x["since_s"] for x in reports or () if x["what"] == "payload"]
     found: list[dict[str, Any]] = []
     for at_s in (1e-9 * stamp for stamp in stamps_ns):
-        near = [x for x in watched if abs(x - at_s) <= SAME_LOAD_S]
-        found.append({"stamp_s": near[0] if near else at_s})
+        near = min(watched, key=lambda x: abs(x - at_s), default=at_s)
+        found.append({"stamp_s": near if abs(near - at_s) <= SAME_LOAD_S else at_s})
     if found and payload is not None:
         found[-1]["payload"] = told_load(payload)
     return found
