@@ -18,6 +18,7 @@ from rich.text import Text
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_urdf
+from adapter.effects.kept import with_kept
 from adapter.errors import MeansError, UsageError
 from adapter.gap import servo_words
 from adapter.gap.result import GapResult, Shortfall
@@ -50,6 +51,11 @@ WITH_TORQUE = (  # options
 
 def run(args: argparse.Namespace) -> int:
     """Carry the subcommand out."""
+    with with_kept(args.kept):
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     positions = _position_logs(args)
     if positions is not None:
         return _explain_positions(args, *positions)

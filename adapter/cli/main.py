@@ -70,6 +70,11 @@ COMMANDS = {  # in the order of --help
         "adapter.cli.gap:run",
         begins="comparing {model} with {logs}",
     ),
+    "effects": Command(
+        model_options.declare_effects,
+        "what can be named, and laws of one's own",
+        "adapter.cli.effects:run",
+    ),
     "fleet": Command(
         model_options.declare_fleet,
         "one model per arm from many recordings",

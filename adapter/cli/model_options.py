@@ -77,6 +77,7 @@ def declare_gap(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="rounds of the search, in each of which something may be named (default 24)",
     )
+    add_effects(parser)
     add(
         "--simulator",
         choices=("pybullet", "mujoco"),
@@ -94,6 +95,32 @@ def _check_gap(args: argparse.Namespace) -> None:
         raise UsageError("--validate-from splits one LOG; of several, --hold-out names the scored")
     check_told(args)
     check_robot(args.model)
+
+
+def declare_effects(parser: argparse.ArgumentParser) -> None:
+    """Declare them."""
+    parser.description = (
+        "What effects can be named, one's own among them; `keep RESULT --as NAME` keeps a law "
+        "that adapter gap found, under a name by which it is looked for in other recordings."
+    )
+    add = parser.add_argument
+    add("keep", nargs="*", metavar="keep RESULT", help="results folder, or gap.json in it")
+    add("--as", dest="name", metavar="NAME", help="what the law is called: hose_joint_3")
+    add("--joint", type=int, metavar="J", help="whose law it is, where the result has several")
+    add_effects(parser, Path("effects.toml"))
+
+
+def add_effects(parser: argparse.ArgumentParser, default: Path | None = None) -> None:
+    """The file of kept laws."""
+    parser.add_argument(
+        "--effects",
+        dest="kept",
+        type=Path,
+        metavar="FILE",
+        default=default,
+        help="laws of one's own, TOML as `adapter effects keep` writes it"
+        + (f" (default {default})" if default else ""),
+    )
 
 
 def declare_fleet(parser: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from adapter.effects.base import (
     Values,
 )
 from adapter.effects.by_joint import ByJoint
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import KNOWN
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from drivers.errors import choices
@@ -135,9 +135,9 @@ def _of_entry(entry: Any, n: int) -> list[Active]:
     if not isinstance(entry, Mapping) or any(key not in entry for key in NEEDED):
         raise ModelError(f"an effect needs {' and '.join(NEEDED)}, got {entry!r}")
     name = entry["effect"]
-    if not isinstance(name, str) or name not in CATALOGUE:
-        raise ModelError(f"no effect '{name}'; {choices(name, CATALOGUE)}")
-    effect = CATALOGUE[name]
+    if not isinstance(name, str) or name not in KNOWN:
+        raise ModelError(f"no effect '{name}'; {choices(name, KNOWN)}")
+    effect = KNOWN[name]
     values = entry["parameters"]
     if not isinstance(values, Mapping):
         raise ModelError(f"{effect.name}: 'parameters' must hold {_keys(effect)}, got {values!r}")

@@ -51,7 +51,7 @@ JOINT, LINK, FLANGE, BASE, ALL = "joint", "link", "flange", "base", "all"
 
 def with_squares(unit: str) -> str:
     """A unit of a file as people write it: kg m² for kg m2."""
-    return unit.replace("2", "²")
+    return unit.translate(str.maketrans("234", "²³⁴"))
 
 
 @dataclass(frozen=True)
@@ -256,6 +256,7 @@ class Template:
             `is_theta`; None where its coefficients are these parameters themselves.
         chord: whether its signature is that of effects as large as `prior_std`, not of the least
             ones: for what is not linear near zero.
+        linear: whether the torque is, in its coefficients.
     """
 
     prior_std: tuple[float, ...]
@@ -263,6 +264,7 @@ class Template:
     label: str = ""
     theta: Array | None = field(default=None, compare=False)
     chord: bool = False
+    linear: bool = True
 
 
 class Effect(ABC):
@@ -270,6 +272,7 @@ class Effect(ABC):
 
     Attributes:
         name: canonical name; title: for people.
+        in_files: what a model's file calls it, so that others can read it; its name where empty.
         scope: what `joints` counts: `JOINT` one joint each, `LINK` the link of that number,
             `FLANGE` and `BASE` none, `ALL` all joints or one.
         parameters: in the order of the catalogue.
@@ -298,6 +301,7 @@ class Effect(ABC):
     """
 
     name: ClassVar[str]
+    in_files: ClassVar[str] = ""
     title: ClassVar[str]
     scope: ClassVar[str] = JOINT
     parameters: ClassVar[tuple[Parameter, ...]]

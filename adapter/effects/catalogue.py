@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import ChainMap
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TypeGuard
 
@@ -18,6 +19,7 @@ from adapter.effects.external_wrench import ExternalWrench
 from adapter.effects.friction_drift import FrictionDrift
 from adapter.effects.joint_elasticity import JointElasticity
 from adapter.effects.joint_spring import JointSpring
+from adapter.effects.law import LAWS
 from adapter.effects.link_inertia import LinkInertia
 from adapter.effects.load_dependent_friction import LoadDependentFriction
 from adapter.effects.motor_inertia import MotorInertia
@@ -59,6 +61,9 @@ CATALOGUE: dict[str, Effect] = {
         FrictionDrift(),
     )
 }
+
+# What files and findings may name: effects, and laws of what none of them is.
+KNOWN: Mapping[str, Effect] = ChainMap(CATALOGUE, dict[str, Effect](LAWS))
 
 
 def learnable(effect: Effect) -> TypeGuard[LearnedEffect]:

@@ -35,6 +35,7 @@ from adapter.effects.base import (
 )
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.catalogue import HELD
+from adapter.effects.law import LAWS, Law
 from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
@@ -165,7 +166,7 @@ def templates(effect: Effect, hand: Hand) -> tuple[Template, ...]:
 def signatures(
     at: Stages,
     joints: Sequence[int],
-    extra: Sequence[tuple[Effect, int]] = (),
+    extra: Sequence[tuple[Effect, int, Template]] = (),
     hand: Hand = ANYWHERE,
 ) -> tuple[Array, list[Candidate]]:
     """Every signature in the band, and what each belongs to.
@@ -173,7 +174,7 @@ def signatures(
     Args:
         at: the model as it stands on a recording.
         joints: (from 0) that move; effects of others cannot be told.
-        extra: further effects, each with its joint.
+        extra: further effects, each with its joint and how it is looked for.
         hand: where a load is.
 
     Returns:
@@ -189,7 +190,7 @@ def signatures(
         if joint < 0 or effect.scope == LINK or joint in joints
         for template in templates(effect, hand)
     ]
-    ways += [(effect, joint, effect.templates()[0]) for effect, joint in extra]
+    ways += extra
     for effect, joint, template in ways:
         if effect.is_theta and template.theta is None:
             k = 10 * (joint if joint >= 0 else n - 1)
@@ -247,7 +248,7 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
 
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
 SLOW_PIECES = 10  # over time
-SIZE_NM = 0.3
+SIZE_NM, LEAST_RMS = 0.3, 1e-6
 LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
 LINE_HZ = (0.15, 9.0)
 SHARPENED, FINE = 12, 40  # rounds in which a line's frequency is sharpened; steps either way
@@ -303,6 +304,42 @@ def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
             own.append(Pattern(f"dq{i + 1}", (f"dq{i + 1}",), _other("dq", i), 1))
             own.append(Pattern(f"tau{i + 1}", (f"tau{i + 1}",), _other("tau", i), 1))
     return tuple(own)
+
+
+def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]]:
+    """Every law that the torque on a joint (from 0) may have, at each setting that is tried.
+
+    How large a law may well be is known of its torque, not of its coefficient.
+    """
+    out, ranges = list[tuple[Law, int, Template]](), {"": (0.0, 1.0)}
+    q = np.concatenate([at.links.q[:, joint] for at in stages])
+    ranges["q"] = float(q.min()), float(q.max())
+    ranges["|tau|"] = 0.0, max(float(np.abs(at.rigid[:, joint]).max()) for at in stages)
+    kept = {effect.in_files for effect in CATALOGUE.values()}  # by another name
+    for law in LAWS.values():
+        if law.by > stages[0].links.arm.n or law.by == joint + 1 or law.name in kept:
+            continue
+        setting = law.expression.setting
+        low, high = ranges[setting.within if setting else ""]
+        tried = [low + share * (high - low) for share in setting.tried] if setting else [1.0]
+        for template in map(law.at, tried):
+            rms = np.sqrt(np.mean([_power(at, law, template, joint) for at in stages]))
+            std = SIZE_NM / max(float(rms), LEAST_RMS)
+            scaled = (std,) * len(template.prior_std)
+            out.append((law, joint, replace(template, prior_std=scaled)))
+    return out
+
+
+def _power(at: Stages, law: Law, template: Template, joint: int) -> float:
+    """Mean square of a law's torque on a joint where its first coefficient is one."""
+    values = template.decode(np.eye(len(template.prior_std))[0])
+
+    def compute() -> Array:
+        return np.asarray(np.mean(law.on(at.links, at.rigid, joint, values) ** 2))
+
+    if law.by_load or not at.unmoved:
+        return float(compute())
+    return float(at.signals.once(("power", law.name, template.label, joint), compute))
 
 
 def line(hz: float) -> Pattern:

@@ -11,7 +11,7 @@ import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
-from adapter.effects.catalogue import CATALOGUE, HELD, WRONG_LINK
+from adapter.effects.catalogue import HELD, KNOWN, WRONG_LINK
 from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds
 from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
@@ -63,7 +63,7 @@ def entries(
             begin, end = (None if not np.isfinite(x) else float(x) for x in named.interval_s)
             out.append(
                 {
-                    "effect": named.candidate.effect.name,
+                    "effect": named.candidate.effect.in_files or named.candidate.effect.name,
                     "joints": _joints(named),
                     "interval_s": None if begin is None and end is None else [begin, end],
                     "parameters": named.values,
@@ -212,7 +212,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 units=effect.units(),
                 evidence=evidence,
                 overlaps=overlaps,
-                split_by="; ".join(experiments(effect, [CATALOGUE[x] for x in overlaps])),
+                split_by="; ".join(experiments(effect, [KNOWN[x] for x in overlaps])),
                 detectability=float(np.sqrt(standing.chi2)),
                 torque_rms_nm=np.sqrt(np.mean(torque[on] ** 2, axis=0)),
                 recording=name if own and len(ends) > 1 else "",

@@ -18,9 +18,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from adapter.effects.active import WHOLE, Active
 from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
-from adapter.effects.catalogue import CATALOGUE, LATENESS
+from adapter.effects.catalogue import LATENESS
 from adapter.effects.torque import added, sensors
-from adapter.gap.candidates import Candidate, Stages, stages_of
+from adapter.gap.candidates import Candidate, Pattern, Stages, stages_of
 from adapter.gap.evidence import Carried, Moments, Noise, Score, noise_of
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.signals import Signals
@@ -35,6 +35,7 @@ BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
 FAR_STEP = 3.0  # where others stay as they are
+MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +59,8 @@ class Named:
 
     @property
     def is_pattern(self) -> bool:
-        """Whether it has no name in the catalogue."""
-        return self.candidate.effect.name not in CATALOGUE
+        """Whether it has neither a name nor a law."""
+        return isinstance(self.candidate.effect, Pattern)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -210,9 +211,10 @@ class Model:
 
         Those of an effect that hangs on the measured motion alone are the same in every fit.
         """
-        if e.candidate.effect.by_load or not at.unmoved:  # type: ignore[attr-defined]
+        effect, template = e.candidate.effect, e.candidate.template
+        if effect.by_load or not (template.linear and at.unmoved):  # type: ignore[attr-defined]
             return self._torque_differences(e, at)
-        shape = repr(e.candidate.template.decode(e.candidate.prior_std))
+        shape = repr(template.decode(e.candidate.prior_std))
         key = "slopes", e.candidate.key, shape, e.interval_s
         return at.signals.once(key, lambda: self._torque_differences(e, at))
 
@@ -302,7 +304,8 @@ class Fit:
     def is_linear(self) -> bool:
         """Whether the predicted torque is linear in all coefficients (a delay of 1 ms is)."""
         return all(
-            isinstance(e.candidate.effect, TorqueEffect) or e.candidate.columns_are_theta
+            (isinstance(e.candidate.effect, TorqueEffect) and e.candidate.template.linear)
+            or e.candidate.columns_are_theta
             for e in self.named
         )
 
@@ -356,6 +359,21 @@ class Fit:
         """Noise that its residuals show."""
         return self.noise_of(self.model.residuals())
 
+    def noise_beside(self, known: Carried) -> tuple[Noise, ...]:
+        """Noise that its residuals show, and that its coefficients have fitted away (Bessel).
+
+        Of a motion of some seconds as many rows are independent as there are coefficients.
+        """
+        shares = np.sum(known.N * known.solved(known.N.T).T, axis=0)  # that each row decided
+        ends = np.cumsum([own.tau.size for own in self.recordings])[:-1]
+        out = []
+        parts = zip(self.recordings, self.own_noise(), self.weights, strict=True)
+        for (own, noise, weight), share in zip(parts, np.split(shares, ends), strict=True):
+            rows = np.maximum(np.sum(own.sliding * weight**2, axis=0) / noise.memory, 1.0)
+            fitted = np.minimum(share.reshape(own.tau.shape).sum(axis=0) / rows, MOST_FITTED)
+            out.append(replace(noise, level=noise.level / np.sqrt(1.0 - fitted)))
+        return tuple(out)
+
     def with_noise(self, noise: Sequence[Noise] | None = None) -> Fit:
         """The same under another noise model; that of its own residuals where None is given."""
         fit = replace(self, doubts=tuple(self._doubt(i) for i in range(len(self.recordings))))
@@ -398,8 +416,8 @@ class Fit:
 
 def under_own_noise(fit: Fit) -> tuple[Fit, Carried]:
     """A fit under the noise that it leaves itself, and what is known of its coefficients."""
-    fit, _ = refitted(fit.with_noise())
-    return refitted(fit.with_noise())
+    fit, known = refitted(fit.with_noise())
+    return refitted(fit.with_noise(fit.noise_beside(known)))
 
 
 def unsure(model: Model, recording: int, place: int) -> Array:

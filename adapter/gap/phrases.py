@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.base import ALL, BASE, FLANGE, LINK
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.base import ALL, BASE, FLANGE, LINK, with_squares
+from adapter.effects.catalogue import KNOWN
 from adapter.effects.phrases import Length, Phrase
 from adapter.gap.result import Finding
 from adapter.model.inertia import PARAMETERS, UNITS
@@ -22,7 +22,6 @@ SHOWN_UNITS = {
     "s": (1e3, "ms"),
     "s2": (1e6, "ms²"),
     "m": (1e3, "mm"),
-    "kg m2": (1.0, "kg m²"),
 }
 
 
@@ -40,7 +39,7 @@ def shown_unit(value: Any, unit: str) -> tuple[float, str]:
     """(factor, name) of the unit in which a value of a file's unit is shown."""
     if unit == "rad" and 0.0 < abs(_number(value)) < SMALL_RAD:
         return 1e3, "mrad"
-    return SHOWN_UNITS.get(unit, (1.0, unit))
+    return SHOWN_UNITS.get(unit, (1.0, with_squares(unit)))
 
 
 def parameter(finding: Finding, key: str, size: bool = False) -> str:
@@ -90,12 +89,12 @@ def _components(finding: Finding, length: Length) -> np.ndarray:
 
 def phrase_of(finding: Finding) -> Phrase:
     """How the effect of a finding is said to be there."""
-    return CATALOGUE[finding.effect].phrase if finding.effect in CATALOGUE else Phrase()
+    return KNOWN[finding.effect].phrase if finding.effect in KNOWN else Phrase()
 
 
 def who(effect: str, joints: Sequence[int]) -> str:
     """What an effect acts on: "joint 4", "joints 1 and 2", "link 5", "all joints", "the flange"."""
-    scope = CATALOGUE[effect].scope if effect in CATALOGUE else ""
+    scope = KNOWN[effect].scope if effect in KNOWN else ""
     if scope in (FLANGE, BASE):
         return f"the {scope}"
     if not joints:

@@ -16,10 +16,12 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from adapter.effects.active import WHOLE
-from adapter.effects.base import JOINT, Effect, TorqueEffect
+from adapter.effects.base import JOINT, Effect, Template, TorqueEffect
+from adapter.effects.law import Law
 from adapter.gap.candidates import (
     Candidate,
     Pattern,
+    laws,
     line,
     line_hz,
     log_odds,
@@ -41,7 +43,7 @@ from adapter.gap.evidence import (
 from adapter.gap.fit import Fit
 from adapter.model.spatial import Array
 
-CATALOGUED, PATTERNS = "catalogued", "patterns"
+CATALOGUED, PATTERNS, FORMS = "catalogued", "patterns", "forms"
 BLOCK_S, DATE_STEP_S = 0.4, 0.04
 UNSURE_S = 0.16  # a date is not known better before the effect is refitted
 AT_ONCE = 24  # candidates of a long recording
@@ -91,8 +93,8 @@ def rich_noise(X: Array, candidates: Sequence[Candidate], residual: Array, heard
     """
     prior = np.zeros(len(X))
     for c in candidates:
-        # patterns are so many that they would explain noise, but for a line that stands out
-        if not isinstance(c.effect, Pattern) or c.effect.name.endswith("Hz"):
+        # patterns and laws are so many that they would explain noise, but for a line
+        if not isinstance(c.effect, Pattern | Law) or c.effect.name.endswith("Hz"):
             k = list(c.columns)
             prior[k] = np.maximum(prior[k], c.prior_std)
     used, x = np.flatnonzero(prior > 0.0), np.zeros(len(X))
@@ -123,7 +125,8 @@ class SignatureTable:
 
     Args:
         fit: the model as it stands; joints: (from 0) that move.
-        kind: of the candidates, `CATALOGUED` or `PATTERNS`.
+        kind: of the candidates: `CATALOGUED`, with laws for rivals; `PATTERNS` and laws; `FORMS`,
+            laws alone.
         rich: whiten by that noise; by the fit's own where False.
     """
 
@@ -132,6 +135,7 @@ class SignatureTable:
     ) -> None:
         tables, noise = [], []
         extra = self._patterns(fit, joints) if kind == PATTERNS else []
+        extra += self._laws(fit, joints if kind != CATALOGUED else self._rivalled(fit, joints))
         self.candidates: list[Candidate] = []
         for i in range(len(fit.recordings)):
             table, self.candidates = signatures(fit.model.stages(i), joints, extra, fit.model.hand)
@@ -139,8 +143,8 @@ class SignatureTable:
             if rich:
                 own, heard = fit.model.residual(i), fit.recordings[i].heard
                 noise.append(rich_noise(table, self.candidates, own, heard))
-        if kind == PATTERNS:
-            self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern)]
+        if kind != CATALOGUED:
+            self.candidates = [c for c in self.candidates if isinstance(c.effect, Pattern | Law)]
         self.fit = fit.with_noise(noise) if rich else fit
         self.tables = tables
         self.carried_tables = [self.fit.model.signatures(i) for i in range(len(tables))]
@@ -156,9 +160,21 @@ class SignatureTable:
         """(c, r) all signatures, white."""
         return self.fit.whiten(self.tables)
 
-    def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int]]:
-        """What no effect of the catalogue has: patterns of each joint, and lines in time."""
-        found: list[tuple[Effect, int]] = [(p, j) for j in joints for p in patterns(fit.n, j)]
+    def _laws(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
+        stages = [fit.model.stages(i) for i in range(len(fit.recordings))]
+        return [way for j in joints for way in laws(stages, j)]
+
+    def _rivalled(self, fit: Fit, joints: Sequence[int]) -> list[int]:
+        """Joints that have a law, or an effect that one may be taken for."""
+        named = [e for e in fit.named if e.candidate.joint in joints and not e.assumed]
+        effects = [(e.candidate.joint, e.candidate.effect) for e in named]
+        return sorted({j for j, effect in effects if isinstance(effect, Law) or effect.over_angle})
+
+    def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
+        """Patterns of each joint, and lines in time."""
+        found: list[tuple[Effect, int, Template]] = [
+            (p, j, p.templates()[0]) for j in joints for p in patterns(fit.n, j)
+        ]
         residuals = fit.model.residuals()
         i = int(np.argmax([len(x) for x in residuals]))
         own, residual = fit.recordings[i], residuals[i]
@@ -168,7 +184,7 @@ class SignatureTable:
             if hz is not None:
                 if end - begin < len(residual):
                     hz = sharpened(hz, residual[:, j], own.t, BAND_HZ / (end - begin))
-                found.append((line(hz), j))
+                found.append((line(hz), j, line(hz).templates()[0]))
         return found
 
     def gated(self, lead: Lead) -> list[Array]:

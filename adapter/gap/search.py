@@ -26,6 +26,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
+from adapter.gap.laws import lawful
 from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
@@ -117,7 +118,10 @@ def search(
     # noise that was taken for the first effect's may have hidden another one
     fit = _extended(fit, joints, CATALOGUED, budget, progress)
     fit = _extended(fit, joints, PATTERNS, budget, progress)
-    found = _as_resolved(settled(_renamed(fit, joints), joints))
+    found = settled(_renamed(fit, joints), joints)
+    progress("laws of what no effect explains")
+    fit = lawful(found.fit)
+    found = _as_resolved(found if fit is found.fit else settled(fit, joints))
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)
 
 

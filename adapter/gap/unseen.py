@@ -38,7 +38,8 @@ def unseen(found: Found, joints: Sequence[int]) -> tuple[Unseen, ...]:
     best: dict[tuple[str, int], Unseen] = {}
     for c in table.candidates:
         whole_body = c.columns_are_theta and c.template.theta is None
-        if c.effect.simpler or c.effect.passing or whole_body or c.key in named:
+        usual = c.effect.name in CATALOGUE and not (c.effect.simpler or c.effect.passing)
+        if not usual or whole_body or c.key in named:
             continue
         own = _least(c, table.X[list(c.columns)], fit, table.carried)
         if own is None:

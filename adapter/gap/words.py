@@ -10,7 +10,7 @@ import numpy as np
 from rich.markup import escape
 
 from adapter.effects.by_joint import SMOOTHING_DQ
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import KNOWN
 from adapter.gap.phrases import (
     listed,
     numbered,
@@ -26,6 +26,7 @@ from adapter.model.spatial import Array
 
 MOST_PARTS = 3  # of a headline; the page's table has the rest
 ABOVE_NOISE = 1.5  # torque error over the noise from which "down to its noise" is not true
+WIDER = "move the joint faster, and over a wider range"  # what tells one curve from another
 NOT_EXPLAINED = "are not explained by any effect of the catalogue"
 SIGNALS = {
     "dq": "velocity",
@@ -95,7 +96,7 @@ def rivals(findings: Sequence[Finding]) -> str:
     if not shares:
         return ""
     parts = [f"{title_of(name)}, which explains {share} of it here" for name, share in shares]
-    return f"could also be {', or '.join(parts)}; to split: {findings[0].split_by}"
+    return f"could also be {', or '.join(parts)}; to split: {findings[0].split_by or WIDER}"
 
 
 def shares_of(findings: Sequence[Finding]) -> list[tuple[str, str]]:
@@ -121,7 +122,7 @@ def alike(findings: Sequence[Finding]) -> list[list[Finding]]:
 
 def title_of(effect: str) -> str:
     """Name of an effect for people."""
-    return CATALOGUE[effect].title if effect in CATALOGUE else effect.replace("_", " ")
+    return KNOWN[effect].title if effect in KNOWN else effect.replace("_", " ")
 
 
 def percent(share: float) -> str:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adapter.effects.catalogue import CATALOGUE, HELD
+from adapter.effects.catalogue import HELD, KNOWN
 from adapter.effects.robots import read_robot
 from adapter.gap.changes import loaded, with_changes
 from adapter.gap.findings import ODD, disagreement, findings_of, noise_floor, told_of
@@ -26,6 +26,7 @@ from adapter.gap.fit import Fit, worth
 from adapter.gap.folds import holds_out
 from adapter.gap.hand import hand_frame
 from adapter.gap.held_out import GapTask, HeldOut, Simulate, lasting, measure, model_of
+from adapter.gap.laws import notes_on
 from adapter.gap.load import plain_load
 from adapter.gap.long_recording import (
     LongRecording,
@@ -351,7 +352,8 @@ def _result(task: GapTask, measured: HeldOut, settings: GapSettings) -> GapResul
     told, left = told_of(found, ends, trusted)
     findings = tuple(f for f in told if f.evidence >= NO_NAME)
     notes = [unnamed(f.title, f.joints) for f in told if f.evidence < NO_NAME]
-    placed = any(CATALOGUE[f.effect].is_theta for f in findings)
+    notes += notes_on(found.fit)
+    placed = any(KNOWN[f.effect].is_theta for f in findings)
     if np.abs(found.fit.dtheta / trusted).max() > ODD and not placed:
         notes.append(UNPLACED)
     if found.weak:

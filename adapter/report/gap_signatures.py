@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adapter.gap.result import GapResult, Leftover, RolloutCurves
+from adapter.effects.catalogue import KNOWN
+from adapter.effects.law import Law
+from adapter.gap.result import Finding, GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
 from adapter.model.spatial import Array
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_JOINTS = 3  # with signatures
+LAW_POINTS = 200
 MOST_DOTS = 500  # of one cloud; a panel shows no more
 BINS, FEWEST_IN_BIN = 24, 4
 WIDEST = 99.5  # percentile of |residual| that a panel still holds
@@ -80,12 +83,7 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
     """The residual of the joints worth a look, against what it may depend on."""
     panels = []
     for j in shown_joints(result):
-        clouds = [
-            _cloud(
-                result, j, np.concatenate([getattr(c, key)[:, j] for c in result.curves]), *words
-            )
-            for key, *words in SIGNATURES
-        ]
+        clouds = [_cloud(result, j, *words) for words in SIGNATURES]
         times = [_over_time(result, j), _motion(result, j)]
         panels.append(JointPanels(f"Joint {j + 1}", _why(result, j), clouds, times))
     return panels
@@ -102,10 +100,10 @@ def _worst(worth: Array) -> int:
     return int(np.argmax(np.nan_to_num(worth))) if np.size(worth) else -1
 
 
-def _cloud(result: GapResult, j: int, x: Array, title: str, label: str) -> Panel:
-    before, after = (
+def _cloud(result: GapResult, j: int, key: str, title: str, label: str) -> Panel:
+    x, before, after = (
         np.concatenate([getattr(c, side)[:, j] for c in result.curves])
-        for side in ("before", "after")
+        for side in (key, "before", "after")
     )
     drawing = Drawing("quarter")
     drawing.figure.subplots_adjust(left=LEFT)
@@ -116,8 +114,27 @@ def _cloud(result: GapResult, j: int, x: Array, title: str, label: str) -> Panel
         _dots(ax, x, y, color)
     for y, color in ((before, GOAL), (after, ACCENT)):
         ax.plot(*_running_mean(x, y), color=color, linewidth=1.6)
+    laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
+    for finding in laws:
+        _law(ax, finding, key, np.linspace(np.nanmin(x), np.nanmax(x), LAW_POINTS))
     time_axis(drawing, label)
-    return drawing.panel(title, "N m")
+    return drawing.panel(title, "N m", ", ".join(f.title for f in laws))
+
+
+def _follows_alone(finding: Finding, key: str) -> bool:
+    """Whether it is a law of one signal of its own joint."""
+    law = KNOWN.get(finding.effect)
+    return isinstance(law, Law) and not law.by and law.expression.variables == {key}
+
+
+def _law(ax: Axes, finding: Finding, key: str, x: Array) -> None:
+    """A law over its signal, with twice the doubt of its coefficient."""
+    law, c = KNOWN[finding.effect], finding.parameters["c"]
+    assert isinstance(law, Law)
+    y = law.curve(key, x, finding.parameters)
+    doubt = 2.0 * np.abs(y / c) * (finding.std.get("c") or 0.0) if c else 0.0 * y
+    ax.fill_between(x, y - doubt, y + doubt, color=INK, alpha=0.2, linewidth=0)
+    ax.plot(x, y, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
 
 
 def _limits(ax: Axes, x: Array, ys: Sequence[Array]) -> None:

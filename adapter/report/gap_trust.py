@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from adapter.effects.law import LAW
 from adapter.gap.phrases import who
 from adapter.gap.result import GapResult
 from adapter.gap.words import left_above_noise, noise_times, percent, stopped, worse
@@ -89,6 +90,12 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     if result.problem is not None and result.model_in:
         why = "Design a motion in which every joint moves enough"
         steps.append(Step(why, command("excite", *_robot(result))))
+    laws = [f for f in result.findings if f.effect.startswith(LAW)]
+    if laws:
+        why = "Keep the law under a name, to look for it in other recordings (--effects)"
+        name, joint = f"law_joint_{laws[0].joints[0]}", str(laws[0].joints[0])
+        words = ("effects", "keep", figures, "--as", name, "--joint", joint)
+        steps.append(Step(why, command(*words)))
     out = result.model_out
     if out is not None:
         why = "See joint by joint what the new model holds otherwise"

@@ -204,8 +204,9 @@ def test_noise_and_a_slightly_wrong_model_have_no_name(seed: int, tmp_path: Path
     assert result["findings"] == []
 
 
-def test_what_is_in_no_list_stays_unexplained(outside: Told) -> None:
+def test_what_is_in_no_list_gets_a_law_or_stays_unexplained(outside: Told) -> None:
     left = [{"effect": "", "joints": [x["joint"]]} for x in outside.result["unexplained"]]
+    left += [x for x in outside.result["findings"] if x["effect"].startswith("law: ")]
     assert any(same_joints(x, outside.truth) for x in left), outside
     for x in outside.result["unexplained"]:
         assert x["depends_on"] and x["rmse_nm"] > x["noise_floor_nm"]

@@ -428,7 +428,7 @@ def test_signatures_of_a_load_are_those_of_its_body(signals: Signals):
 def test_signatures_that_are_kept_are_those_of_any_model():
     """What hangs on the measured motion alone is computed once, whatever the inertias are."""
     other = ARM.changed(theta=1.2 * ARM.theta)
-    ways = [(pattern, RUBS) for pattern in patterns(N, RUBS)]
+    ways = [(x, RUBS, x.templates()[0]) for x in patterns(N, RUBS)]
     used, fresh = prepare(SHORT, ARM), prepare(SHORT, ARM)
     signatures(stages_of(used, ()), EVERYWHERE, ways)
     kept, _ = signatures(stages_of(used, (), other), EVERYWHERE, ways)

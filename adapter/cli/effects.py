@@ -1,0 +1,39 @@
+"""`adapter effects`: what can be named, and laws of one's own beside it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from rich.table import Table
+
+from adapter.effects.base import Effect
+from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.kept import keep, with_kept
+from adapter.effects.law import LAW, LAWS
+from adapter.errors import UsageError
+from adapter.runs.terminal import output, show
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry the subcommand out."""
+    if args.keep:
+        if args.keep[0] != "keep" or len(args.keep) != 2 or args.name is None:
+            raise UsageError("as in: adapter effects keep results/gap --as hose_joint_3")
+        show(keep(Path(args.keep[1]), args.name, args.joint, args.kept))
+        show(f"kept in {args.kept}; looked for by adapter gap ... --effects {args.kept}")
+        return 0
+    with with_kept(args.kept if args.kept.exists() else None):
+        output.print(_table(list(CATALOGUE.values())))
+    forms = dict.fromkeys(law.expression.text for law in LAWS.values())
+    show(f"laws of what none of these is: c times {', '.join(forms)} (ⱼ: another joint's)")
+    return 0
+
+
+def _table(effects: list[Effect]) -> Table:
+    table = Table("name", "what", "of", "numbers", box=None, pad_edge=False)
+    for effect in effects:
+        numbers = ", ".join(f"{p.key} {p.written}".rstrip() for p in effect.parameters)
+        own = f" ({effect.in_files.removeprefix(LAW)})" if effect.in_files else ""
+        table.add_row(effect.name, f"{effect.title}{own}", effect.scope, numbers)
+    return table

@@ -1,0 +1,144 @@
+"""Laws that people keep: found in one recording, named, looked for by that name in the next."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapter.effects.base import Template, Values
+from adapter.effects.catalogue import CATALOGUE, registered
+from adapter.effects.law import LAW, LAWS, Law
+from adapter.errors import SettingsError
+from drivers.errors import choices
+
+NAME = re.compile(r"[a-z][a-z0-9_]*")
+
+
+class KeptLaw(Law):
+    """A law with a name, looked for as the effects of the catalogue are.
+
+    Args:
+        law: what it is; name, title: what people call it.
+        values: its coefficient and setting as they were found: the search begins there, and
+            another arm's is about as large.
+    """
+
+    def __init__(self, law: Law, name: str, title: str, values: Values) -> None:
+        super().__init__(law.expression, law.by)
+        self.in_files = law.name  # type: ignore[misc]
+        self.name, self.title, self.log_odds = name, title, 0.0  # type: ignore[misc]
+        self._values = values
+
+    def templates(self) -> tuple[Template, ...]:
+        """At the setting that it was kept with."""
+        setting = self.expression.setting
+        template = self.at(float(self._values[setting.key]) if setting else 1.0)
+        std = abs(float(self._values["c"])) or float(np.atleast_1d(self.prior_std)[0])
+        return (replace(template, prior_std=(std,) * len(template.prior_std)),)
+
+    def reshaped(self, values: Values, ratio: float) -> Template | None:
+        """Another setting, of one that is no whole number."""
+        setting = self.expression.setting
+        if setting is None or setting.wave:
+            return None
+        return replace(
+            self.at(ratio * float(values[setting.key])), prior_std=self.templates()[0].prior_std
+        )
+
+
+def read_kept(path: Path) -> list[KeptLaw]:
+    """The laws in a TOML file: a table each, its name being the law's.
+
+    Raises:
+        OSError: there is no such file.
+        SettingsError: it is no TOML; names the table, the key and the choices.
+    """
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: not TOML: {error}") from None
+    if not tables:
+        raise SettingsError(f"{path}: holds no law; `adapter effects keep` writes one")
+    return [_law(f"{path}: [{name}]", name, table) for name, table in tables.items()]
+
+
+def _law(where: str, name: str, table: Any) -> KeptLaw:
+    _check_name(where, name)
+    if not isinstance(table, Mapping) or "law" not in table:
+        raise SettingsError(f'{where} needs law, as in law = "dq |dq|"')
+    law = LAWS.get(f"{LAW}{table['law']}")
+    if law is None:
+        known = [key.removeprefix(LAW) for key in LAWS]
+        raise SettingsError(
+            f"{where}: no law '{table['law']}'; {choices(str(table['law']), known)}"
+        )
+    setting = law.expression.setting
+    for p in law.parameters:
+        needed = p.key == "c" or (setting is not None and p.key == setting.key)
+        if needed and not isinstance(table.get(p.key), int | float):
+            raise SettingsError(f"{where} needs the number {p.key} ({p.unit or '1'})")
+    return KeptLaw(law, name, str(table.get("title", name)), table)
+
+
+def _check_name(where: str, name: str) -> None:
+    if not NAME.fullmatch(name):
+        raise SettingsError(f"{where}: a name has small letters, digits and _: hose_joint_3")
+    if name in CATALOGUE:
+        raise SettingsError(f"{where}: there is an effect '{name}' already")
+
+
+@contextmanager
+def with_kept(path: Path | None) -> Iterator[None]:
+    """The catalogue with the laws of a file, as long as the block lasts. Raises as `read_kept`."""
+    with ExitStack() as stack:
+        for law in read_kept(path) if path is not None else ():
+            stack.enter_context(registered(law))
+        yield
+
+
+def keep(result: Path, name: str, joint: int | None, path: Path) -> str:
+    """Add a law of a gap's result to a file under a name; returns the text that was added.
+
+    Args:
+        result: gap.json, or the folder that holds it.
+        joint: (from 1) of the law, where the result has several.
+
+    Raises:
+        OSError: a file that is not there.
+        SettingsError: a result without such a law, a name that is taken; names the choices.
+    """
+    result = result / "gap.json" if result.is_dir() else result
+    try:
+        findings = json.loads(result.read_text(encoding="utf-8"))["findings"]
+    except (ValueError, KeyError, TypeError):
+        raise SettingsError(f"{result}: no result of `adapter gap`") from None
+    laws = [f for f in findings if f["effect"].startswith(LAW)]
+    found = [f for f in laws if joint in (None, *f["joints"])]
+    if len(found) != 1:
+        have = "; ".join(f"joint {f['joints'][0]}: {f['effect'].removeprefix(LAW)}" for f in laws)
+        one = "several laws, say --joint" if found else "no such law"
+        raise SettingsError(f"{result}: {one}; have: {have or 'none'}")
+    _check_name(str(path), name)
+    if path.exists() and name in {law.name for law in read_kept(path)}:
+        raise SettingsError(f"{path}: [{name}] is there already; choose another name")
+    text = _as_toml(name, found[0])
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text)
+    return text
+
+
+def _as_toml(name: str, finding: Mapping[str, Any]) -> str:
+    lines = [f"[{name}]", f'title = "{name}"']
+    lines += [f'law = "{finding["effect"].removeprefix(LAW)}"', f"joints = {finding['joints']}"]
+    for key, value in finding["parameters"].items():
+        unit, std = finding["units"].get(key, ""), finding["std"].get(key) or 0.0
+        lines.append(f"{key} = {value!r}  # {unit}, ± {std:.2g}".replace("# ,", "#"))
+    return "\n".join([*lines, "", ""])

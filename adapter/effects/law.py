@@ -1,0 +1,287 @@
+"""Laws in closed form of what no effect of the catalogue is: one term of a small grammar each.
+
+A law is a coefficient times an expression of the joint's own signals, or of another joint's. The
+expression is its name, so that a file that holds it can be read by whoever has not seen it found.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from adapter.effects.base import (
+    Array,
+    JointSignals,
+    JointTorque,
+    Motion,
+    Parameter,
+    Template,
+    Values,
+    on_joint,
+    polar,
+)
+from adapter.effects.phrases import Phrase
+from adapter.effects.splits import SPEEDS, STILL, TURN
+
+LAW = "law: "  # begins the name of a law that has no other
+SIZE_NM = 1.0  # of a law's torque where its signals are as large as in `SIGNALS`
+LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
+EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
+BENDS = tuple(np.geomspace(0.1, 3.0, 12))  # shares of the largest torque at which a sensor bends
+BY, MOST_JOINTS = "ⱼ", 32
+POWERS = (0.3, 0.5, 0.7, 1.4, 1.7, 2.5)
+TURNS = tuple(map(float, range(1, 21)))  # per turn
+
+
+class Signal(NamedTuple):
+    """A usual size of a signal, and its unit, above and below the line."""
+
+    size: float
+    above: Mapping[str, int]
+    below: Mapping[str, int] = {}
+
+
+SIGNALS = {
+    "q": Signal(1.0, {"rad": 1}),
+    "dq": Signal(1.0, {"rad": 1}, {"s": 1}),
+    "ddq": Signal(5.0, {"rad": 1}, {"s": 2}),
+    "tau": Signal(3.0, {"N m": 1}),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The one number of an expression in which it is not linear.
+
+    Attributes:
+        key, unit, size, lower: of it: as it is written, its usual size, the least it may be.
+        tried: values; shares of a range where it lies `within` one: "q", or "|tau|" from zero on.
+        wave: whether it is the n of a factor sin(n q + phase).
+    """
+
+    key: str
+    unit: str
+    tried: tuple[float, ...]
+    within: str = ""
+    size: float = 1.0
+    lower: float = -np.inf
+    wave: bool = False
+
+
+EDGE = Setting("a", "rad", EDGES, within="q")
+PLAY = Setting("a", "N m", EDGES, within="|tau|", size=10.0, lower=0.0)
+BEND = Setting("a", "N m", BENDS, within="|tau|", size=10.0, lower=0.1)
+POWER = Setting("p", "", POWERS, lower=0.05)
+WAVE = Setting("n", "per turn", TURNS, wave=True)
+
+
+@dataclass(frozen=True)
+class Expression:
+    """How a torque depends on signals, apart from its size.
+
+    Attributes:
+        text: as people write it; `BY` stands for the number of another joint, whose signals it has.
+        powers: of its signals, for the coefficient's unit.
+        term: of the signals and the setting, where there is one.
+        setting: that it has.
+    """
+
+    text: str
+    powers: Mapping[str, int]
+    term: Callable[[JointSignals, Array], Array]
+    setting: Setting | None = None
+
+    @property
+    def variables(self) -> frozenset[str]:
+        """Signals that it follows."""
+        return frozenset(re.findall(r"ddq|dq|tau|q", self.text))
+
+    @property
+    def unit(self) -> str:
+        """Of its coefficient: N m over the signals' units to their powers."""
+        total: dict[str, int] = {"N m": 1}
+        for name, power in self.powers.items():
+            for part, sign in ((SIGNALS[name].above, -1), (SIGNALS[name].below, 1)):
+                for unit, own in part.items():
+                    total[unit] = total.get(unit, 0) + sign * own * power
+        above = " ".join(_raised(unit, p) for unit, p in total.items() if p > 0)
+        below = " ".join(_raised(unit, -p) for unit, p in total.items() if p < 0)
+        return f"{above or 1}/{below}" if below else above or ""
+
+
+def _raised(unit: str, power: int) -> str:
+    if power == 1:
+        return unit
+    return f"({unit}){power}" if " " in unit else f"{unit}{power}"
+
+
+def _above(at: JointSignals, a: Array) -> Array:
+    return np.maximum(at.q - a, 0.0)
+
+
+def _below(at: JointSignals, a: Array) -> Array:
+    return np.maximum(a - at.q, 0.0)
+
+
+def _deadband(at: JointSignals, a: Array) -> Array:
+    return np.asarray(np.sign(at.tau) * np.maximum(np.abs(at.tau) - a, 0.0))
+
+
+def _power(at: JointSignals, p: Array) -> Array:
+    return np.asarray(np.sign(at.dq) * np.abs(at.dq) ** p)
+
+
+def _grammar() -> tuple[Expression, ...]:
+    """Every expression that is tried."""
+    out = [
+        Expression("dq |dq|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq)),
+        Expression("dq³", {"dq": 3}, lambda at, _: at.dq**3),
+        Expression("|dq|", {"dq": 1}, lambda at, _: np.abs(at.dq)),
+        Expression("dq²", {"dq": 2}, lambda at, _: at.dq**2),
+        Expression("sign(dq) |dq|^p", {}, _power, POWER),
+        Expression("q²", {"q": 2}, lambda at, _: at.q**2),
+        Expression("(q - a)³", {"q": 3}, lambda at, a: (at.q - a) ** 3, EDGE),
+        Expression("max(q - a, 0)", {"q": 1}, _above, EDGE),
+        Expression("max(a - q, 0)", {"q": 1}, _below, EDGE),
+        Expression("max(q - a, 0)²", {"q": 2}, lambda at, a: _above(at, a) ** 2, EDGE),
+        Expression("max(a - q, 0)²", {"q": 2}, lambda at, a: _below(at, a) ** 2, EDGE),
+        Expression("ddq |ddq|", {"ddq": 2}, lambda at, _: at.ddq * np.abs(at.ddq)),
+        Expression("tau |tau|", {"tau": 2}, lambda at, _: at.tau * np.abs(at.tau)),
+        Expression("tau²", {"tau": 2}, lambda at, _: at.tau**2),
+        Expression("tau³", {"tau": 3}, lambda at, _: at.tau**3),
+        Expression("sign(tau) max(|tau| - a, 0)", {"tau": 1}, _deadband, PLAY),
+        Expression("tanh(tau/a)", {}, lambda at, a: np.tanh(at.tau / a), BEND),
+        Expression("tau² sign(dq)", {"tau": 2}, lambda at, _: at.tau**2 * at.direction),
+        Expression("dqⱼ", {"dq": 1}, lambda at, _: at.dq),
+        Expression("sign(dqⱼ)", {}, lambda at, _: at.direction),
+        Expression("dqⱼ |dqⱼ|", {"dq": 2}, lambda at, _: at.dq * np.abs(at.dq)),
+        Expression("tauⱼ", {"tau": 1}, lambda at, _: at.tau),
+        Expression("tauⱼ |tauⱼ|", {"tau": 2}, lambda at, _: at.tau * np.abs(at.tau)),
+    ]
+    return (
+        *out,
+        *_over_angle("sign(dq)", {}, lambda at: at.direction),
+        *_over_angle("dq", {"dq": 1}, lambda at: at.dq),
+    )
+
+
+def _over_angle(
+    text: str, powers: Mapping[str, int], friction: Callable[[JointSignals], Array]
+) -> tuple[Expression, ...]:
+    """Friction that depends on the angle."""
+    once, twice = {**powers, "q": 1}, {**powers, "q": 2}
+    return (
+        Expression(f"{text} q", once, lambda at, _: friction(at) * at.q),
+        Expression(f"{text} q²", twice, lambda at, _: friction(at) * at.q**2),
+        Expression(f"{text} max(q - a, 0)", once, lambda at, a: friction(at) * _above(at, a), EDGE),
+        Expression(f"{text} max(a - q, 0)", once, lambda at, a: friction(at) * _below(at, a), EDGE),
+        Expression(f"{text} sin(n q + phase)", powers, lambda at, _: friction(at), WAVE),
+    )
+
+
+class Law(JointTorque):
+    """A torque c times an expression.
+
+    Args:
+        expression: of it.
+        by: joint (from 1) whose signals it takes; 0 for its own.
+    """
+
+    inexact = 0.02
+    steady = True
+    shows = ((SPEEDS, "follows its curve"), (STILL, "is gone"), (TURN, "follows its curve"))
+
+    def __init__(self, expression: Expression, by: int = 0) -> None:
+        self.expression, self.by, setting = expression, by, expression.setting
+        text = expression.text.replace(BY, str(by))
+        self.name = self.in_files = f"{LAW}{text}"  # type: ignore[misc]
+        self.title = f"a torque of c {text}"  # type: ignore[misc]
+        self.by_load = "tau" in expression.variables  # type: ignore[misc]
+        sizes = [SIGNALS[key].size ** p for key, p in expression.powers.items()]
+        self.prior_std = SIZE_NM / float(np.prod(sizes))  # type: ignore[misc]
+        self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
+        own = [Parameter("c", expression.unit)]
+        own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []
+        own += [Parameter("phase", "rad")] if setting and setting.wave else []
+        self.parameters = tuple(own)  # type: ignore[misc]
+        sizes_said = ", ".join(f"{p.key} = {{{p.key}}}" for p in own)
+        self.phrase = Phrase(f"{{who}} {{has}} {{title}}: {sizes_said}", "c")  # type: ignore[misc]
+
+    def templates(self) -> tuple[Template, ...]:
+        """Its coefficient, or two of a wave, at the first setting that is tried."""
+        setting = self.expression.setting
+        return (self.at(setting.tried[0] if setting else 1.0),)
+
+    def at(self, value: float) -> Template:
+        """Its coefficients where its setting is fixed."""
+        setting, std = self.expression.setting, float(np.atleast_1d(self.prior_std)[0])
+        fixed = {setting.key: value} if setting else {}
+        label = f"{setting.key} = {value:.4g}" if setting else ""
+        if not (setting and setting.wave):
+            return Template((std,), lambda x: {"c": float(x[0]), **fixed}, label)
+
+        def decode(x: Array) -> dict[str, Any]:
+            size, phase = polar(x)
+            return {"c": size, **fixed, "phase": phase}
+
+        return Template((std, std), decode, label)
+
+    def around(self, values: Values, std: float) -> Template | None:
+        """Its coefficient, and by how much its setting is not as in `values`; None without one.
+
+        `std`: of the coefficient.
+        """
+        setting = self.expression.setting
+        if setting is None or setting.wave:
+            return None
+        key, middle = setting.key, float(values[setting.key])
+
+        def decode(x: Array) -> dict[str, Any]:
+            return {"c": float(x[0]), key: max(middle + float(x[1]), setting.lower)}
+
+        return Template((std, setting.size), decode, linear=False)
+
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """c times the expression of signals (..., n) of all joints, or of one that has its own."""
+        if self.by:
+            k = slice(self.by - 1, self.by)
+            tau = at.tau[..., k] if self.by_load else at.tau
+            at = at._replace(q=at.q[..., k], dq=at.dq[..., k], ddq=at.ddq[..., k], tau=tau)
+        return self._torque(at, values)
+
+    def curve(self, signal: str, x: Array, values: Values) -> Array:
+        """Torque (k,) over the one signal that it follows."""
+        q, dq, ddq, tau = (x if key == signal else np.zeros_like(x) for key in SIGNALS)
+        return self._torque(JointSignals(q, dq, ddq, tau), values)
+
+    def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """Torque (m,) of one joint, by its own signals or another's."""
+        k = self.by - 1 if self.by else joint
+        at = JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
+        return self._torque(at, values)
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """The law on one joint."""
+        return on_joint(motion, joint, self.on(motion, tau, joint, values))
+
+    def _torque(self, at: JointSignals, values: Values) -> Array:
+        setting = self.expression.setting
+        term = self.expression.term(at, np.asarray(values[setting.key] if setting else 0.0))
+        if setting and setting.wave:
+            term = term * np.sin(values["n"] * at.q + values["phase"])
+        return np.asarray(values["c"] * term)
+
+
+LAWS: dict[str, Law] = {
+    law.name: law
+    for expression in _grammar()
+    for law in (
+        [Law(expression, by) for by in range(1, MOST_JOINTS + 1)]
+        if BY in expression.text
+        else [Law(expression)]
+    )
+}

@@ -1,0 +1,193 @@
+"""Laws of no catalogue: what a file names them, their torque, and that they are found."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import adapter
+from adapter.cli.main import main
+from adapter.effects.active import active_effects, by_joint
+from adapter.effects.by_joint import JointSignals
+from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.kept import keep, read_kept, with_kept
+from adapter.effects.law import LAWS, Law
+from adapter.errors import SettingsError
+from adapter.gap.result import GapResult
+from adapter.gap.words import as_json, headline
+from adapter.gap.workflow import find_gap
+from adapter.model.model_file import load_model
+from adapter.model.robots import documented
+from adapter.physics.rigid_arm import RigidArm
+from drivers.files.mcap import Log
+from tests.helpers.arm_data import Motion, arm, panda_model, record, trajectory
+
+N, J = 7, 1  # joints; the one that has a law, from 0
+PANDA = documented("panda")
+Q, DQ, DDQ = (x[::40] for x in trajectory(Motion(8.0, seed=3)))
+TAU = RigidArm.of(PANDA).torque(Q, DQ, DDQ)
+SMALL = [law for law in LAWS.values() if law.by in (0, 3)]
+# By formulas of the test's own, of signals of the joint itself or of joint 3.
+FORMULAS: dict[str, Callable[..., np.ndarray]] = {
+    "law: dq |dq|": lambda q, v, a, tau, x: v * np.abs(v),
+    "law: (q - a)³": lambda q, v, a, tau, x: np.power(q - x, 3.0),
+    "law: max(a - q, 0)²": lambda q, v, a, tau, x: np.where(q < x, (q - x) ** 2, 0.0),
+    "law: sign(tau) max(|tau| - a, 0)": lambda q, v, a, tau, x: tau - np.clip(tau, -x, x),
+    "law: tanh(tau/a)": lambda q, v, a, tau, x: np.tanh(tau / x),
+    "law: dq3 |dq3|": lambda q, v, a, tau, x: v * np.abs(v),
+    "law: tau3": lambda q, v, a, tau, x: tau,
+    "law: dq q²": lambda q, v, a, tau, x: v * q * q,
+}
+
+
+def values_of(law: Law) -> dict[str, float]:
+    """Parameters that none of its own defaults are."""
+    return {"c": 0.7} | {p.key: 0.4 for p in law.parameters[1:]}
+
+
+def torque_of(law: Law, values: dict[str, float]) -> np.ndarray:
+    """(m, n) that a model with the law on a joint says more than one without."""
+    entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
+    model = replace(PANDA, effects=(entry,))
+    return np.asarray(adapter.inverse_dynamics(model, Q, DQ, DDQ)) - TAU
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_a_law_is_what_its_name_says(name: str) -> None:
+    law, values = LAWS[name], values_of(LAWS[name])
+    k = 2 if "3" in name else J
+    own = FORMULAS[name](Q[:, k], DQ[:, k], DDQ[:, k], TAU[:, k], 0.4)
+    said = torque_of(law, values)
+    np.testing.assert_allclose(said[:, J], 0.7 * own, rtol=1e-9, atol=1e-9)
+    assert not np.delete(said, J, axis=1).any()
+
+
+@pytest.mark.parametrize("law", SMALL, ids=lambda law: law.name)
+def test_one_instant_shows_as_much_as_a_table(law: Law) -> None:
+    values = values_of(law)
+    entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
+    sums = by_joint(active_effects([entry], N), N)
+    for row in (3, 80, 150):
+        at = JointSignals(Q[row], DQ[row], DDQ[row], TAU[row])
+        whole = torque_of(law, values)[row]
+        np.testing.assert_allclose(sums.torque(at), whole, rtol=1e-9, atol=1e-9)
+
+
+def test_units_are_those_of_torque_over_signals() -> None:
+    units = {law.name: law.parameters[0].unit for law in LAWS.values()}
+    assert units["law: dq |dq|"] == "N m s2/rad2" and units["law: tau²"] == "1/N m"
+    assert units["law: sign(dq3)"] == "N m" and units["law: ddq |ddq|"] == "N m s4/rad2"
+    assert units["law: tau3"] == "" and not set(units) & set(CATALOGUE)
+
+
+class Hidden(NamedTuple):
+    """A law on a joint of a simulated arm: name, rms in N m, what it is of angles and speeds."""
+
+    name: str
+    size_nm: float
+    column: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+    def recorded(self) -> tuple[Log, float]:
+        """A recording, and the law's coefficient."""
+        data = record(arm(), Motion(15.0, seed=4))
+        torque = self.column(*data.true[:2])
+        c, tau = self.size_nm / float(torque.std()), data.tau.copy()
+        tau[:, J] += c * torque
+        return replace(data, tau=tau).log(), c
+
+
+HOSE = Hidden("law: max(q - a, 0)", 0.4, lambda q, v: np.maximum(q[:, J] - np.median(q[:, J]), 0.0))
+LAWS_HIDDEN = [
+    Hidden("law: dq³", 0.5, lambda q, v: v[:, J] ** 3),
+    HOSE,
+    Hidden("law: dq4 |dq4|", 0.3, lambda q, v: v[:, 3] * np.abs(v[:, 3])),
+]
+
+
+@cache
+def answer(law: Hidden) -> GapResult:
+    return find_gap([law.recorded()[0]], panda_model())
+
+
+@pytest.mark.parametrize("law", LAWS_HIDDEN, ids=lambda law: law.name)
+def test_a_hidden_law_is_found_and_joins_the_model(law: Hidden) -> None:
+    result, c = answer(law), law.recorded()[1]
+    (found,) = result.findings
+    assert (found.effect, found.joints) == (law.name, (J + 1,)), headline(result)
+    assert abs(found.parameters["c"] - c) < 3.0 * found.std["c"] < 0.5 * c
+    assert result.unexplained == ()
+    assert result.after.torque_rmse_nm[J] < 1.25 * result.noise_floor_nm[J]
+    assert f"a torque of c {law.name.removeprefix('law: ')}: c = " in headline(result)
+    (note,) = [x for x in result.notes if x.startswith("joint 2: a torque")]
+    energy = {"law: dq³": "takes energy", HOSE.name: "stores energy"}
+    assert energy.get(law.name, "feeds energy in: ") in note
+
+
+@pytest.fixture
+def kept(tmp_path: Path) -> Path:
+    """A file with the hose of joint 2, kept by the command line."""
+    (tmp_path / "gap.json").write_text(json.dumps(as_json(answer(HOSE)), default=np.ndarray.tolist))
+    file = tmp_path / "own.toml"
+    words = ["keep", str(tmp_path), "--as", "hose_joint_2", "--effects", str(file)]
+    assert main(["effects", *words]) == 0
+    return file
+
+
+def test_a_kept_law_is_looked_for_by_its_name(kept: Path, tmp_path: Path) -> None:
+    """The new model can be read by whoever has not the file."""
+    out = tmp_path / "model.json"
+    with with_kept(kept):
+        assert "hose_joint_2" in CATALOGUE
+        result = find_gap([HOSE.recorded()[0]], panda_model(), model_out=out)
+    (found,) = result.findings
+    assert (found.effect, found.joints) == ("hose_joint_2", (J + 1,))
+    assert HOSE.name not in found.overlaps and found.evidence > 0.99
+    (entry,) = [e for e in load_model(out).effects if e["joints"] == [J + 1]]
+    assert entry["effect"] == HOSE.name and "hose_joint_2" not in CATALOGUE
+
+
+def test_the_command_lists_kept_laws_too(kept: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["effects", "--effects", str(kept)]) == 0
+    said = capsys.readouterr().out
+    assert "hose_joint_2" in said and "bristle_friction" in said and "tanh(tau/a)" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x = [", "not TOML"),
+        ("", "holds no law"),
+        ("[hose]\n", "needs law"),
+        ('[hose]\nlaw = "dq |dq"\n', "did you mean dq |dq|"),
+        ('[hose]\nlaw = "max(q - a, 0)"\nc = 2.0\n', "needs the number a (rad)"),
+        ('[hose]\nlaw = "dq³"\n', "needs the number c (N m s3/rad3)"),
+        ('[Hose]\nlaw = "dq |dq|"\n', "small letters"),
+        ('[payload]\nlaw = "dq |dq|"\n', "there is an effect 'payload' already"),
+    ],
+)
+def test_a_file_that_is_not_right_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text(text)
+    with pytest.raises(SettingsError, match=re.escape(said)):
+        read_kept(file)
+
+
+def test_what_cannot_be_kept_is_said(kept: Path, tmp_path: Path) -> None:
+    for name, joint, said in (
+        ("hose_joint_2", None, "is there already"),
+        ("other", 5, "no such law; have: joint 2: max(q - a, 0)"),
+        ("Hose", None, "small letters"),
+    ):
+        with pytest.raises(SettingsError, match=re.escape(said)):
+            keep(tmp_path, name, joint, kept)
+    (tmp_path / "gap.json").write_text("{}")
+    with pytest.raises(SettingsError, match="no result of"):
+        keep(tmp_path, "other", None, kept)
