@@ -22,7 +22,7 @@ import pybullet as bullet
 
 from sim.dynamics import end_effector
 from sim.effects import WRENCH
-from sim.joint_effects import Losses, add_up, bend, losses_at, rows_of, step
+from sim.joint_effects import Losses, add_up, bend, rows_of, step
 from sim.obstacles import Obstacles
 from sim.rigid_bodies import ArmClient, disconnect, load, rigid_truths
 from sim.truth import Array, Truth
@@ -146,7 +146,9 @@ class Engine:
             self._set(stored, dq)
         if self._ddq is None:
             self._ddq = self.acceleration(self._q, dq, law.ff0)
-        stage, ahead = self._stage, self._coriolis_ahead(self._ddq)
+        stage = self._stage  # ahead: by how much the Coriolis torque grows in half a sub-step
+        ahead = stage.torques(self._q, dq + h / 2 * self._ddq, self._rest)
+        ahead = ahead - stage.torques(self._q, dq, self._rest)
         self.stopped, self._mass = False, None
         # Where nothing depends on the motion the state is only asked for at the tick's end.
         acting = len(self._rows) or self._wrenches or self._end_stops or len(self.obstacles)
@@ -206,7 +208,7 @@ class Engine:
             bullet.resetJointState(stage.arm, j, at, speed, physicsClientId=stage.client)
 
     def _losses(self, t: float, q: Array, dq: Array, rigid: Array) -> Losses:
-        losses = losses_at(self._rows, t, q, dq, rigid, self._bent)
+        losses = Losses(*add_up(self._rows, t, q, dq, rigid, self._bent))
         losses.explicit[:] -= self._contact(t, q)
         return losses
 
@@ -218,12 +220,6 @@ class Engine:
                 _, J = end_effector(self._stage.truth.frames, q, np.eye(4))
                 torque += J.T @ wrench
         return torque
-
-    def _coriolis_ahead(self, ddq: Array) -> Array:
-        """By how much the Coriolis torque (n,) N m grows in half a sub-step."""
-        stage, middle = self._stage, self._dq + self._h / 2 * ddq
-        now = stage.torques(self._q, self._dq, self._rest)
-        return stage.torques(self._q, middle, self._rest) - now
 
     def _reaching(
         self, t: float, q: Array, dq: Array, law: DriveLaw, ff: Array, ahead: Array

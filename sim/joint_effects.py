@@ -99,24 +99,20 @@ def _rows(effect: Effect, n: int) -> list[list[float]]:
     return [[kind, j, other, *numbers, effect.start_s, effect.end_s] for j, other in pairs]
 
 
-def losses_at(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array) -> Losses:
-    """Everything the rows say at t (s), q, v (n,) under the rigid arm's torque `rigid` (n,).
-
-    Args:
-        bent: (r,) N m, what each row of the Dahl model holds in its bristles.
-    """
-    return Losses(*add_up(rows, t, q, v, rigid, bent))
-
-
 @compiled
 def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array) -> Array:
-    """(5, n): explicit, viscous, positive, negative, armature; arguments as in `losses_at`."""
+    """(5, n): explicit, viscous, positive, negative, armature of all rows at t (s), q, v (n,).
+
+    Args:
+        rigid: (n,) N m, the rigid arm's torque.
+        bent: (r,) N m, what each row of the Dahl model holds in its bristles.
+    """
     out = np.zeros((5, len(q)))
     for r in range(len(rows)):
         _, j, other, a, b, c, start, end = rows[r]
         if t < start or t >= end:
             continue
-        kind, i = int(rows[r, 0]), int(j)
+        kind, i, level = int(rows[r, 0]), int(j), 0.0  # level: of friction alike in both directions
         if kind == Row.VISCOUS:
             out[1, i] += a
         elif kind == Row.COULOMB:
@@ -132,44 +128,25 @@ def add_up(rows: Array, t: float, q: Array, v: Array, rigid: Array, bent: Array)
             out[0, i] += bent[r]
         elif kind == Row.CROSS_VISCOUS:
             out[0, i] += a * v[int(other)]
-        elif (
-            kind == Row.TORQUE_RIPPLE
-            or kind == Row.SPRING
-            or kind == Row.CUBIC_SPRING
-            or kind == Row.SINE
-        ):
-            out[0, i] += _torque(rows[r], q[i], t)
-        else:
-            level = _level(rows[r], q[i], v[i], rigid[i], t)
-            out[2, i] += level
-            out[3, i] += level
+        elif kind == Row.TORQUE_RIPPLE:
+            out[0, i] += a * np.sin(b * q[i] + c)
+        elif kind == Row.SPRING:
+            out[0, i] += a * (q[i] - b)
+        elif kind == Row.CUBIC_SPRING:
+            out[0, i] += a * (q[i] - b) ** 3
+        elif kind == Row.SINE:
+            out[0, i] += a * np.sin(2 * np.pi * b * t + c)
+        elif kind == Row.STRIBECK:
+            level = a + (b - a) * np.exp(-((v[i] / c) ** 2))
+        elif kind == Row.LOAD_DEPENDENT:
+            level = a * abs(rigid[i])
+        elif kind == Row.DRIFT:
+            level = a * (t - max(start, 0.0))
+        else:  # of the position
+            level = a * (1.0 + np.sin(q[i] + b))
+        out[2, i] += level
+        out[3, i] += level
     return out
-
-
-@compiled
-def _level(row: Array, q: float, v: float, rigid: float, t: float) -> float:
-    """Level of a friction that is alike in both directions, N m."""
-    kind, a, b, c = int(row[0]), row[3], row[4], row[5]
-    if kind == Row.STRIBECK:
-        return a + (b - a) * np.exp(-((v / c) ** 2))
-    if kind == Row.LOAD_DEPENDENT:
-        return a * abs(rigid)
-    if kind == Row.DRIFT:
-        return a * (t - max(row[6], 0.0))
-    return a * (1.0 + np.sin(q + b))
-
-
-@compiled
-def _torque(row: Array, q: float, t: float) -> float:
-    """Torque of position or time alone, N m."""
-    kind, a, b, c = int(row[0]), row[3], row[4], row[5]
-    if kind == Row.TORQUE_RIPPLE:
-        return a * np.sin(b * q + c)
-    if kind == Row.SPRING:
-        return a * (q - b)
-    if kind == Row.CUBIC_SPRING:
-        return a * (q - b) ** 3
-    return a * np.sin(2 * np.pi * b * t + c)
 
 
 @compiled

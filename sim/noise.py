@@ -48,7 +48,7 @@ class SensorNoise:
 
     def __init__(self, levels: NoiseLevels, n: int, seed: int) -> None:
         self._levels = levels
-        sizes = levels.twist_and_accel
+        sizes = np.array([[levels.link_twist], [levels.link_accel]])
         draws: list[Draw] = [
             _JointNoise(levels, n),
             lambda rng: sizes * rng.standard_normal((BLOCK, n, 2, 6)),

@@ -53,11 +53,6 @@ class NoiseLevels:
         if self.dropouts >= 1.0:
             raise ValueError(f"noise 'dropouts' is {self.dropouts}; have: below 1")
 
-    @property
-    def twist_and_accel(self) -> Array:
-        """(2, 1): the link noise as it scales rows of twist and acceleration."""
-        return np.array([[self.link_twist], [self.link_accel]])
-
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers for a truth file."""
         return asdict(self)

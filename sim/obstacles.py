@@ -50,10 +50,12 @@ class Obstacles:
         for number, effect in enumerate(self._effects):
             if not effect.acts(t):
                 self._places.pop(number, None)
-            elif effect.name == "x_wall":
-                against -= self._wall(number, effect, q, dq, frames)
-            elif effect.name == "x_floor":
-                against -= self._floor(number, effect, q, dq, frames)
+            elif effect.name in ("x_wall", "x_floor"):
+                pose, J = end_effector(frames, q, HAND)
+                touch = self._wall if effect.name == "x_wall" else self._floor
+                push = touch(number, effect, pose[:3, 3], J[:3] @ dq)
+                self.force += float(np.linalg.norm(push))
+                against -= J[:3].T @ push
             else:
                 joints = effect.columns(self._n)
                 k = effect.number("k", HOLD_STIFFNESS)
@@ -63,32 +65,25 @@ class Obstacles:
         self.torque = -against - damping * dq
         return against, damping
 
-    def _wall(self, k: int, effect: Effect, q: Array, dq: Array, frames: Frames) -> Array:
-        """Torque (n,) N m of a wall upon the hand."""
-        pose, J = end_effector(frames, q, HAND)
-        hand, speed = pose[:3, 3], J[:3] @ dq
+    def _wall(self, k: int, effect: Effect, hand: Array, speed: Array) -> Array:
+        """Force (3,) N of a wall upon the hand, which is there (m) at that speed (m/s)."""
         if k not in self._places:
             fast = float(np.linalg.norm(speed))
             if fast < 1e-3:
-                return np.zeros(self._n)  # there is no way to stand across yet
+                return np.zeros(3)  # there is no way to stand across yet
             way = speed / fast
             self._places[k] = way, float(way @ hand) + effect.number("gap")
         way, at = self._places[k]
         depth = float(way @ hand) - at
-        if depth <= 0.0:
-            return np.zeros(self._n)
         push = max(WALL_STIFFNESS * depth + WALL_DAMPING * float(way @ speed), 0.0)
-        self.force += push
-        return np.asarray(-push * (J[:3].T @ way))
+        return np.asarray(-push * way if depth > 0.0 else np.zeros(3))
 
-    def _floor(self, k: int, effect: Effect, q: Array, dq: Array, frames: Frames) -> Array:
-        """Torque (n,) N m of a level plane upon the hand."""
-        pose, J = end_effector(frames, q, HAND)
-        hand, speed = pose[:3, 3], J[:3] @ dq
+    def _floor(self, k: int, effect: Effect, hand: Array, speed: Array) -> Array:
+        """Force (3,) N of a level plane upon the hand."""
         depth = effect.number("height") - hand[2]
         if depth <= 0.0:
             self._places.pop(k, None)
-            return np.zeros(self._n)
+            return np.zeros(3)
         touched, _ = self._places.setdefault(k, (hand.copy(), 0.0))
         push = WALL_STIFFNESS * (touched - hand) - WALL_DAMPING * speed
         push[2] = max(WALL_STIFFNESS * depth - WALL_DAMPING * speed[2], 0.0)
@@ -96,5 +91,4 @@ class Obstacles:
         if side > most:  # it slides, and what it holds on to comes along
             push[:2] *= most / side
             touched[:2] = hand[:2] + push[:2] / WALL_STIFFNESS
-        self.force += float(np.linalg.norm(push))
-        return np.asarray(J[:3].T @ push)
+        return push

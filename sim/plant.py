@@ -11,10 +11,9 @@ from drivers.interface import DriverError, JointSample, LinkMotion
 from sim.dynamics import link_motion
 from sim.effects import ENCODER, TORQUE
 from sim.engine import PERIOD_S, SUBSTEPS, Engine
-from sim.imus import Imus
 from sim.noise import SensorNoise, levels_of
 from sim.noise_levels import NoiseLevels
-from sim.sensors import Sensors
+from sim.sensors import Imus, Sensors
 from sim.truth import Array, Truth
 
 PERIOD_NS = round(PERIOD_S * 1e9)
@@ -62,7 +61,7 @@ class Plant:
             seed: of the noise.
             noise: what the sensors add; a real Panda's by default.
             links: whether the links' motion is measured; or names of links with a sensor glued
-                on, anyhow (`sim.imus`).
+                on, anyhow (`sim.sensors`).
             q0: (n,) posture at the start, rad; the truth's by default.
             substeps: of a tick.
         """

@@ -73,8 +73,10 @@ def _work_in(effect: Effect, theta: Array, gravity: Array) -> Array:
         theta[-1] += payload_theta(effect)
     elif effect.name == "link_inertia":
         theta[effect.columns(len(theta))[0]] += np.asarray(effect.parameters["dtheta"], float)
-    else:
-        return _tilted(gravity, effect.number("rx"), effect.number("ry"))
+    else:  # the base is turned by the rotation vector [rx, ry, 0]
+        rx, ry = effect.number("rx"), effect.number("ry")
+        angle, way = float(np.hypot(rx, ry)), float(np.arctan2(ry, rx))
+        gravity = (turn(2, way) @ turn(0, angle) @ turn(2, -way)).T @ gravity
     return gravity
 
 
@@ -83,13 +85,6 @@ def payload_theta(load: Effect) -> Array:
     com = [load.number(key) for key in ("cx", "cy", "cz")]
     inertia = np.asarray(load.parameters.get("inertia", [0.0] * 6), float)
     return theta_of(load.number("m"), com, inertia.tolist())
-
-
-def _tilted(gravity: Array, rx: float, ry: float) -> Array:
-    """R(r)^T g for the base turned by the rotation vector [rx, ry, 0]."""
-    angle, way = float(np.hypot(rx, ry)), float(np.arctan2(ry, rx))
-    about_x = turn(2, way) @ turn(0, angle) @ turn(2, -way)
-    return np.asarray(about_x.T @ gravity)
 
 
 def load(start_s: float, truth: Truth, period_s: float) -> ArmClient:
@@ -175,6 +170,6 @@ def _round_bodies(truth: Truth) -> Array:
         m, c, inertia = body_of(truth.theta[j])
         moments, axes = principal(inertia)
         spread = 0.1 * np.array([1.0, 1.1, 1.2]) * max(moments.max(), 1e-9)
-        about_origin = axes @ np.diag(spread) @ axes.T + m * (c @ c * np.eye(3) - np.outer(c, c))
-        out[j, 4:] = about_origin[np.triu_indices(3)]
+        round_ = axes @ np.diag(spread) @ axes.T
+        out[j, 4:] = theta_of(m, c.tolist(), round_[np.triu_indices(3)].tolist())[4:]
     return out

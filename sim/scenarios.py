@@ -12,12 +12,12 @@ import numpy as np
 
 from sim.effects import Effect, payload, per_joint
 from sim.engine import PERIOD_S, SUBSTEPS
-from sim.imus import Imus
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.options import ROBOTS, SCENARIOS, check
 from sim.plant import Plant
-from sim.truth import Array, Truth, documented, facts_of, turn
+from sim.sensors import Imus
+from sim.truth import Array, Truth, direction, documented, facts_of, turn, turn_about
 
 FORMAT, VERSION = "panda-adapter/truth", 2
 TRUTH_STREAM = 1 << 32  # keeps the draw of a truth apart from the streams of its noise
@@ -84,8 +84,8 @@ def bent_link(
     arm = documented(robot)
     angles = np.radians(angle_deg) * rng.random(arm.n)
     lengths = offset_m * rng.random(arm.n)
-    turns = np.array([_turn_about(_direction(rng), angle) for angle in angles])
-    shifts = np.array([length * _direction(rng) for length in lengths])
+    turns = np.array([turn_about(direction(rng), angle) for angle in angles])
+    shifts = np.array([length * direction(rng) for length in lengths])
     return arm.with_changes(R=arm.R @ turns, p=arm.p + shifts)
 
 
@@ -195,16 +195,3 @@ def in_trouble(truth: Truth, trouble: dict[str, Any]) -> Truth:
         load = payload(float(trouble["load"]), com)
         effects.append(Effect(load.name, (), load.parameters, (-1.0, since[0])))
     return truth.with_changes(effects=tuple(effects))
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    """A unit vector, all directions alike."""
-    v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
-
-
-def _turn_about(axis: Array, angle: float) -> Array:
-    """Rotation matrix by `angle` (rad) about a unit vector (Rodrigues)."""
-    x, y, z = axis
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K

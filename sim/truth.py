@@ -185,6 +185,19 @@ def turn(axis: int, angle: float) -> Array:
     return R
 
 
+def turn_about(axis: Array, angle: float) -> Array:
+    """Rotation matrix by `angle` (rad) about a unit vector (Rodrigues)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+
+
+def direction(rng: np.random.Generator) -> Array:
+    """A unit vector, all directions alike."""
+    v = rng.standard_normal(3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
 def from_rpy(rpy: list[float]) -> Array:
     """Rotation matrix of URDF's roll, pitch, yaw (rad): turns about fixed x, then y, then z."""
     return turn(2, rpy[2]) @ turn(1, rpy[1]) @ turn(0, rpy[0])

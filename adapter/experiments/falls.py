@@ -11,7 +11,6 @@ from adapter.learning.batch.smoothing import Measured, smoothed_data
 from adapter.learning.tree_data import BodyMotion, TreeData, stacked
 from adapter.model.tree import Tree
 from sim.falls.data_set import FallData
-from sim.falls.links import link_tables
 
 
 class Falls:
@@ -28,8 +27,7 @@ class Falls:
     def exact(self, k: int) -> TreeData:
         """Trajectory k without noise."""
         record = self._exact.exact(k)
-        base = (record.base_v, record.base_w, record.base_a, record.base_dw)
-        links = link_tables(self.truth, record.q, record.dq, record.ddq, base)
+        links = record.links(self.truth)
         free = np.zeros((len(record.q), 6))  # nothing pushes a falling base
         return TreeData(
             self.tree,

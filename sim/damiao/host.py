@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import can
 
 from drivers.interface import Array, Driver, Intake, JointSample
-from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario
-
-SETTLE_TICKS = 300  # the motors take the arm over from its stand
-
-
-class Serviceable(Protocol):
-    """Boards that work when they are called."""
-
-    def service(self) -> int:
-        """Handle the frames that have arrived."""
 
 
 class ServedBus(can.BusABC):
@@ -31,7 +21,7 @@ class ServedBus(can.BusABC):
         serving: whether to do so; without it the boards' owner calls `Boards.service`.
     """
 
-    def __init__(self, bus: can.BusABC, boards: Serviceable) -> None:
+    def __init__(self, bus: can.BusABC, boards: Boards) -> None:
         """Wrap the host's end of a bus."""
         self._bus, self._boards, self.serving = bus, boards, True
         self._can_protocol = bus.protocol
@@ -138,43 +128,3 @@ class InProcess(WrappedDriver):
         self._boards.close()
         self._bus.shutdown()
         self._far.shutdown()
-
-
-class Lockstep(WrappedDriver):
-    """A driver whose clock is the line's: each `read` lets one period of virtual time pass.
-
-    Args:
-        driver: built on `line.host` with the clock `line.now_ns`.
-        line: with the boards attached.
-    """
-
-    arrived_ns = 0
-
-    def __init__(self, driver: Driver, line: Line) -> None:
-        super().__init__(driver)
-        self._line, self._next_ns = line, 0
-
-    def connect(self) -> None:
-        """Connect and let the arm come to rest in its motors. Raises DriverError."""
-        with self._line.eager():
-            self._driver.connect()
-        self._next_ns = self._line.next_whole_ns(self.period_ns)
-        for _ in range(SETTLE_TICKS):
-            self.read()
-
-    def read(self) -> JointSample:
-        """The next sample. Raises DriverError."""
-        self._line.advance_to(self._next_ns)
-        self._next_ns += self.period_ns
-        return self._driver.read()
-
-    def stop(self) -> None:
-        """Bring the arm to a stand. Raises DriverError."""
-        with self._line.eager():
-            self._driver.stop()
-        self._next_ns = self._line.next_whole_ns(self.period_ns)  # it took a while
-
-    def close(self) -> None:
-        """Release the driver."""
-        with self._line.eager():
-            self._driver.close()

@@ -132,11 +132,6 @@ class Motor:
         """It gives torque."""
         return self.status == ENABLED and self.registers[CTRL_MODE] == MIT_MODE
 
-    @property
-    def most_torque(self) -> float:
-        """N m, the end of its scale or of its strength."""
-        return min(self.scale.tmax, self.kind.scale.tmax)
-
     def feed(self, now_ns: int) -> None:
         """A frame came: the watchdog starts again."""
         if self._limit_ns != NEVER_NS:
@@ -160,11 +155,6 @@ class Motor:
     def fail(self, status: int) -> None:
         """Show an error and give no torque."""
         self.status = status
-
-    def clear_error(self) -> None:
-        """Back to disabled after an error."""
-        if self.status != ENABLED:
-            self.status = DISABLED
 
     def take(self, data: bytes) -> None:
         """A MIT command; without effect while the motor is not enabled."""

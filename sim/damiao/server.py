@@ -1,4 +1,4 @@
-"""The seven boards: frames in, frames out, the arm between them."""
+"""The seven boards: motors at work on the arm, frames in, frames out."""
 
 from __future__ import annotations
 
@@ -6,21 +6,24 @@ import argparse
 import contextlib
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import can
+import numpy as np
 
+from sim.damiao import codec, motor
 from sim.damiao.arm import World
 from sim.damiao.bus import address_of, check_alone, open_bus
 from sim.damiao.codec import BUS_OFF, data_frame, error_frame, is_command
-from sim.damiao.faults import Faults, Outbox
-from sim.damiao.motor import motor_set
+from sim.damiao.faults import HOT_C, JUMP_RAD, STATUS, Faults, Outbox, spiked
+from sim.damiao.motor import Motor, in_joint_angles, motor_set
 from sim.damiao.options import check
-from sim.damiao.robot import MotorBank
 from sim.effects import ENCODER, TORQUE
 from sim.ending import Ending, sum_up
+from sim.engine import DriveLaw
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.options import options_of
@@ -31,6 +34,135 @@ IDLE_S = 5e-3  # longest wait without frames: the arm goes on in steps of this
 ACTIVE_NS = 10_000_000  # so long after a frame the ticks keep their rhythm
 FIFO_PRIORITY = 40
 MOST_UNREADABLE = 1000  # failures to receive in a row, then the bus counts as gone
+REPLY_OFFSET = 0x10  # reply id = command id + 0x10, as OpenArm sets it
+WARM_UP_TICKS = 20  # temperatures are slow: they move on every 20 ms
+
+
+class MotorBank:
+    """Motors 1 to 7 with the arm between them; knows nothing of a bus.
+
+    Attributes:
+        motors: joint 1 first; by_id: places in there (from 0) by the id that frames are sent to.
+        frames: what was asked of them, by what it was.
+    """
+
+    def __init__(self, motors: str, world: World, faults: Faults) -> None:
+        """Motors of a set, disabled. Raises ValueError, naming the choices."""
+        self.motors = [
+            Motor(j, j + REPLY_OFFSET, kind, scale)
+            for j, (kind, scale) in enumerate(motor_set(motors), 1)
+        ]
+        self.frames: Counter[str] = Counter()
+        self._world, self._faults = world, faults
+        self._told: dict[int, tuple[float, float]] = {}
+        self._index()
+
+    def answer(
+        self, j: int, identifier: int, data: bytes, now_ns: int, now_s: float
+    ) -> bytes | None:
+        """What motor j does with a frame and what it replies; None for nothing.
+
+        Args:
+            j: from 0.
+            identifier, data: of the frame.
+            now_ns: the clock.
+            now_s: time that the faults go by.
+        """
+        unit = self.motors[j]
+        unit.watch(now_ns)
+        unit.feed(now_ns)
+        if identifier == codec.SERVICE_ID:
+            return self._serve_register(j, data, now_ns, now_s)
+        return self._obey(j, data, now_ns, now_s)
+
+    def law(self, start_ns: int, reached: Array) -> DriveLaw:
+        """The motors' law in the tick that begins at an instant; (7,) torques reached by then."""
+        rows = np.zeros((7, len(self.motors)))
+        warm_up = self._world.ticks % WARM_UP_TICKS == 0
+        for j, unit in enumerate(self.motors):
+            unit.watch(start_ns)
+            if warm_up:
+                tau = self._world.at(start_ns, j)[2] if unit.drives else 0.0
+                unit.warm_up(tau, WARM_UP_TICKS * 1e-3)
+            if unit.drives:
+                q_des, dq_des, kp, kd, ff = in_joint_angles(unit.command, unit.zero)
+                most = min(unit.scale.tmax, unit.kind.scale.tmax)  # its scale's, or its strength
+                rows[:, j] = q_des, dq_des, kp, kd, reached[j], ff, most
+        return DriveLaw(*rows)
+
+    def _index(self) -> None:
+        self.by_id = {unit.motor_id: j for j, unit in enumerate(self.motors)}
+
+    def _obey(self, j: int, data: bytes, now_ns: int, now_s: float) -> bytes:
+        """A special frame or a MIT command; every one is answered with feedback."""
+        unit = self.motors[j]
+        kind = data[7] if data[:7] == codec.SPECIAL else None
+        if kind == codec.ENABLE:
+            self.frames["enable"] += 1
+            unit.enable()
+        elif kind == codec.DISABLE:
+            self.frames["disable"] += 1
+            unit.disable()
+        elif kind == codec.CLEAR_ERROR:
+            self.frames["clear error"] += 1
+            if unit.status != motor.ENABLED:
+                unit.status = motor.DISABLED
+        elif kind == codec.SET_ZERO:
+            self.frames["set zero"] += 1
+            unit.zero = self._world.at(now_ns, j)[0]
+        else:
+            self.frames["commands"] += 1
+            reply = self._feedback(j, now_ns, now_s)
+            unit.take(data)
+            if self._world.held and all(m.commanded and m.drives for m in self.motors):
+                self._world.held = False
+            return reply
+        return self._feedback(j, now_ns, now_s)
+
+    def _serve_register(self, j: int, data: bytes, now_ns: int, now_s: float) -> bytes | None:
+        """A frame on the service id."""
+        unit, what, register = self.motors[j], data[2], data[3]
+        if what == codec.REFRESH:
+            self.frames["refresh"] += 1
+            return self._feedback(j, now_ns, now_s)
+        if what == codec.SAVE:
+            self.frames["save"] += 1
+            return codec.encode_save_reply(unit.motor_id)
+        if what not in (codec.READ, codec.WRITE):
+            self.frames["unknown service"] += 1
+            return None
+        self.frames["register reads" if what == codec.READ else "register writes"] += 1
+        if what == codec.WRITE:
+            unit.write(register, codec.register_value(register, data[4:]))
+            self._index()
+        value = unit.read(register, self._world.at(now_ns, j)[0])
+        if value is None:
+            return None
+        return codec.encode_register_reply(unit.motor_id, what, register, value)
+
+    def _feedback(self, j: int, now_ns: int, now_s: float) -> bytes:
+        """What motor j (from 0) says of this instant."""
+        q, dq, tau = self._world.at(now_ns, j)
+        unit, faults = self.motors[j], self._faults
+        if faults:
+            number = j + 1
+            if faults.hits("stuck", number, now_s):
+                q, dq = self._told.setdefault(j, (q, 0.0))
+            if faults.hits("jump", number, now_s):
+                q += JUMP_RAD
+            q = spiked(q, faults, now_s)
+            if unit.status <= motor.ENABLED:
+                self._fail(unit, number, now_s)
+        return unit.feedback(q, dq, tau)
+
+    def _fail(self, unit: Motor, number: int, now_s: float) -> None:
+        """Errors that the faults bring about."""
+        if self._faults.hits("overtemp", number, now_s):
+            unit.rotor_c = HOT_C
+            unit.fail(motor.HOT_ROTOR)
+        for name, status in STATUS.items():
+            if self._faults.hits(name, number, now_s):
+                unit.fail(status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +355,8 @@ class Boards:
             self.frames["not for motors"] += 1
             return
         identifier, data = message.arbitration_id, bytes(message.data)
-        j = self._bank.addressed(identifier, data)
+        to = data[0] | data[1] << 8 if identifier == codec.SERVICE_ID else identifier
+        j = self._bank.by_id.get(to)
         if j is None:
             self.frames["other ids"] += 1
             return

@@ -43,7 +43,7 @@ class Arm:
     """
 
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
-        self.truth = known_arm(scenario.truth)
+        self.truth = scenario.truth.with_changes(effects=())  # all that the robot knows
         self._motors = motor_inertias(scenario.truth)
         self._plant: Plant = scenario.plant(substeps=SERVED_SUBSTEPS)
         self._n = self.truth.n
@@ -175,11 +175,6 @@ class Arm:
         """Pose and external wrench at the present posture."""
         self.pose, self.jacobian = self.frame(self.q)
         self.wrench = wrench_at(self.pose, self.jacobian, self._to_K, self.tau_external, SINGULAR)
-
-
-def known_arm(truth: Truth) -> Truth:
-    """What the robot knows of itself: the rigid arm as it starts, without effects."""
-    return truth.with_changes(effects=())
 
 
 def motor_inertias(truth: Truth) -> Array:

@@ -11,7 +11,7 @@ from sim.compiled import compiled
 from sim.dynamics import Frames, cross, end_effector
 from sim.fci.codec import TICK_S, Generator, RobotCommand
 from sim.fci.joint_limits import ROOM, LimitErrors, broken
-from sim.truth import Array, Limits
+from sim.truth import Array, Limits, turn_about
 
 ELBOW_FLIP = -0.467002423653011  # rad of joint 4 (libfranka headers)
 START_TOLERANCE = 1e-3  # m and rad, first pose from the desired one; the robot's is not published
@@ -184,9 +184,7 @@ def moved(pose: Array, twist: Array) -> Array:
     w = twist[3:] * TICK_S
     angle = np.sqrt(w @ w)
     if angle > 0.0:
-        x, y, z = w / angle
-        K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        out[:3, :3] = (np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K) @ out[:3, :3]
+        out[:3, :3] = turn_about(w / angle, float(angle)) @ out[:3, :3]
     return out
 
 

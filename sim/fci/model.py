@@ -1,9 +1,13 @@
-"""The arm as a model library, for clients of protocol 5.
+"""The arm as its clients get it: a model library in protocol 5, URDF in protocol 10.
 
 The library's source is C with one arm's numbers, built once with the machine's own compiler. It has
 thirty functions by name (libfranka 0.9.2): `Ji_J_Jk` and `O_J_Jk`, Jacobians in the frame's own and
 in base axes; `O_T_Jk`, poses; k = 1..7 joints, 8 flange, 9 end effector; `M_NE`, `c_NE`, `g_NE`,
 mass matrix, Coriolis and gravity torques with a load. Matrices are column-major.
+
+libfranka 0.21 demands of the URDF seven movable joints with `joint1` to `joint7` in their names,
+each with its limits and with `position_based_velocity_limits`, and a link that is called exactly
+`link8`, the flange.
 """
 
 from __future__ import annotations
@@ -18,8 +22,11 @@ from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from sim.scenarios import FLANGE_M
-from sim.truth import Truth
+from sim.truth import Truth, body_of
+from sim.urdf_writer import joint_text, limit_text, link_text
 
 _HEAD = """#include <math.h>
 #include <string.h>
@@ -97,3 +104,25 @@ def _cache_folder() -> Path:
     if folder.is_symlink() or facts.st_uid != os.getuid() or facts.st_mode & 0o077:
         return Path(tempfile.mkdtemp(prefix="simulated-fci-models-"))
     return folder
+
+
+def robot_urdf(truth: Truth) -> str:
+    """The arm without payloads and losses."""
+    parts = ['<robot name="simulated_arm">', '<link name="link0"/>']
+    slowing, offset = truth.limits.acceleration, np.zeros(truth.n)
+    if truth.limits.slowing is not None:
+        slowing, offset = truth.limits.slowing.deceleration, truth.limits.slowing.offset
+    for j in range(truth.n):
+        limits = (
+            f"{limit_text(truth.limits, j)}<position_based_velocity_limits "
+            f'velocity_offset="{float(offset[j])!r}" deceleration_limit="{float(slowing[j])!r}"/>'
+        )
+        links, place = (f"link{j}", f"link{j + 1}"), (truth.p[j], truth.R[j])
+        parts.append(link_text(links[1], *body_of(truth.theta[j])))
+        parts.append(joint_text(f"joint{j + 1}", links, place, limits))
+    parts.append('<link name="link8"/>')
+    parts.append(
+        f'<joint name="joint8" type="fixed"><origin xyz="0 0 {FLANGE_M!r}" rpy="0 0 0"/>'
+        '<parent link="link7"/><child link="link8"/></joint>'
+    )
+    return "\n".join([*parts, "</robot>"])

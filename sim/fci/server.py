@@ -31,10 +31,9 @@ from sim.fci.codec import (
 from sim.fci.faults import KINDS, Spoiler
 from sim.fci.gripper import PORT as GRIPPER_PORT
 from sim.fci.gripper import GripperServer
-from sim.fci.model import model_library
+from sim.fci.model import model_library, robot_urdf
 from sim.fci.options import chosen
 from sim.fci.robot import Reporter, Robot
-from sim.fci.urdf import robot_urdf
 from sim.scenarios import Scenario, build
 
 CHUNK = 4096  # bytes at a time; the longest request has 428

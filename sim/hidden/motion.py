@@ -85,7 +85,10 @@ def draw_motion(
     t: Array = np.arange(0.0, SPAN_S, STEP_S) if pace is None else pace
     drawn = {"sines": _sines, "points": points, "hand": hand}[kind]
     paced = drawn(rng, SLOW_FACTOR * t if slow else t, n)
-    shape = paced if kind == "points" else _fade_in(t)[:, None] * paced
+    shape = paced
+    if kind != "points":  # a quintic step from 0 to 1 over the first second
+        x = np.clip(t / RAMP_S, 0.0, 1.0)
+        shape = (x**3 * (10 - 15 * x + 6 * x**2))[:, None] * paced
     reach, speed = rng.uniform(*REACH_RAD, n), rng.uniform(*SPEED_SHARE, n) * limits.velocity
     if slow:
         speed = SLOW_FACTOR * speed
@@ -137,9 +140,3 @@ def hand(rng: np.random.Generator, t: Array, n: int) -> Array:
     for _ in range(4):
         out = lfilter([1 - keep], [1, -keep], out, axis=0)
     return np.asarray(out[early:] - out[early])
-
-
-def _fade_in(t: Array) -> Array:
-    """Quintic step from 0 to 1 over the first second, (m,)."""
-    x = np.clip(t / RAMP_S, 0.0, 1.0)
-    return np.asarray(x**3 * (10 - 15 * x + 6 * x**2))

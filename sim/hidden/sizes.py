@@ -7,11 +7,12 @@ range (the ratio of its ends): a learner that believes in the ranges is wrong ab
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from sim.effects import PAIRS, Effect
-from sim.truth import Array, Truth
+from sim.truth import Array, Truth, direction
 
 SECONDS = 20.0
 WIDER = np.sqrt(3.0)  # either end of a range of sizes is further out by this
@@ -55,6 +56,7 @@ DEADBAND = (0.15, 0.6)  # N m
 SATURATION = (0.6, 1.2)  # of the joint's effort limit
 
 Numbers = dict[str, float | list[float]]
+Draw = Callable[[np.random.Generator, int, Truth], float]  # of a joint (from 1) of an arm
 Maker = Callable[[np.random.Generator, int, Truth], Numbers]
 ALL = (1, 2, 3, 4, 5, 6, 7)
 
@@ -78,18 +80,38 @@ def torque_size(rng: np.random.Generator, joint: int, span: tuple[float, float])
     return wide(rng, span) * (WRIST_SHARE if joint >= WRIST else 1.0)
 
 
-def _torque(key: str, span: tuple[float, float], signed: bool = False) -> Maker:
+def _of(**draws: Draw) -> Maker:
+    """Numbers by key, drawn one after the other in the order in which they stand."""
+
     def make(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-        return {key: torque_size(rng, joint, span) * (_sign(rng) if signed else 1.0)}
+        return {key: draw(rng, joint, arm) for key, draw in draws.items()}
 
     return make
 
 
-def _plain(key: str, span: tuple[float, float], signed: bool = False) -> Maker:
-    def make(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-        return {key: wide(rng, span) * (_sign(rng) if signed else 1.0)}
+def _torque(span: tuple[float, float], signed: bool = False) -> Draw:
+    return lambda rng, joint, arm: torque_size(rng, joint, span) * (_sign(rng) if signed else 1.0)
 
-    return make
+
+def _plain(span: tuple[float, float], signed: bool = False) -> Draw:
+    return lambda rng, joint, arm: wide(rng, span) * (_sign(rng) if signed else 1.0)
+
+
+def _exact(span: tuple[float, float]) -> Draw:
+    return lambda rng, joint, arm: log_uniform(rng, span)
+
+
+def _phase(rng: np.random.Generator, joint: int, arm: Truth) -> float:
+    return float(rng.uniform(-np.pi, np.pi))
+
+
+def _order(rng: np.random.Generator, joint: int, arm: Truth) -> float:
+    return float(rng.choice(RIPPLE_ORDERS))
+
+
+def _rest(reach: float) -> Draw:
+    """A position so far from the ready one at most."""
+    return lambda rng, joint, arm: float(arm.ready[joint - 1] + rng.uniform(-reach, reach))
 
 
 def _asymmetric(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
@@ -104,26 +126,14 @@ def _stribeck(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     return {"Fc": Fc, "Fs": Fs, "vs": log_uniform(rng, STRIBECK_SPEED)}
 
 
-def _ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    order = float(rng.choice(RIPPLE_ORDERS))
-    phase = float(rng.uniform(-np.pi, np.pi))
-    return {"a": torque_size(rng, joint, RIPPLE), "n": order, "phase": phase}
-
-
-def _spring(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    rest = float(arm.ready[joint - 1] + rng.uniform(-0.5, 0.5))
-    return {"k": torque_size(rng, joint, SPRING), "q0": rest}
-
-
-def _encoder_ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    phase = float(rng.uniform(-np.pi, np.pi))
-    return {"a": wide(rng, ENCODER_RIPPLE), "phase": phase}
+def box_moments(m: float, half: Array) -> Array:
+    """(3,) kg m² of a box of mass m about its centre, from its half sides (3,) m."""
+    return np.asarray(m / 3 * (half @ half - half**2))
 
 
 def _payload(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     m = wide(rng, MASS)
-    half = rng.uniform(*BODY_M, 3)
-    xx, yy, zz = (m / 3 * (half @ half - half**2)).tolist()  # a box's, from its half sides
+    xx, yy, zz = box_moments(m, rng.uniform(*BODY_M, 3)).tolist()
     x, y = rng.uniform(-ASIDE_M, ASIDE_M, 2).tolist()
     z = FLANGE_M + float(rng.uniform(*BEYOND_M))
     return {"m": m, "cx": x, "cy": y, "cz": z, "inertia": [xx, 0.0, 0.0, yy, 0.0, zz]}
@@ -153,34 +163,6 @@ def _contact(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     return {"fx": x, "fy": y, "fz": z, "mx": 0.0, "my": 0.0, "mz": 0.0}
 
 
-def _quadratic_drag(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    return {"c": torque_size(rng, joint, DRAG)}
-
-
-def _cubic_spring(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    rest = float(arm.ready[joint - 1] + rng.uniform(-0.3, 0.3))
-    return {"c": torque_size(rng, joint, CUBIC), "q0": rest}
-
-
-def _position_friction(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    return {"A": torque_size(rng, joint, COULOMB), "phase": float(rng.uniform(-np.pi, np.pi))}
-
-
-def _sine_disturbance(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    phase = float(rng.uniform(-np.pi, np.pi))
-    return {"a": torque_size(rng, joint, RIPPLE), "f": log_uniform(rng, SINE_HZ), "phase": phase}
-
-
-def _velocity_ripple(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    phase = float(rng.uniform(-np.pi, np.pi))
-    order = float(rng.choice(RIPPLE_ORDERS))
-    return {"a": torque_size(rng, joint, VISCOUS), "n": order, "phase": phase}
-
-
-def _bristle(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
-    return {"Fc": torque_size(rng, joint, COULOMB), "s0": wide(rng, BRISTLE)}
-
-
 def _low_pass(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
     d = wide(rng, LOW_PASS)
     return {"d": d, "c": d * d * float(rng.uniform(*LOW_PASS_POLES))}
@@ -192,40 +174,43 @@ def _saturation(rng: np.random.Generator, joint: int, arm: Truth) -> Numbers:
 
 # Name -> (joints it may sit on, how its numbers are drawn); no joints: acts on the whole arm.
 CATALOGUE: dict[str, tuple[tuple[int, ...], Maker]] = {
-    "viscous_friction": (ALL, _torque("Fv", VISCOUS)),
-    "coulomb_friction": (ALL, _torque("Fc", COULOMB)),
+    "viscous_friction": (ALL, _of(Fv=_torque(VISCOUS))),
+    "coulomb_friction": (ALL, _of(Fc=_torque(COULOMB))),
     "asymmetric_friction": (ALL, _asymmetric),
     "stribeck_friction": (ALL, _stribeck),
-    "load_dependent_friction": (ALL, _plain("Fl", LOAD_SHARE)),
-    "motor_inertia": (ALL, _torque("B", ARMATURE)),
-    "joint_elasticity": (ALL, _plain("k", STIFFNESS)),
-    "backlash": (ALL, _plain("b", PLAY)),
-    "torque_ripple": (ALL, _ripple),
-    "joint_spring": (ALL, _spring),
-    "torque_offset": (ALL, _torque("o", OFFSET, signed=True)),
-    "torque_gain": (ALL, _plain("g", GAIN, signed=True)),
-    "encoder_offset": (ALL, _plain("o", ENCODER_OFFSET, signed=True)),
-    "encoder_ripple": (ALL, _encoder_ripple),
-    "signal_delay": (ALL, _plain("d", DELAY)),
+    "load_dependent_friction": (ALL, _of(Fl=_plain(LOAD_SHARE))),
+    "motor_inertia": (ALL, _of(B=_torque(ARMATURE))),
+    "joint_elasticity": (ALL, _of(k=_plain(STIFFNESS))),
+    "backlash": (ALL, _of(b=_plain(PLAY))),
+    "torque_ripple": (ALL, _of(n=_order, phase=_phase, a=_torque(RIPPLE))),
+    "joint_spring": (ALL, _of(q0=_rest(0.5), k=_torque(SPRING))),
+    "torque_offset": (ALL, _of(o=_torque(OFFSET, signed=True))),
+    "torque_gain": (ALL, _of(g=_plain(GAIN, signed=True))),
+    "encoder_offset": (ALL, _of(o=_plain(ENCODER_OFFSET, signed=True))),
+    "encoder_ripple": (ALL, _of(phase=_phase, a=_plain(ENCODER_RIPPLE))),
+    "signal_delay": (ALL, _of(d=_plain(DELAY))),
     "payload": ((), _payload),
     "link_inertia": ((2, 3, 4, 5, 6, 7), _link_inertia),
     "base_tilt": ((), _tilt),
     "external_wrench": ((), _contact),
-    "friction_drift": (ALL, _torque("dFc", DRIFT)),
-    "bristle_friction": (ALL, _bristle),
+    "friction_drift": (ALL, _of(dFc=_torque(DRIFT))),
+    "bristle_friction": (ALL, _of(Fc=_torque(COULOMB), s0=_plain(BRISTLE))),
     "torque_filter": (ALL, _low_pass),
 }
 
 # Effects that are in no list, by the names under which `sim.effects` simulates them.
 OUTSIDE: dict[str, tuple[tuple[int, ...], Maker]] = {
-    "x_quadratic_drag": (ALL, _quadratic_drag),
-    "x_cubic_spring": (ALL, _cubic_spring),
-    "x_position_friction": (ALL, _position_friction),
-    "x_sine_disturbance": (ALL, _sine_disturbance),
-    "x_velocity_ripple": (ALL, _velocity_ripple),
-    "x_cross_viscous": (ALL, _torque("c", VISCOUS)),
-    "x_torque_crosstalk": (ALL, _plain("share", CROSSTALK, signed=True)),
-    "x_torque_deadband": (ALL, _torque("w", DEADBAND)),
+    "x_quadratic_drag": (ALL, _of(c=_torque(DRAG))),
+    "x_cubic_spring": (ALL, _of(q0=_rest(0.3), c=_torque(CUBIC))),
+    "x_position_friction": (ALL, _of(A=_torque(COULOMB), phase=_phase)),
+    "x_sine_disturbance": (
+        ALL,
+        _of(phase=_phase, a=_torque(RIPPLE), f=_exact(SINE_HZ)),
+    ),
+    "x_velocity_ripple": (ALL, _of(phase=_phase, n=_order, a=_torque(VISCOUS))),
+    "x_cross_viscous": (ALL, _of(c=_torque(VISCOUS))),
+    "x_torque_crosstalk": (ALL, _of(share=_plain(CROSSTALK, signed=True))),
+    "x_torque_deadband": (ALL, _of(w=_torque(DEADBAND))),
     "x_torque_saturation": ((2, 4), _saturation),
 }
 
@@ -251,7 +236,61 @@ def _interval(rng: np.random.Generator, name: str) -> tuple[float, float | None]
     return (start, None) if late else None
 
 
-def direction(rng: np.random.Generator) -> Array:
-    """A unit vector, all directions alike."""
-    v = rng.standard_normal(3)
-    return v / np.linalg.norm(v)
+# --- friction with a memory ----------------------------------------------------------------------
+
+RUB_COULOMB, RUB_VISCOUS = (0.2, 1.0), (0.05, 0.5)  # N m, N m s/rad
+RUB_STICTION, RUB_SPEED = (1.0, 1.6), (0.02, 0.1)  # of Coulomb's; rad/s
+RUB_RAD = (0.3e-3, 4e-3)  # over which a joint winds up
+
+
+@dataclass(frozen=True, eq=False)
+class Bristles:
+    """Friction with a memory in every joint; of another shape than any learner's.
+
+    LuGre's (Canudas de Wit et al. 1995), without damping of the bristles.
+
+    Attributes:
+        coulomb, stiction, speed, viscous, deflection: (n,) N m, N m, rad/s, N m s/rad, rad.
+        start: (n,) deflection at the first sample, of the largest.
+    """
+
+    coulomb: Array
+    stiction: Array
+    speed: Array
+    viscous: Array
+    deflection: Array
+    start: Array
+
+    def along(self, dq: Array, step_s: float) -> Array:
+        """Torque (m, n) N m along joint velocities (m, n)."""
+        out, z = np.empty_like(dq), self.start * self.coulomb
+        for k, v in enumerate(dq):
+            z = self.after(z, v, step_s)
+            out[k] = z + self.viscous * v
+        return out
+
+    def after(self, z: Array, v: Array, step_s: float) -> Array:
+        """Torque (n,) of the bristles a step at velocity v (n,) later: exact for a constant v."""
+        level = self.coulomb + (self.stiction - self.coulomb) * np.exp(-np.square(v / self.speed))
+        rate = np.abs(v) * self.coulomb / (self.deflection * level)
+        end = np.sign(v) * level
+        return np.asarray(end + (z - end) * np.exp(-rate * step_s))
+
+
+def draw_bristles(rng: np.random.Generator, n: int) -> Bristles:
+    """Of n joints; WRIST_SHARE of the torques from joint WRIST (from 1) on."""
+    share = np.where(np.arange(1, n + 1) >= WRIST, WRIST_SHARE, 1.0)
+    coulomb = share * sizes(rng, RUB_COULOMB, n)
+    return Bristles(
+        coulomb,
+        coulomb * rng.uniform(*RUB_STICTION, n),
+        rng.uniform(*RUB_SPEED, n),
+        share * sizes(rng, RUB_VISCOUS, n),
+        sizes(rng, RUB_RAD, n),
+        rng.uniform(-1, 1, n),
+    )
+
+
+def sizes(rng: np.random.Generator, span: tuple[float, float], n: int) -> Array:
+    """(n,) sizes from a span, all orders of magnitude alike."""
+    return np.array([log_uniform(rng, span) for _ in range(n)])

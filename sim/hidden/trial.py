@@ -18,7 +18,6 @@ import numpy as np
 from scipy.signal import lfilter
 
 from sim.effects import Effect
-from sim.hidden.bristles import Bristles, draw_bristles
 from sim.hidden.motion import DrawnMotion, draw_motion
 from sim.hidden.sizes import (
     CATALOGUE,
@@ -27,6 +26,8 @@ from sim.hidden.sizes import (
     SECONDS,
     WRIST,
     WRIST_SHARE,
+    Bristles,
+    draw_bristles,
     draw_effect,
     log_uniform,
     torque_size,
@@ -34,7 +35,7 @@ from sim.hidden.sizes import (
 from sim.noise import levels_of
 from sim.noise_levels import NoiseLevels
 from sim.truth import Array, Truth, body_of, panda
-from sim.urdf_writer import urdf
+from sim.urdf_writer import limit_text, urdf
 
 FORMAT, VERSION = "panda-adapter/hidden-truth", 1
 KINDS = ("null", "single", "pair", "outside")
@@ -192,21 +193,16 @@ def draw(
         disturbance_hz=log_uniform(rng, DISTURBANCE_HZ),
         commands=bool(rng.random() < COMMANDS_SHARE),
         effects=_effects(rng, kind, arm, effect, RUBS if rubs or sticks else ())
-        + (_dry(rng, arm.n) if sticks else ()),
+        + tuple(  # in every joint
+            Effect("coulomb_friction", (j,), {"Fc": torque_size(rng, j, COULOMB)})
+            for j in range(1, arm.n + 1 if sticks else 1)
+        ),
         friction=draw_bristles(rng, arm.n) if rubs else None,
         arm=arm,
         nominal=nominal,
         model_error=model_error,
         motion=path,
         noise=levels_of("real"),
-    )
-
-
-def _dry(rng: np.random.Generator, n: int) -> tuple[Effect, ...]:
-    """Coulomb friction of every joint."""
-    return tuple(
-        Effect("coulomb_friction", (j,), {"Fc": torque_size(rng, j, COULOMB)})
-        for j in range(1, n + 1)
     )
 
 
@@ -241,15 +237,19 @@ def _apart(first: Effect, second: Effect) -> bool:
 
 def wrong_bodies(theta: Array, error: float, rng: np.random.Generator) -> Array:
     """θ (n, 10) with each number changed by `error` rms, every body still possible."""
-    wrong = theta.copy()
-    for j, body in enumerate(theta):
-        for _ in range(ATTEMPTS):
-            wrong[j] = body * (1 + error * rng.standard_normal(10))
-            if possible(wrong[j]):
-                break
-        else:
-            raise AssertionError(f"no possible body near that of link {j + 1}")
-    return wrong
+    wrong = [wrong_body(body, error, rng) for body in theta]
+    for j, body in enumerate(wrong):
+        assert body is not None, f"no possible body near that of link {j + 1}"
+    return np.array(wrong)
+
+
+def wrong_body(body: Array, error: float, rng: np.random.Generator) -> Array | None:
+    """(10,) with each number changed by `error` rms; None where none of those drawn is possible."""
+    for _ in range(ATTEMPTS):
+        wrong = np.asarray(body * (1 + error * rng.standard_normal(10)))
+        if possible(wrong):
+            return wrong
+    return None
 
 
 def possible(theta: Array) -> bool:
@@ -269,32 +269,26 @@ def first_order(white: Array, keep: float) -> Array:
 def nominal_urdf(nominal: Truth) -> str:
     """The nominal model as URDF text with the joints' limits."""
     text = urdf(nominal)
-    limits = nominal.limits
     for j, name in enumerate(nominal.joint_names):
-        low, high, fast, strong = (
-            float(x[j]) for x in (limits.lower, limits.upper, limits.velocity, limits.effort)
-        )
         old = f'<joint name="{name}" type="continuous">'
-        bound = f'<limit lower="{low!r}" upper="{high!r}" velocity="{fast!r}" effort="{strong!r}"/>'
+        bound = limit_text(nominal.limits, j)
         text = text.replace(old, f'<joint name="{name}" type="revolute">{bound}')
     return text
 
 
 def seal(contents: dict[str, Any]) -> str:
     """Text of a truth file: its contents and their SHA-256, so that a change shows."""
-    body = json.dumps(contents, sort_keys=True)
-    return json.dumps({"sha256": _digest(body), "truth": contents}) + "\n"
+    return json.dumps({"sha256": _digest(contents), "truth": contents}) + "\n"
 
 
-def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()
+def _digest(contents: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(contents, sort_keys=True).encode()).hexdigest()
 
 
 def unseal(path: Path | str) -> dict[str, Any]:
     """Contents of a sealed truth file. Raises ValueError if they were changed."""
     outer = json.loads(Path(path).read_text("utf-8"))
-    body = json.dumps(outer["truth"], sort_keys=True)
-    if _digest(body) != outer["sha256"]:
-        raise ValueError(f"{path}: the truth was changed after it was sealed")
     contents: dict[str, Any] = outer["truth"]
+    if _digest(contents) != outer["sha256"]:
+        raise ValueError(f"{path}: the truth was changed after it was sealed")
     return contents

@@ -16,13 +16,21 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from drivers.files.mcap import Log
-from sim.hidden.bristles import Bristles, draw_bristles, sizes
 from sim.hidden.motion import MARGIN_RAD, hand, points
 from sim.hidden.record import log_of
-from sim.hidden.sizes import FLANGE_M, WRIST, WRIST_SHARE, log_uniform
-from sim.hidden.trial import ATTEMPTS, first_order, possible
+from sim.hidden.sizes import (
+    FLANGE_M,
+    WRIST,
+    WRIST_SHARE,
+    Bristles,
+    box_moments,
+    draw_bristles,
+    log_uniform,
+    sizes,
+)
+from sim.hidden.trial import first_order, wrong_body
 from sim.noise import levels_of
-from sim.truth import Array, Truth, panda
+from sim.truth import Array, Truth, panda, theta_of
 
 STREAM, NOISE_STREAM = 36, 37  # apart from those of the other trials
 STEP_S = 1e-3  # of the motion that is recorded
@@ -95,7 +103,10 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
     nominal = panda()
     n = nominal.n
     error = np.append(np.full(n - 1, rng.uniform(*MODEL_ERROR)), LAST_ERROR)
-    theta = np.array([_other_body(*x, rng) for x in zip(nominal.theta, error, strict=True)])
+    theta = np.empty((n, 10))
+    for k, (body, size) in enumerate(zip(nominal.theta, error, strict=True)):
+        other = wrong_body(body, size, rng)
+        theta[k] = body * (1 + size * rng.standard_normal()) if other is None else other
     load_kg, body, load_at = _held(rng)
     q, kind = _motion(rng, nominal)
     if load:
@@ -122,28 +133,12 @@ def draw_twin(seed: int, motion: int = 0, load: int = 0) -> Twin:
 
 
 def _held(rng: np.random.Generator) -> tuple[float, Array, Array]:
-    """What the hand holds: its mass kg, its ten parameters, and its centre (3,) m."""
+    """What the hand holds, a box: mass kg, (10,) about the last link's origin, centre (3,) m."""
     mass = 0.0 if rng.random() < BARE_SHARE else log_uniform(rng, LOAD_KG)
-    return mass, *_load(rng, mass)
-
-
-def _other_body(body: Array, error: float, rng: np.random.Generator) -> Array:
-    """A possible body (10,) whose numbers differ by `error` rms."""
-    for _ in range(ATTEMPTS):
-        other = np.asarray(body * (1 + error * rng.standard_normal(10)))
-        if possible(other):
-            return other
-    return np.asarray(body * (1 + error * rng.standard_normal()))
-
-
-def _load(rng: np.random.Generator, mass: float) -> tuple[Array, Array]:
-    """A box (10,) about the last link's origin, and its centre (3,) m."""
     x, y = rng.uniform(-LOAD_ASIDE_M, LOAD_ASIDE_M, 2)
     c = np.array([x, y, FLANGE_M + rng.uniform(*LOAD_BEYOND_M)])
-    half = rng.uniform(*LOAD_HALF_M, 3)
-    own = np.diag(mass / 3 * (half @ half - half**2))
-    about_origin = own + mass * (c @ c * np.eye(3) - np.outer(c, c))
-    return np.array([mass, *(mass * c), *about_origin[np.triu_indices(3)]]), c
+    xx, yy, zz = box_moments(mass, rng.uniform(*LOAD_HALF_M, 3)).tolist()
+    return mass, theta_of(mass, c.tolist(), [xx, 0.0, 0.0, yy, 0.0, zz]), c
 
 
 def _motion(rng: np.random.Generator, arm: Truth) -> tuple[Array, str]:

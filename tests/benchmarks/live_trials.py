@@ -24,10 +24,9 @@ import numpy as np
 
 from sim.effects import Effect
 from sim.hidden import Trial, draw
-from sim.hidden.bristles import draw_bristles
 from sim.hidden.motion import STEP_S, draw_motion
 from sim.hidden.record import write
-from sim.hidden.sizes import COULOMB, draw_effect, torque_size
+from sim.hidden.sizes import COULOMB, draw_bristles, draw_effect, torque_size
 from tests.helpers.gap_mujoco import mujoco_recording
 from tests.helpers.gap_tools import pinocchio_recording
 

@@ -228,9 +228,9 @@ def theta_trial(
 def can_arm(world: Scenario, seed: int) -> Driver:
     """The arm behind Damiao motors: 16, 12 and 12 bits, replies of the joints one by one."""
     from drivers.damiao.arm import DamiaoArm
-    from sim.damiao.host import Lockstep
     from sim.damiao.line import Line
     from sim.damiao.server import Boards
+    from tests.helpers.can_lockstep import Lockstep
 
     line = Line()
     line.attach(Boards(line.boards, world, now_ns=line.now_ns))

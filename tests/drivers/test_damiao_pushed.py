@@ -23,10 +23,10 @@ from drivers.damiao.codec import Scales
 from drivers.damiao.guardian import Guardian, GuardianMemory, GuardianMode
 from drivers.damiao.holding import Braker, Push, PushWatch
 from drivers.damiao.settings import BusSettings
-from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario, build
+from tests.helpers.can_lockstep import Lockstep
 
 PANDA = documented("panda")
 LIMITS = [Scales(12.5, 25.0, 100.0)] * 2

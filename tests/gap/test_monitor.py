@@ -20,7 +20,7 @@ from adapter.runs.replay import ReplayOptions, replay
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import StateLayout
 from drivers.files.estimates import EstimateNames
-from sim.hidden.bristles import draw_bristles
+from sim.hidden.sizes import draw_bristles
 from sim.scenarios import build
 from tests.helpers.arm_data import ArmData, Motion, arm, learner_for, panda_model, record, states_of
 

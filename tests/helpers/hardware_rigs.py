@@ -15,11 +15,11 @@ from drivers.damiao.arm import DamiaoArm
 from drivers.fci.arm import FciArm
 from drivers.interface import JointSample
 from drivers.ros2.arm import Ros2Arm
-from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.scenarios import build
 from tests.helpers.board_tools import free_port
+from tests.helpers.can_lockstep import Lockstep
 from tests.helpers.contract_suite import Start
 
 SERVE = "-m", "adapter", "sim"

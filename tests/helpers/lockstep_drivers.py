@@ -12,11 +12,11 @@ from drivers.damiao.arm import DamiaoArm
 from drivers.fci import torque_control
 from drivers.interface import Driver
 from drivers.pybullet_arm import PyBulletArm
-from sim.damiao.host import Lockstep
 from sim.damiao.line import Line
 from sim.damiao.server import Boards
 from sim.obstacles import Obstacles
 from sim.scenarios import Scenario
+from tests.helpers.can_lockstep import Lockstep
 from tests.helpers.fci_lockstep import FciLockstep
 
 # When a motion can begin, by the plant's time: motors of a CAN arm are switched on and settle

@@ -1,19 +1,180 @@
-"""Recordings of simulated position-controlled arms, and what is true of their servos."""
+"""A position-controlled arm: servos on the joints of a rigid arm, with encoders and nothing else.
+
+Each servo holds the last position command that has reached it and drives its joint by
+kp (q_cmd - q) + kd (dq_cmd - dq). Where it is told no speed, dq_cmd is zero, or, in servos that
+feed the speed forward, the rate of the last two commands. Commands take `delay_s` to reach it.
+Coulomb friction holds a joint at rest (that of `sim.effects` lets it creep, which a servo's steady
+error would show), so that the arm is moved by the simulator's own equations of rigid bodies.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adapter.gap.servo import UNITS, ServoGap
 from adapter.gap.servo_model import ServoModel
-from drivers.files.mcap import Commands, Log
-from sim.dynamics import mass_matrix
+from drivers.files.mcap import Commands, Log, McapWriter
+from sim.compiled import compiled
+from sim.dynamics import Frames, mass_matrix, torques
 from sim.hidden.motion import draw_motion
-from sim.position_arm import PositionRecording, Servos, draw_servos, record
 from sim.truth import Array, Truth, documented
+
+TICK_S, STEPS = 1e-3, 8  # commands act at ticks; steps of a tick
+SETTLE_S = 1.0  # at the first command before the recording begins
+
+
+@dataclass(frozen=True, eq=False)
+class Servos:
+    """What is true of the servos, (n,) each.
+
+    Attributes:
+        kp, kd: position and velocity gain, N m/rad and N m s/rad.
+        coulomb, viscous: friction, N m and N m s/rad; armature: the motor's inertia, kg m².
+        delay_s: from a command's stamp until it acts, whole milliseconds.
+        feeds_speed: the servos derive the command's speed and feed it forward.
+        noise_rad: standard deviation of an encoder's reading.
+    """
+
+    kp: Array
+    kd: Array
+    coulomb: Array
+    viscous: Array
+    armature: Array
+    delay_s: float = 0.003
+    feeds_speed: bool = True
+    noise_rad: float = 2e-5
+
+
+class Body(NamedTuple):
+    """The rigid arm as compiled code takes it, see `sim.dynamics.torques`."""
+
+    frames: Frames
+    theta: Array
+    base: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PositionRecording:
+    """What a recording of such an arm holds.
+
+    Attributes:
+        joint_names: order of the columns.
+        stamp_ns: (m,) of encoders and commands; q, q_command: (m, n) rad.
+    """
+
+    joint_names: tuple[str, ...]
+    stamp_ns: NDArray[np.int64]
+    q: Array
+    q_command: Array
+
+    def write(self, path: Path) -> None:
+        """As an MCAP file: joint states and commands, positions only."""
+        with McapWriter(path, self.joint_names, overwrite=True) as writer:
+            rows = zip(self.stamp_ns.tolist(), self.q, self.q_command, strict=True)
+            for stamp_ns, q, command in rows:
+                writer.write_position(stamp_ns, q)
+                writer.write_position_command(stamp_ns, command)
+
+
+def record(
+    truth: Truth, servos: Servos, commands: Array, period_s: float = 2e-3, seed: int = 0
+) -> PositionRecording:
+    """Let the arm follow position commands (m, n) rad, one each period (whole milliseconds).
+
+    The arm starts at rest at the first command and settles there before the recording begins.
+
+    Args:
+        truth: the rigid arm; servos: on its joints.
+        seed: of the encoders' noise.
+    """
+    every, late = round(period_s / TICK_S), round(servos.delay_s / TICK_S)
+    body = Body(truth.frames, truth.theta, truth.base)
+    joints = np.array(
+        [servos.kp, servos.kd, servos.coulomb, servos.viscous, servos.armature], float
+    )
+    at, q = np.zeros((3, truth.n)), np.empty_like(commands)
+    at[0] = commands[0]
+    for tick in range(-round(SETTLE_S / TICK_S), len(commands) * every):
+        if tick >= 0 and tick % every == 0:
+            q[tick // every] = at[0]
+        k = max((tick - late) // every, 0)
+        speed = (commands[k] - commands[max(k - 1, 0)]) / period_s * servos.feeds_speed
+        move(body, joints, commands[k], speed, at)
+    q += servos.noise_rad * np.random.default_rng(seed).standard_normal(q.shape)
+    stamp_ns = (np.arange(len(q)) * round(1e9 * period_s)).astype(np.int64)
+    return PositionRecording(truth.joint_names, stamp_ns, q, commands)
+
+
+@compiled
+def move(body: Body, joints: Array, goal: Array, speed: Array, at: Array) -> None:
+    """One millisecond under one command: small steps, forces as at their middles.
+
+    A joint at rest stays there as long as Coulomb friction can hold it against all else, and one
+    whose velocity would change its sign comes to rest.
+
+    Args:
+        joints: (5, n) of `Servos`: kp, kd, coulomb, viscous, armature.
+        goal, speed: (n,) rad, rad/s; at: (3, n) q, dq and the last step's ddq, changed.
+    """
+    kp, kd, coulomb, viscous, armature = joints
+    n, h, still = len(goal), TICK_S / STEPS, np.zeros(len(goal))
+    q, dq, last = at
+    inertia = mass_matrix(body.frames, body.theta, q)
+    for j in range(n):
+        inertia[j, j] += armature[j]
+    for _ in range(STEPS):
+        middle = dq + 0.5 * h * last
+        midway = q + 0.5 * h * dq
+        drive = kp * (goal - midway) + kd * (speed - middle) - viscous * middle
+        drive -= torques(body.frames, body.theta, body.base, midway, middle, still)
+        way, rests = np.sign(dq), dq == 0.0
+        ddq = np.zeros(n)
+        for _ in range(2 * n):  # one joint is let go or held at a time
+            A, b = inertia.copy(), drive - way * coulomb
+            for j in range(n):
+                if rests[j]:
+                    A[j, :], A[:, j], A[j, j], b[j] = 0.0, 0.0, 1.0, 0.0
+            ddq = np.linalg.solve(A, b)
+            needed = np.abs(drive - inertia @ ddq) - coulomb
+            worst, k = 0.0, -1
+            for j in range(n):
+                if rests[j] and needed[j] > worst:
+                    worst, k = needed[j], j
+            if k < 0:
+                break
+            rests[k], way[k] = False, np.sign((drive - inertia @ ddq)[k])
+        new = dq + h * ddq
+        for j in range(n):
+            if dq[j] * new[j] < 0.0:
+                new[j] = 0.0
+        q += 0.5 * h * (dq + new)
+        last[:] = ddq * (new != 0.0)
+        dq[:] = new
+
+
+def draw_servos(
+    rng: np.random.Generator, sizes: Array, feeds_speed: bool = True, noise_rad: float = 2e-5
+) -> Servos:
+    """Servos of an arm whose joints' moments of inertia are about `sizes` (n,) kg m².
+
+    Bandwidths of 5 to 10 Hz, damping of 0.6 to 1, friction as of a geared joint, delays of 1 to
+    8 ms.
+    """
+    n = len(sizes)
+    armature = sizes * rng.uniform(0.3, 1.0, n)
+    moved = sizes + armature
+    omega = 2.0 * np.pi * rng.uniform(5.0, 10.0, n)
+    kp = moved * omega**2
+    viscous = moved * omega * rng.uniform(0.1, 0.4, n)
+    kd = 2.0 * rng.uniform(0.6, 1.0, n) * moved * omega - viscous
+    coulomb = kp * rng.uniform(1e-3, 5e-3, n)
+    delay_s = TICK_S * int(rng.integers(1, 9))
+    return Servos(kp, kd, coulomb, viscous, armature, delay_s, feeds_speed, noise_rad)
 
 
 @dataclass(frozen=True)

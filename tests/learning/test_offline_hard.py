@@ -23,7 +23,8 @@ from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.inertia import min_eigenvalue, theta_from_body
 from adapter.model.tree import Tree
 from adapter.physics.networks import link_motion
-from sim.falls.tree_truth import TreeTruth, random_tree
+from sim.falls.tree_truth import TreeTruth
+from tests.helpers.random_trees import random_tree
 
 
 def fall(

@@ -22,8 +22,8 @@ from adapter.signals.link_imus import with_link_imus
 from adapter.signals.matching import matching
 from drivers.files.mcap import McapWriter, read_log
 from drivers.files.ros_types import IMU
-from sim.imus import Imus
 from sim.scenarios import build
+from sim.sensors import Imus
 from tests.helpers.imu_data import Parts, record
 
 LINKS = ("panda_link3", "panda_link5", "panda_link7")

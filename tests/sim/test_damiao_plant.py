@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim.damiao.bit_times import fd_bits, frame_ns
+from sim.damiao.line import fd_bits, frame_ns
 from sim.engine import Engine
 from sim.scenarios import build
 from tests.helpers.board_tools import (

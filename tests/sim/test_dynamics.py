@@ -8,10 +8,10 @@ import pytest
 
 from sim import dynamics
 from sim.dynamics import Frames
-from sim.falls.tree_truth import random_tree
 from sim.fci.arm import wrench_at
 from sim.scenarios import build
 from tests.helpers.arm_data import pin_model
+from tests.helpers.random_trees import random_tree
 
 PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # of our θ: Pinocchio has XX XY YY XZ YZ ZZ
 

@@ -9,11 +9,10 @@ import pinocchio as pin
 import pytest
 
 from adapter.model.spatial import matrix_from_zxz
-from sim.falls.babbling import Babbling
-from sim.falls.fall import FallRecord, babble
-from sim.falls.links import LinkTables, link_tables
-from sim.falls.tree_truth import TreeTruth, atlas, random_tree
+from sim.falls.fall import Babbling, FallRecord, babble
+from sim.falls.tree_truth import TreeTruth, atlas
 from sim.truth import body_of
+from tests.helpers.random_trees import random_tree
 from tests.helpers.robot_models import read_quietly, shared
 
 EXACT = 1e-8
@@ -71,10 +70,6 @@ def _motion(model: pin.Model, data: pin.Data, number: int) -> np.ndarray:
     return np.stack([twist.linear, twist.angular, accel.linear, accel.angular])
 
 
-def links_of(truth: TreeTruth, x: FallRecord) -> LinkTables:
-    return link_tables(truth, x.q, x.dq, x.ddq, (x.base_v, x.base_w, x.base_a, x.base_dw))
-
-
 @pytest.mark.parametrize("name", ["atlas", "5", "33"])
 def test_every_sample_satisfies_the_equations_of_motion(name: str) -> None:
     truth = tree_of(name)
@@ -83,7 +78,7 @@ def test_every_sample_satisfies_the_equations_of_motion(name: str) -> None:
     wrench, tau, motion, force = answers(truth, record, rows)
     assert np.abs(tau - record.tau[rows]).max() < EXACT * np.median(np.abs(tau))
     assert np.abs(wrench).max() < EXACT * np.median(force)
-    links = links_of(truth, record)
+    links = record.links(truth)
     ours = np.stack([links.v, links.w, links.a, links.dw], axis=2)[rows]
     assert np.abs(ours - motion).max() < 1e-11 * np.abs(motion).max()
     assert np.ptp(record.base_w, axis=0).min() > 0.1  # the base answers the limbs

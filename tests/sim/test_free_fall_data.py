@@ -9,11 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sim.falls.babbling import Babbling
-from sim.falls.data_set import CACHE_VARIABLE, SIGNALS, FallData, Flight, cache_folder, data_set
-from sim.falls.links import link_tables
-from sim.falls.noise import TreeNoise
-from sim.falls.tree_truth import random_tree
+from sim.falls.data_set import (
+    CACHE_VARIABLE,
+    SIGNALS,
+    FallData,
+    Flight,
+    TreeNoise,
+    cache_folder,
+    data_set,
+)
+from sim.falls.fall import Babbling
+from tests.helpers.random_trees import random_tree
 
 TREE = random_tree(6, seed=3)
 FLIGHT = Flight(0.2)
@@ -99,8 +105,7 @@ def test_sensors_add_what_is_documented(tmp_path: Path) -> None:
     seen = data_set(TREE, noise=True, **options)[0]
     assert set(seen) == {"q", "dq", "tau", "base_w", "base_a", "link_w", "link_a"}
     assert all(np.all(np.isfinite(x)) for x in seen.values())
-    base = (clean.base_v, clean.base_w, clean.base_a, clean.base_dw)
-    links = link_tables(TREE, clean.q, clean.dq, clean.ddq, base)
+    links = clean.links(TREE)
     root_band = np.sqrt(500.0)
     gyro, accel = np.radians(0.007) * root_band, 120e-6 * 9.80665 * root_band
     step = 2 * np.pi / 2**19

@@ -1,0 +1,49 @@
+"""A driver on a simulated CAN line, in lockstep with the line's clock."""
+
+from __future__ import annotations
+
+from drivers.interface import Driver, JointSample
+from sim.damiao.host import WrappedDriver
+from sim.damiao.line import Line
+
+SETTLE_TICKS = 300  # the motors take the arm over from its stand
+
+
+class Lockstep(WrappedDriver):
+    """A driver whose clock is the line's: each `read` lets one period of virtual time pass.
+
+    Args:
+        driver: built on `line.host` with the clock `line.now_ns`.
+        line: with the boards attached.
+    """
+
+    arrived_ns = 0
+
+    def __init__(self, driver: Driver, line: Line) -> None:
+        super().__init__(driver)
+        self._line, self._next_ns = line, 0
+
+    def connect(self) -> None:
+        """Connect and let the arm come to rest in its motors. Raises DriverError."""
+        with self._line.eager():
+            self._driver.connect()
+        self._next_ns = self._line.next_whole_ns(self.period_ns)
+        for _ in range(SETTLE_TICKS):
+            self.read()
+
+    def read(self) -> JointSample:
+        """The next sample. Raises DriverError."""
+        self._line.advance_to(self._next_ns)
+        self._next_ns += self.period_ns
+        return self._driver.read()
+
+    def stop(self) -> None:
+        """Bring the arm to a stand. Raises DriverError."""
+        with self._line.eager():
+            self._driver.stop()
+        self._next_ns = self._line.next_whole_ns(self.period_ns)  # it took a while
+
+    def close(self) -> None:
+        """Release the driver."""
+        with self._line.eager():
+            self._driver.close()
