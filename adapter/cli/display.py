@@ -6,7 +6,6 @@ Lines that are said meanwhile come out above it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, Group
@@ -17,16 +16,10 @@ from rich.text import Text
 from adapter.gap.monitor_judge import sentence
 from adapter.model.numbers import plus_minus
 from adapter.realtime.showing import View
-from adapter.runs.live import disagreement
-from adapter.runs.terminal import console
+from adapter.runs.terminal import DISAGREEMENT, console
 from adapter.view.now import ABOVE_NOISE, CONVERGED, KnownRun, Now, Onlooker, untold
 
 GOOD, LOUD, DIM = "green", "yellow", "dim"
-
-
-def make_display(known: KnownRun) -> Callable[[View], None]:
-    """What shows a run on this terminal."""
-    return LiveTable(known, console)
 
 
 class LiveTable:
@@ -34,11 +27,11 @@ class LiveTable:
 
     Args:
         known: the run.
-        shown_on: a terminal.
+        shown_on: a terminal; this one where None.
     """
 
-    def __init__(self, known: KnownRun, shown_on: Console) -> None:
-        self._known, self._console = known, shown_on
+    def __init__(self, known: KnownRun, shown_on: Console | None = None) -> None:
+        self._known, self._console = known, shown_on or console
         self._onlooker = Onlooker(known)
         self._live: Live | None = None
         self._lines = 0
@@ -65,7 +58,7 @@ class LiveTable:
         lines = now.view.lines[self._lines :]
         self._lines = len(now.view.lines)
         for found in untold(now.findings, self._told):
-            lines.append(disagreement(sentence(found, 0.0)))
+            lines.append(f"{DISAGREEMENT}: {sentence(found, 0.0)}")
         for note in now.view.news.get("notes", []):
             if note not in self._told:
                 self._told.add(note)

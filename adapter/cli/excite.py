@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from adapter.cli.agreement import PLAN_PAGE
+from adapter.cli.agreement import PLAN_PAGE, whole_plan
 from adapter.cli.common import robot_of, with_motion
 from adapter.cli.exit_codes import ExitCode
 from adapter.control.designed import DesignedMotion, Designer
-from adapter.control.excitation import RandomMotion, plan_lines
+from adapter.control.excitation import RandomMotion
 from adapter.control.free_path import ArmInCell, FreeMotion
 from adapter.control.information import Expected, Information
 from adapter.control.limits import MotionLimits, need_complete
@@ -274,8 +274,7 @@ def _write(
     """The page and both files of a motion from its start to rest."""
     names = arm.model.tree.joint_names
     least = arm.clearance(motion, seconds)
-    lines = plan_lines(motion, limits, names, seconds)
-    lines.insert(-1, f"Nearest on the way: {least} (margin {arm.cell.margin:g} m).")
+    lines = whole_plan(arm, motion, limits, seconds, least)
     write_plan(folder / PLAN_PAGE, arm, motion, limits, least, PlanWords(lines))
     times_ns, points = _points(motion, seconds, args.rate)
     with (folder / "motion.csv").open("w", newline="") as file:

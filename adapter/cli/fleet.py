@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import csv
+import importlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from rich.progress import Progress
 from rich.table import Table
@@ -12,11 +16,10 @@ from rich.table import Table
 from adapter.cli.common import robot_of, told_of
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.results import write_urdf
-from adapter.errors import MeansError
-from adapter.model.model_file import save_model
+from adapter.model.model_file import save_model, whole_file
 from adapter.report.fleet_page import write_fleet_page
 from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
-from adapter.runs.fleet.arm import FleetArm
+from adapter.runs.fleet.arm import FleetArm, OfLog
 from adapter.runs.fleet.fleet import (
     Fleet,
     Manifest,
@@ -27,7 +30,6 @@ from adapter.runs.fleet.fleet import (
     read_manifest,
     recall,
 )
-from adapter.runs.fleet.table import write_table
 from adapter.runs.terminal import (
     console,
     output,
@@ -69,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
             _print(arm)
     for line in summary(found):
         show(line)
-    figures["table"] = str(_table(found, folder))
+    figures["table"] = str(_write_table(found, folder))
     page = folder / "fleet.html"
     page.unlink(missing_ok=True)  # of earlier models
     if not args.no_report:
@@ -87,13 +89,64 @@ def _write_model(arm: FleetArm, folder: Path) -> Path:
     return path
 
 
-def _table(found: Fleet, folder: Path) -> Path:
-    """Parquet, or CSV where that cannot be written."""
+def _write_table(found: Fleet, folder: Path) -> Path:
+    """A row for each recording, whole or not at all: Parquet, or CSV where there is no pyarrow."""
+    listed, path = _rows(found), folder / "fleet.parquet"
     try:
-        return write_table(found, folder / "fleet.parquet")
-    except MeansError as error:
-        warn([f"{error}; a CSV table is written instead"])
-        return write_table(found, folder / "fleet.csv")
+        arrow = importlib.import_module("pyarrow")
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        needs = "Parquet is written with pyarrow; pip install 'panda-adapter[tables]'"
+        warn([f"{path}: {needs}; a CSV table is written instead"])
+        path = path.with_suffix(".csv")
+        with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(listed[0]) if listed else ["log"])
+            writer.writeheader()
+            writer.writerows(listed)
+        return path
+    with whole_file(path) as part:
+        parquet.write_table(arrow.Table.from_pylist(listed), part)
+    return path
+
+
+def _rows(found: Fleet) -> list[dict[str, Any]]:
+    """A row for each recording; columns of joints are numbered from 1."""
+    out = [_row(arm, k) for arm in found.arms for k in range(len(arm.logs))]
+    out += [{"log": x.path, "state": "broken", "why": x.why} for x in found.broken]
+    out += [{"log": path, "state": "forgotten"} for path in found.forgotten]
+    columns = dict.fromkeys(key for row in out for key in row)
+    return [{key: row.get(key) for key in columns} for row in out]
+
+
+def _row(arm: FleetArm, number: int) -> dict[str, Any]:
+    log = arm.logs[number]
+    taken, load = log.moments, log.load
+    out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
+    return {
+        "log": taken.path,
+        "state": "used" if log.used else "disagrees",
+        "why": None,
+        "arm": arm.name,
+        "content": taken.content,
+        "begin_s": taken.begin_s,
+        "span_s": taken.span_s,
+        "samples": taken.samples,
+        "load_kg": None if load is None else load.mass,
+        "load_std_kg": None if load is None else load.std,
+        "disagrees": " ".join(map(str, log.disagrees)),
+        "stands_out": " ".join(out),
+        "worth_nats": log.worth,
+        **dict(_by_joint(arm, log)),
+    }
+
+
+def _by_joint(arm: FleetArm, log: OfLog) -> Iterator[tuple[str, float]]:
+    for j in range(len(log.rmse)):
+        yield f"rmse_nm_{j + 1}", float(log.rmse[j])
+    for k, name in enumerate(arm.effects):
+        for j in range(len(log.rmse)):
+            yield f"{name}_{j + 1}", float(log.effects[k, j])
+            yield f"{name}_std_{j + 1}", float(log.effects_std[k, j])
 
 
 def _print(arm: FleetArm) -> None:

@@ -7,10 +7,9 @@ import sys
 
 import numpy as np
 
-from adapter.cli.agreement import PLAN_PAGE
+from adapter.cli.agreement import PLAN_PAGE, whole_plan
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.run import run_plan
-from adapter.control.excitation import plan_lines
 from adapter.control.limits import MotionLimits, need_same_robot
 from adapter.control.push_bound import push_bound
 from adapter.control.resting import check_resting_torque
@@ -18,7 +17,6 @@ from adapter.report.next_steps import Step, command, without
 from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import results_folder, say, show
 from drivers.interface import Driver, JointSample
-from drivers.registry import open_driver, split_address
 
 READS = 200  # among which every joint has to be measured
 
@@ -28,9 +26,7 @@ def run(args: argparse.Namespace) -> int:
     plan = run_plan(args)
     robot, limits = plan.robot, MotionLimits.of(plan.robot)
     draw = plan.free_motion(args.duration)
-    scheme, _ = split_address(args.driver)
-    builders = {} if plan.world is None else {scheme: plan.world.driver}
-    driver = open_driver(args.driver, builders, robot.tree.joint_names, False)
+    driver = plan.open(args.driver, False)
     driver.connect()
     try:
         sample = _measured(driver)
@@ -40,11 +36,8 @@ def run(args: argparse.Namespace) -> int:
     motion = draw(limits, sample.q, plan.config.excitation)
     assert draw.least is not None
     duration_s = args.duration + plan.config.excitation.slow_s
-    lines = plan_lines(motion, limits, robot.tree.joint_names, duration_s)
-    lines[-1:-1] = [
-        f"Nearest on the way: {draw.least} (margin {draw.arm.cell.margin:g} m).",
-        *push_bound(robot, motion, limits, plan.config.safety).lines(),
-    ]
+    bound = push_bound(robot, motion, limits, plan.config.safety)
+    lines = whole_plan(draw.arm, motion, limits, duration_s, draw.least, bound.lines())
     page = results_folder(args.out, "plan") / PLAN_PAGE
     # the run of this plan: the same words, but where the plan goes
     kept = without(sys.argv[2:], ["--out"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from rich.progress import Progress
@@ -29,7 +30,7 @@ from adapter.runs.replay import (
 )
 from adapter.runs.replay import replay as learn_from
 from adapter.runs.score import Course, Reference, figures, reference_from
-from adapter.runs.terminal import console, labelled, results_folder, say, show, warn
+from adapter.runs.terminal import DISAGREEMENT, console, labelled, results_folder, say, show, warn
 from adapter.screening.screen import check_torque
 from adapter.signals.base_motion import with_base_motion
 from adapter.signals.link_imus import with_link_imus
@@ -170,14 +171,9 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
             until_s=args.validate_from,
             progress=lambda done: bar.update(task, completed=done),
             resume=args.resume,
-            say=None if args.quiet else tell,
+            say=None if args.quiet else partial(labelled, f"{DISAGREEMENT}:", "yellow"),
         )
         return learn_from(log, robot, config.pipeline, options)
-
-
-def tell(line: str) -> None:
-    """A new disagreement, when it is found."""
-    labelled("new disagreement:", "yellow", line)
 
 
 def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:

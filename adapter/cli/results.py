@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ from adapter.model.self_model import SelfModel, theta_doubt
 from adapter.report import write_report
 from adapter.report.headline import headline
 from adapter.report.next_steps import next_steps
-from adapter.report.words import is_live, missed_words, not_learned, small
+from adapter.report.words import NOT_WATCHED, is_live, missed_words, not_learned, small
 from adapter.report.worth import Worth
 from adapter.runs.outcome import Outcome
 from adapter.runs.run_folder import RunData, load_run, run_data, save_run
@@ -126,7 +126,8 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
         what = f"{plus_minus(load['m'], load['m_std'])} kg" if load else "superseded"
         table.add_row("change at the hand", f"at {change['stamp_s'] - start_s:.2f} s: {what}")
     watched = figures.get("disagreements", []) is not None
-    for line in disagreement_lines(not_learned(figures) if watched else None, start_s):
+    new = [sentence(x, start_s) for x in not_learned(figures)] if watched else [NOT_WATCHED]
+    for line in new:
         table.add_row("new disagreement", line)
     if theta["validation_torque_rmse_nm"]:
         values = " ".join(f"{value:.3f}" for value in theta["validation_torque_rmse_nm"])
@@ -141,15 +142,6 @@ def _figures(figures: dict[str, Any], report: str | None) -> Table:
     if report:
         table.add_row("report", report)
     return table
-
-
-def disagreement_lines(
-    reports: Sequence[Mapping[str, Any]] | None, start_s: float = 0.0
-) -> list[str]:
-    """One line each, times from the stamp `start_s`; one that says so where nothing watched."""
-    if reports is None:
-        return ["not watched for in batches (--every above 1) and where the base floats"]
-    return [sentence(report, start_s) for report in reports]
 
 
 def _reached(figures: dict[str, Any], which: str) -> str:

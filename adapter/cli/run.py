@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from adapter import optional
 from adapter.cli.agreement import agree, need_somebody, reading
 from adapter.cli.common import configure, recording_metadata, robot_of, with_motion
-from adapter.cli.display import make_display
+from adapter.cli.display import LiveTable
 from adapter.cli.exit_codes import ExitCode
 from adapter.cli.publishing import publisher_job, together
 from adapter.cli.results import Learned, code_of, conclude
@@ -111,6 +111,12 @@ class RunPlan:
         draw = self.designer().within(arm) if motion.kind == DESIGNED else RandomMotion
         return FreeMotion(arm, duration_s + motion.slow_s, draw)
 
+    def open(self, address: str, may_move: bool) -> Driver:
+        """The driver of an address, not connected yet. Raises UsageError, ValueError."""
+        scheme, _ = split_address(address)
+        builders = {} if self.world is None else {scheme: self.world.driver}
+        return open_driver(address, builders, self.robot.tree.joint_names, may_move)
+
     def designer(self) -> Designer:
         """What designs a motion, wherever it goes."""
         return Designer(Information(self.robot, self.config.pipeline.filter))
@@ -149,14 +155,6 @@ def run_plan(args: argparse.Namespace) -> RunPlan:
     return RunPlan(config.apply(robot), config, world, real, forward)
 
 
-def open_arm(args: argparse.Namespace, plan: RunPlan) -> Driver:
-    """The driver of a command line, not connected yet. Raises UsageError, ValueError."""
-    scheme, _ = split_address(args.driver)
-    builders = {} if plan.world is None else {scheme: plan.world.driver}
-    driver = open_driver(args.driver, builders, plan.robot.tree.joint_names, _may_move(args))
-    return driver if args.fault is None else with_faults(driver, args.fault, args.seed or 0)
-
-
 def _may_move(args: argparse.Namespace) -> bool:
     return bool(args.allow_motion and not args.passive)
 
@@ -172,7 +170,9 @@ def run(args: argparse.Namespace) -> int:
     folder = results_folder(args.out, "run")
     truth = args.truth or _write_truth(plan.world, folder)
     reference = reference_from(truth, robot)
-    driver = open_arm(args, plan)
+    driver = plan.open(args.driver, _may_move(args))
+    if args.fault is not None:
+        driver = with_faults(driver, args.fault, args.seed or 0)
     if plan.maybe_real and not driver.can_move:
         if _may_move(args):
             warn(["--allow-motion changes nothing here: this driver only listens"])
@@ -194,21 +194,16 @@ def run(args: argparse.Namespace) -> int:
         complain("the learner ended early")
         return ExitCode.LEARNER_FAILED
     _conclude(args, folder, plan, reference, front_end, result)
-    return _ended(result)
+    if result.fault:
+        return ExitCode.ARM_FAILED
+    usual = ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
+    return code_of(result.collected, usual)
 
 
 def _accounts(result: LiveResult) -> list[str]:
     """How long things took, and what became of commands."""
     commands = result.intake.commands
     return result.timing.lines() + ([] if commands is None else [commands.line()])
-
-
-def _ended(result: LiveResult) -> ExitCode:
-    """How a run with results ended."""
-    if result.fault:
-        return ExitCode.ARM_FAILED
-    usual = ExitCode.INCOMPLETE if result.unrecorded else ExitCode.DONE
-    return code_of(result.collected, usual)
 
 
 def _write_truth(world: SimulationLike | None, folder: Path) -> Path | None:
@@ -268,7 +263,7 @@ def _go(
     publisher = publisher_job(args.driver, robot, effects)
     display = None
     if console.is_terminal and not args.quiet:
-        display = DisplayJob(partial(make_display, known), says=True)
+        display = DisplayJob(partial(LiveTable, known), says=True)
 
     later: list[Callable[[], Path] | None] = []
 

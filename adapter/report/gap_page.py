@@ -8,17 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from adapter.gap.phrases import listed
+from adapter.effects.law import LAW
+from adapter.gap.phrases import listed, who
 from adapter.gap.result import GapResult, Leftover
 from adapter.gap.words import (
     by_kind,
     fall,
     headline_parts,
     left_above_noise,
+    noise_times,
+    percent,
     signal_words,
+    stopped,
+    worse,
     worst_joint,
 )
 from adapter.model.numbers import DASH, plain
+from adapter.model.robots import names as robot_names
 from adapter.report.gap_panels import error_panels
 from adapter.report.gap_signatures import signature_panels, unexplained_panels
 from adapter.report.gap_tables import (
@@ -32,9 +38,10 @@ from adapter.report.gap_tables import (
     tied,
     unseen_table,
 )
-from adapter.report.gap_trust import gap_checks, gap_steps
 from adapter.report.html import fill, write_whole
+from adapter.report.next_steps import Step, command
 from adapter.report.tables import Tile
+from adapter.report.trust import BAD, GOOD, LEFT, LOOK, Check
 from adapter.report.words import NARROW, capital
 
 TEMPLATE = "gap.html"
@@ -152,7 +159,11 @@ def _named(recordings: Sequence[str]) -> list[str]:
 def _tiles(result: GapResult) -> list[Tile]:
     before, after = result.before, result.after
     noise = np.asarray(result.noise_floor_nm, dtype=float)
-    tiles = [Tile("Effects found", str(len(by_kind(result.findings))), _left_words(result))]
+    left = len(result.unexplained)
+    said = f"{left} thing{'' if left == 1 else 's'} unexplained"
+    if not left:
+        said = left_above_noise(result) or "nothing above the noise left"
+    tiles = [Tile("Effects found", str(len(by_kind(result.findings))), said)]
     worst = worst_joint(result)
     if worst is not None:
         first, last = before.torque_rmse_nm[worst], after.torque_rmse_nm[worst]
@@ -169,19 +180,119 @@ def _tiles(result: GapResult) -> list[Tile]:
     off, off_after = before.rollout_rmse_rad, after.rollout_rmse_rad
     if off is not None and np.isfinite(off).any():
         j = int(np.nanargmax(off))
-        left = np.nan if off_after is None else off_after[j]
-        value, note = _arrow(1e3 * off[j], 1e3 * left, "mrad"), f"joint {j + 1}, rms within 0.5 s"
+        still = np.nan if off_after is None else off_after[j]
+        value, note = _arrow(1e3 * off[j], 1e3 * still, "mrad"), f"joint {j + 1}, rms within 0.5 s"
         tiles.append(Tile("Forward simulation off by", value, tied(note)))
     return tiles
 
 
-def _left_words(result: GapResult) -> str:
-    """What stays beside the findings: named as unexplained, or above the noise without a name."""
-    left = len(result.unexplained)
-    if left:
-        return f"{left} thing{'' if left == 1 else 's'} unexplained"
-    return left_above_noise(result) or "nothing above the noise left"
-
-
 def _arrow(before: float, after: float, unit: str) -> str:
     return f"{plain(before, 2)} → {plain(after, 2)} {unit}".replace(" ", NARROW)
+
+
+# --- whether to trust what is named, and what to do next -----------------------------------------
+
+SURE = 0.99  # evidence from which a finding is called well known
+FIGURES = "gap.json"  # beside the page
+
+
+def gap_checks(result: GapResult) -> list[Check]:
+    """All that the result allows; nothing where nothing could be told."""
+    if result.problem is not None:
+        return []
+    checks = [_evidence(result), _rivals(result), _scored(result), _left(result)]
+    checks += [Check(BAD, "Contradiction", text) for text in result.contradictions]
+    if result.stopped_after_rounds:
+        checks.append(Check(LOOK, "The search", stopped(result)))
+    return [check for check in checks if check is not None]
+
+
+def _evidence(result: GapResult) -> Check | None:
+    if not result.findings:
+        return None
+    least = min(result.findings, key=lambda f: f.evidence)
+    called = f"{least.title}, {who(least.effect, least.joints)}"
+    said = f"the least sure of {len(result.findings)}: {called}, {percent(least.evidence)}"
+    return Check(GOOD if least.evidence >= SURE else LOOK, "How sure", said)
+
+
+def _rivals(result: GapResult) -> Check | None:
+    if not result.findings:
+        return None
+    rows = rival_rows(result)
+    if not rows:
+        said = "no other effect of the catalogue explains 90 % of any of these on these data"
+        return Check(GOOD, "What else explains it", said)
+    said = "; ".join(f"{found}: {other} of it" for found, other, _ in rows)
+    return Check(LOOK, "What else explains it", said)
+
+
+def _scored(result: GapResult) -> Check:
+    """On which data errors before and after are told, and whether a joint got worse."""
+    if result.in_sample:
+        said = "in sample only: nothing could be held out, so that errors after may be too small"
+        return Check(LOOK, "On data not fitted", said)
+    lost = worse(result)
+    said = "errors before and after are of data that the fit never saw"
+    said += f"; {lost}" if lost else ""
+    return Check(LOOK if lost else GOOD, "On data not fitted", said)
+
+
+def _left(result: GapResult) -> Check:
+    """What the new model leaves, named as unexplained or not."""
+    after = noise_times(result)[1]
+    joints = sorted({item.joint for item in result.unexplained})
+    loud = left_above_noise(result)
+    if joints:
+        where = f"joint{'s' if len(joints) > 1 else ''} {', '.join(map(str, joints))}"
+        said = f"something that no effect explains on {where}{'; ' + loud if loud else ''}"
+        return Check(LOOK, LEFT, said)
+    if loud:
+        return Check(LOOK, LEFT, f"{loud}, and nothing of the catalogue names it")
+    most = plain(float(np.nanmax(after)), 2) if np.isfinite(after).any() else "an unknown number of"
+    return Check(GOOD, LEFT, f"at most {most} times the noise, on every joint")
+
+
+def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
+    """What to measure next, and what the new model is for."""
+    asked = _asked(result.what_next)
+    figures = FIGURES if folder is None else str(folder / FIGURES)
+    steps = [Step(text) for text in asked]
+    if asked and result.findings:
+        why = "The motion that tells these apart, inside the arm's limits"
+        steps.append(Step(why, command("excite", *_robot(result), "--gap", figures)))
+    if result.problem is not None and result.model_in:
+        why = "Design a motion in which every joint moves enough"
+        steps.append(Step(why, command("excite", *_robot(result))))
+    laws = [f for f in result.findings if f.effect.startswith(LAW)]
+    if laws:
+        why = "Keep the law under a name, to look for it in other recordings (--effects)"
+        name, joint = f"law_joint_{laws[0].joints[0]}", str(laws[0].joints[0])
+        words = ("effects", "keep", figures, "--as", name, "--joint", joint)
+        steps.append(Step(why, command(*words)))
+    out = result.model_out
+    if out is not None:
+        why = "See joint by joint what the new model holds otherwise"
+        steps.append(Step(why, command("diff", result.model_in or "MODEL", out)))
+        why = "Use it in a simulator or planner: the robot's file with what was found"
+        steps.append(Step(why, command("export", out, "--urdf", "learned.urdf")))
+    return steps
+
+
+def _asked(texts: Sequence[str]) -> list[str]:
+    """Experiments, each motion once with all that it tells: "move so: this stays, that grows"."""
+    told: dict[str, dict[str, None]] = {}
+    for text in texts:
+        motion, _, signs = text.partition(": ")
+        told.setdefault(motion, {}).update(dict.fromkeys(filter(None, signs.split(", the "))))
+    found = []
+    for motion, clauses in told.items():
+        signs = ", the ".join(dict.fromkeys(x.removeprefix("the ") for x in clauses))
+        found.append(tied(capital(f"{motion}: the {signs}" if signs else motion)))
+    return found
+
+
+def _robot(result: GapResult) -> tuple[str, ...]:
+    """The option that names the robot, where it is not the usual one."""
+    given = result.model_in
+    return ("--robot", given) if given and given != robot_names()[0] else ()

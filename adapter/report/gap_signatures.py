@@ -83,42 +83,48 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
     """The residual of the joints worth a look, against what it may depend on."""
     panels = []
     for j in shown_joints(result):
-        clouds = [_cloud(result, j, *words) for words in SIGNATURES]
+        clouds = []
+        for key, title, label in SIGNATURES:
+            x = np.concatenate([getattr(c, key)[:, j] for c in result.curves])
+            cloud = _clouds(result, j, x, ("before", "after"), label)
+            laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
+            for finding in laws:
+                _law(
+                    cloud.axes[0], finding, key, np.linspace(np.nanmin(x), np.nanmax(x), LAW_POINTS)
+                )
+            clouds.append(cloud.panel(title, "N m", ", ".join(f.title for f in laws)))
         times = [_over_time(result, j), _motion(result, j)]
-        panels.append(JointPanels(f"Joint {j + 1}", _why(result, j), clouds, times))
+        why = [result.joint_names[j]]
+        said = [
+            f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j
+        ]
+        said += ["something unexplained"] * any(x.joint == j + 1 for x in result.unexplained)
+        why += [", ".join(dict.fromkeys(said))] if said else []
+        panels.append(JointPanels(f"Joint {j + 1}", "; ".join(why), clouds, times))
     return panels
-
-
-def _why(result: GapResult, j: int) -> str:
-    titles = [f.title for f in result.findings if j + 1 in f.joints or _worst(f.torque_rms_nm) == j]
-    left = ["something unexplained"] if any(x.joint == j + 1 for x in result.unexplained) else []
-    said = ", ".join([*dict.fromkeys(titles), *left])
-    return f"{result.joint_names[j]}; {said}" if said else result.joint_names[j]
 
 
 def _worst(worth: Array) -> int:
     return int(np.argmax(np.nan_to_num(worth))) if np.size(worth) else -1
 
 
-def _cloud(result: GapResult, j: int, key: str, title: str, label: str) -> Panel:
-    x, before, after = (
-        np.concatenate([getattr(c, side)[:, j] for c in result.curves])
-        for side in (key, "before", "after")
-    )
+def _clouds(
+    result: GapResult, j: int, x: Array, sides: Sequence[str], label: str, mean: bool = True
+) -> Drawing:
+    """Torque left on joint j "before" or "after", a dot a sample, and its running mean over x."""
+    colors = [ACCENT if side == "after" else GOAL for side in sides]
+    ys = [np.concatenate([getattr(c, side)[:, j] for c in result.curves]) for side in sides]
     drawing = Drawing("quarter")
     drawing.figure.subplots_adjust(left=LEFT)
     ax = drawing.axes[0]
-    _limits(ax, x, [before, after])
+    _limits(ax, x, ys)
     _noise_band(ax, result.noise_floor_nm[j])
-    for y, color in ((before, GOAL), (after, ACCENT)):
+    for y, color in zip(ys, colors, strict=True):
         _dots(ax, x, y, color)
-    for y, color in ((before, GOAL), (after, ACCENT)):
+    for y, color in zip(ys, colors, strict=True) if mean else ():
         ax.plot(*_running_mean(x, y), color=color, linewidth=1.6)
-    laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
-    for finding in laws:
-        _law(ax, finding, key, np.linspace(np.nanmin(x), np.nanmax(x), LAW_POINTS))
     time_axis(drawing, label)
-    return drawing.panel(title, "N m", ", ".join(f.title for f in laws))
+    return drawing
 
 
 def _follows_alone(finding: Finding, key: str) -> bool:
@@ -280,18 +286,8 @@ def _leftover(result: GapResult, item: Leftover) -> Panel:
     x = _signal(result, name)
     if x is None:
         name, x = "t", np.concatenate([c.t for c in result.curves])
-    j = item.joint - 1
-    y = np.concatenate([c.after[:, j] for c in result.curves])
-    drawing = Drawing("quarter")
-    drawing.figure.subplots_adjust(left=LEFT)
-    ax = drawing.axes[0]
-    _limits(ax, x, [y])
-    _noise_band(ax, result.noise_floor_nm[j])
-    _dots(ax, x, y, ACCENT)
-    if name != "t":
-        ax.plot(*_running_mean(x, y), color=ACCENT, linewidth=1.6)
-    unit = UNITS[re.sub(r"\d+$", "", name)]
-    time_axis(drawing, f"{signal_words(name)}, {unit}")
+    label = f"{signal_words(name)}, {UNITS[re.sub(r'[0-9]+$', '', name)]}"
+    drawing = _clouds(result, item.joint - 1, x, ("after",), label, mean=name != "t")
     note = f"{plain(item.rmse_nm, 2)} N m rms, noise {plain(item.noise_floor_nm, 2)} N m"
     return drawing.panel(f"Left on joint {item.joint}", "N m", note)
 

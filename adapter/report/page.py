@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from adapter.gap.monitor_judge import sentence
 from adapter.model.self_model import LAMBDA_MEASURED
@@ -13,8 +16,7 @@ from adapter.report.html import fill, write_whole
 from adapter.report.next_steps import next_steps
 from adapter.report.schema_panels import schema_panels
 from adapter.report.skeleton import has_reference, skeleton_panels
-from adapter.report.style import JOINT_COLORS
-from adapter.report.timing_panels import histogram_panels, tracking_table
+from adapter.report.style import ACCENT, JOINT_COLORS, Drawing, Panel, time_axis
 from adapter.report.torque_panels import (
     BODY_PARTS,
     body_panels,
@@ -30,6 +32,12 @@ from adapter.runs.run_folder import RunData
 from adapter.runs.score import TORQUE_GOAL
 
 TEMPLATE = "report.html"
+TRACKED = {
+    "feedback": "feedback alone",
+    "feedforward": "with feed-forward",
+    "documented": "feed-forward of the documented model",
+    "learned": "feed-forward of the learned model",
+}
 
 
 def render(data: RunData) -> str:
@@ -49,6 +57,7 @@ def write_report(path: str | Path, data: RunData) -> Path:
 def context(data: RunData) -> dict[str, Any]:
     """What the template shows."""
     figures, started, worth = data.figures, theta_started(data), Worth.of(data)
+    fit = data.times(data.score_trace)[fit_window(data)] if started else []
     return {
         "robot": data.documented.name,
         "headline": headline(data, worth),
@@ -74,7 +83,7 @@ def context(data: RunData) -> dict[str, Any]:
         "effects": effect_panels(data) if started else [],
         "prequential": prequential_panels(data) if started else [],
         "fit": fit_panels(data) if started else [],
-        "fit_span": _fit_span(data) if started else "",
+        "fit_span": f"{words.number(fit[0])} to {words.quantity(fit[-1], 's')}" if len(fit) else "",
         "joint_tables": tables.joint_tables(data),
         "matrices": [tables.schema_matrix(data), tables.theta_matrix(data)],
         "changes": tables.changes_table(data),
@@ -84,8 +93,8 @@ def context(data: RunData) -> dict[str, Any]:
         "granted": [str(line) for line in figures.get("granted") or []],
         "speed": words.number(figures.get("times_real_time")),
         "timing": tables.timing_table(figures),
-        "histograms": histogram_panels(figures),
-        "tracking": tracking_table(figures),
+        "histograms": _histogram_panels(figures),
+        "tracking": _tracking_table(figures),
         "theta_table": tables.theta_table(data),
         "schema_table": tables.schema_table(data),
         "provenance": tables.provenance_rows(data),
@@ -100,6 +109,43 @@ def _warnings(figures: dict[str, Any]) -> list[str]:
     return [*ended, *new, *map(str, figures.get("warnings") or [])]
 
 
-def _fit_span(data: RunData) -> str:
-    t = data.times(data.score_trace)[fit_window(data)]
-    return f"{words.number(t[0])} to {words.quantity(t[-1], 's')}" if len(t) else ""
+def _histogram_panels(figures: Mapping[str, Any]) -> list[Panel]:
+    """Histograms, where the run kept them: counts over durations in µs."""
+    given = (figures.get("timing") or {}).get("histograms") or figures.get("histograms") or {}
+    panels = []
+    for key, bins in given.items():
+        edges, counts = np.array(bins["edges_us"], float), np.array(bins["counts"], float)
+        if not counts.any():
+            continue
+        drawing = Drawing("half")
+        ax = drawing.axes[0]
+        ax.stairs(counts, edges, color=ACCENT, fill=True, alpha=0.75)
+        if counts.max() > 100:
+            ax.set_yscale("symlog", linthresh=1.0)
+            ax.set_ylim(0.0, 2.0 * counts.max())
+        time_axis(drawing, "duration, µs")
+        name = tables.TIMES.get(key, key.removesuffix("_us").replace("_", " ").capitalize())
+        panels.append(drawing.panel(name, "ticks per bin"))
+    return panels
+
+
+def _tracking_table(figures: Mapping[str, Any]) -> tables.Table | None:
+    """Tracking error by way of control; None where nothing was tracked."""
+    names, rows = dict(TRACKED), []
+    if figures.get("feedforward"):
+        names["feedforward"] = f"with feed-forward of the {figures['feedforward']} model"
+    for name, values in (figures.get("tracking") or {}).items():
+        if not (isinstance(values, Mapping) and values.get("rms_rad")):
+            continue
+        rms = 1e3 * np.array(values["rms_rad"], float)
+        most = values.get("max_rad")
+        rows.append(
+            [
+                names.get(name, name.replace("_", " ")),
+                words.count(values.get("samples") or 0),
+                words.number(float(np.sqrt(np.mean(rms**2)))),
+                words.number(None if not most else 1e3 * max(most)),
+            ]
+        )
+    heads = ["Control", "Samples", "rms, all joints", "largest"]
+    return tables.Table(heads, rows, ["", "", "mrad", "mrad"]) if rows else None

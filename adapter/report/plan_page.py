@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from adapter.control.cell import Cell
+from adapter.control.cell import Box, Cell, Mesh
 from adapter.control.free_path import ArmInCell, Clearance
 from adapter.control.limits import MotionLimits
 from adapter.control.meshes import read_mesh
@@ -106,18 +106,17 @@ def _outlines(cell: Cell) -> list[Array]:
     """Lines (k, 3) that show a cell's boxes and cylinders, boxes around its meshes, and a piece of
     each plane."""
     loop = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1]], dtype=float)
-    found = []
-    for box in cell.box:
-        R, half = matrix_from_rpy(box.rpy), 0.5 * np.array(box.size)
-        corners = np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
-        found.append(np.array(box.xyz) + (corners * half) @ R.T)
-    for mesh in cell.mesh:
-        low, high = (
-            f(read_mesh(mesh.file, (mesh.scale,)).corners, axis=0) for f in (np.min, np.max)
-        )
-        corners = np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
-        inside = 0.5 * (low + high) + corners * 0.5 * (high - low)
-        found.append(np.array(mesh.xyz) + inside @ matrix_from_rpy(mesh.rpy).T)
+    found, corners = [], np.vstack([np.c_[loop, np.full(5, z)] for z in (-1.0, 1.0)])
+    things: list[Box | Mesh] = [*cell.box, *cell.mesh]
+    for thing in things:
+        middle, half = np.zeros(3), np.zeros(3)
+        if isinstance(thing, Box):
+            half = 0.5 * np.array(thing.size)
+        else:
+            at = read_mesh(thing.file, (thing.scale,)).corners
+            middle, half = 0.5 * (at.min(axis=0) + at.max(axis=0)), 0.5 * np.ptp(at, axis=0)
+        around = middle + corners * half
+        found.append(np.array(thing.xyz) + around @ matrix_from_rpy(thing.rpy).T)
     angle = np.linspace(0.0, 2.0 * np.pi, RIM)
     for each in cell.cylinder:
         ring = each.radius * np.c_[np.cos(angle), np.sin(angle)]

@@ -14,6 +14,7 @@ from adapter.report.headline import against
 from adapter.report.torque_panels import SHARE_ALONE, refusal, theta_started
 from adapter.report.words import (
     GOALS,
+    NOT_WATCHED,
     count,
     is_live,
     missed_words,
@@ -165,11 +166,7 @@ def _learner(data: RunData) -> Check | None:
 def _new(figures: Mapping[str, Any]) -> Check | None:
     new = figures.get("disagreements")
     if new is None:
-        return Check(
-            LOOK,
-            "New disagreements",
-            "not watched for in batches (--every above 1) and where the base floats",
-        )
+        return Check(LOOK, "New disagreements", NOT_WATCHED)
     if not_learned(figures):
         return Check(BAD, "New disagreements", f"{len(new)}, listed among the warnings")
     if new:

@@ -13,6 +13,7 @@ from adapter.runs.score import POSITION_GOAL_M, ROTATION_GOAL_RAD
 NARROW = "\u202f"  # a space that does not break, between a number and its unit
 JOIN = "\u2060"  # no break here
 GOALS = f"{ROTATION_GOAL_RAD:g}{NARROW}rad and {1e3 * POSITION_GOAL_M:g}{NARROW}mm"
+NOT_WATCHED = "not watched for in batches (--every above 1) and where the base floats"
 
 REFUSALS = {
     "non_finite": "a reading was not a finite number",

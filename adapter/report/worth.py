@@ -84,27 +84,20 @@ def torque_fall(data: RunData) -> Fall | None:
         after_std = _known(theta.get(keys[1]))
         seen = "on data held out"
         return Fall(before, np.array(held_out, float), before_std, after_std, size, seen)
-    rows = unseen_rows(data)
+    t, converged = data.times(data.score_trace), data.converged_s("theta")
+    rows = (t >= (t[0] + SETTLING_S if converged is None else converged)) & fit_rows(data)
     if rows.sum() < FEWEST_ROWS:
         return None
     after, seen = rms_of([error[rows]]), "predicted before it was learned from"
     if data.documented.tree.floating:  # the base's motion is not kept for the page
         return Fall(None, after.value, None, after.std, size, seen)
-    documented = ModelTorque(data.documented)(q, dq, ddq, data.times(data.score_trace))
+    documented = ModelTorque(data.documented)(q, dq, ddq, t)
     first = rms_of([(tau - documented)[rows]])
     return Fall(first.value, after.value, first.std, after.std, size, seen)
 
 
 def _known(values: Any) -> Array | None:
     return None if values is None else np.array(values, float)
-
-
-def unseen_rows(data: RunData) -> NDArray[np.bool_]:
-    """(k,) bool: rows of the score that were predicted by what had been learned well before."""
-    t = data.times(data.score_trace)
-    converged = data.converged_s("theta")
-    start = t[0] + SETTLING_S if converged is None else converged
-    return np.asarray(t >= start) & fit_rows(data)
 
 
 def fit_rows(data: RunData) -> NDArray[np.bool_]:

@@ -279,6 +279,11 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
     told = told_parameters(outcome, documented)
     theta, said = completed_theta(outcome, documented, lam, told.basis)
     share = np.einsum("ab,ab->a", told.basis, told.basis).reshape(-1, 10)
+    theta_std = np.full((bodies, 10), np.nan)
+    if known:  # of what torques told of θ; the rest is documentation
+        way = told.shown_map()
+        variance_told = np.einsum("ai,ij,aj->a", way, outcome.covariance, way)
+        theta_std = np.sqrt(np.maximum(variance_told, 0.0)).reshape(-1, 10)
     return replace(
         documented,
         name=f"{documented.name} (learned)",
@@ -287,7 +292,7 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
         base_theta=documented.base_theta,
         lam_std=np.where(shown, np.sqrt(np.maximum(variance, 0.0)), np.nan),
         lam_identifiable=shown,
-        theta_std=_shown_std(outcome, told) if known else np.full((bodies, 10), np.nan),
+        theta_std=theta_std,
         theta_identifiable=share > SHOWN_SHARE,
         effects=(*_effects(outcome, documented.tree), *_kept(documented, outcome.settings.effects)),
         lambda_source=LAMBDA_MEASURED if outcome.lam_measured else LAMBDA_REPRODUCED,
@@ -298,13 +303,6 @@ def learned_model(outcome: Outcome, documented: SelfModel, **provenance: Any) ->
             "changes": changes_at(outcome.changes_ns, outcome.payload, outcome.disagreements),
         },
     )
-
-
-def _shown_std(outcome: Outcome, told: BaseParameters) -> Array:
-    """Standard deviations (bodies, 10) of what torques told of θ; the rest is documentation."""
-    shown = told.shown_map()
-    variance = np.einsum("ai,ij,aj->a", shown, outcome.covariance, shown)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0))).reshape(-1, 10)
 
 
 def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:

@@ -134,7 +134,10 @@ def schema_score(
     """
     lam, filled = completed_lambda(outcome, documented)
     if outcome.settings.schema.imus:
-        reference = _slid(documented, reference, lam)
+        # with its links' frames, along and about their axes, where λ has them
+        ours, theirs = ((matrix_from_zxz(x[:, :3]), x[:, 3:]) for x in (lam, reference.lam))
+        R, p = slid_to(documented.tree, documented.gravity, theirs, ours)
+        reference = replace(reference, lam=np.concatenate([zxz_from_matrix(R), p], axis=1))
     seen = frame_observability(documented.tree, reference.lam, documented.gravity)
     turn, shift = course_errors(outcome, documented, reference)
     inside = (turn < ROTATION_GOAL_RAD).all(axis=1) & (shift < POSITION_GOAL_M).all(axis=1)
@@ -166,13 +169,6 @@ def schema_score(
 def _shown(std: Array) -> list[float | None]:
     """(n,) with None for joints of which no motion shows anything."""
     return [x if x > 0.0 else None for x in std.tolist()]
-
-
-def _slid(documented: SelfModel, reference: Reference, lam: Array) -> Reference:
-    """The reference with its links' frames, along and about their axes, where λ (n, 6) has them."""
-    ours, theirs = ((matrix_from_zxz(x[:, :3]), x[:, 3:]) for x in (lam, reference.lam))
-    R, p = slid_to(documented.tree, documented.gravity, theirs, ours)
-    return replace(reference, lam=np.concatenate([zxz_from_matrix(R), p], axis=1))
 
 
 class ScoreRows:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     console: Console
     output: Console
 
+DISAGREEMENT = "new disagreement"  # the label of what a monitor finds
+
 
 @cache
 def _consoles() -> dict[str, Console]:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from adapter.control.contact_kind import kind_of
 from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.observer import ContactObserver
@@ -24,7 +23,7 @@ from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.learning.settings import LearnerSettings
 from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
-from adapter.runs.contacts import ReplayObserver
+from adapter.runs.contacts import ReplayObserver, kind_of
 from adapter.runs.pipeline import make_front_end, make_learner
 from drivers.interface import Array, JointSample
 from drivers.pybullet_arm import PyBulletArm

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from adapter.cli.main import build_parser
-from adapter.cli.run import controller_of, open_arm, run_plan
+from adapter.cli.run import controller_of, run_plan
 from adapter.control.excitation import RandomMotion
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
@@ -95,7 +95,7 @@ def learn(
         plan = replace(plan, config=config)
     front_end = make_front_end(robot, config.pipeline)
     learner = make_learner(robot, config.pipeline)
-    arm = task.arm_of(world.scenario, task.seed) if task.arm_of else open_arm(args, plan)
+    arm = task.arm_of(world.scenario, task.seed) if task.arm_of else plan.open(args.driver, False)
     controller = controller_of(args, plan, arm)
     watched = Watched(learner, look)
     result = run_lockstep(arm, front_end, watched, controller, args.duration)

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from adapter.cli.main import build_parser, main
-from adapter.cli.run import controller_of, open_arm, run_plan
+from adapter.cli.run import controller_of, run_plan
 from adapter.control.designed import DesignedMotion
 from adapter.control.limits import MotionLimits
 from adapter.effects.splits import LOADS, SPEEDS
@@ -90,7 +90,7 @@ def test_wrong_use_is_one_sentence(options, said, tmp_path, capsys):
 def test_run_follows_a_designed_motion_with_the_documented_model():
     args = build_parser().parse_args(["run", "--excitation", "designed", "--move", "panda_joint4"])
     plan = run_plan(args)
-    arm = open_arm(args, plan)
+    arm = plan.open(args.driver, False)
     controller = controller_of(args, plan, arm)
     arm.connect()
     try:

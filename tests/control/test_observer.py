@@ -8,11 +8,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from adapter.control.contact_kind import Kind, kind_of
 from adapter.control.observer import ContactObserver, ObserverSettings
 from adapter.errors import SettingsError
 from adapter.realtime.following import FollowingObserver
 from adapter.realtime.snapshot import SnapshotReader, SnapshotWriter, nothing_known
+from adapter.runs.contacts import Kind, kind_of
 from drivers.interface import JointSample
 from sim.effects import payload
 from sim.truth import panda

@@ -12,7 +12,7 @@ from adapter.report.headline import headline
 from adapter.report.worth import Worth
 from adapter.runs import live
 from adapter.runs.config import PipelineSettings
-from adapter.runs.live_screen import FIRST_S
+from adapter.runs.live import FIRST_S
 from adapter.runs.pipeline import make_front_end
 from adapter.runs.run_folder import run_data
 from adapter.runs.score import Course, figures, reference_from

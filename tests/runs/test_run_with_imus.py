@@ -9,7 +9,7 @@ import pytest
 
 from adapter.cli import main
 from adapter.cli.main import build_parser
-from adapter.cli.run import open_arm, run_plan
+from adapter.cli.run import run_plan
 from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
@@ -35,7 +35,7 @@ def test_run_and_replay_agree(tmp_path) -> None:
     plan = run_plan(args)
     settings = plan.config.pipeline
     assert settings.learner.schema.imus == LINKS
-    arm, learner = open_arm(args, plan), make_learner(plan.robot, settings)
+    arm, learner = plan.open(args.driver, False), make_learner(plan.robot, settings)
     controller = ExcitationController(MotionLimits.of(plan.robot), ExcitationSettings(seed=3))
     path = tmp_path / "run.mcap"
     with McapWriter(path, arm.joint_names, arm.link_names) as writer:

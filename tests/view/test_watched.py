@@ -30,8 +30,7 @@ from adapter.realtime.showing import Looker, View
 from adapter.realtime.snapshot import ExternalTorque, SnapshotReader, SnapshotWriter
 from adapter.realtime.timing import Histogram, Timing
 from adapter.runs.config import PipelineSettings
-from adapter.runs.live import Publisher, news_of, single_thread_learner
-from adapter.runs.live_screen import FIRST_S
+from adapter.runs.live import FIRST_S, Publisher, news_of, single_thread_learner
 from adapter.runs.pipeline import make_front_end
 from adapter.signals.records import stamp_of
 from adapter.view import foxglove_view
