@@ -32,8 +32,8 @@ from adapter.control.path_motion import (
     SineMotion,
     largest,
     moving,
-    ramp_factors,
     ramp_pairs,
+    ramped,
     usable_range,
 )
 from adapter.control.settings import ExcitationSettings
@@ -124,15 +124,10 @@ def _bounds(
     speed, acceleration, jerk = (
         np.abs(value).max(axis=0) + extra for value, extra in zip(values[1:], more[1:], strict=True)
     )
-    c1, c2 = ramp_factors(settings)
     ramps = ramp_pairs(settings) @ np.array([acceleration, speed])
-    return (
-        q0 + values[0].min(axis=0) - more[0],
-        q0 + values[0].max(axis=0) + more[0],
-        speed,
-        ramps.max(axis=0),
-        jerk + 3.0 * c1 * acceleration + c2 * speed,
-    )
+    jerk = ramped(speed, acceleration, jerk, settings)[2]
+    lower, upper = q0 + values[0].min(axis=0) - more[0], q0 + values[0].max(axis=0) + more[0]
+    return lower, upper, speed, ramps.max(axis=0), jerk
 
 
 class Gauge:
@@ -151,9 +146,9 @@ class Gauge:
         self._down = np.maximum(q0 - lower, np.minimum(LEAST_ROOM, 0.5 * (q0 - limits.lower)))
         self._width = settings.range_share * (upper - lower)
         self._up, self._down = np.fmax(self._up, 1e-9), np.fmax(self._down, 1e-9)
-        self._share, self._limits = settings.share, limits
+        self._limits = limits
         self._velocity = SPEED_ROOM * settings.share * limits.velocity
-        self._ramps, self._jerk_ramps = ramp_pairs(settings), ramp_factors(settings)
+        self._ramps, self._settings = ramp_pairs(settings), settings
 
     def __call__(self, x: Array) -> tuple[Array, Array]:
         """(n,) gauges, and the linear functions (n, 2 k) that they are where they are largest."""
@@ -166,15 +161,15 @@ class Gauge:
             turned.append(part[at] * np.sign(value[at, joints])[:, None])
         speed, acceleration, jerk = turned
         high, low = self._grid.q[top], self._grid.q[foot]
-        c1, c2 = self._jerk_ramps
-        most = self._share * self._limits.acceleration, self._share * self._limits.jerk
+        share, limits = self._settings.share, self._limits
+        most = share * limits.acceleration, share * limits.jerk
         rows = [
             high / self._up[:, None],
             -low / self._down[:, None],
             (high - low) / self._width[:, None],
             speed / self._velocity[:, None],
             *((r * acceleration + d * speed) / most[0][:, None] for r, d in self._ramps),
-            (jerk + 3.0 * c1 * acceleration + c2 * speed) / most[1][:, None],
+            ramped(speed, acceleration, jerk, self._settings)[2] / most[1][:, None],
         ]
         table = np.array([(row * x).sum(axis=1) for row in rows])
         worst = table.argmax(axis=0)

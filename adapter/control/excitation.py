@@ -19,7 +19,7 @@ from adapter.control.path_motion import (
     SineMotion,
     largest,
     moving,
-    ramp_factors,
+    ramped,
     usable_range,
 )
 from adapter.control.settings import ExcitationSettings
@@ -85,14 +85,8 @@ class RandomMotion(SineMotion):
         reach, speed, acceleration, jerk = (
             (self.amplitude * self.omega**k).sum(axis=1) for k in range(4)
         )
-        c1, c2 = ramp_factors(self.settings)
-        return (
-            self.centre - reach,
-            self.centre + reach,
-            speed,
-            acceleration + c1 * speed,
-            jerk + 3.0 * c1 * acceleration + c2 * speed,
-        )
+        bounds = ramped(speed, acceleration, jerk, self.settings)
+        return self.centre - reach, self.centre + reach, *bounds
 
 
 def _scale(
@@ -105,19 +99,12 @@ def _scale(
 ) -> Array:
     """Factor (n,) on the amplitudes with which every limit holds for all time.
 
-    With ramps of T seconds |ddq| <= A + V c1 / T and |jerk| <= J + 3 A c1 / T + V c2 / T², where
-    V, A, J are the sums of |a_i| w_i^k and c1, c2 those of the ramps.
+    Speed, acceleration and jerk of the path are at most the sums of |a_i| w_i^k.
     """
-    c1, c2 = ramp_factors(settings)
     reach, speed, acceleration, jerk = ((relative * omega**k).sum(axis=1) for k in range(4))
     room = settings.range_share * 0.5 * (upper - lower)
-    wanted = settings.share * np.array(
-        [
-            limits.velocity / speed,
-            limits.acceleration / (acceleration + c1 * speed),
-            limits.jerk / (jerk + 3.0 * c1 * acceleration + c2 * speed),
-        ]
-    )
+    allowed = np.array([limits.velocity, limits.acceleration, limits.jerk])
+    wanted = settings.share * (allowed / ramped(speed, acceleration, jerk, settings))
     factor: Array = np.minimum(room / reach, wanted.min(axis=0))
     return factor
 

@@ -180,10 +180,17 @@ def moving(limits: MotionLimits, settings: ExcitationSettings) -> Array:
     return np.array([name in wanted for name in names]) if names else np.ones(len(limits.effort))
 
 
-def ramp_factors(settings: ExcitationSettings) -> tuple[float, float]:
-    """Bounds on the slope, 1/s, and on the second derivative, 1/s², of the path's rate."""
+def ramped(
+    speed: Array, acceleration: Array, jerk: Array, settings: ExcitationSettings
+) -> tuple[Array, Array, Array]:
+    """Bounds of a motion on a path with these bounds, while its rate changes in T seconds, too.
+
+    |ddq| <= A + V c1 / T and |jerk| <= J + 3 A c1 / T + V c2 / T², where V, A, J are the path's
+    and c1, c2 those of the ramps.
+    """
     ramp = min(settings.start_s, settings.stop_s)
-    return RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+    c1, c2 = RAMP_SLOPE / ramp, RAMP_BEND / ramp**2
+    return speed, acceleration + c1 * speed, jerk + 3.0 * c1 * acceleration + c2 * speed
 
 
 @lru_cache

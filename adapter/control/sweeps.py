@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adapter.control.limits import MotionLimits
-from adapter.control.path_motion import PathMotion, ramp_factors, usable_range
+from adapter.control.path_motion import PathMotion, ramped, usable_range
 from adapter.control.settings import ExcitationSettings
 from adapter.effects.splits import BOTH_WAYS, SPEEDS, STILL, TURN, TURNS, DecidingExperiment
 from adapter.errors import SettingsError
@@ -143,11 +143,5 @@ class SweepMotion(PathMotion):
         np.maximum.at(speed, self._joint, size)
         np.maximum.at(acceleration, self._joint, STEP_SLOPE * size / self._ramp)
         np.maximum.at(jerk, self._joint, STEP_BEND * size / self._ramp**2)
-        c1, c2 = ramp_factors(self.settings)
-        return (
-            rests.min(axis=0),
-            rests.max(axis=0),
-            speed,
-            acceleration + c1 * speed,
-            jerk + 3.0 * c1 * acceleration + c2 * speed,
-        )
+        bounds = ramped(speed, acceleration, jerk, self.settings)
+        return rests.min(axis=0), rests.max(axis=0), *bounds

@@ -136,7 +136,7 @@ def linear_misfit(bodies: Bodies, joints: np.ndarray) -> dict[str, Array]:
         k: np.empty((bodies.links, len(joints), bodies.count)) for k in channels
     }
     for k in channels:
-        bases = [_orthonormal(_signals(bodies, k, i)) for i in range(bodies.count)]
+        bases = [_spanning(bodies, k, i) for i in range(bodies.count)]
         starts = np.cumsum([0, *(b.shape[1] for b in bases[:-1])])
         every = np.concatenate(bases, axis=1)
         for j in range(bodies.links):
@@ -147,18 +147,17 @@ def linear_misfit(bodies: Bodies, joints: np.ndarray) -> dict[str, Array]:
     return out
 
 
-def _signals(bodies: Bodies, channel: str, body: int) -> Array:
-    """(m, 6) or (m, 12): all that z of v or a is linear in, for one parent."""
+def _spanning(bodies: Bodies, channel: str, body: int) -> Array:
+    """Orthonormal columns (m, rank) that span all that z of v or a is linear in, for one parent.
+
+    One zero column where all of that is zero.
+    """
     x, w = bodies.motion[channel][:, body], bodies.motion["w"][:, body]
-    if channel == "v":
-        return np.concatenate([x, w], axis=1)
-    products = w[:, [0, 0, 0, 1, 1, 2]] * w[:, [0, 1, 2, 1, 2, 2]]
-    return np.concatenate([x, bodies.motion["dw"][:, body], products], axis=1)
-
-
-def _orthonormal(x: Array) -> Array:
-    """Orthonormal columns (m, rank) that span those of x; one zero column for x = 0."""
-    u, values, _ = np.linalg.svd(x, full_matrices=False)
+    parts = [x, w]
+    if channel == "a":
+        products = w[:, [0, 0, 0, 1, 1, 2]] * w[:, [0, 1, 2, 1, 2, 2]]
+        parts = [x, bodies.motion["dw"][:, body], products]
+    u, values, _ = np.linalg.svd(np.concatenate(parts, axis=1), full_matrices=False)
     kept = u[:, values > FLAT_SIGNAL * max(float(values[0]), 1e-300)]
     return kept if kept.shape[1] else np.zeros((len(x), 1))
 

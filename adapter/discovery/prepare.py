@@ -112,6 +112,10 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:
     noise = {k: _noise(x) * through.passes for k, x in channels.values.items()}
     motion = {k: through(x) for k, x in even.motion.items()}
     without_w = _complete_turning(motion, noise, channels, through)
+    # typical frequency: rms acceleration, less what is noise in it, over rms speed
+    speed = np.sqrt(np.mean(dq[keep] ** 2))
+    change = np.sqrt(max(float(np.mean(ddq[keep] ** 2) - np.mean(joint_noise["ddq"])), 0.0))
+    motion_hz = np.clip(change / max(2 * np.pi * speed, STILL), 0.05, through.cutoff_hz)
     moving = float(np.abs(dq[: 2 * through.edge]).max()) > RESTING
     notes = channels.notes
     if without_w.any():
@@ -128,7 +132,7 @@ def prepare(log: Log, cutoff_hz: float = CUTOFF_HZ) -> PreparedLog:
         measured=channels.measured,
         noise=noise,
         joint_noise=joint_noise,
-        motion_hz=_motion_hz(dq[keep], ddq[keep], joint_noise["ddq"], through.cutoff_hz),
+        motion_hz=float(motion_hz),
         rate_hz=even.rate_hz,
         samples=int(keep.sum()),
         duration_s=float(keep.sum() * through.step / even.rate_hz),
@@ -376,13 +380,6 @@ def _joint_signals(
         noise["ddq"] = noise["dq"] * (2 * np.pi * through.cutoff_hz) ** 2
     noise["q"] = np.minimum(noise["q"], ENCODER_STEP**2)
     return q, dq, through.rate_of(dq), noise
-
-
-def _motion_hz(dq: Array, ddq: Array, noise: Array, most_hz: float) -> float:
-    """Typical frequency: rms acceleration, less what is noise in it, over rms speed."""
-    speed = np.sqrt(np.mean(dq**2))
-    change = np.sqrt(max(float(np.mean(ddq**2)) - float(np.mean(noise)), 0.0))
-    return float(np.clip(change / max(2 * np.pi * speed, STILL), 0.05, most_hz))
 
 
 def _complete_turning(

@@ -15,7 +15,7 @@ shift, take a few products of tensors.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from adapter.errors import ModelError
-from adapter.learning.tree_data import BodyMotion, TreeData, check_motion
+from adapter.learning.tree_data import TreeData, check_motion
 from adapter.model.spatial import Array, matrix_from_zxz, zxz_from_matrix
 from adapter.model.tree import BASE
 from adapter.physics.networks import turn_z
@@ -108,18 +108,30 @@ def schema_by_networks(
         )
     check_motion(data)
     signals = network_signals(data, _channels(data))
-    rng = np.random.default_rng(seed)
-    frames = _random_starts(data.tree.n, settings, rng)
-    total = settings.cycles * (len(data) // settings.minibatch)
+    rng, span = np.random.default_rng(seed), settings.position_span
+    angles = rng.uniform(-np.pi, np.pi, (data.tree.n, settings.starts, 3))
+    p = rng.uniform(-span, span, angles.shape)
+    frames = StartFrames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
+    batches = len(data) // settings.minibatch  # of a cycle; a rest is left out
+    total = settings.cycles * batches
     kept, losses = {}, np.empty((total, data.tree.n, settings.starts))
     curvature, gain = torch.zeros(()), 1.0
-    for epoch, rows in enumerate(_batches(len(data), settings, rng)):
+    for epoch in range(total):
+        if epoch % batches == 0:
+            order = rng.permutation(len(data))[: batches * settings.minibatch]
+            shuffled = order.reshape(batches, settings.minibatch)
         if epoch in settings.snapshots:
             kept[epoch] = _lam(frames)
-        cost, slope, own = slope_and_curvature(frames, signals.take(rows))
-        gain = _gain(settings, gain, epoch / total)
+        batch = signals.take(shuffled[epoch % batches])
+        cost, slope, own = slope_and_curvature(frames, batch)
+        # the newest batch weighs 1, 1/2, 1/3, ... down to `gain`, and on so where that may fall
+        least = settings.gain if epoch / total < settings.constant else 0.0
+        gain = max(least, gain / (1.0 + gain)) if epoch else 1.0
         curvature = (1.0 - gain) * curvature + gain * own
-        frames = frames.moved(_shortened(gain * newton_step(slope, curvature), settings))
+        step = (gain * newton_step(slope, curvature)).unflatten(-1, (2, 3))
+        length = step.norm(dim=-1, keepdim=True)  # of the turn and of the shift
+        share = (settings.longest_step / length.clamp_min(1e-300)).clamp_max(1.0)
+        frames = frames.moved((step * share).flatten(-2))
         losses[epoch] = cost.numpy()
     kept[total] = _lam(frames)
     final = costs(frames, signals).numpy()
@@ -137,37 +149,6 @@ def _channels(data: TreeData) -> list[str]:
     with_speed = data.links.v is not None and data.base.v is not None
     by_twist = with_speed and data.tree.floating
     return ["w", *(["v"] if with_speed else []), *([] if by_twist else ["a"])]
-
-
-def _random_starts(n: int, settings: NetworkSettings, rng: np.random.Generator) -> StartFrames:
-    """Uniform angles, positions within ± the span."""
-    angles = rng.uniform(-np.pi, np.pi, (n, settings.starts, 3))
-    p = rng.uniform(-settings.position_span, settings.position_span, angles.shape)
-    return StartFrames(torch.from_numpy(matrix_from_zxz(angles)), torch.from_numpy(p))
-
-
-def _batches(
-    count: int, settings: NetworkSettings, rng: np.random.Generator
-) -> Iterator[np.ndarray]:
-    """Rows of every mini-batch of every cycle, shuffled anew each cycle; a rest is left out."""
-    whole = count // settings.minibatch
-    for _ in range(settings.cycles):
-        order = rng.permutation(count)[: whole * settings.minibatch]
-        yield from order.reshape(whole, settings.minibatch)
-
-
-def _gain(settings: NetworkSettings, last: float, done: float) -> float:
-    """Weight of the newest batch: 1, 1/2, 1/3, ... to `gain`, and on so where it is to fall."""
-    least = settings.gain if done < settings.constant else 0.0
-    return max(least, last / (1.0 + last)) if done > 0.0 else 1.0
-
-
-def _shortened(step: torch.Tensor, settings: NetworkSettings) -> torch.Tensor:
-    """Turn and shift (..., 6) no longer than the longest step each."""
-    both = step.unflatten(-1, (2, 3))
-    length = both.norm(dim=-1, keepdim=True)
-    share = (settings.longest_step / length.clamp_min(1e-300)).clamp_max(1.0)
-    return (both * share).flatten(-2)
 
 
 def _converged(frames: StartFrames, signals: NetworkSignals) -> np.ndarray:
@@ -247,10 +228,11 @@ def network_signals(data: TreeData, channels: Sequence[str]) -> NetworkSignals:
     """
     assert data.links is not None
     q = torch.from_numpy(np.ascontiguousarray(data.q))
-    up = {
-        name: _of_parents(data.tree.parent, data.base, data.links, name)
-        for name in {"w", "dw", *channels}
-    }
+    up, parents = {}, [i - BASE for i in data.tree.parent]
+    for name in {"w", "dw", *channels}:
+        bodies = getattr(data.base, name)[:, None], getattr(data.links, name)
+        every = np.concatenate(bodies, axis=1)[:, parents]
+        up[name] = torch.from_numpy(np.ascontiguousarray(every))
     spin = cross_matrix(up["w"])
     carried = {"w": torch.zeros_like(spin), "v": spin, "a": cross_matrix(up["dw"]) + spin @ spin}
     y = []
@@ -261,12 +243,6 @@ def network_signals(data: TreeData, channels: Sequence[str]) -> NetworkSignals:
         y.append(turn_z(q, own))
     z, w = [up[name] for name in channels], [carried[name] for name in channels]
     return NetworkSignals(*(torch.stack(parts, dim=2) for parts in (y, z, w)))
-
-
-def _of_parents(parent: tuple[int, ...], base: BodyMotion, links: BodyMotion, name: str) -> Tensor:
-    """A signal (m, n, 3) of the parent of every joint."""
-    every = np.concatenate([getattr(base, name)[:, None], getattr(links, name)], axis=1)
-    return torch.from_numpy(np.ascontiguousarray(every[:, [i - BASE for i in parent]]))
 
 
 def residuals(frames: StartFrames, s: NetworkSignals) -> tuple[Tensor, Tensor]:

@@ -8,25 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from adapter.control.controller import ExcitationController
-from adapter.control.limits import MotionLimits
-from adapter.control.settings import ExcitationSettings
 from adapter.effects.catalogue import REAL_ARM_EFFECTS
 from adapter.experiments.results import PandaResults
 from adapter.experiments.stated import panda_stated
-from adapter.experiments.topology import panda_logs, topology_trials
+from adapter.experiments.topology import panda_logs, panda_moves, topology_trials
 from adapter.learning.settings import LearnerSettings
 from adapter.model.robots import documented
 from adapter.model.spatial import Array
-from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.outcome import collect
-from adapter.runs.pipeline import make_front_end, make_learner
+from adapter.runs.pipeline import make_learner
 from adapter.runs.run_folder import RunData, run_data
 from adapter.runs.score import TORQUE_WINDOW_S, Course, figures, reference_from, trailing_rms
 from adapter.runs.terminal import json_ready
-from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 
 
@@ -99,18 +93,8 @@ def run_panda(seed: int, duration_s: float, topologies: int) -> PandaResults:
     """
     robot, world = documented("panda"), build("nominal", seed)
     settings = PipelineSettings(learner=LearnerSettings(seed=seed, effects=REAL_ARM_EFFECTS))
-    front_end, learner = make_front_end(robot, settings), make_learner(robot, settings)
-    controller = ExcitationController(MotionLimits.of(robot), ExcitationSettings(seed=seed))
-    stamps: list[int] = []
-
-    def note(sample: JointSample, command: object) -> None:
-        stamps.append(sample.stamp_ns)
-
-    arm = PyBulletArm(world.plant())
-    try:
-        done = run_lockstep(arm, front_end, learner, controller, duration_s, each=note)
-    finally:
-        arm.close()
+    learner = make_learner(robot, settings)
+    _, samples, front_end = panda_moves(world, robot, duration_s, settings, learner)
     with tempfile.TemporaryDirectory() as folder:
         truth = Path(folder) / "truth.json"
         world.write_truth(truth)
@@ -120,7 +104,7 @@ def run_panda(seed: int, duration_s: float, topologies: int) -> PandaResults:
         outcome,
         robot,
         reference,
-        Course(done.samples, front_end.refused, front_end.first_moving_ns, front_end.delay_s),
+        Course(len(samples), front_end.refused, front_end.first_moving_ns, front_end.delay_s),
     )
     run = run_data(
         outcome,
@@ -131,4 +115,5 @@ def run_panda(seed: int, duration_s: float, topologies: int) -> PandaResults:
         first_moving_ns=front_end.first_moving_ns,
     )
     found = topology_trials(panda_logs(topologies, seed), robot.tree, seed)
-    return panda_results(run, (len(stamps) - 1) / (1e-9 * (stamps[-1] - stamps[0])), found)
+    span_s = 1e-9 * (samples[-1].stamp_ns - samples[0].stamp_ns)
+    return panda_results(run, (len(samples) - 1) / span_s, found)

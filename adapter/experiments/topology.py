@@ -16,17 +16,20 @@ from adapter.control.controller import ExcitationController
 from adapter.control.limits import MotionLimits
 from adapter.control.settings import ExcitationSettings
 from adapter.discovery import UNSEEN_BASE, Discovery, discover
+from adapter.learning.learner import OnlineLearner
 from adapter.model.robots import documented
+from adapter.model.self_model import SelfModel
 from adapter.model.tree import BASE, Tree
 from adapter.realtime.session import run_lockstep
 from adapter.runs.config import PipelineSettings
 from adapter.runs.pipeline import make_front_end
+from adapter.signals.front_end import FrontEnd
 from drivers.files.mcap import Log
 from drivers.interface import JointSample
 from drivers.pybullet_arm import PyBulletArm
 from sim.falls.data_set import FallData
 from sim.falls.fall import RATE_HZ
-from sim.scenarios import build
+from sim.scenarios import Scenario, build
 
 MOTION_S = 10.0  # of each recording, from its start (the project's goal: at most that)
 Edges = frozenset[tuple[str, str, str]]  # (joint, the link it moves, its parent)
@@ -132,23 +135,35 @@ def fall_logs(noisy: FallData, count: int) -> Iterator[Log]:
         yield _first(log)
 
 
+def panda_moves(
+    world: Scenario,
+    robot: SelfModel,
+    duration_s: float,
+    settings: PipelineSettings,
+    learner: OnlineLearner | None = None,
+) -> tuple[PyBulletArm, list[JointSample], FrontEnd]:
+    """A simulated arm moves by itself, drawn by its seed; what it said, and what heard it."""
+    samples: list[JointSample] = []
+    arm, front_end = PyBulletArm(world.plant()), make_front_end(robot, settings)
+    excitation = ExcitationSettings(seed=world.seed)
+    controller = ExcitationController(MotionLimits.of(robot), excitation)
+
+    def keep(sample: JointSample, command: object) -> None:
+        samples.append(sample)
+
+    try:
+        run_lockstep(arm, front_end, learner, controller, duration_s, each=keep)
+    finally:
+        arm.close()
+    return arm, samples, front_end
+
+
 def panda_logs(count: int, seed: int) -> Iterator[Log]:
     """What simulated Pandas with bent links say, each moving by itself; one log per seed."""
     robot = documented("panda")
-    limits = MotionLimits.of(robot)
     for k in range(seed, seed + count):
-        arm = PyBulletArm(build("bent_link", k).plant())
-        controller = ExcitationController(limits, ExcitationSettings(seed=k))
-        samples: list[JointSample] = []
-
-        def keep(sample: JointSample, command: object, into: list[JointSample] = samples) -> None:
-            into.append(sample)
-
-        front_end = make_front_end(robot, PipelineSettings())
-        try:
-            run_lockstep(arm, front_end, controller=controller, duration_s=MOTION_S, each=keep)
-        finally:
-            arm.close()
+        world = build("bent_link", k)
+        arm, samples, _ = panda_moves(world, robot, MOTION_S, PipelineSettings())
         links = [sample.links for sample in samples if sample.links is not None]
         log = Log(
             Path("simulated Panda"),

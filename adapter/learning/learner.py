@@ -150,7 +150,7 @@ class OnlineLearner:
         theta_started_ns: stamp at which θ began; None before.
         rebuilds: times that θ's moments were rebuilt for a better λ.
         changes: at the hand, in order.
-        screen: judges the states that `step` is given, see `adapter.runs.live_screen`; verdict:
+        screen: judges the states that `step` is given, see `adapter.runs.live`; verdict:
             what it said last.
 
     Raises:
@@ -198,11 +198,11 @@ class OnlineLearner:
         by_rates = any(effect.by_rates for effect in self.theta.effects)
         self._rates = TorqueRates(tree, self.theta.smoothing_s, filtered.delay_s)
         self.rates = self._rates if by_rates else None
-        places, column = [], 0
-        for effect in self.theta.effects:
-            if effect.rate is not None:
-                places.append((column, self.layout.rates.start + effect.rate * tree.n))
-            column += len(effect.shapes) or 1
+        places = [
+            (own.start, self.layout.rates.start + effect.rate * tree.n)
+            for effect, own in zip(self.theta.effects, self.theta.own, strict=True)
+            if effect.rate is not None
+        ]
         self._which = np.array(places, dtype=np.int64).reshape(-1, 2)
         self._rates_known = False
         self.given, self.documented = tuple(known.effects), known.theta

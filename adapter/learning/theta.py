@@ -128,6 +128,7 @@ class Theta:
             all that was known then.
         hand, spare: (slices of P) the hand's body, and the one that stands in for it after a
             change, when `spare_in_use`.
+        own: by effect, which of all effects' columns are its own.
         shapes: (e, n) of the effects that have several columns, chosen between their shapes by what
             the data say; NaN for the others.
         believed: (e, n) of effects before any torque, see `ThetaKnowledge`; NaN without belief.
@@ -158,7 +159,10 @@ class Theta:
         self.hand = slice(first, first + 10)
         self.spare = slice(self._effects_from - 10, self._effects_from)
         self._parent = np.array(tree.parent, dtype=np.int64)
-        self.columns = sum(len(effect.shapes) or 1 for effect in self.effects)
+        widths = [len(effect.shapes) or 1 for effect in self.effects]
+        self.columns = sum(widths)
+        ends = np.cumsum(widths, dtype=int).tolist()
+        self.own = [slice(end - width, end) for end, width in zip(ends, widths, strict=True)]
         self.rows = rows_of(tree, self.effects)
         self.shapes = np.full((e, n), np.nan)
         self._choose_shapes(known.shapes)
@@ -496,7 +500,7 @@ class Theta:
         shares = [
             self.rows.share[j, size - self.columns : size] for j, size in enumerate(self.rows.sizes)
         ]
-        first = np.cumsum([0, *(len(effect.shapes) or 1 for effect in self.effects)])[:-1]
+        first = [own.start for own in self.own]
         # whether an effect acts at all; of one that does not no data speak
         acting = np.add.reduceat(np.array(shares), first, axis=1).T > 0.0
         found = [
@@ -531,13 +535,11 @@ class Theta:
             if effect.shapes:
                 told = np.full(self.tree.n, np.nan) if shapes is None else shapes[k]
                 self.shapes[k] = np.where(np.isfinite(told), told, effect.shapes[FIRST_SHAPE])
-        first = 0
-        for effect, shape in zip(self.effects, self.shapes, strict=True):
-            shares = effect.shares(shape)
+        for effect, shape, own in zip(self.effects, self.shapes, self.own, strict=True):
             for j, size in enumerate(self.rows.sizes if effect.shapes else ()):
-                begin = size - self.columns + first
-                self.rows.share[j, begin : begin + len(shares)] = shares[:, j]
-            first += len(shares)
+                begin = size - self.columns
+                at = slice(begin + own.start, begin + own.stop)
+                self.rows.share[j, at] = effect.shares(shape)[:, j]
 
     def _look_at_shapes(self) -> None:
         """Choose shapes anew where others explain all samples better, whatever the rest is then.
@@ -549,20 +551,18 @@ class Theta:
         if not any(effect.shapes for effect in self.effects):
             return
         known, weights = self._known_of_all(), self.weights()
-        chosen, first = self.shapes.copy(), 0
+        chosen = self.shapes.copy()
         for k, effect in enumerate(self.effects):
-            columns = len(effect.shapes) or 1
-            if effect.shapes:
-                grid = np.geomspace(effect.shapes[0], effect.shapes[-1], SHAPES_TRIED)
-                for j in range(self.tree.n):
-                    own = slice(first, first + columns)
-                    S, y = self._reduced(j, k, own, weights[j], known)
-                    tried = np.r_[self.shapes[k, j], grid]
-                    s = effect.shares(tried).T
-                    gain = np.maximum(s @ y, 0.0) ** 2 / np.einsum("ga,ab,gb->g", s, S, s)
-                    if gain.max() > gain[0] + SHAPE_EVIDENCE:
-                        chosen[k, j] = tried[gain.argmax()]
-            first += columns
+            if not effect.shapes:
+                continue
+            grid = np.geomspace(effect.shapes[0], effect.shapes[-1], SHAPES_TRIED)
+            for j in range(self.tree.n):
+                S, y = self._reduced(j, k, weights[j], known)
+                tried = np.r_[self.shapes[k, j], grid]
+                s = effect.shares(tried).T
+                gain = np.maximum(s @ y, 0.0) ** 2 / np.einsum("ga,ab,gb->g", s, S, s)
+                if gain.max() > gain[0] + SHAPE_EVIDENCE:
+                    chosen[k, j] = tried[gain.argmax()]
         self._choose_shapes(chosen)
 
     def _look_at_rates(self, motion_noise: Array) -> None:
@@ -571,32 +571,30 @@ class Theta:
         Noise of ddq is in the model's torque and, with the other sign, in its second rate: without
         anything there the one takes off what the other puts on, and is learned for that.
         """
-        known, weights, first = self._known_of_all(), self.weights(), 0
+        known, weights = self._known_of_all(), self.weights()
         for k, effect in enumerate(self.effects):
             for j, size in enumerate(self.rows.sizes if effect.by_rates else ()):
-                S, y = self._reduced(j, k, slice(first, first + 1), weights[j], known)
+                S, y = self._reduced(j, k, weights[j], known)
                 told = weights[j] * max(self.moments.counts[j], 1.0)
                 explained = float(y[0] ** 2 / max(S[0, 0], TINY)) / told
                 there = explained > RATES_OVER_NOISE * motion_noise[j] + REAL_MODEL_ERROR**2
-                self.rows.share[j, size - self.columns + first] = float(there)
+                self.rows.share[j, size - self.columns + self.own[k].start] = float(there)
                 if not there:
                     own = self._effects_from + k * self.tree.n + j
                     self.x[own] = self.mean[own] = 0.0
-            first += len(effect.shapes) or 1
         values(self.mean, self.rows.steps, self.th)
 
     def _reduced(
-        self, j: int, k: int, columns: slice, weight: float, known: tuple[Array, Array]
+        self, j: int, k: int, weight: float, known: tuple[Array, Array]
     ) -> tuple[Array, Array]:
         """(K, K) and (K,) information of joint j's columns of effect k, all else integrated out.
 
         Args:
-            columns: among those of the effects.
             weight: of a sample of the joint's torque; known: see `_known_of_all`.
         """
         size, own = self.rows.sizes[j], self._effects_from + k * self.tree.n + j
         (covariance, mean), begin = known, size - self.columns
-        split = np.arange(begin + columns.start, begin + columns.stop)
+        split = begin + np.arange(self.own[k].start, self.own[k].stop)
         moments = weight * self.joint_moments(j)
         G, b = moments[np.ix_(split, split)], moments[split, -1]
         rest = np.delete(np.arange(size), split)

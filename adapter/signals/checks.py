@@ -162,18 +162,20 @@ def packed(rules: Rules) -> Array:
     return np.concatenate([*tables, [*numbers, *rules.gains]])
 
 
+# Rows of n in the packed `Memory`, in this order: last, good, doubted, usual (3 each), fastest,
+# then of the bristles place, edge, direction (1 each) and held. Behind them four rows of what
+# passes the filter: the joints' 3 n, the base's motion, b numbers, and the bristles', K n.
+BY_JOINT, FILTERED = 16 + len(WAYS_RAD), 4
+
+
 def room(n: int, base: int) -> int:
     """Numbers that `Memory` of n joints and so many of a base takes."""
-    bent = len(WAYS_RAD) * n
-    return 16 * n + bent + 4 * (3 * n + base + bent)
+    return BY_JOINT * n + FILTERED * (3 * n + base + len(WAYS_RAD) * n)
 
 
 @jit
 def unpacked(rules, memory, whole):
-    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + MARKS + 2,).
-
-    Behind the joints' 3 n the base's motion, b numbers, and the bristles', K n, pass the filter.
-    """
+    """`Rules` and `Memory` as views of (8 n + 8,), (`room`,) and (n + MARKS + 2,)."""
     n = whole.shape[0] - MARKS - 2
     rest_dq, gap_ns, states, samples = rules[8 * n], rules[8 * n + 1], rules[8 * n + 2], rules[-5]
     gains = Gains(rules[-4], rules[-3], int(rules[-2]), int(rules[-1]))
@@ -181,19 +183,12 @@ def unpacked(rules, memory, whole):
     per = int(gap_ns), int(states), int(samples)
     own = Rules(allowed, rules[4 * n : 5 * n], floor, rest_dq, per[0], per[1], per[2], gains)
     since, marks, times = whole[:n], whole[n : n + MARKS], whole[n + MARKS :]
-    tables = memory[: 12 * n].reshape(4, 3, n)
-    last, good, doubted, usual = tables[0], tables[1], tables[2], tables[3]
-    size = (memory.shape[0] - (16 + len(WAYS_RAD)) * n) // 4
-    wide = memory[12 * n : 12 * n + 4 * size]
-    ahead, old, y, dy = (
-        wide[:size],
-        wide[size : 2 * size],
-        wide[2 * size : 3 * size],
-        wide[3 * size :],
-    )
-    rest = memory[12 * n + 4 * size :].reshape(4 + len(WAYS_RAD), n)
-    state, bristles = FilterState(times, old, y, dy), Bristles(rest[1], rest[2], rest[3], rest[4:])
-    return own, Memory(last, good, doubted, usual, since, ahead, marks, state, rest[0], bristles)
+    rows = memory[: BY_JOINT * n].reshape(BY_JOINT, n)
+    wide = memory[BY_JOINT * n :].reshape(FILTERED, -1)
+    state = FilterState(times, wide[1], wide[2], wide[3])
+    bristles = Bristles(rows[13], rows[14], rows[15], rows[16:])
+    tables = rows[:3], rows[3:6], rows[6:9], rows[9:12]
+    return own, Memory(*tables, since, wide[0], marks, state, rows[12], bristles)
 
 
 @jit

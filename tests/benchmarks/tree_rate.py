@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from adapter.experiments.atlas import noisy, online_trial, without_velocity
 from adapter.experiments.falls import Falls
-from adapter.experiments.online import noisy, online_trial, without_velocity
 from adapter.learning.learner import OnlineLearner
 from adapter.learning.tree_data import TreeData
 from adapter.model.robots import documented

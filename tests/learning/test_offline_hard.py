@@ -15,7 +15,6 @@ from adapter.experiments.networks import NetworkSettings, schema_by_networks
 from adapter.learning.batch.prediction_errors import (
     kinematic_errors,
     predicted_torques,
-    torque_errors,
 )
 from adapter.learning.batch.schema import schema_from_moments
 from adapter.learning.batch.theta import BatchThetaSettings, learn_theta
@@ -25,6 +24,7 @@ from adapter.model.tree import Tree
 from adapter.physics.networks import link_motion
 from sim.falls.tree_truth import TreeTruth
 from tests.helpers.random_trees import random_tree
+from tests.helpers.torque_errors import torque_errors
 
 
 def fall(

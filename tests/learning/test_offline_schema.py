@@ -15,7 +15,6 @@ from adapter.learning.batch.schema import BatchSchemaSettings, schema_from_momen
 from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import matrix_from_zxz, rotation_angle
-from adapter.model.tree import Tree
 from adapter.physics.identifiability import frame_observability
 from tests.helpers.robot_models import PANDA, pinocchio_case, random_urdf
 
@@ -136,15 +135,6 @@ def _noisy(
     return BodyMotion(w, a, dw, read(links.v, noise.v))
 
 
-def test_moments_of_two_parts_are_those_of_the_whole() -> None:
-    _, data = samples(random_urdf(5, 6), True, 60, 6)
-    halves = schema_moments(data.take(slice(0, 25))) + schema_moments(data.take(slice(25, 60)))
-    whole = schema_moments(data)
-    np.testing.assert_allclose(halves.sums, whole.sums, rtol=1e-12, atol=1e-9)
-    assert halves.count == 60
-    np.testing.assert_allclose(schema_from_moments(halves).lam, schema_from_moments(data).lam)
-
-
 @pytest.mark.parametrize(("floating", "speed"), [(True, True), (False, False)])
 def test_networks_reach_the_same_frames(floating: bool, speed: bool) -> None:
     """Eq. 18 from random starts, mini-batches of 10, without moments."""
@@ -171,8 +161,5 @@ def test_bad_input_is_named() -> None:
         schema_from_moments(broken)
     with pytest.raises(ModelError, match="prior"):
         schema_from_moments(data, BatchSchemaSettings(prior=np.zeros((4, 6))))
-    with pytest.raises(ModelError, match="two different trees"):
-        other = replace(schema_moments(data), tree=Tree((-1, 0, 1, 2, 3), True))
-        _ = schema_moments(data) + other
     with pytest.raises(ModelError, match="mini-batch"):
         schema_by_networks(data.take(slice(0, 5)))

@@ -10,16 +10,14 @@ import torch
 from scipy.optimize import least_squares
 
 from adapter.errors import ModelError
-from adapter.learning.batch.branches import branches
 from adapter.learning.batch.prediction_errors import (
     kinematic_errors,
     predicted_torques,
     relative_errors,
-    torque_errors,
 )
 from adapter.learning.batch.schema import schema_from_moments
 from adapter.learning.batch.smoothing import Measured, SmoothingSettings, smoothed_data
-from adapter.learning.batch.theta import BatchThetaSettings, learn_theta
+from adapter.learning.batch.theta import BatchThetaSettings, branches, learn_theta
 from adapter.learning.batch.theta_factors import row_factors, scales, system
 from adapter.learning.batch.theta_solvers import (
     adam_theta,
@@ -33,6 +31,7 @@ from adapter.model.tree import Tree
 from adapter.physics.identifiability import base_parameters
 from adapter.physics.networks import link_motion, theta_from_log_cholesky, wrenches
 from tests.helpers.robot_models import random_urdf, read_quietly, shared
+from tests.helpers.torque_errors import torque_errors
 from tests.learning.test_offline_schema import samples
 
 

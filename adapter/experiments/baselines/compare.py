@@ -177,15 +177,12 @@ class Errors:
             if not self._relative[name]:
                 continue
             table = np.concatenate(self._relative[name])
-            learned.boxes[name] = np.array([_percentiles(column) for column in table.T])
-            every = table[~np.isnan(table)]
+            columns = [column[~np.isnan(column)] for column in table.T]
+            nothing = np.full(len(BOX_PERCENTILES), np.nan)
+            learned.boxes[name] = np.array(
+                [np.percentile(x, BOX_PERCENTILES) if len(x) else nothing for x in columns]
+            )
+            every = np.concatenate(columns)
             learned.median[name], learned.p99[name] = map(float, np.percentile(every, (50, 99)))
             learned.rmse[name] = np.sqrt(self._square[name] / max(self._count[name], 1))
         return learned
-
-
-def _percentiles(column: Array) -> Array:
-    judged = column[~np.isnan(column)]
-    if not len(judged):
-        return np.full(len(BOX_PERCENTILES), np.nan)
-    return np.asarray(np.percentile(judged, BOX_PERCENTILES))

@@ -88,7 +88,10 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
     shown = DASH
     if rank is not None and joints is not None:
         shown = f"{grouped(rank)} of {grouped(6 * joints)}"
-    steps = [_time(online.get(key)) for key in ("step_p50_us", "step_p99_us")]
+    steps = [
+        with_unit(1e-3 * us, "ms", 3) if us is not None and us >= 1e3 else with_unit(us, "µs", 3)
+        for us in map(online.get, ("step_p50_us", "step_p99_us"))
+    ]
     rows = [
         ["samples a second, on one core", with_unit(online.get("samples_per_second"), "1/s", 3)],
         ["time of a sample, median", steps[0]],
@@ -100,13 +103,6 @@ def online_table(online: Mapping[str, Any]) -> Table | None:
         ["directions of λ shown", shown],
     ]
     return Table(["", "ATLAS"], rows)
-
-
-def _time(us: float | None) -> str:
-    """A time in µs, or in ms where it is longer than one."""
-    if us is not None and us >= 1000.0:
-        return with_unit(1e-3 * us, "ms", 3)
-    return with_unit(us, "µs", 3)
 
 
 def online_panels(history: Sequence[Mapping[str, float]]) -> list[Panel]:

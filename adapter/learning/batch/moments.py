@@ -57,16 +57,6 @@ class SchemaMoments:
     count: int
     with_speed: bool
 
-    def __add__(self, other: SchemaMoments) -> SchemaMoments:
-        """The moments of both sets of samples; v only where both have it."""
-        if other.tree != self.tree:
-            raise ModelError("moments of two different trees can't be added")
-        with_speed = self.with_speed and other.with_speed
-        sums = self.sums + other.sums
-        if not with_speed:
-            sums[:, 1] = 0.0
-        return SchemaMoments(self.tree, sums, self.count + other.count, with_speed)
-
     def power(self) -> Array:
         """Sum of |y|² (n, 4)."""
         return np.asarray(np.trace(self.sums[:, :, :3, :3], axis1=2, axis2=3))

@@ -73,20 +73,6 @@ def kinematic_errors(data: TreeData, lam: Array) -> KinematicErrors:
     return KinematicErrors(largest, counts, EDGES, worst)
 
 
-@dataclass(frozen=True)
-class TorqueErrors:
-    """Errors of joint torques (a base's wrench is not among them).
-
-    Attributes:
-        median, p99: of eq. 20 over all joints where the measured torque exceeds 0.1 N m.
-        rmse: (n,) N m.
-    """
-
-    median: float
-    p99: float
-    rmse: Array
-
-
 def predicted_torques(data: TreeData, lam: Array, theta: Array) -> Array:
     """τ (m, rows) of λ (n, 6) and θ (bodies, 10) for the samples' motion, N m.
 
@@ -121,17 +107,3 @@ def relative_errors(tau: Array, estimate: Array) -> Array:
     larger = np.maximum(np.abs(tau), np.abs(estimate))
     error = np.abs(tau - estimate) / np.where(judged, larger, 1.0)
     return np.where(judged, error, np.nan)
-
-
-def torque_errors(data: TreeData, lam: Array, theta: Array) -> TorqueErrors:
-    """Errors on samples; arguments as for `predicted_torques`."""
-    first = data.tree.rows - data.tree.n
-    measured = data.tau[:, first:]
-    predicted = predicted_torques(data, lam, theta)[:, first:]
-    error = relative_errors(measured, predicted)
-    every = error[~np.isnan(error)]
-    median, p99 = (
-        (float(np.quantile(every, q)) for q in (0.5, 0.99)) if len(every) else (np.nan, np.nan)
-    )
-    rmse = np.sqrt(np.mean((measured - predicted) ** 2, axis=0))
-    return TorqueErrors(median, p99, np.asarray(rmse))

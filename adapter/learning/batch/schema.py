@@ -91,7 +91,7 @@ class SchemaResult:
 
 
 def schema_from_moments(
-    data: TreeData | SchemaMoments, settings: BatchSchemaSettings | None = None
+    data: TreeData, settings: BatchSchemaSettings | None = None
 ) -> SchemaResult:
     """λ from measured motion of base and links, in one pass.
 
@@ -101,8 +101,7 @@ def schema_from_moments(
     Raises:
         ModelError: no link motion, numbers that are not finite, a prior that does not fit.
     """
-    settings = settings or BatchSchemaSettings()
-    moments = data if isinstance(data, SchemaMoments) else schema_moments(data)
+    settings, moments = settings or BatchSchemaSettings(), schema_moments(data)
     n = moments.tree.n
     prior = np.zeros((n, 6)) if settings.prior is None else np.asarray(settings.prior, dtype=float)
     if prior.shape != (n, 6) or not np.isfinite(prior).all():
