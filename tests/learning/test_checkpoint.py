@@ -8,7 +8,7 @@ import pytest
 from adapter.errors import SettingsError
 from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 from adapter.learning.learner import OnlineLearner
-from tests.helpers.arm_data import Motion, arm, learner_for, record, states_of
+from tests.helpers.arm_data import Motion, arm, learner_for, record, states_of, teach
 
 EFFECTS = ("viscous_friction", "coulomb_friction")
 
@@ -21,21 +21,15 @@ def states() -> np.ndarray:
 @pytest.fixture(scope="module")
 def whole(states) -> OnlineLearner:
     """What never stopped."""
-    learner = learner_for(effects=EFFECTS)
-    for state in states:
-        learner.step(state)
-    return learner
+    return teach(learner_for(effects=EFFECTS), states, rows=1)
 
 
 @pytest.mark.parametrize("cut", [200, 1000, 2500])
 def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path: Path, states, whole, cut: int) -> None:
     first, second = (learner_for(effects=EFFECTS) for _ in range(2))
-    for state in states[:cut]:
-        first.step(state)
-    save_checkpoint(first, tmp_path / "c.npz")
+    save_checkpoint(teach(first, states[:cut], rows=1), tmp_path / "c.npz")
     load_checkpoint(second, tmp_path / "c.npz")
-    for state in states[cut:]:
-        second.step(state)
+    teach(second, states[cut:], rows=1)
     assert np.array_equal(whole.schema.lam, second.schema.lam)
     assert np.array_equal(whole.theta.th, second.theta.th)
     assert np.array_equal(whole.theta.moments.A, second.theta.moments.A)

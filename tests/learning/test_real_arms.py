@@ -52,17 +52,14 @@ def test_panda_in_one_pass(panda_log: Path, tmp_path: Path) -> None:
     assert (friction > 0.1).all() and (friction < 0.6).all()
 
 
-def test_panda_after_ten_seconds(panda_log: Path, tmp_path: Path) -> None:
-    """The rest has the largest swing of joint 6, which nothing before it shows."""
-    figures = replayed(panda_log, tmp_path, "--validate-from", 10.0)
+@pytest.mark.parametrize(("split_s", "every", "share"), [(10.0, 1, 1.0), (SPLIT_S, 20, 0.92)])
+def test_panda_split_sooner_and_in_batches(
+    panda_log: Path, tmp_path: Path, split_s: float, every: int, share: float
+) -> None:
+    """After 10 s comes the largest swing of joint 6, which nothing before it shows."""
+    figures = replayed(panda_log, tmp_path, "--validate-from", split_s, "--every", every)
     error = np.array(figures["theta"]["validation_torque_rmse_nm"])
-    assert (error <= 1.0 * TOOL).all(), error / TOOL
-
-
-def test_panda_in_batches(panda_log: Path, tmp_path: Path) -> None:
-    figures = replayed(panda_log, tmp_path, "--validate-from", SPLIT_S, "--every", 20)
-    error = np.array(figures["theta"]["validation_torque_rmse_nm"])
-    assert (error <= 0.92 * TOOL).all(), error / TOOL
+    assert (error <= share * TOOL).all(), error / TOOL
 
 
 @pytest.mark.slow

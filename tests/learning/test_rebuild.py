@@ -7,7 +7,7 @@ import pytest
 
 from adapter.learning.learner import OnlineLearner
 from adapter.model.spatial import exp_rotation
-from tests.helpers.arm_data import Motion, arm, learner_for, panda_model, record, states_of
+from tests.helpers.arm_data import Motion, arm, learner_for, panda_model, record, states_of, teach
 
 SECONDS = 6.0
 
@@ -31,10 +31,7 @@ def learner_at(truth: bool, **settings) -> OnlineLearner:
 
 @cache
 def learned(truth: bool) -> OnlineLearner:
-    learner = learner_at(truth)
-    for state in states():
-        learner.step(state)
-    return learner
+    return teach(learner_at(truth), states(), rows=1)
 
 
 def test_moments_are_rebuilt_when_lambda_moves() -> None:
@@ -63,51 +60,38 @@ def test_theta_then_is_that_learned_with_the_right_lambda() -> None:
 def test_a_lambda_that_stays_rebuilds_nothing_more() -> None:
     learner = learned(truth=False)
     done = learner.rebuilds
-    for state in states()[-500:]:
-        learner.step(state)
-    assert learner.rebuilds == done
+    assert teach(learner, states()[-500:], rows=1).rebuilds == done
 
 
 def test_what_was_held_while_theta_waited_counts_too() -> None:
-    learner = learner_for()
-    for state in states()[:4000]:
-        learner.step(state)
+    learner = teach(learner_for(), states()[:4000], rows=1)
     assert learner.theta_started_ns is not None
     assert learner.rebuilds == 1
     assert learner.theta.count == 4000
 
 
 def test_only_what_is_held_can_be_rebuilt() -> None:
-    learner = learner_at(truth=False, held_samples=1000)
-    for state in states()[:3000]:
-        learner.step(state)
+    learner = teach(learner_at(truth=False, held_samples=1000), states()[:3000], rows=1)
     assert learner.rebuilds >= 1
     assert 1000 <= learner.theta.count <= 3000
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6])
 def test_a_step_below_the_floor_is_let_be(size: float) -> None:
-    learner = learner_at(truth=True)
-    for state in states()[:1500]:
-        learner.step(state)
+    learner = teach(learner_at(truth=True), states()[:1500], rows=1)
     done = learner.rebuilds
     learner.schema.p[2, 0] += size
-    for state in states()[1500:1600]:
-        learner.step(state)
-    assert learner.rebuilds == done
+    assert teach(learner, states()[1500:1600], rows=1).rebuilds == done
 
 
 def test_after_a_change_only_what_came_behind_it_is_rebuilt() -> None:
     """Samples of the old load would pull the new one towards it."""
-    learner = learner_at(truth=True)
-    for state in states()[:3000]:
-        learner.step(state)
+    learner = teach(learner_at(truth=True), states()[:3000], rows=1)
     done = learner.rebuilds
     learner._start_change(learner.stamp_ns)
-    for k, state in enumerate(states()[3000:4500]):
-        if k == 500:
-            learner.schema.p[3, 0] += 2e-2
-        learner.step(state)
+    teach(learner, states()[3000:3500], rows=1)
+    learner.schema.p[3, 0] += 2e-2
+    teach(learner, states()[3500:4500], rows=1)
     assert learner.rebuilds > done and learner._shadow is None
     assert learner.theta.count == 1500
     alone = learner.theta.empty_moments()

@@ -110,9 +110,7 @@ def test_theta_waits_for_lambda(seed: int) -> None:
     assert learner.schema.converged
     assert learner.theta_started_ns is not None
     assert 0.2e9 < learner.theta_started_ns < 3e9
-    waiting = learner_for()
-    for state in states_of(plain(seed)[2])[:100]:
-        waiting.step(state)
+    waiting = teach(learner_for(), states_of(plain(seed)[2])[:100], rows=1)
     assert waiting.theta_started_ns is None and waiting.theta.count == 0
     model = learned_model(collect(waiting), panda_model())
     assert not model.theta_identifiable.any() and np.isnan(model.theta_std).all()
