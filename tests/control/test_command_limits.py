@@ -162,47 +162,37 @@ class Record:
     late=st.floats(0.0, 0.3),
 )
 def test_every_limit_holds_in_the_arm_s_own_time_whatever_arrives(faults, stop, seed, late):
-    arm, line, record = Arm(), Line(faults), Record()
-    rng = np.random.default_rng(seed)
+    arm, rng = Arm(), np.random.default_rng(seed)
     controller = ExcitationController(LIMITS, replace(MOTION, seed=seed))
     controller.attend(arm)
+    played(arm, controller, faults, stop, lambda: late * rng.random()).check(share=0.9)
+
+
+def played(arm, controller, faults, stop, late=None) -> Record:
+    """What is commanded where the faults act, with instants that are late by so many periods."""
+    line, record, tau, calls = Line(faults), Record(), HELD, 0
     controller.prepare(arm.sample(0))
-    tau = HELD
     try:
         for tick in range(TICKS):
             if tick == stop:
                 controller.begin_stop()
-            instant = 10**15 + tick * PERIOD_NS + round(late * PERIOD_NS * rng.random())
+            instant = 10**15 + tick * PERIOD_NS + round(late() * PERIOD_NS) if late else 0
             for sample in line.arrive(arm.sample(tick), tick):
-                tau = controller.step(sample, instant)
-                record.add(tick, controller.reference.q, tau)
-            arm.tick(tau)
-    except ControlError as error:
-        assert faults and "joint" in str(error)
-    record.check(share=0.9)
-
-
-@settings(max_examples=25, deadline=None)
-@given(faults=faults, stop=st.one_of(st.none(), ANY_TICK), seed=st.integers(0, 1000))
-def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults, stop, seed):
-    arm, line, record = Arm(), Line(faults), Record()
-    controller = ExcitationController(LIMITS, replace(MOTION, seed=seed))
-    controller.prepare(arm.sample(0))
-    tau, calls = HELD, 0
-    try:
-        for tick in range(TICKS):
-            if tick == stop:
-                controller.begin_stop()
-            for sample in line.arrive(arm.sample(tick), tick):
-                tau = controller.step(sample)
-                calls += 1
-                record.add(calls, controller.reference.q, tau)
-                ref = controller.reference
+                tau, calls, ref = controller.step(sample, instant), calls + 1, controller.reference
+                record.add(tick if late else calls, ref.q, tau)
                 assert (np.abs(ref.dq) <= LIMITS.velocity).all()
                 assert (np.abs(ref.ddq) <= LIMITS.acceleration).all()
             arm.tick(tau)
     except ControlError as error:
         assert faults and "joint" in str(error)
+    return record
+
+
+@settings(max_examples=25, deadline=None)
+@given(faults=faults, stop=st.one_of(st.none(), ANY_TICK), seed=st.integers(0, 1000))
+def test_by_stamps_alone_no_command_is_too_much_and_no_reference_too_fast(faults, stop, seed):
+    controller = ExcitationController(LIMITS, replace(MOTION, seed=seed))
+    record = played(Arm(), controller, faults, stop)
     record.q.clear()  # in whose time these were, stamps alone cannot tell
     record.check(share=1.0)
 

@@ -101,20 +101,27 @@ def test_damping_is_as_gentle_as_the_arm_is_late(delay_ns: int, share: float) ->
     np.testing.assert_allclose(tau, share * damping * (reference.dq - dq), atol=1e-12)
 
 
+class Always:
+    """A model that gives the same torque of every joint."""
+
+    ready, notes, unbent = True, (), np.zeros_like
+
+    def __init__(self, torque: float) -> None:
+        self.torque = torque
+
+    def refresh(self) -> None: ...
+
+    def __call__(self, q, dq, ddq):
+        return np.full(7, self.torque)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_commands_end_at_the_effort_and_step_no_further_than_the_rate(sign: float) -> None:
     """Upwards as downwards; by instants 0.9 of the step that the rate allows."""
 
-    def pull(q, dq, ddq):
-        return np.full(7, sign * 1e4)
-
-    class Model:
-        ready, notes, attach, detach, refresh = True, (), None, None, staticmethod(lambda: None)
-        __call__ = staticmethod(pull)
-
     for instants, most in ((True, 0.9), (False, 1.0)):
         patient = ControlSettings(safety=SafetySettings(saturated_s=1.0))
-        controller = ExcitationController(LIMITS, None, patient, feedforward=Model())
+        controller = ExcitationController(LIMITS, None, patient, Always(sign * 1e4))
         controller.attend(Late(MS))
         controller._adds_gravity = False  # the model's torque as it is
         controller.prepare(_sample(0, tau=np.zeros(7)))
@@ -140,14 +147,8 @@ def test_an_arm_that_carries_itself_gets_no_gravity_from_feedback_nor_model():
         controller = ExcitationController(LIMITS, ExcitationSettings(seed=3), feedforward=model)
         commands = []
         arm = Weightless()
-        result = run_lockstep(
-            arm,
-            FrontEnd(PANDA),
-            None,
-            controller,
-            3.0,
-            each=lambda sample, tau, to=commands: to.append(tau),
-        )
+        each = lambda sample, tau, to=commands: to.append(tau)  # noqa: E731
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 3.0, each=each)
         arm.close()
         assert (result.ended, result.fault) == ("duration", None)
         found = controller.tracking()["feedback" if model is None else "feedforward"]
@@ -185,25 +186,8 @@ def test_it_starts_however_long_ago_it_was_prepared():
     assert controller.reference.time_s == pytest.approx(1e-3)
 
 
-class Broken:
-    """A model that gives nonsense."""
-
-    ready = True
-
-    def attach(self, name: str) -> None: ...
-
-    def detach(self) -> None: ...
-
-    def refresh(self) -> None: ...
-
-    def __call__(self, q, dq, ddq):
-        return np.full(7, np.nan)
-
-    unbent = np.zeros_like
-
-
 def test_nonsense_of_a_model_never_becomes_a_command():
-    controller = ExcitationController(LIMITS, feedforward=Broken())
+    controller = ExcitationController(LIMITS, feedforward=Always(np.nan))
     controller.step(_sample(0))
     with pytest.raises(ControlError, match="not a finite number"):
         for k in range(1, 10):

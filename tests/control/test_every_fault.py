@@ -7,7 +7,7 @@ arm under its controller; `test_parameters_under_faults` has all of the first th
 import numpy as np
 import pytest
 
-from adapter.realtime.session import LockstepResult, run_lockstep
+from adapter.realtime.session import run_lockstep
 from adapter.signals.front_end import FrontEnd
 from adapter.signals.records import stamp_of
 from drivers.faults.driver import with_faults
@@ -105,7 +105,7 @@ def test_a_jump_of_an_encoder_ends_the_run_with_the_last_good_parameters() -> No
     assert 2500 - 260 < run.learner.learned < 2500
 
 
-def listened(path, text: str) -> tuple[LockstepResult, FrontEnd, list[int]]:
+def listened(path, text: str) -> tuple[FrontEnd, list[int]]:
     """A recording of a moving arm behind faults; the stamps of what would be learned, in ms."""
     front_end, learned = FrontEnd(panda_model()), []
     write_log(record(arm(), Motion(3.0, seed=1)).log(), path, {})
@@ -113,7 +113,7 @@ def listened(path, text: str) -> tuple[LockstepResult, FrontEnd, list[int]]:
     result = run_lockstep(driver, front_end, Stamps(learned))
     assert result.ended == "end_of_stream"
     assert result.samples == result.passed_on + sum(front_end.refused.values())
-    return result, front_end, learned
+    return front_end, learned
 
 
 class Stamps:
@@ -127,19 +127,19 @@ class Stamps:
 
 
 def test_in_passive_mode_nothing_is_learned_behind_a_jump(tmp_path) -> None:
-    _, front_end, learned = listened(tmp_path / "a.mcap", "jump:3@1.5+0.05")
+    front_end, learned = listened(tmp_path / "a.mcap", "jump:3@1.5+0.05")
     assert learned[-1] < 1500 and front_end.refused["encoder_jump"] > 1400
     assert front_end.fault is not None and "panda_joint3" in front_end.fault
 
 
 def test_in_passive_mode_a_stuck_joint_is_left_out_until_it_moves(tmp_path) -> None:
-    _, front_end, learned = listened(tmp_path / "a.mcap", "stuck:1@1.5+0.5")
+    front_end, learned = listened(tmp_path / "a.mcap", "stuck:1@1.5+0.5")
     assert 300 < front_end.refused["stuck_joint"] <= 500
     assert not [t for t in learned if 1600 < t < 1950] and learned[-1] > 2900
 
 
 def test_in_passive_mode_a_silence_restarts_the_filter(tmp_path) -> None:
-    _, front_end, learned = listened(tmp_path / "a.mcap", "silence@1.5+0.05")
+    front_end, learned = listened(tmp_path / "a.mcap", "silence@1.5+0.05")
     assert front_end.gaps == [(1_499_000_000, pytest.approx(0.051))]
     assert "without a sample" in front_end.messages[0] and learned[-1] > 2900
 

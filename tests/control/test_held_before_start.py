@@ -46,14 +46,8 @@ def test_an_arm_that_is_pushed_before_it_starts_is_not_moved(name, joint, sign) 
             arm.connect()
             for _ in range(50):
                 arm.read()
-        result = run_lockstep(
-            arm,
-            FrontEnd(PANDA),
-            None,
-            controller(),
-            0.5,
-            each=lambda sample, tau: commands.append(tau),
-        )
+        each = lambda sample, tau: commands.append(tau)  # noqa: E731
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller(), 0.5, each=each)
     assert result.fault is not None and result.fault.startswith("at rest ")
     assert f"panda_joint{joint} holds" in result.fault and "the model says" in result.fault
     assert commands == [None]

@@ -21,6 +21,7 @@ from adapter.errors import ModelWarning, SettingsError
 from adapter.model.robots import documented
 from adapter.model.urdf import read_urdf
 from adapter.runs.config import config_from, config_table, read_config
+from tests.control.test_free_path import ARM
 
 pytest.importorskip("coal")
 PANDA = documented("panda")
@@ -87,16 +88,8 @@ def test_a_box_of_triangles_is_as_far_as_a_box(tmp_path: Path, name, content, sc
     assert compared > 200
 
 
-ARM = """<robot name="two"><link name="base"/><link name="upper"><inertial><mass value="2"/>
-<inertia ixx="0.03" iyy="0.03" izz="0.0025" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="fore"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>
-<inertia ixx="0.01" iyy="0.01" izz="0.0002" ixy="0" ixz="0" iyz="0"/></inertial>
-<collision><origin xyz="0 0 0.15"/><geometry><mesh filename="NAME" scale="0.1 0.1 0.3"/></geometry>
-</collision></link>
-<joint name="a" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/>
-<axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="10"/></joint>
-<joint name="b" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/>
-<axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="10"/></joint></robot>"""
+MESH = """<collision><origin xyz="0 0 0.15"/><geometry><mesh filename="NAME" scale="0.1 0.1 0.3"/>
+</geometry></collision>"""
 
 
 def arm_in(folder: Path, name: str):
@@ -105,7 +98,7 @@ def arm_in(folder: Path, name: str):
     for part in ("urdf", "meshes"):
         (package / part).mkdir(parents=True, exist_ok=True)
     (package / "meshes" / "fore.stl").write_bytes(stl((1.0, 1.0, 1.0)))
-    (package / "urdf" / "two.urdf").write_text(ARM.replace("NAME", name))
+    (package / "urdf" / "two.urdf").write_text(ARM.replace("SHAPE", MESH.replace("NAME", name)))
     return read_urdf(package / "urdf" / "two.urdf")
 
 

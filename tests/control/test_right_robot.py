@@ -88,19 +88,12 @@ def test_an_arm_that_says_it_is_another_robot_is_not_moved():
     assert "of no robot that is known" in another_robot(Says("panda"), stranger)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "said"),
-    [
-        ("lower", np.nan, r"panda_joint3 \(lower\)"),
-        ("velocity", np.nan, r"panda_joint3 \(velocity\)"),
-        ("effort", np.nan, r"panda_joint3 \(effort\)"),
-    ],
-)
-def test_an_arm_with_incomplete_limits_is_not_moved(key, value, said):
+@pytest.mark.parametrize("key", ["lower", "velocity", "effort"])
+def test_an_arm_with_incomplete_limits_is_not_moved(key):
     values = getattr(PANDA.limits, key).copy()
-    values[2] = value
+    values[2] = np.nan
     need_complete(PANDA)
-    with pytest.raises(SettingsError, match=said):
+    with pytest.raises(SettingsError, match=rf"panda_joint3 \({key}\)"):
         need_complete(replace(PANDA, limits=replace(PANDA.limits, **{key: values})))
 
 

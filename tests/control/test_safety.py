@@ -22,7 +22,6 @@ from adapter.signals.front_end import FrontEnd
 from drivers.damiao import holding
 from drivers.fci import torque_control
 from drivers.interface import JointSample
-from drivers.pybullet_arm import PyBulletArm
 from sim.scenarios import build
 from tests.helpers.fci_lockstep import FciLockstep
 from tests.helpers.lockstep_drivers import BEGINS_LOADED_S, BEGINS_S, LET_GO, opened
@@ -34,72 +33,38 @@ N, T_S = PANDA.tree.n, 1.0
 FAR = {"tracking_share": 1.0, "tracking_rad": 3.0, "external_share": 1.0, "power_share": 1.0}
 
 
-def moved(trouble: dict, seconds: float = 3.0, told=PANDA, learned: bool = False, **safety):
-    """(result, plant, last torque of what is in the way, the same a quarter of a second later)."""
-    plant, seed = build("nominal", 1, trouble=trouble).plant(), 1
-    arm, observer = PyBulletArm(plant), ContactObserver(told)
-    controller = ExcitationController(
-        LIMITS,
-        ExcitationSettings(seed=seed),
-        ControlSettings(safety=SafetySettings(**safety)),
-        expected=ModelFeedforward.of(told),
-    )
-    pushes: list[float] = []
-    if learned:
-        none = np.zeros((0, N))
-        observer.adopt(told.lam, told.theta, none, none, np.full(N, 0.05))
-        controller.observer = observer
-
-    def note(sample: JointSample, tau) -> None:
-        observer.step(sample)  # for the next tick
-        pushes.append(np.abs(plant.pushed()).max())
-
-    result = run_lockstep(arm, FrontEnd(PANDA), None, controller, seconds, each=note)
-    for _ in range(250):
-        arm.read()
-    left = float(np.abs(plant.pushed()).max())
-    speed = float(np.abs(plant.link_state()[1]).max())
-    arm.close()
-    assert speed < 0.01  # it stands, and was not dropped
-    return result, pushes, left
-
-
-@pytest.mark.parametrize(
-    ("trouble", "safety", "said"),
-    [
-        ({"held": [2], "t_s": T_S}, {}, "joint 2 (panda_joint2) is pushed"),
-        ({"held": [2], "t_s": T_S}, {**FAR, "tracking_share": 0.3}, "from where it should be"),
-        ({"held": [2], "t_s": T_S}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
-        ({"held": [1, 2, 3, 4, 5, 6, 7], "t_s": T_S}, {}, "is pushed"),
-        ({"wall": 0.01, "t_s": 1.5}, {}, "is pushed"),
-        ({"load": 4.0, "t_s": T_S}, {**FAR, "power_share": 0.1}, "would move with"),
-        ({"load": 4.0, "t_s": T_S}, {**FAR, "external_share": 0.3}, "is pushed"),
-    ],
-    ids=["held", "tracking", "saturated", "all-held", "wall", "load-power", "load"],
-)
-def test_it_stops_by_joint_and_cause_and_lets_go(trouble, safety, said) -> None:
-    result, pushes, left = moved(trouble, **safety)
-    assert result.ended == "driver_error" and result.fault is not None
-    assert result.fault.startswith("joint ") and said in result.fault and "\n" not in result.fault
-    assert len(pushes) > 1000 * T_S
-    assert left <= 0.2 * max(pushes)
-    assert max(pushes) <= 1.2 * LIMITS.effort.max()
-
-
 WALL_S, DROP_S = BEGINS_S["can"] + 1.5, BEGINS_LOADED_S["can"] + T_S
+FOLLOWS = {**FAR, "tracking_share": 0.3}
+SATURATES = {**FAR, "saturated_s": 0.03, "start_share": 0.2}
 ON_DRIVERS = [
+    ("sim", {"held": [2]}, {}, "joint 2 (panda_joint2) is pushed"),
+    ("sim", {"held": [2]}, FOLLOWS, "from where it should be"),
+    ("sim", {"held": [2]}, SATURATES, "was cut at"),
+    ("sim", {"held": [1, 2, 3, 4, 5, 6, 7]}, {}, "is pushed"),
+    ("sim", {"wall": 0.01, "t_s": 1.5}, {}, "is pushed"),
+    ("sim", {"load": 4.0}, {**FAR, "power_share": 0.1}, "would move with"),
+    ("sim", {"load": 4.0}, {**FAR, "external_share": 0.3}, "is pushed"),
     ("fci", {"held": [2]}, {}, "joint 2 (panda_joint2)"),
-    ("fci", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "from where it should be"),
-    ("fci", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
+    ("fci", {"held": [2]}, FOLLOWS, "from where it should be"),
+    ("fci", {"held": [2]}, SATURATES, "was cut at"),
     ("fci", {"wall": 0.01, "t_s": 1.5}, {**FAR, "external_share": 0.2}, "is pushed"),
     ("fci", {"load": 4.0}, {**FAR, "power_share": 0.1}, "would move with"),
-    ("can", {"held": [2]}, {**FAR, "tracking_share": 0.3}, "joint 2 (panda_joint2) is "),
-    ("can", {"held": [2]}, {**FAR, "saturated_s": 0.03, "start_share": 0.2}, "was cut at"),
+    ("can", {"held": [2]}, FOLLOWS, "joint 2 (panda_joint2) is "),
+    ("can", {"held": [2]}, SATURATES, "was cut at"),
     ("can", {"held": [2, 4]}, {**FAR, "external_share": 0.5}, "is pushed"),
     ("can", {"wall": 0.01, "t_s": WALL_S}, {**FAR, "external_share": 0.1}, "is pushed"),
     ("can", {"wall": 0.01, "t_s": WALL_S}, {**FAR, "tracking_share": 0.2}, "from where it"),
     ("can", {"load": 6.0, "t_s": DROP_S}, {**FAR, "external_share": 0.2}, "is pushed"),
 ]
+
+
+def controller_with(**safety) -> ExcitationController:
+    return ExcitationController(
+        LIMITS,
+        ExcitationSettings(seed=1),
+        ControlSettings(safety=SafetySettings(**safety)),
+        expected=ModelFeedforward.of(PANDA),
+    )
 
 
 @pytest.mark.parametrize(("name", "trouble", "safety", "said"), ON_DRIVERS)
@@ -111,12 +76,7 @@ def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
         if isinstance(arm, FciLockstep):  # else the robot's own reflex is sooner
             for most in ("upper_torque", "upper_force"):
                 getattr(arm.served.settings, most)[:] = 1e3
-        controller = ExcitationController(
-            LIMITS,
-            ExcitationSettings(seed=1),
-            ControlSettings(safety=SafetySettings(**safety)),
-            expected=ModelFeedforward.of(PANDA),
-        )
+        controller = controller_with(**safety)
         controller.weight = CarriedWeight(PANDA, trusted=True)
 
         def note(sample: JointSample, tau) -> None:
@@ -131,11 +91,15 @@ def test_every_limit_stops_on_every_driver(name, trouble, safety, said) -> None:
         for _ in range(LET_GO):
             arm.read()
         for_good = np.abs(obstacles.torque)
-    assert result.fault is not None
-    assert result.fault.startswith("joint ") and said in result.fault
+        speed = np.mean([arm.read().dq for _ in range(100)][50:], axis=0)
+    assert result.ended == "driver_error" and result.fault is not None
+    assert result.fault.startswith("joint ") and said in result.fault and "\n" not in result.fault
+    assert name == "can" or len(pushes) > 1000 * T_S  # there the motors' start takes some of it
+    assert max(pushes) <= 1.2 * LIMITS.effort.max()
     assert (np.abs(np.diff(commands, axis=0)) <= 1e-3 * LIMITS.torque_rate + 1e-9).all()
     assert left <= max(0.2 * max(pushes), 1.0)
     assert (for_good <= left_at_most(LIMITS.effort)).all(), for_good
+    assert name != "sim" or np.abs(speed).max() < 0.01  # it stands, and was not dropped
 
 
 @pytest.mark.parametrize("trusted", [False, True])
@@ -162,8 +126,19 @@ def test_a_driver_in_lockstep_gives_the_clock_back(name) -> None:
 
 def test_what_was_learned_stops_a_held_arm_sooner() -> None:
     """At a limit of 0.2 of the effort, as asked for, in place of 0.7."""
-    held = {"held": [2], "t_s": T_S}
-    result, pushes, left = moved(held, 2.0, learned=True, learned_share=0.2)
+    controller, none, pushes = controller_with(learned_share=0.2), np.zeros((0, N)), []
+    controller.observer = observer = ContactObserver(PANDA)
+    observer.adopt(PANDA.lam, PANDA.theta, none, none, np.full(N, 0.05))
+
+    def note(sample: JointSample, tau) -> None:
+        observer.step(sample)  # for the next tick
+        pushes.append(np.abs(obstacles.torque).max())
+
+    with opened("sim", build("nominal", 1, trouble={"held": [2], "t_s": T_S})) as (arm, obstacles):
+        result = run_lockstep(arm, FrontEnd(PANDA), None, controller, 2.0, each=note)
+        for _ in range(250):
+            arm.read()
+        left = np.abs(obstacles.torque).max()
     assert result.fault is not None and "joint 2 (panda_joint2) is pushed" in result.fault
     assert max(pushes) < 0.4 * LIMITS.effort[1]
     assert left <= 0.2 * max(pushes)
