@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from adapter.cli.exit_codes import ExitCode
-from adapter.cli.main import COMMANDS, build_parser, main
+from adapter.cli.main import COMMANDS, build_parser
 from drivers.errors import choices
 
 RECORDING = Path(__file__).parents[2] / "recordings" / "panda_nominal_6s.mcap"
@@ -37,20 +36,6 @@ USELESS = ("gone.mcap", "folder", "noise.mcap", *EMPTY)
 NOISE = bytes(range(256)) * 8
 
 
-def refused(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """What the command says against it, in one line."""
-    try:
-        code = main(words)
-    except SystemExit as end:
-        code = int(end.code or 0)
-    said = capsys.readouterr()
-    lines = [line for line in said.err.splitlines() if not line.endswith(" ...")]
-    assert code == ExitCode.WRONG_USE, f"{code}: {said.err}"
-    assert len(lines) == 1 and lines[0].startswith("error: "), said.err
-    assert "Errno" not in lines[0] and "object at 0x" not in lines[0]
-    return lines[0]
-
-
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of useless files, which is where the user is."""
@@ -62,24 +47,24 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_useless_file_is_refused_by_its_name(command: str, here: Path, capsys) -> None:
+def test_a_useless_file_is_refused_by_its_name(command: str, here: Path, refused) -> None:
     assert set(COMMANDS) == {*FILES, *WITHOUT}
     for name in USELESS if command in FILES else ():
-        said = refused(capsys, command, *(w.replace("FILE", name) for w in FILES[command]))
+        said = refused(command, *(w.replace("FILE", name) for w in FILES[command]))
         assert name in said, said
     assert not list(here.glob("new.*"))
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, capsys) -> None:
+def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, refused) -> None:
     words = [word.replace("FILE", "gone") for word in FILES.get(command, [])]
     words = {"sim": ["fci"], "experiment": ["panda"], "completion": ["bash"]}.get(command, words)
-    assert "has no option '--nonsense'" in refused(capsys, command, *words, "--nonsense")
+    assert "has no option '--nonsense'" in refused(command, *words, "--nonsense")
     options = [o for a in _parser(command)._actions for o in a.option_strings if len(o) > 6]
     for option in (o for o in options if o != "--help"):
         wrong = option[:-2] + option[-1] + option[-2]
         if wrong not in options and wrong != option:
-            assert "did you mean --" in refused(capsys, command, *words, f"{wrong}=1")
+            assert "did you mean --" in refused(command, *words, f"{wrong}=1")
 
 
 def _parser(command: str):
@@ -109,9 +94,9 @@ def _parser(command: str):
         ("completion bsh", "did you mean bash?"),
     ],
 )
-def test_what_is_misspelt_is_guessed(line: str, said: str, here: Path, capsys) -> None:
+def test_what_is_misspelt_is_guessed(line: str, said: str, here: Path, refused) -> None:
     words = (str(RECORDING) if word == "LOG" else word for word in line.split())
-    assert said in refused(capsys, *words)
+    assert said in refused(*words)
 
 
 def test_nothing_alike_is_not_guessed() -> None:

@@ -49,7 +49,7 @@ def test_figures_of_a_run(run: tuple[Path, dict[str, Any]]) -> None:
     assert figures["theta"]["min_pseudo_inertia_eigenvalue"] > 0.0
     assert all(figures["tick_us"][name] > 0 for name in ("p50", "p99", "p99.9", "max"))
     assert {path.name for path in folder.iterdir()} >= {
-        *("recording.mcap", "model.json", "model.urdf", "report.html", "truth.json"),
+        *("recording.mcap", "model.json", "model.urdf", "report.html", "truth.json")
     }
 
 

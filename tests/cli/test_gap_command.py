@@ -114,12 +114,10 @@ def test_the_page(found: tuple[Path, dict[str, Any]]) -> None:
     assert "Coulomb friction" in page.read_text()
 
 
-def test_a_model_is_never_written_over(data: Path, tmp_path: Path) -> None:
-    model = tmp_path / "model.json"
-    save_model(documented(data / "arm.urdf"), model)
+def test_a_model_is_never_written_over(data: Path, tmp_path: Path, refused) -> None:
+    model = save_model(documented(data / "arm.urdf"), tmp_path / "model.json")
     before = model.read_bytes()
-    words = ["gap", data / "one.mcap", "--model", model, "--out", tmp_path, "--quiet"]
-    assert main([str(word) for word in words]) == 2
+    refused("gap", data / "one.mcap", "--model", model, "--out", tmp_path)
     assert model.read_bytes() == before
 
 
@@ -145,7 +143,7 @@ def test_another_robot(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out" / "model.json").exists()
 
 
-def test_validate_from(data: Path, tmp_path: Path) -> None:
+def test_validate_from(data: Path, tmp_path: Path, refused) -> None:
     options = "--validate-from", 8.0, "--no-simulation", "--no-report"
     figures = gap(tmp_path, data / "arm.urdf", [data / "one.mcap"], *options)
     assert figures["exit"] == 0
@@ -153,8 +151,8 @@ def test_validate_from(data: Path, tmp_path: Path) -> None:
     assert figures["before"]["rollout_rmse_rad"] is None and "report" not in figures
     assert figures["after"]["torque_rmse_nm"][3] < 0.2 * figures["before"]["torque_rmse_nm"][3]
     assert not (tmp_path / "out" / "report.html").exists()
-    words = ["gap", data / "one.mcap", "--model", data / "arm.urdf", "--out", tmp_path, "--quiet"]
-    assert main([str(word) for word in (*words, "--validate-from", 11.0)]) == 2
+    words = ["gap", data / "one.mcap", "--model", data / "arm.urdf", "--out", tmp_path]
+    refused(*words, "--validate-from", 11.0)
 
 
 def test_one_of_two_recordings_is_held_out(data: Path, tmp_path: Path) -> None:
@@ -226,9 +224,7 @@ def test_a_tool_takes_part_in_rollouts(simulated: tuple[Recorded, SelfModel, Sel
     np.testing.assert_allclose(errors.before_q, errors.after_q, atol=1e-6)
 
 
-def test_a_model_that_cannot_be_simulated(
-    simulated: tuple[Recorded, SelfModel, SelfModel],
-) -> None:
+def test_a_model_that_cannot_be_simulated(simulated: tuple[Recorded, SelfModel, SelfModel]) -> None:
     recorded, nominal, _ = simulated
     theta = nominal.theta.copy()
     theta[2, 0] = -1.0

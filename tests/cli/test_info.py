@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from adapter.cli import main
-from adapter.cli.exit_codes import ExitCode
 from adapter.control.teachable import teachable
 from adapter.model.robots import documented
 from drivers.files.mcap import McapWriter, read_log
@@ -58,7 +57,7 @@ def test_longer_and_quieter_logs_teach_more():
     assert np.median(loud.std[shown] / whole.std[shown]) > 1.5
 
 
-def test_topic_and_folder(tmp_path, capsys):
+def test_topic_and_folder(tmp_path, capsys, refused):
     topics = {"/a/state": (JOINT_STATE, Motion.of()), "/b/state": (JOINT_STATE, Motion.of(seed=2))}
     bag = write_ros2(tmp_path / "bag", topics)
     assert main(["info", str(bag)]) == 0
@@ -67,13 +66,11 @@ def test_topic_and_folder(tmp_path, capsys):
     assert "joint states: /b/state" in capsys.readouterr().out
     (tmp_path / "empty").mkdir()
     for command in (["replay"], ["gap", "--model", "panda"]):
-        assert main([*command, str(tmp_path / "empty")]) == ExitCode.WRONG_USE
-        assert "no recording in this folder" in capsys.readouterr().err
+        assert "no recording in this folder" in refused(*command, tmp_path / "empty")
     logs = tmp_path / "logs"
     logs.mkdir()
     write_ros1(logs / "one.bag", topics)
-    assert main(["replay", str(logs), "--robot", "panda"]) == ExitCode.WRONG_USE
-    assert "one.bag: 2 topics" in capsys.readouterr().err
+    assert "one.bag: 2 topics" in refused("replay", logs, "--robot", "panda")
 
 
 @pytest.mark.parametrize("period_ns", [50_000_000, 1_000_000])

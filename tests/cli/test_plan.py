@@ -35,10 +35,10 @@ def test_plan_writes_lines_and_a_page_and_moves_nothing(tmp_path, capsys):
     assert page.count("<svg") == 5 and "margin 0.05 m" in page and "NaN" not in page
 
 
-def test_without_a_terminal_nothing_moves_unless_yes_is_said(capsys):
+def test_without_a_terminal_nothing_moves_unless_yes_is_said(refused):
     """Before anything is connected: there is no robot behind this address."""
-    assert main(["run", "--driver", "fci://127.0.0.1:9", "--allow-motion"]) == 2
-    assert "no terminal to ask on; give --yes" in capsys.readouterr().err
+    said = refused("run", "--driver", "fci://127.0.0.1:9", "--allow-motion")
+    assert "no terminal to ask on; give --yes" in said
     agreement.need_somebody(True)
 
 
@@ -60,6 +60,6 @@ def test_only_a_yes_moves_the_arm(answer, moves, monkeypatch):
         agreement._ask(arm, lambda: True)  # Ctrl-C
 
 
-def test_a_can_arm_is_moved_as_a_named_robot_only(capsys):
-    assert main(["run", "--driver", "can://can0?interface=socketcan", "--allow-motion"]) == 2
-    assert "--robot must, before it may be moved: fr3, panda" in capsys.readouterr().err
+def test_a_can_arm_is_moved_as_a_named_robot_only(refused):
+    said = refused("run", "--driver", "can://can0?interface=socketcan", "--allow-motion")
+    assert "--robot must, before it may be moved: fr3, panda" in said

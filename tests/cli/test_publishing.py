@@ -17,12 +17,7 @@ from adapter.realtime.snapshot import ExternalTorque, nothing_known
 from adapter.signals.records import StateLayout
 from drivers.files.estimates import estimate_values
 from drivers.files.messages import decode
-from drivers.files.ros_types import (
-    ESTIMATE,
-    FLOAT64_MULTI_ARRAY,
-    TF,
-    WRENCH_STAMPED,
-)
+from drivers.files.ros_types import ESTIMATE, FLOAT64_MULTI_ARRAY, TF, WRENCH_STAMPED
 from drivers.ros2.settings import parse
 from drivers.ros2.wire import Network
 from tests.helpers.hardware_rigs import free_domain

@@ -171,7 +171,7 @@ def test_other_trees_are_refused() -> None:
         documentation_of(replace(PANDA, source=None, name="mine"))
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], refused) -> None:
     path = str(save_model(heavier({(6, 0): 0.5}), tmp_path / "learned.json"))
     assert main(["diff", path, "--json", "-"]) == 0  # against its documentation
     said = capsys.readouterr()
@@ -181,13 +181,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "the link behind it" in said.err and "0.7355 -> 1.236 kg" in said.err
     assert main(["diff", "panda", path, "--json", str(tmp_path / "diff.json")]) == 0
     assert json.loads((tmp_path / "diff.json").read_text())["hand_max_m"] == 0.0
-    for wrong, told in (
-        (["diff", path, "pnada"], "panda"),
-        (["diff", path, "panda", "--lock", "thumb=1"], "thumb"),
-    ):
-        capsys.readouterr()
-        assert main(wrong) == 2
-        assert told in capsys.readouterr().err
+    assert "panda" in refused("diff", path, "pnada")
+    assert "thumb" in refused("diff", path, "panda", "--lock", "thumb=1")
 
 
 def test_frames_and_bodies_are_a_matrix_in_the_order_of_the_joints() -> None:
