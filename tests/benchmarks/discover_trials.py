@@ -10,9 +10,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +20,10 @@ from rich.table import Table
 
 from adapter.discovery import Discovery, discover
 from adapter.model.self_model import SelfModel
-from tests.helpers.discovery_data import Case, Motion, anyhow, atlas, panda, record
+from tests.helpers.discovery_data import TRUSTED, Case, Motion, anyhow, record
+from tests.helpers.discovery_data import robot as model_of
 
-TRUSTED = 0.9  # no wrong edge may have more confidence than that
-ROBOTS: dict[str, Callable[[], SelfModel]] = {"panda": cache(panda), "atlas": cache(atlas)}
+ROBOTS = ("panda", "atlas")
 
 
 @dataclass(frozen=True)
@@ -59,13 +57,7 @@ class Kind:
         loose = loose[: round(self.mounted * len(loose))]
         mounts = anyhow(seed, loose.tolist(), 1 + model.tree.n)
         return record(
-            model,
-            motion,
-            seed,
-            noise=self.noise,
-            base=self.base,
-            parts=self.parts,
-            mounts=mounts,
+            model, motion, seed, noise=self.noise, base=self.base, parts=self.parts, mounts=mounts
         )
 
 
@@ -128,7 +120,7 @@ def judge(case: Case, found: Discovery) -> dict[str, Any]:
 
 def trial(robot: str, kind: Kind, seed: int, rate_hz: float) -> dict[str, Any]:
     """Record, discover, judge."""
-    case = kind.case(ROBOTS[robot](), seed, rate_hz)
+    case = kind.case(model_of(robot), seed, rate_hz)
     begun = time.process_time()
     found = discover(case.log, base=case.root if kind.named and case.root in case.body else None)
     seconds = time.process_time() - begun
@@ -200,17 +192,14 @@ def main() -> None:
         for kind in (*USUAL, *(HARD if asked.hard else ()))
         if not asked.kind or any(part in kind.name for part in asked.kind)
     ]
-    for robot in asked.robot or ("panda", "atlas"):
+    for robot in asked.robot or ROBOTS:
         for seed in range(asked.first, asked.first + asked.trials):  # kinds share their motions
             rows += [trial(robot, kind, seed, asked.rate) for kind in kinds]
             console.print(f"{robot}: seed {seed}", end="\r")
             if asked.json:
-                _write(asked.json, rows)
+                told = {"summary": summary(rows), "rows": rows}
+                asked.json.write_text(json.dumps(told, indent=1) + "\n")
     _print(console, summary(rows))
-
-
-def _write(path: Path, rows: list[dict[str, Any]]) -> None:
-    path.write_text(json.dumps({"summary": summary(rows), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -31,19 +31,8 @@ import numpy as np
 LIMIT_S, LIMIT_BYTES = 5.0, 2**30
 WORDS = (
     *(b"nan", b"inf", b"-1", b"0", b"1e999", b"-1e-999", b"9" * 40, b"null", b"true", b"[]", b"{}"),
-    *(
-        b"[" * 2000,
-        b'{"a":' * 2000,
-        b'"',
-        b"'",
-        b"\\ud800",
-        b"\xff\xfe",
-        b"\0",
-        b"<!--",
-        b"</",
-        b"<",
-    ),
-    *(b"&a;", b"[/bold]", b"%s", b"../..", b"\r\n", b",", b";", b"", b" "),
+    *(b"[" * 2000, b'{"a":' * 2000, b'"', b"'", b"\\ud800", b"\xff\xfe", b"\0", b"<!--", b"</"),
+    *(b"<", b"&a;", b"[/bold]", b"%s", b"../..", b"\r\n", b",", b";", b"", b" "),
 )
 CELL = b"""[cell]
 table = true
@@ -178,10 +167,7 @@ def wires() -> dict[str, Decoder]:
     asked = fci.request(0, 1, struct.pack("<HH", 5, 4000)) + fci.request(2, 2) + fci.request(12, 3)
     found = {
         f"fci state {p}": Decoder(
-            [fci_peer.state(p, 5, q=range(7), modes=(1, 2, 2))],
-            states(p),
-            (WireError,),
-            0.12,
+            [fci_peer.state(p, 5, q=range(7), modes=(1, 2, 2))], states(p), (WireError,), 0.12
         )
         for p in (5, 10)
     }

@@ -31,6 +31,7 @@ from adapter.learning.theta import Theta
 from adapter.model.inertia import min_eigenvalue
 from adapter.model.robots import documented
 from adapter.realtime.session import run_lockstep
+from adapter.runs.library import regressor
 from adapter.runs.outcome import collect
 from adapter.runs.pipeline import make_front_end, make_learner
 from adapter.runs.score import reference_from, schema_score, theta_score
@@ -151,13 +152,8 @@ def columns_of(theta: Theta, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> 
 
     Columns of the spare body are zero: these trials know no change.
     """
-    robot = documented("panda")
-    out = np.zeros((*q.shape, theta.P))
-    for k in range(70):
-        unit = np.zeros(70)
-        unit[k] = 1.0
-        out[..., k] = ModelTorque(replace(robot, theta=unit.reshape(7, 10)))(q, dq, ddq)
-    joint = np.arange(7)
+    out, joint = np.zeros((*q.shape, theta.P)), np.arange(7)
+    out[..., :70] = regressor(documented("panda"), q, dq, ddq)
     for k, column in enumerate(theta.torque_per_unit(JointSignals(q, dq, ddq))):
         out[:, joint, 80 + 7 * k + joint] = column
     return out
@@ -174,9 +170,8 @@ def theta_trial(
     """
     (seed,) = job
     q, dq, ddq = held_out(seed)
-    tau = ModelTorque(replace(documented("panda"), theta=build("nominal", seed).truth.theta))(
-        q, dq, ddq
-    )
+    truth = replace(documented("panda"), theta=build("nominal", seed).truth.theta)
+    tau = ModelTorque(truth)(q, dq, ddq)
     Y: list[np.ndarray] = []
     ratios: list[tuple[float, ...]] = []
     lowest = [np.inf]
@@ -215,12 +210,8 @@ def theta_trial(
         "min_eigenvalue": lowest[0],
         "changes": len(figures["theta"]["changes"]),
         **{
-            f"largest_{name}": float(np.abs(row).max())
-            for name, row in zip(
-                (effect.name for effect in learner.theta.effects),
-                learner.theta.effect_values,
-                strict=True,
-            )
+            f"largest_{effect.name}": float(np.abs(row).max())
+            for effect, row in zip(learner.theta.effects, learner.theta.effect_values, strict=True)
         },
     }
 
@@ -234,12 +225,9 @@ def can_arm(world: Scenario, seed: int) -> Driver:
 
     line = Line()
     line.attach(Boards(line.boards, world, now_ns=line.now_ns))
-    names = world.truth.joint_names
-    address = "can://line?interface=virtual"
-    return Lockstep(
-        DamiaoArm(address, names, True, bus=line.host, now_ns=line.now_ns, wall_ns=line.now_ns),
-        line,
-    )
+    address, names = "can://line?interface=virtual", world.truth.joint_names
+    clocks = {"now_ns": line.now_ns, "wall_ns": line.now_ns}
+    return Lockstep(DamiaoArm(address, names, True, bus=line.host, **clocks), line)
 
 
 def wire_trial(job: tuple[str, int]) -> Row:

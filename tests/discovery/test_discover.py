@@ -31,8 +31,8 @@ from tests.helpers.discovery_data import (
 
 
 @cache
-def _case(name: str, motion: Motion, seed: int, noise: float = 1.0, parts: str = "ta") -> Case:
-    return record(robot(name), motion, seed, noise=noise, parts=parts)
+def _case(name: str, motion: Motion, seed: int, noise: float = 1.0) -> Case:
+    return record(robot(name), motion, seed, noise=noise)
 
 
 def _worst_wrong(case: Case, found: Discovery) -> float:
@@ -101,15 +101,9 @@ def test_a_missing_link_leaves_its_child_open() -> None:
     case = _case("panda", SHORT, 0)
     gone = next(link for _, link, _ in case.edges if _is_link(case, link, 3))
     keep = [k for k, name in enumerate(case.log.link_names) if name != gone]
-    log = case.log
-    found = discover(
-        replace(
-            log,
-            link_names=tuple(log.link_names[k] for k in keep),
-            twists=log.twists[:, keep],
-            accels=log.accels[:, keep],
-        )
-    )
+    names = tuple(case.log.link_names[k] for k in keep)
+    motion = {part: getattr(case.log, part)[:, keep] for part in ("twists", "accels")}
+    found = discover(replace(case.log, link_names=names, **motion))
     assert _worst_wrong(case, found) < TRUSTED
     assert found.root is None and found.undecided
     with pytest.raises(ModelError, match="carried by nothing"):
@@ -219,10 +213,7 @@ def test_command_writes_tree_and_model(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         (lambda log: {"twists": None, "accels": None, "link_names": ()}, "has no motion of links"),
-        (
-            lambda log: {"twists": np.full_like(log.twists, np.nan), "accels": None},
-            "it has: nothing",
-        ),
+        (lambda log: {"twists": np.nan * log.twists, "accels": None}, "it has: nothing"),
         (lambda log: {"twists": None, "accels": _no_turning(log.accels)}, "neither angular"),
         (lambda log: {"stamp_ns": log.stamp_ns // 1000}, "lasts 0.00 s"),
         (lambda log: {"q": np.full_like(log.q, np.nan)}, "at the same time"),

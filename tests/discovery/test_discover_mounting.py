@@ -70,11 +70,7 @@ def _heard(log: Log, parts: str) -> Log:
 
 @pytest.mark.parametrize(
     ("seed", "parts", "turned", "shifted"),
-    [
-        (0, "ta", True, True),
-        (1, "t", True, False),
-        (2, "a", False, True),
-    ],
+    [(0, "ta", True, True), (1, "t", True, False), (2, "a", False, True)],
 )
 def test_fixed_base_decides_everything(seed: int, parts: str, turned: bool, shifted: bool) -> None:
     case = _case("panda", seed, turned=turned, shifted=shifted)
@@ -226,14 +222,9 @@ def test_angles_that_wrap_and_sensors_with_stamps_of_their_own() -> None:
 def _interleaved(log: Log) -> Log:
     """Joints at every other stamp, links at those between."""
     even = (np.arange(len(log)) % 2 == 0)[:, None]
-    return replace(
-        log,
-        q=np.where(even, log.q, np.nan),
-        dq=np.where(even, log.dq, np.nan),
-        tau=np.where(even, log.tau, np.nan),
-        twists=np.where(even[..., None], np.nan, log.twists),
-        accels=np.where(even[..., None], np.nan, log.accels),
-    )
+    joints = {k: np.where(even, getattr(log, k), np.nan) for k in ("q", "dq", "tau")}
+    links = {k: np.where(even[..., None], np.nan, getattr(log, k)) for k in ("twists", "accels")}
+    return replace(log, **joints, **links)
 
 
 def test_late_sensors_make_edges_doubtful_not_wrong() -> None:

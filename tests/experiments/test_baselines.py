@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -30,11 +31,12 @@ from adapter.physics.networks import (
     link_motion,
     theta_from_log_cholesky,
 )
+from tests.helpers.arm_data import pin_tree
+from tests.helpers.robot_models import relative
 
 # A leg (joint 0), a torso (1) and an arm on it that branches (2, 3, 4).
 TREE = Tree((-1, -1, 1, 2, 2), floating=True)
 ARM, CARRIER = ("joint3", "joint4", "joint5"), "link2"
-NAMES = ("network", "committee", "process", "lagrangian", "least squares")
 
 
 def robot(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -57,27 +59,12 @@ def samples(seed: int, count: int) -> TreeData:
     return TreeData(TREE, q, dq, ddq, tau, base, BodyMotion(w, a, dw, v))
 
 
-def _pinocchio(
-    lam: np.ndarray,
-    theta: np.ndarray,
-    q: np.ndarray,
-    dq: np.ndarray,
-    ddq: np.ndarray,
-    base: BodyMotion,
-) -> np.ndarray:
+def _pinocchio(lam, theta, q, dq, ddq, base) -> np.ndarray:  # type: ignore[no-untyped-def]
     """Torques (m, 6 + n): the base is a free body in a world without gravity."""
-    model = pin.Model()
-    model.gravity.linear = np.zeros(3)
-    order = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
-    joints = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")]
-    for j, i in enumerate(TREE.parent):
-        place = pin.SE3(matrix_from_zxz(lam[j, :3]), lam[j, 3:])
-        joints.append(model.addJoint(joints[i + 1], pin.JointModelRZ(), place, f"j{j}"))
-    for joint, body in zip(joints, theta, strict=True):
-        inertia = pin.Inertia.FromDynamicParameters(body[order])
-        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+    frames = matrix_from_zxz(lam[:, :3]), lam[:, 3:]
+    model = pin_tree(TREE.parent, *frames, theta, np.zeros(3), free=True)
     data = model.createData()
-    at = [model.joints[j].idx_v for j in joints[1:]]
+    at = [model.joints[j].idx_v for j in range(2, model.njoints)]
     tau = np.zeros((len(q), 6 + TREE.n))
     for k in range(len(q)):
         place, speed, accel = pin.neutral(model), np.zeros(model.nv), np.zeros(model.nv)
@@ -89,11 +76,6 @@ def _pinocchio(
         found = pin.rnea(model, data, place, speed, accel)
         tau[k] = np.concatenate([found[:6], found[at]])
     return tau
-
-
-def relative(found: np.ndarray, true: np.ndarray) -> float:
-    """Largest error over the largest true value."""
-    return float(np.abs(found - true).max() / np.abs(true).max())
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -168,21 +150,17 @@ def test_mass_matrix_of_the_network_is_positive_definite_and_learns() -> None:
     assert torch.autograd.gradcheck(run, (weight,))
 
 
-def learner(name: str) -> Baseline:
-    """Small sizes of each."""
-    if name == "network":
-        return FeedForward(units=60, epochs=24, batch=50)
-    if name == "committee":
-        return ElmCommittee(members=3, units=300, points=1200)
-    if name == "process":
-        return GaussianProcess(points=500, tuned_on=120, steps=15)
-    if name == "lagrangian":
-        return DeepLagrangian(Columns(3), (24, 24), steps=200, batch=64, rate=1e-2)
-    return least_squares(1)
-
-
-# Share of the torque's deviation that is left on samples not seen, at these small sizes.
-REST = dict(zip(NAMES, (0.5, 0.35, 0.35, 0.25, 1e-9), strict=True))
+# Small sizes of each, and the share of the torque's deviation that is left on samples not seen.
+LEARNERS: dict[str, tuple[Callable[[], Baseline], float]] = {
+    "network": (partial(FeedForward, units=60, epochs=24, batch=50), 0.5),
+    "committee": (partial(ElmCommittee, members=3, units=300, points=1200), 0.35),
+    "process": (partial(GaussianProcess, points=500, tuned_on=120, steps=15), 0.35),
+    "lagrangian": (
+        partial(DeepLagrangian, Columns(3), (24, 24), steps=200, batch=64, rate=1e-2),
+        0.25,
+    ),
+    "least squares": (partial(least_squares, 1), 1e-9),
+}
 
 
 @pytest.fixture(scope="module")
@@ -190,11 +168,11 @@ def table() -> tuple[np.ndarray, np.ndarray]:
     return arm_problem(samples(1, 2000), ARM, CARRIER)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", LEARNERS)
 def test_every_learner_learns_an_arm(name: str, table: tuple[np.ndarray, np.ndarray]) -> None:
-    x, y = table
+    (x, y), (learner, most) = table, LEARNERS[name]
     told: list[str] = []
-    found = learner(name)
+    found = learner()
     with pytest.raises(ModelError, match="call fit first"):
         found.predict(x)
     with pytest.raises(ModelError, match="call fit first"):
@@ -202,11 +180,11 @@ def test_every_learner_learns_an_arm(name: str, table: tuple[np.ndarray, np.ndar
     found.fit(x[:1500], y[:1500], told.append)
     rest = found.predict(x[1500:]) - y[1500:]
     share = np.sqrt(np.mean(rest**2, axis=0)) / y.std(axis=0)
-    assert np.max(share) < REST[name], share
+    assert np.max(share) < most, share
     facts = found.facts()
     assert told and facts.tuning and facts.train_s > 0.0 and facts.sizes
 
-    again = learner(name)
+    again = learner()
     again.fit(x[:1500], y[:1500])
     np.testing.assert_allclose(again.predict(x[1500:]), found.predict(x[1500:]), atol=1e-6)
 

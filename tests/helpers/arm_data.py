@@ -5,6 +5,7 @@ The truth comes from `sim`, the torques from Pinocchio's RNEA, so nothing here i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -31,6 +32,7 @@ MIDDLE = np.array([0.0, 0.0, 0.0, -1.57, 0.0, 1.87, 0.0])  # rad
 REACH = np.array([1.2, 0.8, 1.2, 0.8, 1.2, 0.9, 1.2])  # rad
 SPEED = np.array([1.2, 1.2, 1.2, 1.2, 1.6, 1.6, 1.6])  # rad/s
 LINK_TWIST_NOISE, LINK_ACCEL_NOISE = 2e-3, 2e-2
+PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's inertias: XX XY YY XZ YZ ZZ
 
 
 @dataclass(frozen=True)
@@ -93,21 +95,39 @@ class ArmData:
 
 def pin_model(truth: Truth, payload: Effect | None = None) -> pin.Model:
     """A Pinocchio model built joint by joint from the truth's numbers, and what it carries."""
-    model = pin.Model()
-    model.gravity.linear = truth.gravity
-    parent = 0
-    for j, name in enumerate(truth.joint_names):
-        place = pin.SE3(truth.R[j], truth.p[j])
-        parent = model.addJoint(parent, pin.JointModelRZ(), place, name)
-        order = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
-        body = pin.Inertia.FromDynamicParameters(truth.theta[j][order])
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+    model = pin_tree(range(-1, truth.n - 1), truth.R, truth.p, truth.theta, truth.gravity)
     if payload is not None:
         com = np.array([payload.number(key) for key in ("cx", "cy", "cz")])
         xx, xy, xz, yy, yz, zz = payload.parameters.get("inertia", [0.0] * 6)  # type: ignore[misc]
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         body = pin.Inertia(payload.number("m"), com, tensor)
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
+        model.appendBodyToJoint(truth.n, body, pin.SE3.Identity())
+    return model
+
+
+def pin_tree(
+    parent: Sequence[int],
+    R: np.ndarray,
+    p: np.ndarray,
+    theta: np.ndarray,
+    gravity: np.ndarray,
+    free: bool = False,
+) -> pin.Model:
+    """A Pinocchio model built joint by joint, on a free base where asked for.
+
+    Bodies θ are those of the links, or of a free base and the links.
+    """
+    model = pin.Model()
+    model.gravity.linear = gravity
+    joints = [0]
+    if free:
+        joints = [model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")]
+    for j, i in enumerate(parent):
+        place = pin.SE3(R[j], p[j])
+        joints.append(model.addJoint(joints[i + 1], pin.JointModelRZ(), place, f"j{j}"))
+    for joint, body in zip(joints[-len(theta) :], theta, strict=True):
+        inertia = pin.Inertia.FromDynamicParameters(body[PIN_ORDER])
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
     return model
 
 

@@ -55,9 +55,7 @@ def ids_of_a_page_that_fetches_nothing(page: str) -> list[str]:
     assert not re.search(r"https?:|url\((?!#)|@import", page)
     assert "default-src 'none'" in page
     scripts = re.findall(r"<script>(.*?)</script>", page, re.S)
-    assert (
-        page.count("<script") == len(scripts) == 1
-    )  # one of the page's own, and it is the allowed
+    assert page.count("<script") == len(scripts) == 1  # the page's own, and it is the allowed
     digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in page
     assert len(links.ids) == len(set(links.ids))
@@ -115,25 +113,16 @@ def laid_out(page: str, folder: Path, width: int) -> dict[str, Any]:
     return dict(json.loads(html.unescape(answer[1])))
 
 
-def screenshot(
-    page: str, folder: Path, size: tuple[int, int] = (1300, 1200), dark: bool = False
-) -> tuple[bytes, list[str]]:
-    """PNG of a page in headless Chromium, and what it said on its console."""
-    picture = folder / "page.png"
-    done = _chromium(
-        page,
-        folder,
-        f"--blink-settings=preferredColorScheme={0 if dark else 1}",
-        f"--window-size={size[0]},{size[1]}",
-        f"--screenshot={picture}",
-    )
-    return picture.read_bytes(), [x for x in done.stderr.splitlines() if "CONSOLE" in x]
-
-
-def shown_without_complaint(page: str, folder: Path, least: int, *how: Any) -> None:
+def shown_without_complaint(
+    page: str, folder: Path, least: int, size: tuple[int, int] = (1300, 1200), dark: bool = False
+) -> None:
     """Assert that Chromium shows a page, in more than so many bytes of PNG, and says nothing."""
-    picture, complaints = screenshot(page, folder, *how)
-    assert complaints == []
+    place = folder / "page.png"
+    scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
+    window = f"--window-size={size[0]},{size[1]}"
+    done = _chromium(page, folder, scheme, window, f"--screenshot={place}")
+    picture = place.read_bytes()
+    assert [x for x in done.stderr.splitlines() if "CONSOLE" in x] == []
     assert picture.startswith(b"\x89PNG")
     assert len(picture) > least  # more than an empty page
 
@@ -203,13 +192,10 @@ class Tab:
             assert time.monotonic() < end, f"not in {timeout_s} s: {expression}"
             time.sleep(0.1)
 
-    def picture(self, path: Path | None = None, whole: bool = True) -> bytes:
-        """PNG of the page as it looks, all of it or what is in the window."""
-        found = self.call("Page.captureScreenshot", captureBeyondViewport=whole)
-        data = base64.b64decode(found["data"])
-        if path is not None:
-            path.write_bytes(data)
-        return data
+    def picture(self) -> bytes:
+        """PNG of all of the page as it looks."""
+        found = self.call("Page.captureScreenshot", captureBeyondViewport=True)
+        return base64.b64decode(found["data"])
 
 
 @contextmanager

@@ -6,7 +6,6 @@ Names and orders are shuffled; what is true is handed along.
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from functools import cache
@@ -14,19 +13,15 @@ from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-import pytest
 
 from adapter.discovery import Discovery
-from adapter.errors import ModelWarning
 from adapter.model.robots import documented
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import exp_rotation, matrix_from_zxz
-from adapter.model.tree import BASE
-from adapter.model.urdf import read_urdf
 from drivers.files.mcap import Log
+from tests.helpers.arm_data import pin_tree
+from tests.helpers.robot_models import frame_motion, read_quietly, urdf_text
 
-SHARED = Path(__file__).parents[2].parent / "shared"
-ATLAS = SHARED / "models" / "atlas_v5.urdf"
 ENCODER_STEP = 2 * np.pi / 2**19  # rad
 GYRO = np.radians(0.007)  # rad/s/√Hz
 ACCELEROMETER = 150e-6 * 9.81  # m/s²/√Hz
@@ -69,26 +64,10 @@ class Case:
     mounts: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
 
 
-def panda() -> SelfModel:
-    """The documented Panda on its fixed base."""
-    return documented("panda")
-
-
-def atlas() -> SelfModel:
-    """ATLAS on a free base; needs the shared folder."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ModelWarning)
-        return read_urdf(ATLAS, floating=True)
-
-
 @cache
 def robot(name: str) -> SelfModel:
-    """The Panda or ATLAS by name; a test that wants ATLAS skips where it is not at hand."""
-    if name == "panda":
-        return panda()
-    if not ATLAS.exists():
-        pytest.skip(f"{ATLAS} is not here: the shared folder stays with the project's makers")
-    return atlas()
+    """The Panda on its fixed base or ATLAS on a free one; a test skips where it is not at hand."""
+    return documented("panda") if name == "panda" else read_quietly(urdf_text(name), floating=True)
 
 
 def _sines(rng: np.random.Generator, t: np.ndarray, n: int, speed: float) -> tuple[np.ndarray, ...]:
@@ -105,23 +84,6 @@ def _sines(rng: np.random.Generator, t: np.ndarray, n: int, speed: float) -> tup
     return value * share, rate * share, second * share
 
 
-def _pin_model(model: SelfModel) -> pin.Model:
-    out = pin.Model()
-    out.gravity.linear = model.gravity
-    root = out.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "free")
-    ids: list[int] = []
-    turns = matrix_from_zxz(model.lam[:, :3])
-    order = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
-    theta = model.theta[1:] if model.tree.floating else model.theta
-    for j, i in enumerate(model.tree.parent):
-        place = pin.SE3(turns[j], model.lam[j, 3:])
-        parent = root if i == BASE else ids[i]
-        ids.append(out.addJoint(parent, pin.JointModelRZ(), place, f"j{j}"))
-        body = pin.Inertia.FromDynamicParameters(theta[j][order])
-        out.appendBodyToJoint(ids[-1], body, pin.SE3.Identity())
-    return out
-
-
 def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """q, dq, ddq, tau (m, n), twists and accels (m, 1 + n, 6), the base first."""
     t = np.arange(round(motion.seconds * motion.rate_hz)) / motion.rate_hz
@@ -133,7 +95,8 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
     for j in motion.still:
         q[:, j], dq[:, j], ddq[:, j] = q[0, j], 0.0, 0.0
     _, speed, change = _sines(rng, t, 6, 0.6 if model.tree.floating else 0.0)
-    arm = _pin_model(model)
+    frames = matrix_from_zxz(model.lam[:, :3]), model.lam[:, 3:]
+    arm = pin_tree(model.tree.parent, *frames, model.theta[-n:], model.gravity, free=True)
     data = arm.createData()
     pose = pin.neutral(arm)
     twists, accels = (np.zeros((len(t), 1 + n, 6)) for _ in range(2))
@@ -145,24 +108,15 @@ def _moved(model: SelfModel, motion: Motion, rng: np.random.Generator) -> tuple[
         tau[k] = pin.rnea(arm, data, pose, rates, seconds)[6:]
         pin.forwardKinematics(arm, data, pose, rates, seconds)
         for b in range(1 + n):
-            twists[k, b] = data.v[b + 1].vector
-            a = data.a[b + 1]
-            w = data.v[b + 1].angular
-            down = data.oMi[b + 1].rotation.T @ model.gravity
-            accels[k, b, :3] = a.linear + np.cross(w, data.v[b + 1].linear) - down
-            accels[k, b, 3:] = a.angular
+            seen = frame_motion(arm, data, b + 1, np.eye(3), model.gravity).ravel()
+            twists[k, b], accels[k, b] = seen[:6], seen[6:]
         v[:6] = speed[k]
         pose = pin.integrate(arm, pose, v / motion.rate_hz)
     return q, dq, ddq, tau, twists, accels
 
 
 def anyhow(
-    seed: int,
-    bodies: Collection[int],
-    count: int,
-    *,
-    turned: bool = True,
-    shifted: bool = True,
+    seed: int, bodies: Collection[int], count: int, *, turned: bool = True, shifted: bool = True
 ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
     """Mountings (rotation, place in m) of `count` bodies, random for those named, else none."""
     rng = np.random.default_rng([seed, 29])
@@ -171,19 +125,13 @@ def anyhow(
         axis, angle = rng.normal(size=3), rng.uniform(0.5, np.pi)
         place = rng.uniform(-0.15, 0.15, 3)
         own_turn = exp_rotation(axis / np.linalg.norm(axis) * angle)
-        mounts.append(
-            (
-                own_turn if turned and b in bodies else np.eye(3),
-                place if shifted and b in bodies else np.zeros(3),
-            )
-        )
+        turn = own_turn if turned and b in bodies else np.eye(3)
+        mounts.append((turn, place if shifted and b in bodies else np.zeros(3)))
     return tuple(mounts)
 
 
 def _seen(
-    twists: np.ndarray,
-    accels: np.ndarray,
-    mounts: tuple[tuple[np.ndarray, np.ndarray], ...],
+    twists: np.ndarray, accels: np.ndarray, mounts: tuple[tuple[np.ndarray, np.ndarray], ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """What sensors mounted so see of motion given in joint frames (m, bodies, 6)."""
     twists, accels = twists.copy(), accels.copy()
@@ -243,11 +191,7 @@ def record(
     twists = twists + noise * np.array(levels[0]) * rng.normal(size=twists.shape)
     accels = accels + noise * np.array(levels[1]) * rng.normal(size=accels.shape)
     n = model.tree.n
-    logged = (
-        list(range(1 + n))
-        if (model.tree.floating if base is None else base)
-        else list(range(1, 1 + n))
-    )
+    logged = range(0 if (model.tree.floating if base is None else base) else 1, 1 + n)
     joints, links = rng.permutation(n), rng.permutation(logged)
     joint_name = {int(j): f"motor_{k}" for k, j in enumerate(joints)}
     link_name = {int(b): f"imu_{k}" for k, b in enumerate(links)}
@@ -270,7 +214,7 @@ def record(
     return Case(log, edges, link_name.get(0, "base"), model, body, mounts)
 
 
-TRUSTED = 0.9
+TRUSTED = 0.9  # no wrong edge may have more confidence than that
 RATE_HZ = 250.0
 SHORT = Motion(seconds=4.0, rate_hz=RATE_HZ)
 

@@ -14,11 +14,10 @@ import pinocchio as pin
 
 from sim.effects import Effect
 from sim.truth import Truth
-from tests.helpers.arm_data import pin_model
+from tests.helpers.arm_data import PIN_ORDER, pin_model
 from tests.helpers.arm_data import rnea as rnea_of_model
 
 Array = np.ndarray
-PIN_ORDER = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]  # Pinocchio's: XX XY YY XZ YZ ZZ
 CROSSING_S = 0.02  # in which the motor crosses the play of a gear on reversal
 PAD = 2000  # samples before and after a recording, for its spectrum
 PUSH_SPEED = 0.01  # rad/s, below it the motor doesn't push in full

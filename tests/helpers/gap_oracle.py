@@ -21,6 +21,7 @@ from sim.effects import Effect
 from sim.hidden import Trial
 from sim.hidden.motion import draw_motion
 from sim.truth import Truth
+from tests.helpers.arm_data import rms
 from tests.helpers.gap_effects import Array, predict, regressor, rnea, sense, slope
 from tests.helpers.gap_tools import sensor_noise
 
@@ -278,8 +279,3 @@ def second(trial: Trial) -> Trial:
     rng = np.random.default_rng([trial.seed, HELD_STREAM])
     motion = draw_motion(rng, trial.nominal.limits, trial.nominal.ready)
     return replace(trial, motion=motion, seed=trial.seed + SECOND)
-
-
-def rms(x: Array) -> Array:
-    """Root mean square of each column."""
-    return np.sqrt(np.mean(np.square(x), axis=0))

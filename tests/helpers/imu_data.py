@@ -16,6 +16,7 @@ from drivers.files.ros_types import IMU, JOINT_STATE
 from sim.scenarios import build
 from sim.truth import Truth
 from tests.helpers.arm_data import Motion, pin_model, rnea, trajectory
+from tests.helpers.robot_models import frame_motion
 from tests.helpers.ros_messages import START_NS, imu, joint_state, ns, write
 
 
@@ -88,9 +89,7 @@ def links_of(truth: Truth, motion: Motion) -> tuple[np.ndarray, np.ndarray, np.n
     for row, x in zip(out, zip(q, dq, ddq, strict=True), strict=True):
         pin.forwardKinematics(model, data, *x)
         for i in range(truth.n):
-            v, a, R = data.v[i + 1], data.a[i + 1], data.oMi[i + 1].rotation
-            felt = a.linear + np.cross(v.angular, v.linear) - R.T @ g
-            row[i] = np.r_[v.angular, a.angular, felt]
+            row[i] = frame_motion(model, data, i + 1, np.eye(3), g)[[1, 3, 2]].ravel()
     return 5e-3 * np.arange(len(q)), rnea(model, q, dq, ddq), out
 
 

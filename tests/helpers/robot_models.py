@@ -66,16 +66,20 @@ def text_of(values: np.ndarray) -> str:
 
 
 def _link(name: str, rng: np.random.Generator) -> str:
-    points = rng.normal(size=(8, 3)) * 0.1  # point masses: any inertia they have is possible
-    mass = float(rng.uniform(0.2, 5.0))
+    points, mass = rng.normal(size=(8, 3)) * 0.1, float(rng.uniform(0.2, 5.0))
+    xyz, rpy = text_of(rng.normal(size=3) * 0.1), text_of(rng.uniform(-3, 3, 3))
+    return link_text(name, mass, points, f'xyz="{xyz}" rpy="{rpy}"')
+
+
+def link_text(name: str, mass: float, points: np.ndarray, origin: str) -> str:
+    """A link with the inertia of point masses (k, 3), which is always a possible one."""
     second = mass * np.cov(points.T)
     i = np.trace(second) * np.eye(3) - second
     keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2]}
     keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
     six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
-    xyz, rpy = text_of(rng.normal(size=3) * 0.1), text_of(rng.uniform(-3, 3, 3))
     return (
-        f'<link name="{name}"><inertial><origin xyz="{xyz}" rpy="{rpy}"/>'
+        f'<link name="{name}"><inertial><origin {origin}/>'
         f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
     )
 
@@ -158,12 +162,24 @@ def _configuration(oracle, model, q, dq, ddq, rng):  # type: ignore[no-untyped-d
         quaternion = rng.normal(size=4)
         full_q[:3], full_q[3:7] = rng.normal(size=3), quaternion / np.linalg.norm(quaternion)
         full_v[:6], full_a[:6] = rng.normal(size=6), rng.normal(size=6) * 3
-    for k, name in enumerate(model.tree.joint_names):
-        joint = oracle.joints[oracle.getJointId(name)]
-        turn = [q[k]] if joint.nq == 1 else [np.cos(q[k]), np.sin(q[k])]
-        full_q[joint.idx_q : joint.idx_q + joint.nq] = turn
-        full_v[joint.idx_v], full_a[joint.idx_v] = dq[k], ddq[k]
+    names = model.tree.joint_names
+    set_angles(oracle, full_q, names, q)
+    places = places_of(oracle, names)
+    full_v[places], full_a[places] = dq, ddq
     return full_q, full_v, full_a
+
+
+def set_angles(oracle, full, names, angles) -> None:  # type: ignore[no-untyped-def]
+    """Put the angles of joints into a configuration of Pinocchio's."""
+    for name, angle in zip(names, angles, strict=True):
+        joint = oracle.joints[oracle.getJointId(name)]
+        turn = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+        full[joint.idx_q : joint.idx_q + joint.nq] = turn
+
+
+def places_of(oracle, names) -> list[int]:  # type: ignore[no-untyped-def]
+    """Where joints stand in Pinocchio's velocities and torques."""
+    return [oracle.joints[oracle.getJointId(name)].idx_v for name in names]
 
 
 def _body(oracle, data, model, joint, gravity):  # type: ignore[no-untyped-def]
@@ -180,8 +196,8 @@ def frame_motion(oracle, data, number, turn, gravity):  # type: ignore[no-untype
 
 
 def _torques(oracle, tau, model):  # type: ignore[no-untyped-def]
-    places = [oracle.joints[oracle.getJointId(name)].idx_v for name in model.tree.joint_names]
-    return np.concatenate([tau[:6] if model.tree.floating else [], tau[places]])
+    own = tau[places_of(oracle, model.tree.joint_names)]
+    return np.concatenate([tau[:6] if model.tree.floating else [], own])
 
 
 def relative(found: object, expected: object) -> float:

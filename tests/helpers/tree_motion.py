@@ -9,7 +9,14 @@ from adapter.learning.tree_data import BodyMotion, TreeData
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import z_to_axis
 from adapter.model.urdf import model_from_urdf
-from tests.helpers.robot_models import frame_motion, text_of
+from tests.helpers.robot_models import (
+    frame_motion,
+    link_text,
+    pin_model,
+    places_of,
+    set_angles,
+    text_of,
+)
 
 FREQUENCIES_HZ = (0.15, 0.9)
 WIDEST_RAD = 0.9  # swing of a joint without narrow limits
@@ -36,28 +43,24 @@ def in_motion(text: str, floating: bool, seconds: float, seed: int, rate_hz: flo
     is the one that leaves no wrench there.
     """
     model = model_from_urdf(text, floating=floating)
-    args = (pin.JointModelFreeFlyer(),) if floating else ()
-    oracle = pin.buildModelFromXML(text, *args)
+    oracle = pin_model(text, floating)
     data = oracle.createData()
     if floating:
         oracle.gravity = pin.Motion.Zero()
     gravity, n = oracle.gravity.linear.copy(), model.tree.n
     dt, m = 1.0 / rate_hz, round(seconds * rate_hz)
     q, dq, ddq = joint_motion(model, dt * np.arange(m), seed)
-    numbers = [oracle.getJointId(name) for name in model.tree.joint_names]
-    joints = [oracle.joints[k] for k in numbers]
+    names = model.tree.joint_names
+    numbers = [oracle.getJointId(name) for name in names]
     turns = [z_to_axis(axis) for axis in model.axis]
     base, links = np.zeros((m, 12)), np.zeros((m, n, 12))
     tau = np.zeros((m, model.tree.rows))
-    places = [joint.idx_v for joint in joints]
+    places = places_of(oracle, names)
     full_q, full_v, full_a = pin.neutral(oracle), np.zeros(oracle.nv), np.zeros(oracle.nv)
     speed = 0.3 * np.random.default_rng(seed + 1000).normal(size=6)
     before = np.zeros(6)
     for k in range(m):
-        for j, joint in enumerate(joints):
-            angle = q[k, j]
-            turn = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
-            full_q[joint.idx_q : joint.idx_q + joint.nq] = turn
+        set_angles(oracle, full_q, names, q[k])
         full_v[places], full_a[places] = dq[k], ddq[k]
         if floating:
             full_v[:6], full_a[:6] = speed, 0.0
@@ -122,13 +125,5 @@ def random_tree_text(links: int, seed: int) -> str:
 
 
 def _link_text(name: str, rng: np.random.Generator) -> str:
-    mass = float(rng.uniform(0.5, 5.0))
-    second = mass * np.cov(0.1 * rng.normal(size=(3, 8)))  # of point masses: a possible body
-    i = np.trace(second) * np.eye(3) - second
-    keys = {"ixx": i[0, 0], "ixy": i[0, 1], "ixz": i[0, 2]}
-    keys |= {"iyy": i[1, 1], "iyz": i[1, 2], "izz": i[2, 2]}
-    six = " ".join(f'{k}="{float(v)!r}"' for k, v in keys.items())
-    return (
-        f'<link name="{name}"><inertial><origin xyz="{text_of(0.1 * rng.normal(size=3))}"/>'
-        f'<mass value="{mass!r}"/><inertia {six}/></inertial></link>'
-    )
+    mass, points = float(rng.uniform(0.5, 5.0)), 0.1 * rng.normal(size=(3, 8))
+    return link_text(name, mass, points.T, f'xyz="{text_of(0.1 * rng.normal(size=3))}"')

@@ -16,6 +16,7 @@ from adapter.runs.config import PipelineSettings
 from adapter.runs.library import make_log
 from adapter.runs.replay import Replay, replay
 from adapter.signals.matching import matching
+from tests.helpers.arm_data import rnea
 
 LEARNER = LearnerSettings(effects=REAL_ARM_EFFECTS)
 SLOW_S, END_S = 9.0, 16.0  # one way only until then
@@ -57,10 +58,7 @@ def learned(urdf: Path, seed: int) -> Replay:
     q = path_of(t)
     dq = np.gradient(q, 1e-3, axis=0)
     ddq = np.gradient(dq, 1e-3, axis=0)
-    model = pin.buildModelFromUrdf(str(urdf))
-    data = model.createData()
-    tau = np.array([pin.rnea(model, data, *row) for row in zip(q, dq, ddq, strict=True)])
-    tau += FRICTION * np.tanh(dq / 0.01)
+    tau = rnea(pin.buildModelFromUrdf(str(urdf)), q, dq, ddq) + FRICTION * np.tanh(dq / 0.01)
     rng = np.random.default_rng(seed)
     dq = dq + NOISE_DQ * rng.standard_normal(q.shape)
     tau += NOISE_TAU * rng.standard_normal(q.shape)

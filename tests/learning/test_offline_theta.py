@@ -32,6 +32,7 @@ from adapter.physics.identifiability import base_parameters
 from adapter.physics.networks import link_motion, theta_from_log_cholesky, wrenches
 from tests.helpers.robot_models import random_urdf, read_quietly, shared
 from tests.helpers.torque_errors import torque_errors
+from tests.helpers.tree_motion import in_motion, random_tree_text
 from tests.learning.test_offline_schema import samples
 
 
@@ -253,38 +254,21 @@ def test_errors_summed_up_are_those_of_the_samples() -> None:
     np.testing.assert_allclose(error.rmse, np.sqrt(np.mean((tau - data.tau[:, 6:]) ** 2, axis=0)))
 
 
-def arm_signals(model, rng, seconds: float):  # type: ignore[no-untyped-def]
-    """Smooth motion of a fixed-base robot at 1 kHz, torques and link motion by the networks."""
-    t = np.arange(0.0, seconds, 1e-3)
-    speed = 2.0 * np.pi * rng.uniform(0.2, 1.0, (3, 1, model.tree.n))
-    phase = rng.uniform(0.0, 2.0 * np.pi, speed.shape)
-    size = rng.uniform(0.2, 0.6, speed.shape)
-    angle = speed * t[:, None] + phase
-    q = (size * np.sin(angle)).sum(axis=0)
-    dq = (size * speed * np.cos(angle)).sum(axis=0)
-    ddq = -(size * speed**2 * np.sin(angle)).sum(axis=0)
-    lam, gravity = torch.from_numpy(model.lam), torch.from_numpy(model.gravity)
-    joints = torch.from_numpy(q), torch.from_numpy(dq), torch.from_numpy(ddq)
-    k = link_motion(model.tree, lam, joints, gravity)
-    tau = wrenches(model.tree, lam, torch.from_numpy(model.theta), torch.from_numpy(q), k)
-    return q, dq, ddq, tau[..., 5].numpy(), k
-
-
 @pytest.mark.parametrize("seed", [21, pytest.param(22, marks=pytest.mark.slow)])
 def test_noisy_signals_cost_no_more_than_with_true_frames(seed: int) -> None:
     """Control torque error of learned λ and θ against weighted least squares with the true λ."""
-    model, _ = samples(random_urdf(5, seed), False, 2, seed)
-    rng = np.random.default_rng(seed)
+    text, rng = random_tree_text(5, seed), np.random.default_rng(seed)
     clean, parts = [], []
-    for _ in range(3):
-        q, dq, ddq, tau, k = arm_signals(model, rng, 6.0)
+    for part in range(3):
+        model, data = in_motion(text, False, 6.0, 10 * seed + part)
         noise = {"q": 2e-5, "dq": 2e-3, "tau": 0.1, "link_w": 2e-3, "link_a": 0.02}
-        true = {"q": q, "dq": dq, "tau": tau, "link_w": k.w.numpy(), "link_a": k.a.numpy()}
+        true = {key: getattr(data, key) for key in ("q", "dq", "tau")}
+        true |= {"link_w": data.links.w, "link_a": data.links.a}
         read = {name: x + noise[name] * rng.normal(size=x.shape) for name, x in true.items()}
         parts.append(smoothed_data(model.tree, Measured(**read), gravity=model.gravity))
         exact = smoothed_data(model.tree, Measured(**true), gravity=model.gravity)
         cut = slice(200, -200)
-        assert np.abs(exact.ddq - ddq[cut]).max() < 2e-2 * np.abs(ddq).max()
+        assert np.abs(exact.ddq - data.ddq[cut]).max() < 2e-2 * np.abs(data.ddq).max()
         assert (exact.base.a == -model.gravity).all()  # what an accelerometer at rest reads
         clean.append(exact)
     learn, control = parts[0].take(slice(None, None, 3)), clean[2]

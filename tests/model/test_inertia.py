@@ -19,10 +19,9 @@ from adapter.model.inertia import (
 )
 from adapter.model.spatial import exp_rotation
 from adapter.physics.networks import theta_from_log_cholesky, theta_from_log_cholesky_torch
+from tests.helpers.arm_data import PIN_ORDER
 
 RNG = np.random.default_rng(3)
-# Pinocchio's order of inertia elements [XX XY YY XZ YZ ZZ] in ours [XX XY XZ YY YZ ZZ].
-_TO_OURS = [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
 
 
 def cloud(points: int = 9) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +58,7 @@ def test_parameters_are_pinocchios() -> None:
     for _ in range(10):
         oracle = pin.Inertia.Random()
         theta = theta_from_body(oracle.mass, oracle.lever, oracle.inertia)
-        np.testing.assert_allclose(theta, oracle.toDynamicParameters()[_TO_OURS], rtol=1e-12)
+        np.testing.assert_allclose(theta, oracle.toDynamicParameters()[PIN_ORDER], rtol=1e-12)
         np.testing.assert_allclose(
             pseudo_inertia(theta), oracle.toPseudoInertia().toMatrix(), atol=1e-12
         )
@@ -74,7 +73,7 @@ def test_log_cholesky_is_pinocchios() -> None:
     for _ in range(10):
         vector = RNG.normal(size=10) * 0.7
         oracle = pin.LogCholeskyParameters(vector)
-        theirs = oracle.toDynamicParameters()[_TO_OURS]
+        theirs = oracle.toDynamicParameters()[PIN_ORDER]
         np.testing.assert_allclose(theta_from_log_cholesky(vector), theirs, rtol=1e-12)
 
 

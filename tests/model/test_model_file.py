@@ -103,20 +103,14 @@ def same(first: Any, second: Any) -> None:
 
 
 def test_numpy_values_and_unknowns_in_effects_are_written_plainly() -> None:
-    model = dataclasses.replace(
-        documented("panda"),
-        effects=(
-            {
-                "effect": "coulomb_friction",
-                "joints": np.array([1, 2]),
-                "parameters": {"Fc": np.array([0.3, 0.2])},
-                "std": {"Fc": np.array([0.1, np.nan])},
-                "n": np.int64(2),
-            },
-        ),
-    )
-    back = loads(dumps(model))
-    (entry,) = back.effects
+    effect = {
+        "effect": "coulomb_friction",
+        "joints": np.array([1, 2]),
+        "parameters": {"Fc": np.array([0.3, 0.2])},
+        "std": {"Fc": np.array([0.1, np.nan])},
+        "n": np.int64(2),
+    }
+    (entry,) = loads(dumps(dataclasses.replace(documented("panda"), effects=(effect,)))).effects
     assert entry["parameters"] == {"Fc": [0.3, 0.2]} and entry["joints"] == [1, 2]
     assert entry["std"] == {"Fc": [0.1, None]} and entry["n"] == 2
 
@@ -136,17 +130,11 @@ FAULTS = {
     "ragged": (lambda d: d["theta"][0].pop(), "'theta' must"),
     "not finite": (lambda d: d["theta"][0].__setitem__(0, None), "theta holds a value that is not"),
     "word": (lambda d: d["lambda"][0].__setitem__(0, "x"), "'lambda' must hold numbers"),
-    "parent": (
-        lambda d: d["tree"].update(parent=[-1, 5, 0, 0, 0, 0, 0]),
-        "joint 1 hangs on link 5",
-    ),
+    "parent": (lambda d: d["tree"]["parent"].__setitem__(1, 5), "joint 1 hangs on link 5"),
     "names": (lambda d: d["tree"].update(joint_names=["a"]), "7 joints need 7 joint names"),
     "source": (lambda d: d.update(lambda_source="guess"), "no lambda_source 'guess'; have: 'docum"),
     "tree": (lambda d: d.update(tree=[]), "'tree' must be a dict, got list"),
-    "frames": (
-        lambda d: d["frames"][0].update(parent="moon"),
-        "rides on 'moon'; have: panda_link0",
-    ),
+    "frames": (lambda d: d["frames"][0].update(parent="moon"), "rides on 'moon'; have: panda_l"),
     "tool": (lambda d: d.update(tool={"mass": 1}), "'com' in 'tool'"),
     "effects": (lambda d: d.update(effects={}), "'effects' must be a list, got dict"),
     "flags": (lambda d: d.update(lambda_identifiable=[1]), "'lambda_identifiable' must hold true"),

@@ -22,7 +22,14 @@ from adapter.model.self_model import SelfModel, Tool
 from adapter.model.spatial import rot_z, z_to_axis
 from adapter.model.urdf import parse_urdf
 from adapter.physics.rigid_arm import RigidArm
-from tests.helpers.robot_models import PANDA, SHARED, random_urdf, read_quietly
+from tests.helpers.robot_models import (
+    PANDA,
+    SHARED,
+    places_of,
+    random_urdf,
+    read_quietly,
+    set_angles,
+)
 from tests.model.test_onto import DRESSED, learned
 
 HAND = SHARED / "models" / "panda_gaz2019_hand.urdf"
@@ -80,15 +87,11 @@ def by_pinocchio(path: Path, motion: Motion, names: Names, centres: Points) -> A
     else:
         oracle = pin.buildModelFromMJCF(str(path))
     q, (dq, ddq), data = pin.neutral(oracle), np.zeros((2, oracle.nv)), oracle.createData()
-    for name in names:
-        joint = oracle.joints[oracle.getJointId(name)]
-        angle = motion[0][name]
-        turn = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
-        q[joint.idx_q : joint.idx_q + joint.nq] = turn
-        dq[joint.idx_v], ddq[joint.idx_v] = motion[1][name], motion[2][name]
+    at, (angles, *rates) = places_of(oracle, names), [[x[name] for name in names] for x in motion]
+    set_angles(oracle, q, names, angles)
+    dq[at], ddq[at] = rates
     tau = pin.rnea(oracle, data, q, dq, ddq)
     pin.framesForwardKinematics(oracle, data, q)
-    at = [oracle.joints[oracle.getJointId(name)].idx_v for name in names]
     frames = {name: data.oMf[oracle.getFrameId(name)] for name in centres}
     return Answer(tau[at], {name: frames[name].act(centres[name]) for name in centres})
 

@@ -14,18 +14,19 @@ from adapter.physics import kernels, networks
 from adapter.physics.kernels import JointMotion, base_at_rest, frames_of
 from adapter.physics.networks import DTYPE, FrameMotion
 from adapter.physics.rigid_arm import RigidArm
+from tests.helpers.arm_data import PIN_ORDER
 from tests.helpers.robot_models import (
     ROBOTS,
     Case,
     pin_model,
     pinocchio_case,
+    places_of,
     random_urdf,
     relative,
+    set_angles,
     urdf_text,
 )
 
-# Pinocchio's order of inertia elements [XX XY YY XZ YZ ZZ] in ours [XX XY XZ YY YZ ZZ].
-TO_OURS = np.array([0, 1, 2, 3, 4, 5, 7, 6, 8, 9])
 SEEDS = range(6)
 floating_or_not = pytest.mark.parametrize("floating", [False, True], ids=["fixed", "floating"])
 
@@ -55,7 +56,7 @@ def test_regressor_of_the_panda_is_pinocchios() -> None:
     mine = networks.regressor(case.model.tree, lam, (case.q, case.dq, case.ddq), case.base)
     oracle = pin_model(text)
     data = oracle.createData()
-    columns = np.concatenate([10 * k + TO_OURS for k in range(7)])
+    columns = np.concatenate([10 * k + np.array(PIN_ORDER) for k in range(7)])
     for k in range(len(case.q)):
         state = (case.q[k].numpy(), case.dq[k].numpy(), case.ddq[k].numpy())
         theirs = pin.computeJointTorqueRegressor(oracle, data, *state)[:, columns]
@@ -223,17 +224,14 @@ def test_torque_of_a_wrench_is_pinocchios_jacobian(robot: str) -> None:
     _, model, (q, _, _) = fixed_case(robot)
     oracle = pin_model(random_urdf(8, seed=3) if robot == "two_arms" else urdf_text(robot))
     data, wrench = oracle.createData(), np.random.default_rng(5).normal(size=6)
-    numbers = [oracle.getJointId(name) for name in model.tree.joint_names]
-    places = [oracle.joints[k].idx_v for k in numbers]
+    names = model.tree.joint_names
+    last, places = oracle.getJointId(names[-1]), places_of(oracle, names)
     found = RigidArm.of(model).wrench_torque(q, wrench)
     for row, angles in zip(found, q, strict=True):
         full = pin.neutral(oracle)
-        for number, angle in zip(numbers, angles, strict=True):
-            joint = oracle.joints[number]
-            turn = [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
-            full[joint.idx_q : joint.idx_q + joint.nq] = turn
+        set_angles(oracle, full, names, angles)
         pin.computeJointJacobians(oracle, data, full)
-        J = pin.getJointJacobian(oracle, data, numbers[-1], pin.LOCAL_WORLD_ALIGNED)
+        J = pin.getJointJacobian(oracle, data, last, pin.LOCAL_WORLD_ALIGNED)
         assert relative(row, (J.T @ wrench)[places]) < 1e-9
 
 

@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
 from adapter.errors import MeansError, SettingsError
@@ -37,7 +36,8 @@ from drivers.files.mcap import read_log, write_log
 from sim.effects import per_joint
 from sim.scenarios import build
 from sim.truth import Truth
-from tests.helpers.arm_data import Motion, panda_model, pin_model, record, rubbing
+from tests.helpers.arm_data import Motion, panda_model, record, rubbing
+from tests.helpers.gap_effects import regressor
 
 DAY_NS = 86_400 * 10**9
 # The log with a load; joint (from 1) whose friction grows; another arm.
@@ -87,8 +87,8 @@ def fleet(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Fleet:
     return learn_fleet(found_logs([str(logs)]), panda_model(), Settings(out, workers=2))
 
 
-def the_arm(found: Fleet, name: str = "A-1") -> FleetArm:
-    return next(arm for arm in found.arms if arm.name == name)
+def the_arm(found: Fleet) -> FleetArm:
+    return next(arm for arm in found.arms if arm.name == "A-1")
 
 
 def off(ours: FleetArm, theirs: FleetArm) -> float:
@@ -125,8 +125,6 @@ def oracle_moments(paths: Sequence[Path]) -> LogMoments:
     """All samples of some recordings in one pass: Pinocchio's regressor, numpy's product."""
     model = panda_model()
     truth = rubbing(0.3, 0.2)  # its frames are the documented ones
-    pinocchio, order = pin_model(truth), [0, 1, 2, 3, 4, 5, 7, 6, 8, 9]
-    data = pinocchio.createData()
     theta = learner_of(model).theta
     states, gain = [], 0.0
     for path in reversed(paths):
@@ -134,12 +132,8 @@ def oracle_moments(paths: Sequence[Path]) -> LogMoments:
         log = read_log(path)
         states.append(front_end.step_table(log.stamp_ns, log.q, log.dq, log.tau))
         gain = front_end.filter.noise_gain
-    table, at, n = np.concatenate(states), theta.layout, 7
-    motion = zip(table[:, at.q], table[:, at.dq], table[:, at.ddq], strict=True)
-    Y = np.empty((len(table), n, 10 * n))
-    for row, (q, dq, ddq) in zip(Y, motion, strict=True):
-        own = pin.computeJointTorqueRegressor(pinocchio, data, q, dq, ddq).reshape(n, n, 10)
-        row.reshape(n, n, 10)[:, :, order] = own
+    table, at = np.concatenate(states), theta.layout
+    Y = regressor(truth, table[:, at.q], table[:, at.dq], table[:, at.ddq])
     effects, tau = theta.effect_columns(table), table[:, at.joint_tau]
     A = theta.moments.A.copy()
     for j, size in enumerate(theta.rows.sizes):
