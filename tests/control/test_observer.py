@@ -118,41 +118,32 @@ def test_what_is_no_number_changes_nothing() -> None:
     assert observer.contacts == []
 
 
-def kind_from_2s_on(observer: ContactObserver) -> Kind:
-    """Of the first contact, which must have begun then."""
-    contact, model = observer.contacts[0], panda_model()
-    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
-    return kind_of(contact, observer.frames, model.gravity, model.limits.effort)
+def torque_of(kind: Kind, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """(m, n) N m, by Pinocchio, of 1 kg that hangs on the hand, or 10 N along y of the base."""
+    bare = pin_model(panda())
+    if kind == Kind.LOAD:
+        held = pin_model(panda(), payload(1.0, (0.0, 0.02, 0.12)))
+        return rnea(held, q, dq, ddq) - rnea(bare, q, dq, ddq)
+    data, tau = bare.createData(), np.empty_like(q)
+    for row, angles in zip(tau, q, strict=True):
+        jacobian = pin.computeJointJacobian(bare, data, angles, 7)
+        row[:] = -jacobian[:3].T @ data.oMi[7].rotation.T @ np.array([0.0, 10.0, 0.0])
+    return tau
 
 
+@pytest.mark.parametrize("kind", [Kind.LOAD, Kind.PUSH])
 @pytest.mark.parametrize("seed", [5, 6, 7])
-def test_a_load_is_no_push_aside(seed: int) -> None:
-    """A body of 1 kg that hangs on the hand from 2 s on, by Pinocchio."""
-    truth, motion = panda(), Motion(4.0, seed, low_hz=0.3)
-    data = record(arm(), motion)
-    q, dq, ddq = data.true[:3]
-    held = pin_model(truth, payload(1.0, (0.0, 0.02, 0.12)))
-    more = rnea(held, q, dq, ddq) - rnea(pin_model(truth), q, dq, ddq)
+def test_a_load_is_told_from_a_push_aside(kind: Kind, seed: int) -> None:
+    """What begins after 2 s."""
+    data, model = record(arm(), Motion(4.0, seed, low_hz=0.3)), panda_model()
+    more = torque_of(kind, *data.true[:3])
+    more[:2000] = 0.0
     observer = learned_observer()
-    for k, stamp_ns in enumerate(data.stamp_ns):
-        tau = data.tau[k] + (more[k] if k >= 2000 else 0.0)
-        observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
-    assert kind_from_2s_on(observer) == Kind.LOAD
-
-
-@pytest.mark.parametrize("seed", [5, 6, 7])
-def test_a_push_aside_is_no_load(seed: int) -> None:
-    """10 N along y of the base at the hand from 2 s on, by Pinocchio's Jacobian."""
-    truth, data = pin_model(panda()), record(arm(), Motion(4.0, seed, low_hz=0.3))
-    scratch, observer = truth.createData(), learned_observer()
-    for k, stamp_ns in enumerate(data.stamp_ns):
-        tau = data.tau[k].copy()
-        if k >= 2000:
-            jacobian = pin.computeJointJacobian(truth, scratch, data.true[0][k], 7)
-            turn = scratch.oMi[7].rotation.T @ np.array([0.0, 10.0, 0.0])
-            tau -= jacobian[:3].T @ turn
-        observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
-    assert kind_from_2s_on(observer) == Kind.PUSH
+    for sample in replace(data, tau=data.tau + more).samples():
+        observer.step(sample)
+    contact = observer.contacts[0]
+    assert 0.0 <= 1e-9 * contact.begin_ns - 2.0 < 0.05
+    assert kind_of(contact, observer.frames, model.gravity, model.limits.effort) == kind
 
 
 def test_friction_that_is_documented_and_learned_counts_once() -> None:
@@ -163,13 +154,9 @@ def test_friction_that_is_documented_and_learned_counts_once() -> None:
     data = record(arm(), Motion(4.0, 3, low_hz=0.1))
     observer = ContactObserver(rough, (name,))
     observer.adopt(model.lam, model.theta, np.full((1, 7), 0.5), np.full((1, 7), np.nan), STD)
-    worst = 0.0
-    for k, stamp_ns in enumerate(data.stamp_ns):
-        tau = data.tau[k] + 0.5 * data.true[1][k]
-        torque = observer.step(JointSample(int(stamp_ns), data.q[k], data.dq[k], tau))
-        worst = max(worst, np.abs(torque[4:]).max())
+    samples = replace(data, tau=data.tau + 0.5 * data.true[1]).samples()
     assert np.abs(data.dq[:, 4:]).max() > 1.0
-    assert worst < 0.3
+    assert max(np.abs(observer.step(sample)[4:]).max() for sample in samples) < 0.3
     assert observer.contacts == []
 
 

@@ -117,8 +117,7 @@ def test_no_circle_between_rooms() -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "forbidden"),
-    [("sim", "adapter"), ("drivers", "adapter"), ("drivers", "sim")],
+    ("source", "forbidden"), [("sim", "adapter"), ("drivers", "adapter"), ("drivers", "sim")]
 )
 def test_truth_and_drivers_know_no_learner(source: str, forbidden: str) -> None:
     chain = graph().find_shortest_chain(source, forbidden, as_packages=True)

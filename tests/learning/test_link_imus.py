@@ -14,9 +14,9 @@ from adapter.learning.learner import OnlineLearner
 from adapter.learning.settings import LearnerSettings, SchemaSettings
 from adapter.model.spatial import matrix_from_zxz
 from adapter.runs.config import PipelineSettings
-from adapter.runs.outcome import collect, learned_model
+from adapter.runs.outcome import Outcome, learned_model
 from adapter.runs.pipeline import Pipeline
-from adapter.runs.replay import Replay, ReplayOptions, replay
+from adapter.runs.replay import ReplayOptions, replay
 from adapter.runs.score import Reference, schema_score
 from adapter.signals.link_imus import with_link_imus
 from drivers.files.mcap import Log
@@ -37,17 +37,20 @@ def _settings(links: tuple[str, ...]) -> PipelineSettings:
     return PipelineSettings(learner=LearnerSettings(schema=SchemaSettings(imus=links)))
 
 
+def _learned(log: Log, every: int) -> Outcome:
+    log, links = with_link_imus(log, panda_model())
+    return replay(log, panda_model(), _settings(links), ReplayOptions(every)).outcome
+
+
 @cache
-def _replayed(every: int = 10) -> Replay:
-    log, links = with_link_imus(_glued().log(), panda_model())
-    assert links == tuple(_glued().truth.link_names[i] for i in LINKS)
-    return replay(log, panda_model(), _settings(links), ReplayOptions(every))
+def _outcome() -> Outcome:
+    return _learned(_glued().log(), 10)
 
 
 def test_axes_are_placed_and_lambda_says_measured() -> None:
-    outcome = _replayed().outcome
+    outcome = _outcome()
     model = learned_model(outcome, panda_model())
-    assert outcome.lam_converged and model.lambda_source == "measured"
+    assert outcome.lam_converged and outcome.lam_measured and model.lambda_source == "measured"
     errors = axis_errors(_glued().truth, matrix_from_zxz(model.lam[:, :3]), model.lam[:, 3:])
     for error, most in zip(errors, (0.1, 2.0, 2.0, 0.1), strict=True):  # deg, mm, mm, deg
         assert np.abs(error).max() < most
@@ -56,7 +59,7 @@ def test_axes_are_placed_and_lambda_says_measured() -> None:
 
 
 def test_errors_are_as_large_as_is_said() -> None:
-    outcome, truth = _replayed().outcome, _glued().truth
+    outcome, truth = _outcome(), _glued().truth
     reference = Reference(truth.lam, None, "truth")
     score = schema_score(outcome, panda_model(), reference, 0.0)
     assert score["source"] == "measured" and score["settled"]
@@ -69,9 +72,7 @@ def test_errors_are_as_large_as_is_said() -> None:
 
 def test_what_no_sensor_shows_is_the_documentation() -> None:
     glued = replace(_glued(), sensors={k: v for k, v in _glued().sensors.items() if k < 6})
-    log, links = with_link_imus(glued.log(), panda_model())
-    found = replay(log, panda_model(), _settings(links), ReplayOptions(10)).outcome
-    model = learned_model(found, panda_model())
+    model = learned_model(_learned(glued.log(), 10), panda_model())
     assert np.allclose(model.lam[4:], panda_model().lam[4:], atol=1e-6)
     assert not model.lam_identifiable[4:].any() and model.lam_identifiable[3].any()
 
@@ -80,14 +81,12 @@ def test_kept_and_restored_it_goes_on_as_before(tmp_path) -> None:
     from adapter.learning.checkpoint import load_checkpoint, save_checkpoint
 
     log, links = with_link_imus(_glued().log(), panda_model())
+    assert links == tuple(_glued().truth.link_names[i] for i in LINKS)
     whole, first, second = (Pipeline(panda_model(), _settings(links)) for _ in range(3))
-    table = whole.front_end.step_table(
-        log.stamp_ns[:3000],
-        log.q[:3000],
-        log.dq[:3000],
-        log.tau[:3000],
-        (log.twists[:3000], log.accels[:3000]),
+    *signals, twists, accels = (
+        getattr(log, x)[:3000] for x in ("stamp_ns", "q", "dq", "tau", "twists", "accels")
     )
+    table = whole.front_end.step_table(*signals, (twists, accels))
     parts = np.array_split(table, 60)
     for part in parts:
         whole.learner.learn_schema(part, 1)
@@ -134,18 +133,15 @@ def test_a_sensor_that_cannot_be_used_is_named() -> None:
     w = w.copy()
     w[100:110] = np.nan
     log = replace(glued, sensors=sensors | {6: (t_s, w, a)}).log()
-    with_imus, links = with_link_imus(log, panda_model())
-    outcome = replay(with_imus, panda_model(), _settings(links), ReplayOptions(20)).outcome
-    assert len(outcome.lam_notes) == 2
-    assert f"{names[1]} reads 20 times a second, and 40 are needed" in outcome.lam_notes[0]
-    assert f"{names[3]} always reads the same" in outcome.lam_notes[1]
+    slow, still = _learned(log, 20).lam_notes
+    assert f"{names[1]} reads 20 times a second, and 40 are needed" in slow
+    assert f"{names[3]} always reads the same" in still
 
 
 def test_a_sensor_on_another_link_is_not_believed() -> None:
     names = _glued().truth.link_names
     log = _glued().log({1: names[5], 3: names[3], 6: names[6]})
-    with_imus, links = with_link_imus(log, panda_model())
-    outcome = replay(with_imus, panda_model(), _settings(links), ReplayOptions(20)).outcome
+    outcome = _learned(log, 20)
     assert not outcome.lam_converged
     assert any(names[5] in note and "which link is it on" in note for note in outcome.lam_notes)
 
@@ -159,4 +155,3 @@ def test_settings_name_links_of_the_robot() -> None:
         OnlineLearner(robot.tree, robot.gravity, settings)
     with pytest.raises(SettingsError, match="twice"):
         SchemaSettings(imus=("panda_link3", "panda_link3"))
-    assert collect(_replayed().pipeline.learner).lam_measured

@@ -48,15 +48,6 @@ def test_moments_are_rebuilt_when_lambda_moves() -> None:
     assert np.allclose(a, b, rtol=0.02)
 
 
-@pytest.mark.slow
-def test_theta_then_is_that_learned_with_the_right_lambda() -> None:
-    off, right = learned(truth=False), learned(truth=True)
-    table = states()[::50]
-    frames = right.schema.R0, right.schema.p
-    a, b = (x.theta.errors(frames, table) for x in (off, right))
-    assert np.abs(a - b).max() < 0.05 * np.abs(b).max() + 1e-3
-
-
 def test_a_lambda_that_stays_rebuilds_nothing_more() -> None:
     learner = learned(truth=False)
     done = learner.rebuilds

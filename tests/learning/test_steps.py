@@ -72,13 +72,7 @@ def same(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        {"mode": Mode.SAMPLE},
-        {"update_every": 4},
-        {"wait_for_schema": False},
-    ],
-    ids=str,
+    "settings", [{"mode": Mode.SAMPLE}, {"update_every": 4}, {"wait_for_schema": False}], ids=str
 )
 def test_other_ways_to_learn(settings: dict, tmp_path: Path) -> None:
     """Those that a call does not serve go one by one."""

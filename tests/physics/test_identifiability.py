@@ -122,19 +122,6 @@ def test_frame_jacobian_against_numerical_derivatives() -> None:
     np.testing.assert_allclose(exact.T @ exact, numerical.T @ numerical, rtol=1e-6)
 
 
-def test_a_floating_base_shows_every_frame() -> None:
-    model = PANDA.with_base(floating=True)
-    assert frame_observability(model.tree, model.lam, model.gravity).rank == 42
-
-
-def test_motion_of_a_floating_base_comes_first() -> None:
-    model = PANDA.with_base(floating=True)
-    base = FrameMotion(*(torch.full((2, 3), float(k), dtype=torch.float64) for k in range(4)))
-    q = torch.zeros(2, 7, dtype=torch.float64)
-    k = link_motion(model.tree, torch.from_numpy(model.lam), (q, q, q), base)
-    assert k.v.shape == (2, 8, 3) and torch.equal(k.a[:, 0], base.a)
-
-
 def pinocchio_rank(text: str, floating: bool, seed: int = 0) -> int:
     """Rank of Pinocchio's torque regressor over random motion."""
     oracle = pin_model(text, floating)

@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 
 from adapter.errors import ModelError, SettingsError
 from adapter.model.robots import documented
-from adapter.runs.config import (
-    Config,
-    config_from,
-    config_recorded,
-    config_table,
-    read_config,
-)
+from adapter.runs.config import Config, config_from, config_recorded, config_table, read_config
 
 WHOLE = """
 gravity = [9.81, 0, 0.0]

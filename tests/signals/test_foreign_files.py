@@ -81,10 +81,7 @@ TEXTS = {  # name: (content, expected words, options)
     "ten seconds apart.csv": (scaled([0], 1e3), READ, "--units", "time=s"),
     "nanoseconds untold.csv": (scaled([0], 1e9), "is the time in s\\?|is no time"),
     "stamps.csv": (text(STAMPS), READ),
-    "stamps in ns untold.csv": (
-        text(STAMPS * [1e9, 1, 1, 1, 1, 1, 1]),
-        "line 2: .* is no time",
-    ),
+    "stamps in ns untold.csv": (text(STAMPS * [1e9, 1, 1, 1, 1, 1, 1]), "line 2: .* is no time"),
     "degrees.csv": (scaled([1, 2, 3, 4], 180 / np.pi), READ, "--units", "q=deg"),
     "degrees untold.csv": (scaled([1, 2, 3, 4], 57.3), "are they degrees\\? Say --units q=deg"),
     "far turned.csv": (scaled([1, 2, 3, 4], 57.3), "look like degrees", "--units", "q=rad"),

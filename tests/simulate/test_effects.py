@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
-from collections.abc import Callable
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,8 @@ from tests.simulate.test_rollouts import CASES, PANDA, SENSED, model_with
 
 READY = np.array([0.0, -0.8, 0.0, -2.3, 0.0, 1.6, 0.8])
 DQ = np.array([0.4, -0.5, 0.6, 0.3, -0.7, 0.8, -0.9])
+STILL = np.zeros(7)
+RIGID = pin_model(panda())
 LOSSES = (
     Effect("viscous_friction", (1, 5), {"Fv": 0.6}),
     Effect("coulomb_friction", (2, 7), {"Fc": 0.5}),
@@ -40,6 +41,18 @@ STICKING = (
 )
 
 
+def torque_of(q: np.ndarray, dq: np.ndarray = STILL, ddq: np.ndarray = STILL) -> np.ndarray:
+    """(n,) N m of the bare arm, by Pinocchio."""
+    return pin.rnea(RIGID, RIGID.createData(), q, dq, ddq)
+
+
+def placed(simulator: str, model: SelfModel, dq: np.ndarray = STILL) -> Any:
+    """An arm in its ready pose."""
+    arm = SIMULATORS[simulator](model)
+    arm.place(READY, dq)
+    return arm
+
+
 def test_the_torque_is_that_of_the_effects_own_equations() -> None:
     """Where nothing is stiff, against Pinocchio's rigid torque and the equations by hand."""
     model = model_with(
@@ -50,9 +63,7 @@ def test_the_torque_is_that_of_the_effects_own_equations() -> None:
         Effect("torque_offset", (6,), {"o": 2.0}),
         Effect("friction_drift", (7,), {"dFc": 0.02}),
     )
-    arm = pin_model(panda())
-    load = pin.rnea(arm, arm.createData(), READY, DQ, np.zeros(7))
-    added = Effects(model, 1e-6, "bodies")(READY, DQ, np.zeros(7), load, 5.0)
+    added = Effects(model, 1e-6, "bodies")(READY, DQ, STILL, torque_of(READY, DQ), 5.0)
     stribeck = 0.4 + 0.6 * np.exp(-((DQ[3] / 0.3) ** 2))
     by_hand = [0.6 * DQ[0], -0.5, 0.0, stribeck]
     by_hand += [0.4 * np.sin(6.0 * READY[4] + 0.2), 0.0, -0.02 * 5.0]  # the offset is a sensor's
@@ -61,11 +72,10 @@ def test_the_torque_is_that_of_the_effects_own_equations() -> None:
 
 def test_friction_goes_with_the_load_of_this_very_step() -> None:
     """The load is the rigid torque at the acceleration that comes out, by Pinocchio."""
-    arm, tau = pin_model(panda()), np.array([5.0, -30.0, 8.0, 20.0, 1.0, 2.0, 0.1])
+    tau = np.array([5.0, -30.0, 8.0, 20.0, 1.0, 2.0, 0.1])
     model = model_with(Effect("load_dependent_friction", (1, 2, 3), {"Fl": 0.1}))
     added = Effects(model, 1e-6, "bodies")(READY, DQ, None, tau, 0.0)
-    ddq = pin.aba(arm, arm.createData(), READY, DQ, tau + added)
-    load = pin.rnea(arm, arm.createData(), READY, DQ, ddq)
+    load = torque_of(READY, DQ, pin.aba(RIGID, RIGID.createData(), READY, DQ, tau + added))
     expected = -0.1 * np.abs(load[:3]) * np.sign(DQ[:3])
     np.testing.assert_allclose(added[:3], expected, atol=0.02 * np.abs(load).max())
 
@@ -76,21 +86,17 @@ def test_what_the_file_holds_is_not_added_again(holds: str) -> None:
     model, h = model_with(*LOSSES), 1e-5
     whole = _acceleration(model, "bodies", h)
     np.testing.assert_allclose(_acceleration(model, holds, h), whole, rtol=1e-3)
-    assert np.abs(Effects(model, h, holds)(READY, DQ, None, np.zeros(7), 0.0)).max() > 0.1
+    assert np.abs(Effects(model, h, holds)(READY, DQ, None, STILL, 0.0)).max() > 0.1
     if holds == "mjcf":  # holds all of these
         held = model_with(LOSSES[0], LOSSES[1], LOSSES[4], LOSSES[5])
-        assert np.abs(Effects(held, h, holds)(READY, DQ, None, np.zeros(7), 0.0)).max() < 1e-9
+        assert np.abs(Effects(held, h, holds)(READY, DQ, None, STILL, 0.0)).max() < 1e-9
 
 
 def _acceleration(model: SelfModel, holds: str, h: float) -> np.ndarray:
     """(n,) rad/s² of one step; losses of the file by hand, as a simulator takes them."""
-    arm = pin_model(panda())
-    data = arm.createData()
-    M = pin.crba(arm, data, READY) + 0.0
-    M = np.triu(M) + np.triu(M, 1).T
-    tau = pin.rnea(arm, data, READY, DQ, np.zeros(7))
-    tau = tau + Effects(model, h, holds)(READY, DQ, None, tau, 0.0)
-    push = tau - pin.rnea(arm, data, READY, DQ, np.zeros(7))
+    M = np.triu(pin.crba(RIGID, RIGID.createData(), READY))
+    M = M + np.triu(M, 1).T
+    push = Effects(model, h, holds)(READY, DQ, None, torque_of(READY, DQ), 0.0)
     parts = {
         "pybullet": ("damping",),
         "bodies": (),
@@ -111,11 +117,7 @@ def _acceleration(model: SelfModel, holds: str, h: float) -> np.ndarray:
 @pytest.mark.parametrize("simulator", list(SIMULATORS))
 def test_friction_holds_still_without_chattering(simulator: str) -> None:
     """At 1 ms, under a torque below friction: the arm creeps less than a hand's unrest."""
-    model = model_with(*STICKING)
-    arm = SIMULATORS[simulator](model)
-    arm.place(READY, np.zeros(7))
-    rigid = pin_model(panda())
-    hold = pin.rnea(rigid, rigid.createData(), READY, np.zeros(7), np.zeros(7))
+    arm, hold = placed(simulator, model_with(*STICKING)), torque_of(READY)
     push = 0.4 * np.array([1, -1, 1, -1, 1, -1, 1])
     speeds = []
     for _ in range(500):
@@ -137,14 +139,9 @@ def test_bristles_wind_up_and_hold(simulator: str, s0: float) -> None:
         Effect("bristle_friction", joints, {"Fc": level, "s0": s0}),
         Effect("viscous_friction", joints, {"Fv": 5.0}),  # or the arm swings on its bristles
     )
-    arm = SIMULATORS[simulator](model)
-    arm.place(READY, np.zeros(7))
-    rigid, way = pin_model(panda()), np.array([1, -1, 1, -1, 1, -1, 1])
-    data = rigid.createData()
+    arm, way = placed(simulator, model), np.array([1, -1, 1, -1, 1, -1, 1])
     for k in range(1000):
-        q, _ = arm.state()
-        weight = pin.rnea(rigid, data, q, np.zeros(7), np.zeros(7))
-        arm.step(weight + 0.6 * level * min(k / 700, 1.0) * way)
+        arm.step(torque_of(arm.state()[0]) + 0.6 * level * min(k / 700, 1.0) * way)
     wound = (arm.state()[0] - READY) * way
     arm.close()
     assert (wound < 2e-4 + 1.2 * s0).all()  # a way below 0.1 mrad is taken as longer
@@ -154,13 +151,9 @@ def test_bristles_wind_up_and_hold(simulator: str, s0: float) -> None:
 
 @pytest.mark.parametrize("simulator", list(SIMULATORS))
 def test_a_joint_comes_to_rest(simulator: str) -> None:
-    arm = SIMULATORS[simulator](model_with(*STICKING))
-    arm.place(READY, 0.3 * DQ)
-    rigid = pin_model(panda())
-    data = rigid.createData()
+    arm = placed(simulator, model_with(*STICKING), 0.3 * DQ)
     for _ in range(1000):
-        q, dq = arm.state()
-        arm.step(pin.rnea(rigid, data, q, dq, np.zeros(7)))
+        arm.step(torque_of(*arm.state()))
     _, dq = arm.state()
     arm.close()
     assert np.abs(dq).max() < 1e-4
@@ -267,14 +260,7 @@ def _own_pybullet(model: SelfModel, tau: np.ndarray, folder: Path, share: float)
 
 
 def test_missing_mujoco_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    real: Callable[..., Any] = builtins.__import__
-
-    def without(name: str, *rest: Any, **more: Any) -> Any:
-        if name == "mujoco":
-            raise ImportError(name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(MeansError, match=r"panda-adapter\[mujoco\]"):
         Rollouts("mujoco")
 
