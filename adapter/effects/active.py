@@ -22,6 +22,7 @@ from adapter.effects.base import (
 )
 from adapter.effects.by_joint import ByJoint
 from adapter.effects.catalogue import KNOWN
+from adapter.effects.law import Law
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
 from drivers.errors import choices
@@ -138,6 +139,8 @@ def _of_entry(entry: Any, n: int) -> list[Active]:
     if not isinstance(name, str) or name not in KNOWN:
         raise ModelError(f"no effect '{name}'; {choices(name, KNOWN)}")
     effect = KNOWN[name]
+    if isinstance(effect, Law) and effect.by > n:
+        raise ModelError(f"{effect.name}: no joint {effect.by}; have: 1 to {n}")
     values = entry["parameters"]
     if not isinstance(values, Mapping):
         raise ModelError(f"{effect.name}: 'parameters' must hold {_keys(effect)}, got {values!r}")

@@ -482,7 +482,10 @@ class JointTorque(TorqueEffect):
 
     def absent(self, n: int) -> dict[str, Array]:
         """Parameters (n,) each of joints without it; what may not be zero stands at its least."""
-        return {p.key: np.full(n, np.clip(0.0, p.lower, p.upper)) for p in self.parameters}
+        return {
+            p.key: np.full(n if p.count == 1 else (n, p.count), np.clip(0.0, p.lower, p.upper))
+            for p in self.parameters
+        }
 
 
 class LearnedEffect(Effect):

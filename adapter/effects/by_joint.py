@@ -132,7 +132,7 @@ class ByJoint:
             self._taken.append(set())
         self._taken[at].add(joint)
         for key, value in values.items():
-            self.laws[at][1][key][joint] = float(value)
+            self.laws[at][1][key][joint] = value
 
     @cached_property
     def ripple(self) -> Array:

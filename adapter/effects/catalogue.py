@@ -19,7 +19,7 @@ from adapter.effects.external_wrench import ExternalWrench
 from adapter.effects.friction_drift import FrictionDrift
 from adapter.effects.joint_elasticity import JointElasticity
 from adapter.effects.joint_spring import JointSpring
-from adapter.effects.law import LAWS
+from adapter.effects.law import CURVES, LAWS
 from adapter.effects.link_inertia import LinkInertia
 from adapter.effects.load_dependent_friction import LoadDependentFriction
 from adapter.effects.motor_inertia import MotorInertia
@@ -63,7 +63,7 @@ CATALOGUE: dict[str, Effect] = {
 }
 
 # What files and findings may name: effects, and laws of what none of them is.
-KNOWN: Mapping[str, Effect] = ChainMap(CATALOGUE, dict[str, Effect](LAWS))
+KNOWN: Mapping[str, Effect] = ChainMap(CATALOGUE, {**LAWS, **CURVES})
 
 
 def learnable(effect: Effect) -> TypeGuard[LearnedEffect]:

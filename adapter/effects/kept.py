@@ -120,7 +120,7 @@ def keep(result: Path, name: str, joint: int | None, path: Path) -> str:
         findings = json.loads(result.read_text(encoding="utf-8"))["findings"]
     except (ValueError, KeyError, TypeError):
         raise SettingsError(f"{result}: no result of `adapter gap`") from None
-    laws = [f for f in findings if f["effect"].startswith(LAW)]
+    laws = [f for f in findings if f["effect"] in LAWS]
     found = [f for f in laws if joint in (None, *f["joints"])]
     if len(found) != 1:
         have = "; ".join(f"joint {f['joints'][0]}: {f['effect'].removeprefix(LAW)}" for f in laws)

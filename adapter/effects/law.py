@@ -7,6 +7,7 @@ expression is its name, so that a file that holds it can be read by whoever has 
 from __future__ import annotations
 
 import re
+from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -30,6 +31,7 @@ from adapter.effects.splits import SPEEDS, STILL, TURN
 LAW = "law: "  # begins the name of a law that has no other
 SIZE_NM = 1.0  # of a law's torque where its signals are as large as in `SIGNALS`
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
+CURVE_NM = 0.3  # of a curve's coefficients
 EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
 BENDS = tuple(np.geomspace(0.1, 3.0, 12))  # shares of the largest torque at which a sensor bends
 BY, MOST_JOINTS = "ⱼ", 32
@@ -183,7 +185,27 @@ def _over_angle(
     )
 
 
-class Law(JointTorque):
+class OverSignals(JointTorque):
+    """A torque of no catalogue, by signals of one joint."""
+
+    by: int
+
+    @property
+    @abstractmethod
+    def variables(self) -> frozenset[str]:
+        """Signals that it follows."""
+
+    def curve(self, signal: str, x: Array, values: Values) -> Array:
+        """Torque (k,) over the one signal that it follows."""
+        q, dq, ddq, tau = (x if key == signal else np.zeros_like(x) for key in SIGNALS)
+        return self.on_signals(JointSignals(q, dq, ddq, tau), values)
+
+    @abstractmethod
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
+        """Torque by signals of the joint that it follows."""
+
+
+class Law(OverSignals):
     """A torque c times an expression.
 
     Args:
@@ -210,6 +232,11 @@ class Law(JointTorque):
         self.parameters = tuple(own)  # type: ignore[misc]
         sizes_said = ", ".join(f"{p.key} = {{{p.key}}}" for p in own)
         self.phrase = Phrase(f"{{who}} {{has}} {{title}}: {sizes_said}", "c")  # type: ignore[misc]
+
+    @property
+    def variables(self) -> frozenset[str]:
+        """Signals that it follows."""
+        return self.expression.variables
 
     def templates(self) -> tuple[Template, ...]:
         """Its coefficient, or two of a wave, at the first setting that is tried."""
@@ -251,24 +278,19 @@ class Law(JointTorque):
             k = slice(self.by - 1, self.by)
             tau = at.tau[..., k] if self.by_load else at.tau
             at = at._replace(q=at.q[..., k], dq=at.dq[..., k], ddq=at.ddq[..., k], tau=tau)
-        return self._torque(at, values)
-
-    def curve(self, signal: str, x: Array, values: Values) -> Array:
-        """Torque (k,) over the one signal that it follows."""
-        q, dq, ddq, tau = (x if key == signal else np.zeros_like(x) for key in SIGNALS)
-        return self._torque(JointSignals(q, dq, ddq, tau), values)
+        return self.on_signals(at, values)
 
     def on(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """Torque (m,) of one joint, by its own signals or another's."""
         k = self.by - 1 if self.by else joint
         at = JointSignals(motion.q[:, k], motion.dq[:, k], motion.ddq[:, k], tau[:, k])
-        return self._torque(at, values)
+        return self.on_signals(at, values)
 
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The law on one joint."""
         return on_joint(motion, joint, self.on(motion, tau, joint, values))
 
-    def _torque(self, at: JointSignals, values: Values) -> Array:
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
         setting = self.expression.setting
         term = self.expression.term(at, np.asarray(values[setting.key] if setting else 0.0))
         if setting and setting.wave:
@@ -276,6 +298,89 @@ class Law(JointTorque):
         return np.asarray(values["c"] * term)
 
 
+PIECES, DEGREE = 5, 3  # of a spline over a signal's range
+WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
+    "": lambda at: 1.0,
+    "sign(dq) ": lambda at: at.direction,
+    "dq ": lambda at: at.dq,
+}
+
+
+def splines(x: Array, low: Array | float, high: Array | float) -> Array:
+    """Cubic B-splines (PIECES + DEGREE, ...) over a range; beyond it they stay as at its end."""
+    step = np.maximum(np.subtract(high, low), 1e-9) / PIECES
+    at = np.clip((x - low) / step, 0.0, PIECES) + DEGREE
+    knots = np.arange(PIECES + DEGREE).reshape(-1, *[1] * np.ndim(at))
+    away = np.abs(at - knots - 2.0)
+    inside = 4.0 - 3.0 * (2.0 - away) * away**2
+    return np.where(away < 1.0, inside, np.maximum(2.0 - away, 0.0) ** 3) / 6.0
+
+
+class Curve(OverSignals):
+    """A torque that follows a signal by no formula: a spline over the range that was seen.
+
+    Args:
+        signal: "q", "dq", "ddq" or "tau"; weight: one of `WEIGHTS`, which it is times.
+    """
+
+    steady = True
+    log_odds = LOG_ODDS
+    by = 0
+
+    def __init__(self, signal: str, weight: str = "") -> None:
+        self.signal, self.weight = signal, weight
+        text = f"{weight}curve({signal})"
+        self.name = f"{LAW}{text}"  # type: ignore[misc]
+        self.title = f"a torque of {text}, without a formula"  # type: ignore[misc]
+        self.by_load = signal == "tau"  # type: ignore[misc]
+        unit = " ".join(SIGNALS[signal].above) + "".join(
+            f"/{_raised(x, p)}" for x, p in SIGNALS[signal].below.items()
+        )
+        self.parameters = (  # type: ignore[misc]
+            Parameter("x", "N m", count=PIECES + DEGREE),
+            Parameter("low", unit),
+            Parameter("high", unit),
+        )
+        self.phrase = Phrase("{who} {has} {torque} that follow " + text + " by no formula")  # type: ignore[misc]
+
+    @property
+    def variables(self) -> frozenset[str]:
+        """Signals that it follows."""
+        return frozenset({self.signal} | ({"dq"} if self.weight else set()))
+
+    def between(self, low: float, high: float) -> Template:
+        """All its coefficients over a range."""
+
+        def decode(x: Array) -> dict[str, Any]:
+            return {"x": [float(value) for value in x], "low": low, "high": high}
+
+        return Template((CURVE_NM,) * (PIECES + DEGREE), decode)
+
+    def templates(self) -> tuple[Template, ...]:
+        """Over a usual range."""
+        return (self.between(-1.0, 1.0),)
+
+    def law(self, at: JointSignals, values: Values) -> Array:
+        """By each joint's own signals."""
+        return self.on_signals(at, values)
+
+    def on_signals(self, at: JointSignals, values: Values) -> Array:
+        """Splines times coefficients, (..., n) of all joints or of one."""
+        basis = splines(getattr(at, self.signal), values["low"], values["high"])
+        x = np.moveaxis(np.asarray(values["x"], dtype=float), -1, 0)
+        x = x.reshape(len(x), *[1] * (basis.ndim - x.ndim), *x.shape[1:])
+        return np.asarray(WEIGHTS[self.weight](at) * np.sum(basis * x, axis=0))
+
+    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
+        """The curve on one joint."""
+        q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
+        return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), values))
+
+
+CURVES: dict[str, Curve] = {
+    curve.name: curve
+    for curve in (*map(Curve, SIGNALS), Curve("q", "sign(dq) "), Curve("q", "dq "))
+}
 LAWS: dict[str, Law] = {
     law.name: law
     for expression in _grammar()

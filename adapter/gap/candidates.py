@@ -35,7 +35,7 @@ from adapter.effects.base import (
 )
 from adapter.effects.by_joint import smooth_sign
 from adapter.effects.catalogue import HELD
-from adapter.effects.law import LAWS, Law
+from adapter.effects.law import CURVES, DEGREE, LAW, LAWS, PIECES, Law
 from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
@@ -246,7 +246,6 @@ def _change(at: Stages, effect: Effect, joint: int, values: dict) -> Array:
     return bodies(links, (Active(effect, joint, values),)) - at.bare
 
 
-PIECES, DEGREE = 5, 3  # of a spline over a signal's range
 SLOW_PIECES = 10  # over time
 SIZE_NM, LEAST_RMS = 0.3, 1e-6
 LINE_RATIO = 30.0  # by which a spectral line must stand out to be looked at
@@ -261,6 +260,7 @@ class Pattern(TorqueEffect):
         label: tells patterns apart; depends_on: signals that it follows ("dq3"), own joint first.
         basis: motion and rigid torque to basis functions (m, k) at the joint.
         count: k.
+        curve: the effect that it is, where it is one.
     """
 
     title = "something that is not in the catalogue"
@@ -272,10 +272,12 @@ class Pattern(TorqueEffect):
         depends_on: tuple[str, ...],
         basis: Callable[[Motion, Array, int], Array],
         count: int,
+        curve: str = "",
     ) -> None:
         self.name = f"{UNEXPLAINED}:{label}"  # type: ignore[misc]
         self.parameters = (Parameter("x", "N m", count=count),)  # type: ignore[misc]
         self.depends_on, self.basis, self._count = depends_on, basis, count
+        self.curve = CURVES.get(curve)
         self.by_load = any(name.startswith("tau") for name in depends_on)  # type: ignore[misc]
 
     def templates(self) -> tuple[Template, ...]:
@@ -290,11 +292,14 @@ class Pattern(TorqueEffect):
 def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
     """What the torque on a joint (from 0) of n may follow."""
     k = joint + 1
-    curves = ("q", "dq", "ddq", "tau")
+    curves, both = ("q", "dq", "ddq", "tau"), (f"q{k}", f"dq{k}")
     own = [
-        *(Pattern(f"{x}{k}", (f"{x}{k}",), _curve(x), PIECES + DEGREE) for x in curves),
-        Pattern(f"q{k},sign", (f"q{k}", f"dq{k}"), _times_sign, PIECES + DEGREE),
-        Pattern(f"q{k},dq", (f"q{k}", f"dq{k}"), _times_speed, PIECES + DEGREE),
+        *(
+            Pattern(f"{x}{k}", (f"{x}{k}",), _curve(x), PIECES + DEGREE, f"{LAW}curve({x})")
+            for x in curves
+        ),
+        Pattern(f"q{k},sign", both, _times_sign, PIECES + DEGREE, f"{LAW}sign(dq) curve(q)"),
+        Pattern(f"q{k},dq", both, _times_speed, PIECES + DEGREE, f"{LAW}dq curve(q)"),
         Pattern(
             "t", ("t",), lambda motion, *_: _spline(motion.t, SLOW_PIECES), SLOW_PIECES + DEGREE
         ),

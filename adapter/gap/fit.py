@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from adapter.effects.active import WHOLE, Active
 from adapter.effects.base import ArmDynamics, SensorEffect, TorqueEffect
 from adapter.effects.catalogue import LATENESS
+from adapter.effects.law import Curve
 from adapter.effects.torque import added, sensors
 from adapter.gap.candidates import Candidate, Pattern, Stages, stages_of
 from adapter.gap.evidence import Carried, Moments, Noise, Score, noise_of
@@ -61,6 +62,11 @@ class Named:
     def is_pattern(self) -> bool:
         """Whether it has neither a name nor a law."""
         return isinstance(self.candidate.effect, Pattern)
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is free enough to stand for an effect."""
+        return isinstance(self.candidate.effect, Pattern | Curve)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -461,13 +467,13 @@ def worth(fit: Fit, carried: Carried | Moments, place: int) -> Score:
 def beside(fit: Fit, place: int) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients of a named effect, and those that are carried along when it is judged.
 
-    These are all others; but an effect of the catalogue need not pay beside patterns, which
+    These are all others; but an effect of the catalogue need not pay beside curves, which
     could stand for it.
     """
     own = place_of(fit, place)
     left_out = [own]
-    if not fit.named[place].is_pattern:
-        left_out += [place_of(fit, k) for k, e in enumerate(fit.named) if e.is_pattern]
+    if not fit.named[place].is_curve:
+        left_out += [place_of(fit, k) for k, e in enumerate(fit.named) if e.is_curve]
     return own, np.delete(np.arange(len(fit.coefficients)), np.concatenate(left_out))
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from adapter.effects.active import WHOLE
-from adapter.effects.law import Law
+from adapter.effects.law import Curve, Law
+from adapter.gap.candidates import Pattern
 from adapter.gap.fit import Fit, Named, place_of, refitted
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, FORMS, SignatureTable
@@ -36,21 +37,22 @@ def notes_on(fit: Fit) -> list[str]:
     notes, motion = [], fit.recordings[0].motion
     for k, e in enumerate(fit.named):
         law, joint = e.candidate.effect, e.candidate.joint
-        if not isinstance(law, Law) or e.recording is not None:
+        if not isinstance(law, Law | Curve) or e.recording is not None:
             continue
         power = fit.model.contribution(0, k)[:, joint] * fit.recordings[0].low_dq[:, joint]
         given = float(-power[power < 0.0].sum() / max(np.abs(power).sum(), 1e-12))
-        if law.expression.variables == {"q"} and not law.by:
+        if law.variables == {"q"} and not law.by:
             does = "stores energy and gives it back, as a spring does"
         elif given < PASSIVE:
             does = "takes energy, as friction does"
         else:
             does = f"feeds energy in: {given:.0%} of what it exchanges".replace("%", " %")
         own, ranges = law.by - 1 if law.by else joint, []
-        for name in sorted(law.expression.variables - {"tau"}):
+        for name in sorted(law.variables - {"tau"}):
             x = getattr(motion, name)[:, own]
             ranges.append(f"{name}{own + 1} from {x.min():.2f} to {x.max():.2f}")
-        seen = f"; seen over {' and '.join(ranges)}, beyond it goes on as written" if ranges else ""
+        beyond = "stays as it is there" if isinstance(law, Curve) else "goes on as written"
+        seen = f"; seen over {' and '.join(ranges)}, beyond it {beyond}" if ranges else ""
         notes.append(f"joint {joint + 1}: {law.title} {does}{seen}")
     return notes
 
@@ -73,7 +75,25 @@ def _of_joint(fit: Fit, joint: int) -> Fit:
         worth += best.log_evidence
         more = lawful.with_named((*lawful.named, Named(best.candidate, best.x)))
         lawful = _settled(more, len(more.named) - 1)
-    return lawful if worth > asked - BELIEF else fit
+    if worth > asked - BELIEF:
+        return lawful
+    return fit.with_named(
+        [_as_curve(fit, e) if k in places else e for k, e in enumerate(fit.named)]
+    )
+
+
+def _as_curve(fit: Fit, named: Named) -> Named:
+    """A pattern as the effect that it is, in one recording; those of time stay what they are."""
+    pattern = named.candidate.effect
+    assert isinstance(pattern, Pattern)
+    if pattern.curve is None or len(fit.recordings) > 1:
+        return named
+    at = fit.model.stages(0)
+    signals = {"tau": at.rigid} | {key: getattr(at.links, key) for key in ("q", "dq", "ddq")}
+    x = signals[pattern.curve.signal][:, named.candidate.joint]
+    template = pattern.curve.between(float(x.min()), float(x.max()))
+    candidate = replace(named.candidate, effect=pattern.curve, template=template)
+    return replace(named, candidate=candidate)
 
 
 def _settled(fit: Fit, place: int) -> Fit:

@@ -197,7 +197,7 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
             and isinstance(e.candidate.effect, TorqueEffect)
             and not e.assumed
         ]
-        words = [e for e in names if not e.is_pattern and e.interval_s == WHOLE]
+        words = [e for e in names if not e.is_curve and e.interval_s == WHOLE]
         curve = len({e.candidate.effect.name for e in words if e.candidate.effect.over_angle}) > 1
         curve = curve and all(e.candidate.effect.over_angle for e in words)
         if not curve and (len(words) != 1 or len(names) == 1):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.law import LAW
+from adapter.effects.law import LAWS
 from adapter.gap.phrases import listed, who
 from adapter.gap.result import GapResult, Leftover
 from adapter.gap.words import (
@@ -264,7 +264,7 @@ def gap_steps(result: GapResult, folder: Path | None) -> list[Step]:
     if result.problem is not None and result.model_in:
         why = "Design a motion in which every joint moves enough"
         steps.append(Step(why, command("excite", *_robot(result))))
-    laws = [f for f in result.findings if f.effect.startswith(LAW)]
+    laws = [f for f in result.findings if f.effect in LAWS]
     if laws:
         why = "Keep the law under a name, to look for it in other recordings (--effects)"
         name, joint = f"law_joint_{laws[0].joints[0]}", str(laws[0].joints[0])

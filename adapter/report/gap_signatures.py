@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adapter.effects.catalogue import KNOWN
-from adapter.effects.law import Law
+from adapter.effects.law import Curve, Law
 from adapter.gap.result import Finding, GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
@@ -130,13 +130,13 @@ def _clouds(
 def _follows_alone(finding: Finding, key: str) -> bool:
     """Whether it is a law of one signal of its own joint."""
     law = KNOWN.get(finding.effect)
-    return isinstance(law, Law) and not law.by and law.expression.variables == {key}
+    return isinstance(law, Law | Curve) and not law.by and law.variables == {key}
 
 
 def _law(ax: Axes, finding: Finding, key: str, x: Array) -> None:
     """A law over its signal, with twice the doubt of its coefficient."""
-    law, c = KNOWN[finding.effect], finding.parameters["c"]
-    assert isinstance(law, Law)
+    law, c = KNOWN[finding.effect], finding.parameters.get("c")
+    assert isinstance(law, Law | Curve)
     y = law.curve(key, x, finding.parameters)
     doubt = 2.0 * np.abs(y / c) * (finding.std.get("c") or 0.0) if c else 0.0 * y
     ax.fill_between(x, y - doubt, y + doubt, color=INK, alpha=0.2, linewidth=0)

@@ -8,10 +8,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 import adapter
 from adapter.cli.main import main
@@ -19,8 +20,8 @@ from adapter.effects.active import active_effects, by_joint
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.kept import keep, read_kept, with_kept
-from adapter.effects.law import LAWS, Law
-from adapter.errors import SettingsError
+from adapter.effects.law import CURVES, LAWS, Curve, Law, splines
+from adapter.errors import ModelError, SettingsError
 from adapter.gap.result import GapResult
 from adapter.gap.words import as_json, headline
 from adapter.gap.workflow import find_gap
@@ -48,12 +49,14 @@ FORMULAS: dict[str, Callable[..., np.ndarray]] = {
 }
 
 
-def values_of(law: Law) -> dict[str, float]:
+def values_of(law: Law | Curve) -> dict[str, Any]:
     """Parameters that none of its own defaults are."""
+    if isinstance(law, Curve):
+        return {"x": list(np.linspace(-1.0, 2.0, 8) ** 2), "low": -0.5, "high": 0.4}
     return {"c": 0.7} | {p.key: 0.4 for p in law.parameters[1:]}
 
 
-def torque_of(law: Law, values: dict[str, float]) -> np.ndarray:
+def torque_of(law: Law | Curve, values: dict[str, Any]) -> np.ndarray:
     """(m, n) that a model with the law on a joint says more than one without."""
     entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
     model = replace(PANDA, effects=(entry,))
@@ -70,8 +73,8 @@ def test_a_law_is_what_its_name_says(name: str) -> None:
     assert not np.delete(said, J, axis=1).any()
 
 
-@pytest.mark.parametrize("law", SMALL, ids=lambda law: law.name)
-def test_one_instant_shows_as_much_as_a_table(law: Law) -> None:
+@pytest.mark.parametrize("law", [*SMALL, *CURVES.values()], ids=lambda law: law.name)
+def test_one_instant_shows_as_much_as_a_table(law: Law | Curve) -> None:
     values = values_of(law)
     entry = {"effect": law.name, "joints": [J + 1], "parameters": values}
     sums = by_joint(active_effects([entry], N), N)
@@ -79,6 +82,11 @@ def test_one_instant_shows_as_much_as_a_table(law: Law) -> None:
         at = JointSignals(Q[row], DQ[row], DDQ[row], TAU[row])
         whole = torque_of(law, values)[row]
         np.testing.assert_allclose(sums.torque(at), whole, rtol=1e-9, atol=1e-9)
+
+
+def test_a_law_of_a_joint_that_is_not_there_is_refused() -> None:
+    with pytest.raises(ModelError, match="no joint 9; have: 1 to 7"):
+        torque_of(LAWS["law: dq9"], {"c": 1.0})
 
 
 def test_units_are_those_of_torque_over_signals() -> None:
@@ -129,6 +137,25 @@ def test_a_hidden_law_is_found_and_joins_the_model(law: Hidden) -> None:
     (note,) = [x for x in result.notes if x.startswith("joint 2: a torque")]
     energy = {"law: dq³": "takes energy", HOSE.name: "stores energy"}
     assert energy.get(law.name, "feeds energy in: ") in note
+
+
+def test_splines_are_scipys() -> None:
+    """And beyond their range they stay as at its end."""
+    x = np.linspace(-2.0, 3.0, 101)
+    knots = -2.0 + np.arange(-3, 9)
+    own = BSpline.design_matrix(np.minimum(x, 3.0 - 1e-9), knots, 3).toarray().T
+    np.testing.assert_allclose(splines(x, -2.0, 3.0), own, atol=1e-8)
+    assert np.array_equal(splines(x + 9.0, -2.0, 3.0)[:, -1], splines(x, -2.0, 3.0)[:, -1])
+
+
+def test_what_no_expression_is_joins_the_model_as_a_curve() -> None:
+    hidden = Hidden("law: curve(dq)", 0.5, lambda q, v: v[:, J] / (1.0 + 20.0 * v[:, J] ** 2))
+    result = answer(hidden)
+    (found,) = [f for f in result.findings if f.effect.startswith("law: ")]
+    assert (found.effect, found.joints) == (hidden.name, (J + 1,)), headline(result)
+    assert not any(x.joint == J + 1 for x in result.unexplained)
+    assert result.after.torque_rmse_nm[J] < 0.4 * result.before.torque_rmse_nm[J]
+    assert "by no formula" in headline(result)
 
 
 @pytest.fixture
@@ -188,6 +215,10 @@ def test_what_cannot_be_kept_is_said(kept: Path, tmp_path: Path) -> None:
     ):
         with pytest.raises(SettingsError, match=re.escape(said)):
             keep(tmp_path, name, joint, kept)
+    curve = {"effect": "law: curve(dq)", "joints": [2]}
+    (tmp_path / "gap.json").write_text(json.dumps({"findings": [curve]}))
+    with pytest.raises(SettingsError, match="no such law; have: none"):
+        keep(tmp_path, "other", None, kept)
     (tmp_path / "gap.json").write_text("{}")
     with pytest.raises(SettingsError, match="no result of"):
         keep(tmp_path, "other", None, kept)
