@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Protocol
 
 import numpy as np
@@ -183,3 +184,31 @@ class Driver(Protocol):
 
     def close(self) -> None:
         """Release the connection; may be called more than once."""
+
+
+def _of_driver(name: str) -> Any:
+    """An attribute that is the driver's own."""
+    return property(attrgetter(f"driver.{name}"))
+
+
+class PassedOn:
+    """What stands before another driver and has its names, period, account and commands.
+
+    Attributes:
+        driver: the one behind.
+    """
+
+    joint_names, link_names = _of_driver("joint_names"), _of_driver("link_names")
+    period_ns, delay_ns = _of_driver("period_ns"), _of_driver("delay_ns")
+    paced, can_move = _of_driver("paced"), _of_driver("can_move")
+    adds_gravity, intake = _of_driver("adds_gravity"), _of_driver("intake")
+    arrived_ns = _of_driver("arrived_ns")
+    # The driver's, where it is told what carries the arm; None where it is not.
+    carry = property(lambda self: getattr(self.driver, "carry", None))
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+
+    def command(self, tau: Array) -> None:
+        """Pass (n,) N m on. Raises DriverError."""
+        self.driver.command(tau)

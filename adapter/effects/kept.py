@@ -11,8 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from adapter.effects.base import Template, Values
 from adapter.effects.catalogue import CATALOGUE, registered
 from adapter.effects.law import LAW, LAWS, Law
@@ -41,7 +39,7 @@ class KeptLaw(Law):
         """At the setting that it was kept with."""
         setting = self.expression.setting
         template = self.at(float(self._values[setting.key]) if setting else 1.0)
-        std = abs(float(self._values["c"])) or float(np.atleast_1d(self.prior_std)[0])
+        std = abs(float(self._values["c"])) or 1.0
         return (replace(template, prior_std=(std,) * len(template.prior_std)),)
 
     def reshaped(self, values: Values, ratio: float) -> Template | None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,6 @@ from adapter.effects.phrases import Phrase
 from adapter.effects.splits import SPEEDS, STILL, TURN
 
 LAW = "law: "  # begins the name of a law that has no other
-SIZE_NM = 1.0  # of a law's torque where its signals are as large as in `SIGNALS`
 LOG_ODDS, SETTING_NATS = -7.0, 3.0  # what has no name is rarer; the price of a setting
 CURVE_NM = 0.3  # of a curve's coefficients
 EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
@@ -39,20 +39,24 @@ POWERS = (0.3, 0.5, 0.7, 1.4, 1.7, 2.5)
 TURNS = tuple(map(float, range(1, 21)))  # per turn
 
 
-class Signal(NamedTuple):
-    """A usual size of a signal, and its unit, above and below the line."""
-
-    size: float
-    above: Mapping[str, int]
-    below: Mapping[str, int] = {}
-
-
-SIGNALS = {
-    "q": Signal(1.0, {"rad": 1}),
-    "dq": Signal(1.0, {"rad": 1}, {"s": 1}),
-    "ddq": Signal(5.0, {"rad": 1}, {"s": 2}),
-    "tau": Signal(3.0, {"N m": 1}),
+SIGNALS = {  # powers of the units that they have
+    "q": {"rad": 1},
+    "dq": {"rad": 1, "s": -1},
+    "ddq": {"rad": 1, "s": -2},
+    "tau": {"N m": 1},
 }
+
+
+def _unit(powers: Mapping[str, int]) -> str:
+    """A unit as files have it: N m s2/rad2."""
+
+    def product(sign: int) -> str:
+        parts = [(f"({x})" if " " in x else x, sign * p) for x, p in powers.items() if sign * p > 0]
+        own = [x.strip("()") if p == 1 else f"{x}{p}" for x, p in parts]
+        return " ".join(own)
+
+    above, below = product(1), product(-1)
+    return f"{above or 1}/{below}" if below else above
 
 
 @dataclass(frozen=True)
@@ -98,27 +102,12 @@ class Expression:
     setting: Setting | None = None
 
     @property
-    def variables(self) -> frozenset[str]:
-        """Signals that it follows."""
-        return frozenset(re.findall(r"ddq|dq|tau|q", self.text))
-
-    @property
     def unit(self) -> str:
         """Of its coefficient: N m over the signals' units to their powers."""
-        total: dict[str, int] = {"N m": 1}
+        total = Counter({"N m": 1})
         for name, power in self.powers.items():
-            for part, sign in ((SIGNALS[name].above, -1), (SIGNALS[name].below, 1)):
-                for unit, own in part.items():
-                    total[unit] = total.get(unit, 0) + sign * own * power
-        above = " ".join(_raised(unit, p) for unit, p in total.items() if p > 0)
-        below = " ".join(_raised(unit, -p) for unit, p in total.items() if p < 0)
-        return f"{above or 1}/{below}" if below else above or ""
-
-
-def _raised(unit: str, power: int) -> str:
-    if power == 1:
-        return unit
-    return f"({unit}){power}" if " " in unit else f"{unit}{power}"
+            total.subtract({unit: own * power for unit, own in SIGNALS[name].items()})
+        return _unit(total)
 
 
 def _above(at: JointSignals, a: Array) -> Array:
@@ -186,14 +175,14 @@ def _over_angle(
 
 
 class OverSignals(JointTorque):
-    """A torque of no catalogue, by signals of one joint."""
+    """A torque of no catalogue, by signals of one joint.
 
-    by: int
+    Attributes:
+        by: that joint, from 1; 0 for its own. variables: the signals that it follows.
+    """
 
-    @property
-    @abstractmethod
-    def variables(self) -> frozenset[str]:
-        """Signals that it follows."""
+    by = 0
+    variables: frozenset[str]
 
     def curve(self, signal: str, x: Array, values: Values) -> Array:
         """Torque (k,) over the one signal that it follows."""
@@ -222,9 +211,8 @@ class Law(OverSignals):
         text = expression.text.replace(BY, str(by))
         self.name = self.in_files = f"{LAW}{text}"  # type: ignore[misc]
         self.title = f"a torque of c {text}"  # type: ignore[misc]
-        self.by_load = "tau" in expression.variables  # type: ignore[misc]
-        sizes = [SIGNALS[key].size ** p for key, p in expression.powers.items()]
-        self.prior_std = SIZE_NM / float(np.prod(sizes))  # type: ignore[misc]
+        self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
+        self.by_load = "tau" in self.variables  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
         own = [Parameter("c", expression.unit)]
         own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []
@@ -233,29 +221,24 @@ class Law(OverSignals):
         sizes_said = ", ".join(f"{p.key} = {{{p.key}}}" for p in own)
         self.phrase = Phrase(f"{{who}} {{has}} {{title}}: {sizes_said}", "c")  # type: ignore[misc]
 
-    @property
-    def variables(self) -> frozenset[str]:
-        """Signals that it follows."""
-        return self.expression.variables
-
     def templates(self) -> tuple[Template, ...]:
         """Its coefficient, or two of a wave, at the first setting that is tried."""
         setting = self.expression.setting
         return (self.at(setting.tried[0] if setting else 1.0),)
 
     def at(self, value: float) -> Template:
-        """Its coefficients where its setting is fixed."""
-        setting, std = self.expression.setting, float(np.atleast_1d(self.prior_std)[0])
+        """Its coefficients, of unit prior, where its setting is fixed."""
+        setting = self.expression.setting
         fixed = {setting.key: value} if setting else {}
         label = f"{setting.key} = {value:.4g}" if setting else ""
         if not (setting and setting.wave):
-            return Template((std,), lambda x: {"c": float(x[0]), **fixed}, label)
+            return Template((1.0,), lambda x: {"c": float(x[0]), **fixed}, label)
 
         def decode(x: Array) -> dict[str, Any]:
             size, phase = polar(x)
             return {"c": size, **fixed, "phase": phase}
 
-        return Template((std, std), decode, label)
+        return Template((1.0, 1.0), decode, label)
 
     def around(self, values: Values, std: float) -> Template | None:
         """Its coefficient, and by how much its setting is not as in `values`; None without one.
@@ -306,11 +289,11 @@ WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
 }
 
 
-def splines(x: Array, low: Array | float, high: Array | float) -> Array:
-    """Cubic B-splines (PIECES + DEGREE, ...) over a range; beyond it they stay as at its end."""
-    step = np.maximum(np.subtract(high, low), 1e-9) / PIECES
-    at = np.clip((x - low) / step, 0.0, PIECES) + DEGREE
-    knots = np.arange(PIECES + DEGREE).reshape(-1, *[1] * np.ndim(at))
+def splines(x: Array, low: Array | float, high: Array | float, pieces: int = PIECES) -> Array:
+    """Cubic B-splines (pieces + DEGREE, ...) over a range; beyond it they stay as at its end."""
+    step = np.maximum(np.subtract(high, low), 1e-9) / pieces
+    at = np.clip((x - low) / step, 0.0, pieces) + DEGREE
+    knots = np.arange(pieces + DEGREE).reshape(-1, *[1] * np.ndim(at))
     away = np.abs(at - knots - 2.0)
     inside = 4.0 - 3.0 * (2.0 - away) * away**2
     return np.where(away < 1.0, inside, np.maximum(2.0 - away, 0.0) ** 3) / 6.0
@@ -325,28 +308,21 @@ class Curve(OverSignals):
 
     steady = True
     log_odds = LOG_ODDS
-    by = 0
 
     def __init__(self, signal: str, weight: str = "") -> None:
         self.signal, self.weight = signal, weight
+        self.variables = frozenset({signal, "dq"} if weight else {signal})
         text = f"{weight}curve({signal})"
         self.name = f"{LAW}{text}"  # type: ignore[misc]
         self.title = f"a torque of {text}, without a formula"  # type: ignore[misc]
         self.by_load = signal == "tau"  # type: ignore[misc]
-        unit = " ".join(SIGNALS[signal].above) + "".join(
-            f"/{_raised(x, p)}" for x, p in SIGNALS[signal].below.items()
-        )
+        unit = _unit(SIGNALS[signal])
         self.parameters = (  # type: ignore[misc]
             Parameter("x", "N m", count=PIECES + DEGREE),
             Parameter("low", unit),
             Parameter("high", unit),
         )
         self.phrase = Phrase("{who} {has} {torque} that follow " + text + " by no formula")  # type: ignore[misc]
-
-    @property
-    def variables(self) -> frozenset[str]:
-        """Signals that it follows."""
-        return frozenset({self.signal} | ({"dq"} if self.weight else set()))
 
     def between(self, low: float, high: float) -> Template:
         """All its coefficients over a range."""

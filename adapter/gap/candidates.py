@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.interpolate import BSpline
 
 from adapter.effects import CATALOGUE
 from adapter.effects.active import Active
@@ -33,9 +32,9 @@ from adapter.effects.base import (
     Values,
     on_joint,
 )
-from adapter.effects.by_joint import smooth_sign
+from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import HELD
-from adapter.effects.law import CURVES, DEGREE, LAW, LAWS, PIECES, Law
+from adapter.effects.law import CURVES, DEGREE, LAWS, PIECES, WEIGHTS, Curve, Law, splines
 from adapter.effects.torque import added, bodies, moved_links, sensors
 from adapter.gap.hand import ANYWHERE, Hand
 from adapter.gap.result import UNEXPLAINED
@@ -272,12 +271,12 @@ class Pattern(TorqueEffect):
         depends_on: tuple[str, ...],
         basis: Callable[[Motion, Array, int], Array],
         count: int,
-        curve: str = "",
+        curve: Curve | None = None,
     ) -> None:
         self.name = f"{UNEXPLAINED}:{label}"  # type: ignore[misc]
         self.parameters = (Parameter("x", "N m", count=count),)  # type: ignore[misc]
         self.depends_on, self.basis, self._count = depends_on, basis, count
-        self.curve = CURVES.get(curve)
+        self.curve = curve
         self.by_load = any(name.startswith("tau") for name in depends_on)  # type: ignore[misc]
 
     def templates(self) -> tuple[Template, ...]:
@@ -289,26 +288,22 @@ class Pattern(TorqueEffect):
         return on_joint(motion, joint, self.basis(motion, tau, joint) @ np.asarray(values["x"]))
 
 
-def patterns(n: int, joint: int) -> tuple[Pattern, ...]:
-    """What the torque on a joint (from 0) of n may follow."""
-    k = joint + 1
-    curves, both = ("q", "dq", "ddq", "tau"), (f"q{k}", f"dq{k}")
-    own = [
-        *(
-            Pattern(f"{x}{k}", (f"{x}{k}",), _curve(x), PIECES + DEGREE, f"{LAW}curve({x})")
-            for x in curves
-        ),
-        Pattern(f"q{k},sign", both, _times_sign, PIECES + DEGREE, f"{LAW}sign(dq) curve(q)"),
-        Pattern(f"q{k},dq", both, _times_speed, PIECES + DEGREE, f"{LAW}dq curve(q)"),
-        Pattern(
-            "t", ("t",), lambda motion, *_: _spline(motion.t, SLOW_PIECES), SLOW_PIECES + DEGREE
-        ),
-    ]
-    for i in range(n):
-        if i != joint:
-            own.append(Pattern(f"dq{i + 1}", (f"dq{i + 1}",), _other("dq", i), 1))
-            own.append(Pattern(f"tau{i + 1}", (f"tau{i + 1}",), _other("tau", i), 1))
-    return tuple(own)
+def patterns(joint: int) -> tuple[Pattern, ...]:
+    """What the torque on a joint (from 0) may follow by no formula: its signals, or time."""
+    over_time = Pattern("t", ("t",), lambda motion, *_: _over_time(motion), SLOW_PIECES + DEGREE)
+    return (*(_free(curve, joint + 1) for curve in CURVES.values()), over_time)
+
+
+def _free(curve: Curve, k: int) -> Pattern:
+    """A curve on the k-th joint (from 1), over the range of each recording."""
+
+    def basis(motion: Motion, tau: Array, joint: int) -> Array:
+        x = _signal_of(curve.signal, motion, tau, joint)
+        weight = WEIGHTS[curve.weight](JointSignals(x, motion.dq[:, joint], x))
+        return np.asarray((weight * splines(x, float(x.min()), float(x.max()))).T)
+
+    depends_on = (f"{curve.signal}{k}", *([f"dq{k}"] if curve.weight else []))
+    return Pattern(f"{curve.name} {k}", depends_on, basis, PIECES + DEGREE, curve)
 
 
 def laws(stages: Sequence[Stages], joint: int) -> list[tuple[Law, int, Template]]:
@@ -391,33 +386,10 @@ def _signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:
     return np.asarray(tau[:, joint] if name == "tau" else getattr(motion, name)[:, joint])
 
 
-def _spline(x: Array, pieces: int) -> Array:
-    """Cubic B-splines (m, pieces + 3) over the range of x (m,)."""
-    low, high = float(x.min()), float(x.max())
-    step = max(high - low, 1e-9) / pieces
-    knots = low + step * np.arange(-DEGREE, pieces + DEGREE + 1)
-    inside = np.clip(x, low, high - 1e-9 * step)
-    return np.asarray(BSpline.design_matrix(inside, knots, DEGREE).toarray())
-
-
-def _curve(name: str) -> Callable[[Motion, Array, int], Array]:
-    return lambda motion, tau, joint: _spline(_signal_of(name, motion, tau, joint), PIECES)
-
-
-def _times_sign(motion: Motion, tau: Array, joint: int) -> Array:
-    return _spline(motion.q[:, joint], PIECES) * smooth_sign(motion.dq[:, joint])[:, None]
-
-
-def _times_speed(motion: Motion, tau: Array, joint: int) -> Array:
-    return _spline(motion.q[:, joint], PIECES) * motion.dq[:, joint, None]
-
-
-def _other(name: str, i: int) -> Callable[[Motion, Array, int], Array]:
-    def basis(motion: Motion, tau: Array, joint: int) -> Array:
-        x = _signal_of(name, motion, tau, i)
-        return np.asarray(((x - x.mean()) / (x.std() + 1e-9))[:, None])
-
-    return basis
+def _over_time(motion: Motion) -> Array:
+    """Splines (m, SLOW_PIECES + 3) of time."""
+    t = motion.t
+    return splines(t, float(t[0]), float(t[-1]), SLOW_PIECES).T
 
 
 def simpler_wins(simple: tuple[Candidate, float], other: tuple[Candidate, float]) -> bool:

@@ -173,7 +173,7 @@ class SignatureTable:
     def _patterns(self, fit: Fit, joints: Sequence[int]) -> list[tuple[Effect, int, Template]]:
         """Patterns of each joint, and lines in time."""
         found: list[tuple[Effect, int, Template]] = [
-            (p, j, p.templates()[0]) for j in joints for p in patterns(fit.n, j)
+            (p, j, p.templates()[0]) for j in joints for p in patterns(j)
         ]
         residuals = fit.model.residuals()
         i = int(np.argmax([len(x) for x in residuals]))

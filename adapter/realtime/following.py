@@ -95,11 +95,8 @@ class FollowingObserver(EstimateFollower):
             self.observer.adopt(*values)
         external = self.observer.step(sample)
         if self._board is not None:
-            self._board.publish_external(self._external(sample.stamp_ns))
+            seen = self.observer
+            joint = None if seen.contact is None else seen.contact.joint
+            what = seen.torque, seen.std, *seen.wrench(), joint
+            self._board.publish_external(ExternalTorque(*what, seen.learned, sample.stamp_ns))
         return external
-
-    def _external(self, stamp_ns: int) -> ExternalTorque:
-        seen = self.observer
-        joint = None if seen.contact is None else seen.contact.joint
-        what = seen.torque, seen.std, *seen.wrench(), joint
-        return ExternalTorque(*what, seen.learned, stamp_ns)

@@ -276,11 +276,10 @@ class RecorderTask:
             rows = ring.peek(ROWS_AT_ONCE)
             for row in rows:
                 own[:] = row
-                sample, command = layout.sample(own)
+                sample, command, external = layout.sample(own)
                 writer.write(sample)
                 if command is not None:
                     writer.write_command(sample.stamp_ns, command)
-                external = layout.external_torque(own)
                 if external is not None:
                     writer.write_external(sample.stamp_ns, external)
                 beside.sample(sample.stamp_ns, sample.q)

@@ -51,18 +51,14 @@ class RawLayout:
         words = record[:2].view(np.int64)
         words[0], words[1] = sample.stamp_ns, flags
 
-    def sample(self, record: Array) -> tuple[JointSample, Array | None]:
-        """The sample and the command of a record; arrays are views of it."""
+    def sample(self, record: Array) -> tuple[JointSample, Array | None, Array | None]:
+        """Sample, command and external torque of a record, as views; None for what is not there."""
         stamp_ns, flags = (int(word) for word in record[:2].view(np.int64))
         links = None
         if flags & HAS_LINKS:
             motion = record[self.motion].reshape(self.links, 12)
             links = LinkMotion(motion[:, :6], motion[:, 6:])
         command = record[self.command] if flags & HAS_COMMAND else None
+        external = record[self.external] if flags & HAS_EXTERNAL else None
         parts = record[self.q], record[self.dq], record[self.tau]
-        return JointSample(stamp_ns, *parts, links), command
-
-    def external_torque(self, record: Array) -> Array | None:
-        """External torque (n,) N m of a record, where somebody observes it."""
-        flags = int(record[1:2].view(np.int64)[0])
-        return record[self.external] if flags & HAS_EXTERNAL else None
+        return JointSample(stamp_ns, *parts, links), command, external

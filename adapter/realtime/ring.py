@@ -60,14 +60,6 @@ def read_before(header, place):
     return value
 
 
-def _compile(size: int) -> None:
-    """Compile (or load) the kernels before the clock runs."""
-    header = np.zeros(HEADER_WORDS, np.int64)
-    put(header, np.zeros((1, size)), np.zeros(size))
-    unread_rows(header)
-    set_after(header, TAIL, 1)
-
-
 def affordable_rows(sizes: tuple[int, ...], rows: int) -> int:
     """Rows that rings of these record sizes can have in the shared memory that is free."""
     free = free_bytes()
@@ -99,7 +91,10 @@ class Ring:
             raise ValueError(f"a ring needs records and rows of at least 1, got {size}, {rows}")
         ring = cls(SharedBlock.create(HEADER_BYTES + 8 * size * rows), size, rows)
         ring._header[ROWS], ring._header[SIZE] = rows, size
-        _compile(size)
+        header = np.zeros(HEADER_WORDS, np.int64)  # kernels are compiled before the clock runs
+        put(header, np.zeros((1, size)), np.zeros(size))
+        unread_rows(header)
+        set_after(header, TAIL, 1)
         return ring
 
     @classmethod

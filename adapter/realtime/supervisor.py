@@ -6,6 +6,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from adapter.realtime.worker import (
     RestartPolicy,
     Worker,
     WorkerError,
-    WorkerStarter,
+    worker_starter,
 )
 from drivers.interface import Driver, JointSample
 
@@ -87,7 +88,7 @@ class Supervisor:
         self._record = self.raw.new()
         self._state_size, self._period_ns, self._options = state_size, driver.period_ns, options
         self._cores = split_cores()[1]
-        self._starter: WorkerStarter | None = None
+        self._starter: ThreadPoolExecutor | None = None
         self._folder: Path | None = None
         self.states: Ring | None = None
         self.samples: Ring | None = None
@@ -109,7 +110,7 @@ class Supervisor:
             SharedMemoryError, SnapshotError, WorkerError: as they say.
         """
         jobs, rows = self._jobs, self._rows()
-        self._starter = WorkerStarter(self._cores)
+        self._starter = worker_starter(self._cores)
         if jobs.learner is not None:
             self.states = Ring.create(self._state_size, rows)
             self.board = self._new_board(jobs.learner)
@@ -304,7 +305,7 @@ class Supervisor:
     def close(self) -> None:
         """End what still runs and free all memory; may be called more than once."""
         if self._starter is not None:
-            self._starter.close()
+            self._starter.shutdown()
         for worker in (self.learner, self.recorder, self.display, self.view):
             if worker is not None:
                 worker.kill()

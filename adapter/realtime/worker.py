@@ -221,32 +221,20 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
                 os.environ[key] = value
 
 
-class WorkerStarter:
+def worker_starter(cores: set[int]) -> ThreadPoolExecutor:
     """A thread that starts workers: that takes milliseconds, which a tick does not have.
 
-    It stays off the loop's core and takes no priority. Created before the loop asks for its own,
-    so that it inherits none of that.
-
-    Args:
-        cores: where it may run.
+    It stays on `cores`, off the loop's, and takes no priority. To be made before the loop asks for
+    its own, so that it inherits none of that.
     """
 
-    def __init__(self, cores: set[int]) -> None:
+    def stay() -> None:
+        with suppress(OSError):
+            os.sched_setaffinity(0, cores)
 
-        def stay() -> None:
-            with suppress(OSError):
-                os.sched_setaffinity(0, cores)
-
-        self._pool = ThreadPoolExecutor(1, "worker starter", stay)
-        self._pool.submit(int).result()  # the thread exists from here on
-
-    def start_worker(self, build: Callable[[], Worker]) -> Future[Worker]:
-        """Have a worker started; returns at once."""
-        return self._pool.submit(build)
-
-    def close(self) -> None:
-        """Let the thread end; may be called more than once."""
-        self._pool.shutdown()
+    starter = ThreadPoolExecutor(1, "worker starter", stay)
+    starter.submit(int).result()  # the thread exists from here on
+    return starter
 
 
 @dataclass(frozen=True)
@@ -260,7 +248,7 @@ class RestartPolicy:
         lost: what it means for the run when nobody follows.
     """
 
-    starter: WorkerStarter
+    starter: ThreadPoolExecutor
     most: int
     tell: Callable[[str], None]
     lost: str
@@ -330,7 +318,7 @@ class RestartableWorker:
             self.restarts += 1
             k = self.restarts
             policy.tell(f"{trouble}; a new one starts ({k} of {policy.most})")
-            self._next = policy.starter.start_worker(lambda: self._build(k))
+            self._next = policy.starter.submit(self._build, k)
             self._started.append(self._next)
         else:
             policy.tell(f"{trouble}; {policy.lost}")

@@ -10,17 +10,6 @@ from drivers.damiao.bus_time import BusTime, budget
 from drivers.damiao.codec import REPLY_OFFSET
 from drivers.interface import DriverError
 
-OPTIONS = (
-    "interface",
-    "fd",
-    "bitrate",
-    "data_bitrate",
-    "rate",
-    "joints",
-    "first_id",
-    "reply_offset",
-    "guardian",
-)
 VIRTUAL, MULTICAST = "virtual", "udp_multicast"
 MULTICAST_PORT = 43113  # python-can's own choice
 RANGES = {
@@ -31,6 +20,7 @@ RANGES = {
     "first_id": (1, 15),
     "reply_offset": (1, 0x7E0),
 }
+OPTIONS = ("interface", "fd", *RANGES, "guardian")
 
 
 @dataclass(frozen=True)

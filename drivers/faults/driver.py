@@ -5,14 +5,12 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
-from typing import Any
 
 import numpy as np
 
 from drivers.faults.alter import SIGNALS, blank, corrupt, corrupt_stamp, frozen, shifted, spike
 from drivers.faults.spec import KINDS, Fault, Faults
-from drivers.interface import Array, Driver, DriverError, EndOfStream, JointSample
+from drivers.interface import Array, Driver, DriverError, EndOfStream, JointSample, PassedOn
 
 SILENCE_LIMIT_S = 0.1  # an arm that is silent for longer is given up with a DriverError
 
@@ -45,12 +43,7 @@ class Account:
         return f"faults put into {self.taken} samples: {', '.join(counts) or 'none'}"
 
 
-def _of_driver(name: str) -> Any:
-    """An attribute that is the driver's own."""
-    return property(attrgetter(f"driver.{name}"))
-
-
-class FaultyDriver:
+class FaultyDriver(PassedOn):
     """A driver with faults; names, period, intake and arrival instants are those of the driver.
 
     `lost`, `late` and `reordered` make one read take several samples of the driver, so that an
@@ -72,19 +65,15 @@ class FaultyDriver:
         DriverError: a fault names a joint that the arm does not have.
     """
 
-    joint_names, link_names = _of_driver("joint_names"), _of_driver("link_names")
-    period_ns, delay_ns = _of_driver("period_ns"), _of_driver("delay_ns")
-    paced, can_move = _of_driver("paced"), _of_driver("can_move")
-    adds_gravity, intake = _of_driver("adds_gravity"), _of_driver("intake")
     robot = property(lambda self: getattr(self.driver, "robot", ""))  # that it says it is
-    arrived_ns = _of_driver("arrived_ns")  # when the newest sample taken had arrived
 
     def __init__(self, driver: Driver, faults: Faults, seed: int = 0) -> None:
         n = len(driver.joint_names)
         for item in faults.items:
             if item.joint is not None and not 1 <= item.joint <= n:
                 raise DriverError(f"fault '{item}': the arm has joints 1 to {n}")
-        self.driver, self.faults, self.seed = driver, faults, seed
+        super().__init__(driver)
+        self.faults, self.seed = faults, seed
         self.plant_time_ns = 0
         self._shares = {item.name: item for item in faults.items if item.share is not None}
         self._lasting = faults.timed("stuck", "jump", "clock")
@@ -110,12 +99,7 @@ class FaultyDriver:
         """Pass (n,) N m on. Raises DriverError."""
         if self._dead is not None:
             raise DriverError(self._dead)
-        self.driver.command(tau)
-
-    @property
-    def carry(self) -> Any:
-        """The driver's, where it is told what carries the arm; None where it is not."""
-        return getattr(self.driver, "carry", None)
+        super().command(tau)
 
     def stop(self) -> None:
         """Stop the driver."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,7 +74,8 @@ def estimate_values(fields: Fields) -> dict[str, Any]:
         (BODY_TABLES, bodies, THETA_FIELDS),
     ):
         for table, part in zip(tables, ("value", "std"), strict=True):
-            found[table] = _array(([row[part][name] for name in names] for row in rows), len(names))
+            values = [[row[part][name] for name in names] for row in rows]
+            found[table] = np.array(values, dtype=np.float64).reshape(-1, len(names))
     for table, part in zip(EFFECT_TABLES, ("value", "std", "shape"), strict=True):
         found[table] = np.array([x[part] for x in effects], dtype=np.float64).reshape(-1, n or 1)
     found["torque_std"] = np.array([row["torque_std"] for row in joints], dtype=np.float64)
@@ -108,7 +109,3 @@ def _rows(names: Sequence[str], value: Array, std: Array) -> dict[str, dict[str,
     """A row of a table and of its standard deviations, by the fields' names."""
     both = (dict(zip(names, row.tolist(), strict=True)) for row in (value, std))
     return dict(zip(("value", "std"), both, strict=True))
-
-
-def _array(rows: Iterable[Sequence[float]], width: int) -> Array:
-    return np.array(list(rows), dtype=np.float64).reshape(-1, width)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import can
 
-from drivers.interface import Array, Driver, Intake, JointSample
+from drivers.interface import Driver, JointSample, PassedOn
 from sim.damiao.server import Boards
 from sim.scenarios import Scenario
 
@@ -48,33 +47,7 @@ class ServedBus(can.BusABC):
         self._bus.shutdown()
 
 
-class WrappedDriver:
-    """A driver whose calls are passed on."""
-
-    paced = False
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-        self.joint_names, self.link_names = driver.joint_names, driver.link_names
-        self.period_ns, self.adds_gravity = driver.period_ns, driver.adds_gravity
-        self.can_move, self.delay_ns = driver.can_move, driver.delay_ns
-
-    @property
-    def intake(self) -> Intake:
-        """The driver's."""
-        return self._driver.intake
-
-    def command(self, tau: Array) -> None:
-        """Pass on (n,) N m. Raises DriverError."""
-        self._driver.command(tau)
-
-    @property
-    def carry(self) -> Any:
-        """The driver's, where it is told what carries the arm; None where it is not."""
-        return getattr(self._driver, "carry", None)
-
-
-class InProcess(WrappedDriver):
+class InProcess(PassedOn):
     """A driver whose motors work between its reads, in real time.
 
     Args:
@@ -85,6 +58,8 @@ class InProcess(WrappedDriver):
     Attributes:
         plant_time_ns: how long the boards worked in the last `read`; no part of a driver's time.
     """
+
+    paced = False
 
     def __init__(
         self, channel: str, scenario: Scenario, make: Callable[[can.BusABC], Driver]
@@ -97,14 +72,9 @@ class InProcess(WrappedDriver):
         self.plant_time_ns = 0
         self._closed = False
 
-    @property
-    def arrived_ns(self) -> int:
-        """The driver's."""
-        return self._driver.arrived_ns
-
     def connect(self) -> None:
         """Connect; the boards answer. Raises DriverError."""
-        self._driver.connect()
+        self.driver.connect()
         self._bus.serving = False
 
     def read(self) -> JointSample:
@@ -112,19 +82,19 @@ class InProcess(WrappedDriver):
         before = self._boards.compute_ns
         self._boards.service()
         self.plant_time_ns = self._boards.compute_ns - before
-        return self._driver.read()
+        return self.driver.read()
 
     def stop(self) -> None:
         """Bring the arm to a stand. Raises DriverError."""
         self._bus.serving = True
-        self._driver.stop()
+        self.driver.stop()
 
     def close(self) -> None:
         """Release driver, boards and bus; may be called more than once."""
         if self._closed:
             return
         self._closed, self._bus.serving = True, True
-        self._driver.close()
+        self.driver.close()
         self._boards.close()
         self._bus.shutdown()
         self._far.shutdown()

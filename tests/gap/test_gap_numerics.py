@@ -428,7 +428,7 @@ def test_signatures_of_a_load_are_those_of_its_body(signals: Signals):
 def test_signatures_that_are_kept_are_those_of_any_model():
     """What hangs on the measured motion alone is computed once, whatever the inertias are."""
     other = ARM.changed(theta=1.2 * ARM.theta)
-    ways = [(x, RUBS, x.templates()[0]) for x in patterns(N, RUBS)]
+    ways = [(x, RUBS, x.templates()[0]) for x in patterns(RUBS)]
     used, fresh = prepare(SHORT, ARM), prepare(SHORT, ARM)
     signatures(stages_of(used, ()), EVERYWHERE, ways)
     kept, _ = signatures(stages_of(used, (), other), EVERYWHERE, ways)
@@ -744,7 +744,7 @@ def test_patterns_hold_every_smooth_curve_of_their_signal(signals: Signals):
         ARM.torque(signals.motion.q, signals.motion.dq, signals.motion.ddq),
     )
     x = motion.dq[:, RUBS]
-    curve = next(p for p in patterns(N, RUBS) if p.depends_on == (f"dq{RUBS + 1}",))
+    curve = next(p for p in patterns(RUBS) if p.depends_on == (f"dq{RUBS + 1}",))
     basis = np.column_stack(
         [curve.torque(motion, tau, RUBS, {"x": unit})[:, RUBS] for unit in np.eye(8)]
     )

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from drivers.interface import Driver, JointSample
-from sim.damiao.host import WrappedDriver
+from drivers.interface import Driver, JointSample, PassedOn
 from sim.damiao.line import Line
 
 SETTLE_TICKS = 300  # the motors take the arm over from its stand
 
 
-class Lockstep(WrappedDriver):
+class Lockstep(PassedOn):
     """A driver whose clock is the line's: each `read` lets one period of virtual time pass.
 
     Args:
@@ -17,6 +16,7 @@ class Lockstep(WrappedDriver):
         line: with the boards attached.
     """
 
+    paced = False
     arrived_ns = 0
 
     def __init__(self, driver: Driver, line: Line) -> None:
@@ -26,7 +26,7 @@ class Lockstep(WrappedDriver):
     def connect(self) -> None:
         """Connect and let the arm come to rest in its motors. Raises DriverError."""
         with self._line.eager():
-            self._driver.connect()
+            self.driver.connect()
         self._next_ns = self._line.next_whole_ns(self.period_ns)
         for _ in range(SETTLE_TICKS):
             self.read()
@@ -35,15 +35,15 @@ class Lockstep(WrappedDriver):
         """The next sample. Raises DriverError."""
         self._line.advance_to(self._next_ns)
         self._next_ns += self.period_ns
-        return self._driver.read()
+        return self.driver.read()
 
     def stop(self) -> None:
         """Bring the arm to a stand. Raises DriverError."""
         with self._line.eager():
-            self._driver.stop()
+            self.driver.stop()
         self._next_ns = self._line.next_whole_ns(self.period_ns)  # it took a while
 
     def close(self) -> None:
         """Release the driver."""
         with self._line.eager():
-            self._driver.close()
+            self.driver.close()
