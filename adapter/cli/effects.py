@@ -10,7 +10,7 @@ from rich.table import Table
 from adapter.effects.base import Effect
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.kept import keep, with_kept
-from adapter.effects.law import LAW, LAWS
+from adapter.effects.law import EXPRESSIONS, LAW
 from adapter.errors import UsageError
 from adapter.runs.terminal import output, show
 
@@ -25,8 +25,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     with with_kept(args.kept if args.kept.exists() else None):
         output.print(_table(list(CATALOGUE.values())))
-    forms = dict.fromkeys(law.expression.text for law in LAWS.values())
-    show(f"laws of what none of these is: c times {', '.join(forms)} (ⱼ: another joint's)")
+    said = ", ".join(EXPRESSIONS)
+    show(f"laws of what none of these is: c times {said} (ⱼ: another joint's)")
     return 0
 
 

@@ -21,7 +21,7 @@ from adapter.effects.base import (
     Values,
 )
 from adapter.effects.by_joint import ByJoint
-from adapter.effects.catalogue import KNOWN
+from adapter.effects.catalogue import CATALOGUE, KNOWN
 from adapter.effects.law import Law
 from adapter.errors import ModelError
 from adapter.model.self_model import SelfModel
@@ -137,7 +137,7 @@ def _of_entry(entry: Any, n: int) -> list[Active]:
         raise ModelError(f"an effect needs {' and '.join(NEEDED)}, got {entry!r}")
     name = entry["effect"]
     if not isinstance(name, str) or name not in KNOWN:
-        raise ModelError(f"no effect '{name}'; {choices(name, KNOWN)}")
+        raise ModelError(f"no effect '{name}'; {choices(name, CATALOGUE)}")
     effect = KNOWN[name]
     if isinstance(effect, Law) and effect.by > n:
         raise ModelError(f"{effect.name}: no joint {effect.by}; have: 1 to {n}")

@@ -471,7 +471,7 @@ class JointTorque(TorqueEffect):
     def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
         """The law on one joint."""
         q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
-        numbers = {key: float(value) for key, value in values.items()}
+        numbers = {key: x if np.ndim(x) else float(x) for key, x in values.items()}
         return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), numbers))
 
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 from adapter.effects.base import Template, Values
 from adapter.effects.catalogue import CATALOGUE, registered
-from adapter.effects.law import LAW, LAWS, Law
+from adapter.effects.law import EXPRESSIONS, LAW, LAWS, Law
 from adapter.errors import SettingsError
 from drivers.errors import choices
 
@@ -74,10 +74,8 @@ def _law(where: str, name: str, table: Any) -> KeptLaw:
         raise SettingsError(f'{where} needs law, as in law = "dq |dq|"')
     law = LAWS.get(f"{LAW}{table['law']}")
     if law is None:
-        known = [key.removeprefix(LAW) for key in LAWS]
-        raise SettingsError(
-            f"{where}: no law '{table['law']}'; {choices(str(table['law']), known)}"
-        )
+        text = str(table["law"])
+        raise SettingsError(f"{where}: no law '{text}'; {choices(text, EXPRESSIONS)}")
     setting = law.expression.setting
     for p in law.parameters:
         needed = p.key == "c" or (setting is not None and p.key == setting.key)

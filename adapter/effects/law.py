@@ -347,11 +347,6 @@ class Curve(OverSignals):
         x = x.reshape(len(x), *[1] * (basis.ndim - x.ndim), *x.shape[1:])
         return np.asarray(WEIGHTS[self.weight](at) * np.sum(basis * x, axis=0))
 
-    def torque(self, motion: Motion, tau: Array, joint: int, values: Values) -> Array:
-        """The curve on one joint."""
-        q, dq, ddq, own = (x[:, joint] for x in (motion.q, motion.dq, motion.ddq, tau))
-        return on_joint(motion, joint, self.law(JointSignals(q, dq, ddq, own), values))
-
 
 CURVES: dict[str, Curve] = {
     curve.name: curve
@@ -366,3 +361,4 @@ LAWS: dict[str, Law] = {
         else [Law(expression)]
     )
 }
+EXPRESSIONS = tuple(dict.fromkeys(law.expression.text for law in LAWS.values()))

@@ -290,7 +290,7 @@ class Pattern(TorqueEffect):
 
 def patterns(joint: int) -> tuple[Pattern, ...]:
     """What the torque on a joint (from 0) may follow by no formula: its signals, or time."""
-    over_time = Pattern("t", ("t",), lambda motion, *_: _over_time(motion), SLOW_PIECES + DEGREE)
+    over_time = Pattern("t", ("t",), _over_time, SLOW_PIECES + DEGREE)
     return (*(_free(curve, joint + 1) for curve in CURVES.values()), over_time)
 
 
@@ -298,7 +298,7 @@ def _free(curve: Curve, k: int) -> Pattern:
     """A curve on the k-th joint (from 1), over the range of each recording."""
 
     def basis(motion: Motion, tau: Array, joint: int) -> Array:
-        x = _signal_of(curve.signal, motion, tau, joint)
+        x = signal_of(curve.signal, motion, tau, joint)
         weight = WEIGHTS[curve.weight](JointSignals(x, motion.dq[:, joint], x))
         return np.asarray((weight * splines(x, float(x.min()), float(x.max()))).T)
 
@@ -382,11 +382,12 @@ def sharpened(hz: float, residual: Array, t: Array, width_hz: float) -> float:
     return hz
 
 
-def _signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:
+def signal_of(name: str, motion: Motion, tau: Array, joint: int) -> Array:
+    """(m,) a joint's "q", "dq", "ddq" or rigid "tau"."""
     return np.asarray(tau[:, joint] if name == "tau" else getattr(motion, name)[:, joint])
 
 
-def _over_time(motion: Motion) -> Array:
+def _over_time(motion: Motion, tau: Array, joint: int) -> Array:
     """Splines (m, SLOW_PIECES + 3) of time."""
     t = motion.t
     return splines(t, float(t[0]), float(t[-1]), SLOW_PIECES).T

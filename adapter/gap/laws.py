@@ -8,7 +8,7 @@ import numpy as np
 
 from adapter.effects.active import WHOLE
 from adapter.effects.law import Curve, Law
-from adapter.gap.candidates import Pattern
+from adapter.gap.candidates import Pattern, signal_of
 from adapter.gap.fit import Fit, Named, place_of, refitted
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, FORMS, SignatureTable
@@ -89,8 +89,7 @@ def _as_curve(fit: Fit, named: Named) -> Named:
     if pattern.curve is None or len(fit.recordings) > 1:
         return named
     at = fit.model.stages(0)
-    signals = {"tau": at.rigid} | {key: getattr(at.links, key) for key in ("q", "dq", "ddq")}
-    x = signals[pattern.curve.signal][:, named.candidate.joint]
+    x = signal_of(pattern.curve.signal, at.links, at.rigid, named.candidate.joint)
     template = pattern.curve.between(float(x.min()), float(x.max()))
     candidate = replace(named.candidate, effect=pattern.curve, template=template)
     return replace(named, candidate=candidate)

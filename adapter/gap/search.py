@@ -207,7 +207,8 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         catalogued = SignatureTable(bare, joints, CATALOGUED)
         named = catalogued.together([catalogued.lead_of(e.candidate) for e in words])
         table = SignatureTable(bare, joints, PATTERNS)
-        patterns = [table.lead_of(c) for c in table.candidates if c.joint == joint]
+        own = [c for c in table.candidates if c.joint == joint and isinstance(c.effect, Pattern)]
+        patterns = [table.lead_of(c) for c in own]
         best = max(map(table.honest, patterns), key=lambda x: x.chi2)
         if named.chi2 < (CURVE_SHARE if curve else PATTERN_SHARE) * best.chi2:
             fit = _with(bare, Move((best,), best.log_evidence), table.fit.noise) or fit
