@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from adapter.effects import LEARNED
-from adapter.effects.catalogue import REAL_ARM_EFFECTS
+from adapter.effects.catalogue import LEARNABLE, REAL_ARM_EFFECTS
+from adapter.effects.kept import read_kept
+from adapter.effects.law import LAW
 from adapter.errors import SettingsError
 from adapter.runs.config import read_config
 from drivers.errors import choices
@@ -25,17 +28,35 @@ def check_run(args: argparse.Namespace) -> None:
 def effects_named(text: str) -> tuple[str, ...]:
     """Names of the effects to learn: none, or a list with commas between, real being several.
 
+    A file of kept laws (.toml) stands for those that it holds.
+
     Raises:
-        SettingsError: no such effect; with the choices.
+        SettingsError: no such effect, with the choices; a law that is not learned online.
+        OSError: no such file.
     """
     if text == "none":
         return ()
     names: dict[str, None] = {}
     for name in (name.strip() for name in text.split(",") if name.strip()):
-        if name != "real" and name not in LEARNED:
+        if name.endswith(".toml"):
+            names.update(dict.fromkeys(_learned_of(Path(name))))
+            continue
+        if name != "real" and name not in LEARNABLE:
             raise SettingsError(f"no effect '{name}'; {choices(name, ('none', 'real', *LEARNED))}")
         names.update(dict.fromkeys(REAL_ARM_EFFECTS if name == "real" else [name]))
     return tuple(names)
+
+
+def _learned_of(path: Path) -> list[str]:
+    """Laws of a file of kept ones."""
+    kept = read_kept(path)
+    for law in kept:
+        if law.in_files not in LEARNABLE:
+            raise SettingsError(
+                f"{path}: [{law.name}] is c {law.in_files.removeprefix(LAW)}: its size is not "
+                "learned online; a model that has it, from adapter gap, keeps it as it is"
+            )
+    return [law.in_files for law in kept]
 
 
 def check_learning(args: argparse.Namespace) -> None:

@@ -33,7 +33,7 @@ def add_learning(parser: argparse.ArgumentParser) -> None:
         "--effects",
         metavar="LIST",
         help="effects learned beside θ: none, real, or names with commas between (a name that "
-        "does not exist lists them)",
+        "does not exist lists them), a file of kept laws (.toml) among them",
     )
     add("--seed", type=int, help="of every random choice")
     add("--truth", type=Path, metavar="FILE", help="model or truth to compare with")

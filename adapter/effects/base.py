@@ -359,6 +359,10 @@ class Effect(ABC):
         """ln of how much rarer these parameters are met than others of the effect."""
         return 0.0
 
+    def log_odds_over(self, values: Values, turned: float) -> float:
+        """The same where the joint turned by so many rad, of what cannot be told from it."""
+        return 0.0
+
     def at_instant(self, sums: ByJoint, joint: int | slice, values: Values) -> bool:
         """Add what one instant shows of the effect to sums; False where it shows nothing.
 

@@ -75,6 +75,11 @@ LEARNED: dict[str, LearnedEffect] = {
     name: effect for name, effect in CATALOGUE.items() if learnable(effect)
 }
 
+# With laws that need no name to be learned.
+LEARNABLE: Mapping[str, LearnedEffect] = ChainMap(
+    LEARNED, {name: law for name, law in LAWS.items() if learnable(law)}
+)
+
 # What a real arm's joints have, as far as anybody knows before it has moved. Those that the data
 # do not show fade.
 REAL_ARM_EFFECTS = (
@@ -110,6 +115,6 @@ def effects_by_name(names: Iterable[str]) -> tuple[LearnedEffect, ...]:
     """The learner's effects of these names, in order. Raises SettingsError with the choices."""
     chosen = list(names)
     for name in chosen:
-        if name not in LEARNED:
+        if name not in LEARNABLE:
             raise SettingsError(f"no effect '{name}'; {choices(name, LEARNED)}")
-    return tuple(LEARNED[name] for name in chosen)
+    return tuple(LEARNABLE[name] for name in chosen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -100,28 +100,32 @@ def with_kept(path: Path | None) -> Iterator[None]:
         yield
 
 
-def keep(result: Path, name: str, joint: int | None, path: Path) -> str:
+def keep(
+    findings: Path | Sequence[Mapping[str, Any]], name: str, joint: int | None, path: Path
+) -> str:
     """Add a law of a gap's result to a file under a name; returns the text that was added.
 
     Args:
-        result: gap.json, or the folder that holds it.
+        findings: of the result, or its gap.json, or the folder that holds it.
         joint: (from 1) of the law, where the result has several.
 
     Raises:
         OSError: a file that is not there.
         SettingsError: a result without such a law, a name that is taken; names the choices.
     """
-    result = result / "gap.json" if result.is_dir() else result
-    try:
-        findings = json.loads(result.read_text(encoding="utf-8"))["findings"]
-    except (ValueError, KeyError, TypeError):
-        raise SettingsError(f"{result}: no result of `adapter gap`") from None
+    where = findings if isinstance(findings, Path) else "the result"
+    if isinstance(findings, Path):
+        try:
+            kept = findings / "gap.json" if findings.is_dir() else findings
+            findings = list(json.loads(kept.read_text(encoding="utf-8"))["findings"])
+        except (ValueError, KeyError, TypeError):
+            raise SettingsError(f"{where}: no result of `adapter gap`") from None
     laws = [f for f in findings if f["effect"] in LAWS]
     found = [f for f in laws if joint in (None, *f["joints"])]
     if len(found) != 1:
         have = "; ".join(f"joint {f['joints'][0]}: {f['effect'].removeprefix(LAW)}" for f in laws)
         one = "several laws, say --joint" if found else "no such law"
-        raise SettingsError(f"{result}: {one}; have: {have or 'none'}")
+        raise SettingsError(f"{where}: {one}; have: {have or 'none'}")
     _check_name(str(path), name)
     if path.exists() and name in {law.name for law in read_kept(path)}:
         raise SettingsError(f"{path}: [{name}] is there already; choose another name")
@@ -133,8 +137,9 @@ def keep(result: Path, name: str, joint: int | None, path: Path) -> str:
 
 def _as_toml(name: str, finding: Mapping[str, Any]) -> str:
     lines = [f"[{name}]", f'title = "{name}"']
-    lines += [f'law = "{finding["effect"].removeprefix(LAW)}"', f"joints = {finding['joints']}"]
+    text, joints = finding["effect"].removeprefix(LAW), list(finding["joints"])
+    lines += [f'law = "{text}"', f"joints = {joints}"]
     for key, value in finding["parameters"].items():
         unit, std = finding["units"].get(key, ""), finding["std"].get(key) or 0.0
-        lines.append(f"{key} = {value!r}  # {unit}, ± {std:.2g}".replace("# ,", "#"))
+        lines.append(f"{key} = {float(value)!r}  # {unit}, ± {std:.2g}".replace("# ,", "#"))
     return "\n".join([*lines, "", ""])

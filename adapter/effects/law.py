@@ -19,6 +19,7 @@ from adapter.effects.base import (
     Array,
     JointSignals,
     JointTorque,
+    LearnedEffect,
     Motion,
     Parameter,
     Template,
@@ -184,9 +185,14 @@ class OverSignals(JointTorque):
     by = 0
     variables: frozenset[str]
 
-    def curve(self, signal: str, x: Array, values: Values) -> Array:
-        """Torque (k,) over the one signal that it follows."""
-        q, dq, ddq, tau = (x if key == signal else np.zeros_like(x) for key in SIGNALS)
+    @property
+    def along(self) -> str:
+        """The signal over which it is a curve; of what is a kind of friction, not its speed."""
+        return next(iter(self.variables - {"dq"}), "dq")
+
+    def curve(self, x: Array, values: Values) -> Array:
+        """Torque (k,) over that signal; of what is a kind of friction, at 1 rad/s."""
+        q, dq, ddq, tau = (x if key == self.along else np.ones_like(x) for key in SIGNALS)
         return self.on_signals(JointSignals(q, dq, ddq, tau), values)
 
     @abstractmethod
@@ -210,7 +216,7 @@ class Law(OverSignals):
         self.expression, self.by, setting = expression, by, expression.setting
         text = expression.text.replace(BY, str(by))
         self.name = self.in_files = f"{LAW}{text}"  # type: ignore[misc]
-        self.title = f"a torque of c {text}"  # type: ignore[misc]
+        self.title = f"torque of c {text}"  # type: ignore[misc]
         self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
         self.by_load = "tau" in self.variables  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
@@ -219,7 +225,7 @@ class Law(OverSignals):
         own += [Parameter("phase", "rad")] if setting and setting.wave else []
         self.parameters = tuple(own)  # type: ignore[misc]
         sizes_said = ", ".join(f"{p.key} = {{{p.key}}}" for p in own)
-        self.phrase = Phrase(f"{{who}} {{has}} {{title}}: {sizes_said}", "c")  # type: ignore[misc]
+        self.phrase = Phrase(f"{{who}} {{has}} a {{title}}: {sizes_said}", "c")  # type: ignore[misc]
 
     def templates(self) -> tuple[Template, ...]:
         """Its coefficient, or two of a wave, at the first setting that is tried."""
@@ -281,6 +287,23 @@ class Law(OverSignals):
         return np.asarray(values["c"] * term)
 
 
+class LearnedLaw(LearnedEffect, Law):
+    """A law without a setting, by the joint's own motion: it can be learned on beside θ."""
+
+    prior_std, step = 10.0, 1.0  # of powers of some tenths of a rad/s
+
+    def basis(self, at: JointSignals) -> tuple[Array, ...]:
+        """The expression."""
+        return (np.asarray(self.expression.term(at, np.zeros(1))),)
+
+
+def _laws_of(expression: Expression) -> list[Law]:
+    if BY in expression.text:
+        return [Law(expression, by) for by in range(1, MOST_JOINTS + 1)]
+    alone = expression.setting is None and "tau" not in expression.powers
+    return [LearnedLaw(expression) if alone else Law(expression)]
+
+
 PIECES, DEGREE = 5, 3  # of a spline over a signal's range
 WEIGHTS: dict[str, Callable[[JointSignals], Array | float]] = {
     "": lambda at: 1.0,
@@ -314,7 +337,7 @@ class Curve(OverSignals):
         self.variables = frozenset({signal, "dq"} if weight else {signal})
         text = f"{weight}curve({signal})"
         self.name = f"{LAW}{text}"  # type: ignore[misc]
-        self.title = f"a torque of {text}, without a formula"  # type: ignore[misc]
+        self.title = f"torque of {text}, without a formula"  # type: ignore[misc]
         self.by_load = signal == "tau"  # type: ignore[misc]
         unit = _unit(SIGNALS[signal])
         self.parameters = (  # type: ignore[misc]
@@ -352,13 +375,5 @@ CURVES: dict[str, Curve] = {
     curve.name: curve
     for curve in (*map(Curve, SIGNALS), Curve("q", "sign(dq) "), Curve("q", "dq "))
 }
-LAWS: dict[str, Law] = {
-    law.name: law
-    for expression in _grammar()
-    for law in (
-        [Law(expression, by) for by in range(1, MOST_JOINTS + 1)]
-        if BY in expression.text
-        else [Law(expression)]
-    )
-}
+LAWS: dict[str, Law] = {law.name: law for x in _grammar() for law in _laws_of(x)}
 EXPRESSIONS = tuple(dict.fromkeys(law.expression.text for law in LAWS.values()))

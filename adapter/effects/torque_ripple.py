@@ -21,6 +21,7 @@ from adapter.effects.splits import TURN
 
 # Harmonic drives and motors give 1, 2, 4 and the numbers of poles and rollers.
 NUMBERS = tuple(range(1, 31))
+CURVE_ODDS = -7.0  # as of what has no name
 
 
 class TorqueRipple(JointTorque):
@@ -41,6 +42,10 @@ class TorqueRipple(JointTorque):
     def templates(self) -> tuple[Template, ...]:
         """Sine and cosine of each number per turn."""
         return tuple(Template((0.3, 0.3), partial(_decode, n), f"n = {n}") for n in NUMBERS)
+
+    def log_odds_over(self, values: Values, turned: float) -> float:
+        """Less than a whole wave may be any curve over the angle."""
+        return 0.0 if values["n"] * turned > 2.0 * np.pi else CURVE_ODDS
 
     def law(self, at: JointSignals, values: Values) -> Array:
         """a sin(n q + phase)."""

@@ -199,6 +199,9 @@ def signatures(
             columns = tuple(range(size, size + len(template.prior_std)))
             size += len(columns)
         odds = prior_log_odds(effect, joint, n, len(templates(effect, hand)))
+        if joint >= 0:
+            values = template.decode(np.array(template.prior_std))
+            odds += effect.log_odds_over(values, float(np.ptp(at.links.q[:, joint])))
         candidates.append(Candidate(effect, template, joint, columns, odds))
     return np.concatenate(tables), candidates
 

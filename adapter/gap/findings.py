@@ -12,8 +12,9 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.effects.base import ALL, JOINT, LINK, TWO_LEVELS
 from adapter.effects.catalogue import HELD, KNOWN, WRONG_LINK
+from adapter.effects.law import OverSignals
 from adapter.effects.splits import experiments
-from adapter.gap.candidates import Pattern, prior_log_odds
+from adapter.gap.candidates import Pattern, prior_log_odds, signal_of
 from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
 from adapter.gap.result import Curves, Finding, Leftover
@@ -29,6 +30,7 @@ OPEN_NATS = 3.0  # by which a name may be the better one and leave the other ope
 SINGLED_OUT = 0.9  # probability of a link's correction
 ODD = 4.0  # standard deviations from which on a correction is a finding
 DIFFERENCE = 1e-4  # of a coefficient's prior
+CURVE_POINTS = 41  # of a law over its signal
 DISCREPANCY = 0.12  # of a finding's torque: what is below that is its equation's inexactness
 OUTBURST_S, OUTBURST = 1.0, 5.0  # windows; how many times louder than usual
 SMOOTH, BEFORE = 3.5, 6  # level of a residual over what so many samples before do not foretell
@@ -73,6 +75,26 @@ def entries(
             if covariance is not None:
                 out[-1]["std"] = parameter_std(fit, covariance, k)
     return out
+
+
+def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
+    """A law's torque over the range of its signal that was seen, and its standard deviation."""
+    named, own = fit.named[k], place_of(fit, k)
+    law, template = named.candidate.effect, named.candidate.template
+    if not isinstance(law, OverSignals):
+        return None
+    joint, at = law.by - 1 if law.by else named.candidate.joint, fit.model.stages(0)
+    seen = signal_of(law.along, at.links, at.rigid, joint)
+    x = np.linspace(seen.min(), seen.max(), CURVE_POINTS)
+    y, steps = law.curve(x, named.values), DIFFERENCE * named.candidate.prior_std
+    slopes = np.array(
+        [
+            (law.curve(x, template.decode(named.x + step * unit)) - y) / step
+            for step, unit in zip(steps, np.eye(len(named.x)), strict=True)
+        ]
+    )
+    std = np.sqrt(np.einsum("ik,ij,jk->k", slopes, covariance[np.ix_(own, own)], slopes))
+    return {"over": f"{law.along}{joint + 1}", "at": x, "torque_nm": y, "std_nm": std}
 
 
 def parameter_std(fit: Fit, covariance: Array, k: int) -> dict[str, Any]:
@@ -216,6 +238,7 @@ def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
                 detectability=float(np.sqrt(standing.chi2)),
                 torque_rms_nm=np.sqrt(np.mean(torque[on] ** 2, axis=0)),
                 recording=name if own and len(ends) > 1 else "",
+                curve=_curve(fit, covariance, k),
             )
         )
     return tuple(sorted(_with_rests(fit, out), key=lambda f: -f.detectability))

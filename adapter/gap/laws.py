@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Container, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from adapter.effects.active import WHOLE
-from adapter.effects.law import Curve, Law
+from adapter.effects.law import Curve, Law, OverSignals
 from adapter.gap.candidates import Pattern, signal_of
-from adapter.gap.fit import Fit, Named, place_of, refitted
+from adapter.gap.fit import Fit, Named, place_of, refitted, under_own_noise
 from adapter.gap.rivals import price
-from adapter.gap.scan import BELIEF, FORMS, SignatureTable
+from adapter.gap.scan import BELIEF, FORMS, Lead, SignatureTable
 
 MOST_TERMS = 3  # of one joint: more are a curve with another name
+COMPARED = 4  # laws, each at its best setting
 PASSIVE = 0.03  # share of exchanged energy that a law may feed in and count as friction
 ROUNDS = 2  # in which a setting is fitted about where it was
 
 
-def lawful(fit: Fit) -> Fit:
-    """With laws in place of the patterns of each joint where they are worth as much.
+def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
+    """With laws in place of each joint's patterns, and of its curves over the angle, that lose.
 
-    All are weighed under the noise that the patterns leave, the patterns too: an expression that is
-    not the right one leaves more than they do. A curve must be clearly better than a law.
+    Joints (from 0) that are `without` any law keep what they have.
     """
-    for joint in sorted({e.candidate.joint for e in fit.named if e.is_pattern}):
-        fit = _of_joint(fit, joint)
-    for k, e in enumerate(fit.named):  # those that took a name's place
-        if isinstance(e.candidate.effect, Law) and e.candidate.template.linear:
-            fit = _settled(fit, k)
+    for joint in sorted({e.candidate.joint for e in fit.named if _gives_way(e)}):
+        fit = _of_joint(fit, joint, MOST_TERMS if joint not in without else 0)
     return fit
+
+
+def bare(before: Fit, after: Fit) -> set[int]:
+    """Joints (from 0) that had a pattern and are left without any law or curve."""
+    had = {e.candidate.joint for e in before.named if _is_curve(before, e)}
+    return had - {
+        e.candidate.joint for e in after.named if isinstance(e.candidate.effect, OverSignals)
+    }
 
 
 def notes_on(fit: Fit) -> list[str]:
@@ -53,46 +58,108 @@ def notes_on(fit: Fit) -> list[str]:
             ranges.append(f"{name}{own + 1} from {x.min():.2f} to {x.max():.2f}")
         beyond = "stays as it is there" if isinstance(law, Curve) else "goes on as written"
         seen = f"; seen over {' and '.join(ranges)}, beyond it {beyond}" if ranges else ""
-        notes.append(f"joint {joint + 1}: {law.title} {does}{seen}")
+        notes.append(f"joint {joint + 1}: a {law.title} {does}{seen}")
     return notes
 
 
-def _of_joint(fit: Fit, joint: int) -> Fit:
-    places = [k for k, e in enumerate(fit.named) if e.is_pattern and e.candidate.joint == joint]
-    if any(fit.named[k].interval_s != WHOLE for k in places):
-        return fit
-    own = np.concatenate([place_of(fit, k) for k in places])
-    carried = fit.carried()
-    asked = carried.worth(own, np.delete(np.arange(len(carried.g)), own)).log_evidence
-    asked += sum(price(fit.named[k]) for k in places)
-    kept, worth = [e for k, e in enumerate(fit.named) if k not in places], 0.0
-    lawful, _ = refitted(fit.with_named(kept))
-    for _ in range(MOST_TERMS):
-        table = SignatureTable(lawful, [joint], FORMS, rich=False)
-        best = max(table.whole(), key=lambda lead: lead.log_evidence)
-        if best.log_evidence < BELIEF:
+def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
+    """Patterns as laws, or as the curves that they are; a law must clearly beat a name.
+
+    Both are weighed under the least noise that any leaves: what is not right leaves more, and
+    would make itself harder to tell.
+    """
+    places = [k for k, e in enumerate(fit.named) if e.candidate.joint == joint and _gives_way(e)]
+    rest = [e for k, e in enumerate(fit.named) if k not in places]
+    lawful, _ = refitted(fit.with_named(rest))
+    for _ in range(most):
+        before, lawful = lawful, _with_law(lawful, joint)
+        if lawful is before:
             break
-        worth += best.log_evidence
-        more = lawful.with_named((*lawful.named, Named(best.candidate, best.x)))
-        lawful = _settled(more, len(more.named) - 1)
-    if worth > asked - BELIEF:
-        return lawful
-    return fit.with_named(
-        [_as_curve(fit, e) if k in places else e for k, e in enumerate(fit.named)]
+    new = range(len(rest), len(lawful.named))
+    noise = (fit.noise, under_own_noise(lawful)[0].noise)
+    least = min(noise, key=lambda own: max(float(x.level[joint]) for x in own))
+    worth_it, asked = (
+        _together(lawful.with_noise(least), new),
+        _together(fit.with_noise(least), places),
     )
+    if any(fit.named[k].is_pattern for k in places):
+        asked -= BELIEF
+    elif not any(_nameless(fit.named[k]) for k in places):
+        asked += BELIEF
+    if new and worth_it > asked:
+        return lawful
+    fit = fit.with_named([_as_curve(fit, e) if k in places else e for k, e in enumerate(fit.named)])
+    for k in places:
+        if isinstance(fit.named[k].candidate.effect, Law):
+            fit = _settled(fit, k)
+    return fit
+
+
+def _together(fit: Fit, places: Sequence[int]) -> float:
+    """Nats that named effects are worth together, their odds included."""
+    for k in places:
+        fit = fit.instead(k, _fixed(fit.named[k]))
+    own = np.concatenate([place_of(fit, k) for k in places]) if places else np.zeros(0, int)
+    carried = fit.carried()
+    found = carried.worth(own, np.delete(np.arange(len(carried.g)), own))
+    return found.log_evidence + sum(price(fit.named[k]) for k in places)
+
+
+def _nameless(named: Named) -> bool:
+    """Whether it is a pattern, or a law that took a name's place."""
+    return named.is_pattern or isinstance(named.candidate.effect, Law)
+
+
+def _gives_way(named: Named) -> bool:
+    """Whether a law may take its place: it is none, or a curve over the angle that is not right."""
+    return _nameless(named) or (named.candidate.effect.over_angle and not named.assumed)
+
+
+def _with_law(fit: Fit, joint: int) -> Fit:
+    """With one more law, or as it is where none is believed.
+
+    Those that are best at the settings tried are compared each at its own best setting.
+    """
+    best: dict[str, Lead] = {}
+    table = SignatureTable(fit, [joint], FORMS, rich=False)
+    for lead in sorted(table.whole(), key=lambda lead: -lead.log_evidence):
+        best.setdefault(lead.candidate.effect.name, lead)
+    found, most, place = fit, BELIEF, len(fit.named)
+    for lead in list(best.values())[:COMPARED]:
+        if lead.log_evidence > BELIEF:
+            more = _settled(fit.with_named((*fit.named, Named(lead.candidate, lead.x))), place)
+            nats = _together(more, [place])
+            if nats > most:
+                found, most = more, nats
+    return found
+
+
+def _fixed(named: Named) -> Named:
+    """A law whose setting is no longer sought: linear, it is worth no more than it explains."""
+    law, c = named.candidate.effect, named.candidate
+    if c.template.linear or not isinstance(law, Law) or law.expression.setting is None:
+        return named
+    template = law.at(float(named.values[law.expression.setting.key]))
+    template = replace(template, prior_std=c.template.prior_std[:1])
+    return replace(named, candidate=replace(c, template=template), x=named.x[:1])
 
 
 def _as_curve(fit: Fit, named: Named) -> Named:
     """A pattern as the effect that it is, in one recording; those of time stay what they are."""
     pattern = named.candidate.effect
-    assert isinstance(pattern, Pattern)
-    if pattern.curve is None or len(fit.recordings) > 1:
+    if not _is_curve(fit, named):
         return named
+    assert isinstance(pattern, Pattern) and pattern.curve is not None
     at = fit.model.stages(0)
     x = signal_of(pattern.curve.signal, at.links, at.rigid, named.candidate.joint)
     template = pattern.curve.between(float(x.min()), float(x.max()))
     candidate = replace(named.candidate, effect=pattern.curve, template=template)
     return replace(named, candidate=candidate)
+
+
+def _is_curve(fit: Fit, named: Named) -> bool:
+    pattern = named.candidate.effect
+    return isinstance(pattern, Pattern) and pattern.curve is not None and len(fit.recordings) == 1
 
 
 def _settled(fit: Fit, place: int) -> Fit:

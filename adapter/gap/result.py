@@ -55,6 +55,7 @@ class Finding:
         detectability: z, its size in standard deviations of what else could explain it.
         torque_rms_nm: (n,) what it adds to each joint, rms while it acts.
         recording: whose own it is; empty where it is common to all.
+        curve: of a law its torque `over` a signal ("q2"): torque_nm and std_nm at some of it.
     """
 
     effect: str
@@ -71,6 +72,7 @@ class Finding:
     detectability: float
     torque_rms_nm: Array
     recording: str = ""
+    curve: dict[str, Any] | None = None
 
     @property
     def throughout(self) -> bool:

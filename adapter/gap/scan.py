@@ -456,13 +456,14 @@ def least_chi2(effect: Effect, interval_s: tuple[float, float]) -> float:
 def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
     """The best leads of each joint and the best of all.
 
-    Noise is still what they explain as well: under its own, one may be worth far more.
+    Noise is still what they explain as well: under its own, one may be worth far more, above all
+    one of those that the richest model of all does not have.
     """
     seen: dict[int, int] = {}
     chosen = []
     for place, lead in enumerate(leads):
-        if lead.log_evidence < 0.0:
-            break
+        if lead.log_evidence < 0.0 and not isinstance(lead.candidate.effect, Pattern | Law):
+            continue
         joint = lead.candidate.joint
         plain = lead.candidate.effect.bundled and lead.interval_s == WHOLE
         if plain or place < BEST_OF_ALL or seen.get(joint, 0) < BEST_OF_JOINT:

@@ -10,6 +10,7 @@ import numpy as np
 from adapter.effects.active import WHOLE
 from adapter.effects.base import Effect, TorqueEffect
 from adapter.effects.catalogue import HELD
+from adapter.effects.law import Law
 from adapter.gap.candidates import PATTERN_SHARE, Pattern, is_finer
 from adapter.gap.evidence import LEAST_NM, Carried, Moments, Noise
 from adapter.gap.fit import (
@@ -26,7 +27,7 @@ from adapter.gap.fit import (
     worth,
 )
 from adapter.gap.folds import Folds, pays_held_out
-from adapter.gap.laws import lawful
+from adapter.gap.laws import bare, lawful
 from adapter.gap.real_arm import BRISTLES, COULOMB, start, usually_shaped
 from adapter.gap.rivals import Rival, Standing, price, standings
 from adapter.gap.scan import (
@@ -121,7 +122,10 @@ def search(
     found = settled(_renamed(fit, joints), joints)
     progress("laws of what no effect explains")
     fit = lawful(found.fit)
-    found = _as_resolved(found if fit is found.fit else settled(fit, joints))
+    if fit is not found.fit:
+        lawless = bare(found.fit, (judged := settled(fit, joints)).fit)
+        found = settled(lawful(found.fit, lawless), joints) if lawless else judged
+    found = _as_resolved(found)
     return replace(found, rounds=budget.made, ran_out=budget.ran_out)
 
 
@@ -201,6 +205,8 @@ def _renamed(fit: Fit, joints: Sequence[int]) -> Fit:
         curve = len({e.candidate.effect.name for e in words if e.candidate.effect.over_angle}) > 1
         curve = curve and all(e.candidate.effect.over_angle for e in words)
         if not curve and (len(words) != 1 or len(names) == 1):
+            continue
+        if any(isinstance(e.candidate.effect, Law) for e in names):  # its place is told next
             continue
         bare = fit.with_named([e for e in fit.named if e not in names]).with_noise()
         bare, _ = refitted(bare)

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from adapter.effects.active import Active, by_joint, lasting_effects, with_bodies
-from adapter.effects.catalogue import LEARNED, effects_by_name
+from adapter.effects.catalogue import LEARNABLE, effects_by_name
 from adapter.effects.link_angles import Gears, JointTorques, to_links
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
@@ -74,15 +74,15 @@ def to_joints(stamps, table, sensors, gears, clock, memory):
 def learnable(model: SelfModel, names: Sequence[str]) -> tuple[str, ...]:
     """Effects to learn: these, and after them what the model has that can be learned further."""
     lasting = lasting_effects(model.effects, model.tree.n)
-    told = {name for active in lasting for name in starts_from(active, tuple(LEARNED))}
-    return (*names, *(name for name in LEARNED if name in told and name not in names))
+    told = {name for active in lasting for name in starts_from(active, tuple(LEARNABLE))}
+    return (*names, *(name for name in LEARNABLE if name in told and name not in names))
 
 
 def starts_from(active: Active, names: Sequence[str]) -> dict[str, float]:
     """Which of the learned effects, by name, start from what of an effect of a model; or none."""
     if active.effect.name not in names:
         return {}
-    parts = LEARNED[active.effect.name].learned_from(active.values)
+    parts = LEARNABLE[active.effect.name].learned_from(active.values)
     parts = {name: value for name, value in parts.items() if value or name == active.effect.name}
     return parts if set(parts) <= set(names) else {}
 
@@ -103,7 +103,7 @@ def believed(known: Sequence[Active], names: Sequence[str], n: int) -> tuple[Arr
     total, variance = np.zeros((len(effects), n)), np.full((len(effects), n), np.nan)
     for active in known:
         for name, value in starts_from(active, names).items():
-            effect, at = LEARNED[name], (names.index(name), active.joint)
+            effect, at = LEARNABLE[name], (names.index(name), active.joint)
             std = active.std.get(effect.key) if effect is active.effect else None
             widest = effect.learned_std
             known_to = None if std is None or not np.isfinite(std) else float(std)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import KNOWN
 from adapter.report.fleet_words import (
     EPOCH_S,
     HEADS,
@@ -53,8 +53,8 @@ def _arm(arm: FleetArm) -> dict[str, Any]:
 
 def _parameters(arm: FleetArm) -> Table:
     """What is learned of each joint and of the link that it moves; θ whole is in the model file."""
-    heads = ["joint", "mass of its link", *(CATALOGUE[name].title for name in arm.effects)]
-    units = ["", "kg", *(CATALOGUE[name].parameters[0].written for name in arm.effects)]
+    heads = ["joint", "mass of its link", *(KNOWN[name].title for name in arm.effects)]
+    units = ["", "kg", *(KNOWN[name].parameters[0].written for name in arm.effects)]
     std = arm.outcome.effects_std
     links = len(arm.model.theta) - arm.model.tree.n  # a base that floats comes first
     rows = []
@@ -95,7 +95,7 @@ def _courses(arm: FleetArm, used: list[OfLog]) -> list[Panel]:
         )
         drawing.figure.subplots_adjust(top=0.9)  # for the legend
         ax.set_xlabel(label)
-        effect = CATALOGUE[name]
+        effect = KNOWN[name]
         unit = effect.parameters[0].written
         panels.append(drawing.panel(effect.title, unit, "by joint, with standard deviations"))
     return panels

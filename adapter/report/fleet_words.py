@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from adapter.effects.catalogue import CATALOGUE
+from adapter.effects.catalogue import KNOWN
 from adapter.model.numbers import plus_minus
 from adapter.runs.fleet.arm import TIME, FleetArm, OfLog
 from adapter.runs.fleet.course import Drift, StandsOut
@@ -53,7 +53,7 @@ def _signed(value: float, std: float) -> str:
 
 def drift_words(drift: Drift) -> str:
     """A sentence."""
-    effect, per = CATALOGUE[drift.effect], f"per unit of {drift.follows}"
+    effect, per = KNOWN[drift.effect], f"per unit of {drift.follows}"
     unit = effect.parameters[0].written
     per = "a day" if drift.follows == TIME else per
     share = f" ({100.0 * drift.span / abs(drift.usual):.0f} % of it)" if drift.usual else ""
@@ -73,8 +73,8 @@ def standing_out_words(arm: FleetArm) -> Iterator[str]:
         by_log.setdefault(one.number, []).append(one)
     for number, several in sorted(by_log.items()):
         told = [
-            f"{CATALOGUE[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
-            f"{CATALOGUE[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
+            f"{KNOWN[x.effect].title.lower()} of joint {x.joint} is {x.value:.3g} "
+            f"{KNOWN[x.effect].parameters[0].written} where {x.expected:.3g} was to be expected"
             for x in several
         ]
         yield f"{Path(arm.logs[number].moments.path).name} stands out: {'; '.join(told)}"

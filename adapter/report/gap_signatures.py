@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from adapter.effects.catalogue import KNOWN
-from adapter.effects.law import Curve, Law
+from adapter.effects.law import OverSignals
 from adapter.gap.result import Finding, GapResult, Leftover, RolloutCurves
 from adapter.gap.words import signal_words
 from adapter.model.numbers import plain
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_JOINTS = 3  # with signatures
-LAW_POINTS = 200
 MOST_DOTS = 500  # of one cloud; a panel shows no more
 BINS, FEWEST_IN_BIN = 24, 4
 WIDEST = 99.5  # percentile of |residual| that a panel still holds
@@ -89,9 +88,7 @@ def signature_panels(result: GapResult) -> list[JointPanels]:
             cloud = _clouds(result, j, x, ("before", "after"), label)
             laws = [f for f in result.findings if f.joints == (j + 1,) and _follows_alone(f, key)]
             for finding in laws:
-                _law(
-                    cloud.axes[0], finding, key, np.linspace(np.nanmin(x), np.nanmax(x), LAW_POINTS)
-                )
+                _law(cloud.axes[0], finding)
             clouds.append(cloud.panel(title, "N m", ", ".join(f.title for f in laws)))
         times = [_over_time(result, j), _motion(result, j)]
         why = [result.joint_names[j]]
@@ -130,16 +127,14 @@ def _clouds(
 def _follows_alone(finding: Finding, key: str) -> bool:
     """Whether it is a law of one signal of its own joint."""
     law = KNOWN.get(finding.effect)
-    return isinstance(law, Law | Curve) and not law.by and law.variables == {key}
+    return isinstance(law, OverSignals) and not law.by and law.variables == {key}
 
 
-def _law(ax: Axes, finding: Finding, key: str, x: Array) -> None:
-    """A law over its signal, with twice the doubt of its coefficient."""
-    law, c = KNOWN[finding.effect], finding.parameters.get("c")
-    assert isinstance(law, Law | Curve)
-    y = law.curve(key, x, finding.parameters)
-    doubt = 2.0 * np.abs(y / c) * (finding.std.get("c") or 0.0) if c else 0.0 * y
-    ax.fill_between(x, y - doubt, y + doubt, color=INK, alpha=0.2, linewidth=0)
+def _law(ax: Axes, finding: Finding) -> None:
+    """A law over its signal, with twice its doubt."""
+    assert finding.curve is not None
+    x, y, std = (np.asarray(finding.curve[key]) for key in ("at", "torque_nm", "std_nm"))
+    ax.fill_between(x, y - 2.0 * std, y + 2.0 * std, color=INK, alpha=0.2, linewidth=0)
     ax.plot(x, y, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
 
 

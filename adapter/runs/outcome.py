@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from adapter.effects.active import active_effects, with_bodies
-from adapter.effects.catalogue import CATALOGUE, effects_by_name
+from adapter.effects.catalogue import KNOWN, effects_by_name
 from adapter.errors import ModelError
 from adapter.learning.batch.theta_filling import (
     filled_theta,
@@ -318,7 +318,7 @@ def _effects(outcome: Outcome, tree: Tree) -> list[dict[str, Any]]:
                     "joints": [j + 1],
                     "parameters": parameters,
                     "std": {effect.key: float(outcome.effects_std[k, j])},
-                    "units": CATALOGUE[name].units(),
+                    "units": KNOWN[name].units(),
                 }
             )
     return entries

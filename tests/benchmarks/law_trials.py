@@ -1,7 +1,8 @@
 """Laws of no catalogue, hidden: variables, form, coefficient, what is left. `make trials`.
 
-Each trial adds one law to one joint of Pinocchio's arm, beside no friction, that of the catalogue
-in all joints or LuGre's, half of them point to point; `--none` adds none. Formulas are its own.
+Each trial adds one law to one joint of Pinocchio's arm (or MuJoCo's), beside no friction, that of
+the catalogue in all joints or LuGre's, half of them point to point; `--none` adds none, `--quiet`
+takes nine tenths of the disturbance away. Formulas are its own.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,16 +25,19 @@ from adapter.gap.workflow import find_gap
 from sim.hidden import Trial, draw, nominal_urdf
 from sim.hidden.record import write_files
 from tests.helpers.gap_effects import rnea, sense
+from tests.helpers.gap_mujoco import simulate
 from tests.helpers.gap_scorer import wilson
 from tests.helpers.gap_tools import recorded
 
 Array = np.ndarray
 Row = dict[str, Any]
 SIZES_NM, WRIST_SHARE = (0.1, 1.0), 0.3  # rms of the law's torque; of joints 5 to 7
+QUIET = 0.1  # of the disturbance
+FASTEST = 6.0  # rad/s
 
 
 class Arm(NamedTuple):
-    """Signals (m,) of the joint and of another, and what draws settings."""
+    """Signals (m,) of the joint and of another, what draws settings, and the angles planned."""
 
     q: Array
     dq: Array
@@ -40,6 +45,7 @@ class Arm(NamedTuple):
     dq_other: Array
     tau_other: Array
     rng: np.random.Generator
+    planned: Array
 
     @property
     def sign(self) -> Array:
@@ -48,7 +54,7 @@ class Arm(NamedTuple):
 
     def edge(self) -> float:
         """An angle in the middle of those seen."""
-        return float(np.quantile(self.q, self.rng.uniform(0.25, 0.75)))
+        return float(np.quantile(self.planned, self.rng.uniform(0.25, 0.75)))
 
 
 def _sine(at: Arm) -> Array:
@@ -75,7 +81,7 @@ WITHIN: dict[str, Callable[[Arm], Array]] = {
     "tau² sign(dq)": lambda at: at.sign * at.tau**2,
 }
 BEYOND: dict[str, Callable[[Arm], Array]] = {
-    "exp(3 q)": lambda at: np.exp(3.0 * (at.q - at.q.mean())),
+    "exp(3 q)": lambda at: np.exp(3.0 * (at.q - at.planned.mean())),
     "dq / (1 + 9 dq²)": lambda at: at.dq / (1.0 + 9.0 * at.dq**2),
     "exp(-(q - a)² / 0.02)": lambda at: np.exp(-((at.q - at.edge()) ** 2) / 0.02),
     "sign(dq) exp(q)": lambda at: at.sign * np.exp(at.q),
@@ -84,23 +90,44 @@ BEYOND: dict[str, Callable[[Arm], Array]] = {
 }
 
 
-def _trial(seed: int, none: bool) -> tuple[Trial, str, dict[str, Any], tuple[Array, ...]]:
+class Job(NamedTuple):
+    """A trial: its seed, whether no law is hidden, whose arm it is, whether little disturbs it."""
+
+    seed: int
+    none: bool = False
+    simulator: str = "pinocchio"
+    quiet: bool = False
+
+
+def _trial(job: Job) -> tuple[Trial, str, dict[str, Any], tuple[Array, ...]]:
     """Drawn arm and motion, the law's name and what was drawn of it, readings with it."""
+    seed = job.seed
     rng = np.random.default_rng([seed, 777])
     friction = str(rng.choice(["none", "rubs", "sticks"]))
     motion = "points" if seed % 2 else "sines"
     trial = draw(seed, "null", None, friction != "none", motion, friction == "sticks")
+    trial = replace(trial, disturbance_nm=trial.disturbance_nm * (QUIET if job.quiet else 1.0))
     path = trial.motion.at(trial.times)
-    rubs = trial.friction.along(path[1], 1e-3) if trial.friction else 0.0
-    q, dq, tau = sense(trial.arm, trial.effects, trial.times, *path, rubs)
     rigid, names = rnea(trial.arm, *path), [*WITHIN, *BEYOND]
     j, name = int(rng.integers(7)), names[seed // 2 % len(names)]
     other = int(rng.choice([k for k in range(7) if k != j]))
-    at = Arm(path[0][:, j], path[1][:, j], rigid[:, j], path[1][:, other], rigid[:, other], rng)
-    law = (WITHIN | BEYOND)[name](at)
+    drawn = int(rng.integers(2**32))
+
+    def law(q: Array, dq: Array, tau: Array) -> Array:
+        """Of signals (..., 7), always with the same settings."""
+        signals = q[..., j], dq[..., j], tau[..., j], dq[..., other], tau[..., other]
+        return (WITHIN | BEYOND)[name](Arm(*signals, np.random.default_rng(drawn), path[0][:, j]))
+
     size = np.exp(rng.uniform(*np.log(SIZES_NM))) * (WRIST_SHARE if j > 3 else 1.0)
-    c = 0.0 if none else size / law.std()
-    tau[:, j] += c * law
+    c = 0.0 if job.none else size / law(*path[:2], rigid).std()
+    if job.simulator == "mujoco":
+        more = np.eye(7)[j]
+        q, dq, tau, _ = simulate(trial, lambda *signals: c * law(*signals) * more)
+    else:
+        rubs = trial.friction.along(path[1], 1e-3) if trial.friction else 0.0
+        q, dq, tau = sense(trial.arm, trial.effects, trial.times, *path, rubs)
+        tau[:, j] += c * law(*path[:2], rigid)
+        tau += trial.disturbance()
     kind = {"within": name in WITHIN, "friction": friction, "motion": motion}
     said = {**kind, "size_nm": size, "c": c, "joint": j + 1}
     return trial, name.replace("ⱼ", str(other + 1)), said, (q, dq, tau)
@@ -111,11 +138,12 @@ def _variables(text: str, joint: int) -> set[str]:
     return {x.removesuffix(str(joint)) for x in re.findall(r"(?:ddq|dq|tau|q|t)\d*", text)} - {"t"}
 
 
-def run(job: tuple[int, bool]) -> Row:
-    """One trial: what was hidden and what was said."""
-    seed, none = job
-    trial, name, drawn, (q, dq, tau) = _trial(seed, none)
-    log = recorded(trial, q, dq, tau + trial.disturbance(), None)
+def run(job: Job) -> Row | None:
+    """One trial: what was hidden and what was said; None where the law threw the arm about."""
+    trial, name, drawn, (q, dq, tau) = _trial(job)
+    if not np.abs(dq).max() < FASTEST:
+        return None
+    log = recorded(trial, q, dq, tau, None)
     with tempfile.TemporaryDirectory() as folder:
         paths = write_files(log, nominal_urdf(trial.nominal), {}, Path(folder))
         begun = time.process_time()
@@ -127,7 +155,7 @@ def run(job: tuple[int, bool]) -> Row:
     right = [f for f in own if f.effect == f"law: {name}"]
     off = [(abs(f.parameters["c"] - drawn["c"]), f.std["c"]) for f in right]
     return {
-        "seed": seed,
+        "seed": job.seed,
         "law": name,
         **drawn,
         "told": bool(own or left),
@@ -168,11 +196,14 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=132)
     parser.add_argument("--none", action="store_true", help="hide no law")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--simulator", choices=("pinocchio", "mujoco"), default="pinocchio")
+    parser.add_argument("--quiet", action="store_true", help="a tenth of the disturbance")
     args = parser.parse_args()
     rows: list[Row] = []
-    jobs = [(seed, args.none) for seed in range(args.first, args.first + args.trials)]
+    seeds = range(args.first, args.first + args.trials)
+    jobs = [Job(seed, args.none, args.simulator, args.quiet) for seed in seeds]
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(run, jobs):
+        for row in filter(None, pool.map(run, jobs)):
             rows.append(row)
             print(json.dumps(row, default=float), flush=True)
     print("\n".join(summary(rows)))

@@ -16,6 +16,7 @@ from scipy.interpolate import BSpline
 
 import adapter
 from adapter.cli.main import main
+from adapter.cli.names import effects_named
 from adapter.effects.active import active_effects, by_joint
 from adapter.effects.by_joint import JointSignals
 from adapter.effects.catalogue import CATALOGUE
@@ -145,12 +146,25 @@ def test_splines_are_scipys() -> None:
 
 def test_what_no_expression_is_joins_the_model_as_a_curve() -> None:
     hidden = Hidden("law: curve(dq)", 0.5, lambda q, v: v[:, J] / (1.0 + 20.0 * v[:, J] ** 2))
-    result = answer(hidden)
+    result, c = answer(hidden), hidden.recorded()[1]
     (found,) = [f for f in result.findings if f.effect.startswith("law: ")]
     assert (found.effect, found.joints) == (hidden.name, (J + 1,)), headline(result)
     assert not any(x.joint == J + 1 for x in result.unexplained)
     assert result.after.torque_rmse_nm[J] < 0.4 * result.before.torque_rmse_nm[J]
     assert "by no formula" in headline(result)
+    curve = found.curve
+    assert curve is not None and curve["over"] == "dq2" and len(curve["at"]) > 20
+    away = curve["torque_nm"] - c * curve["at"] / (1.0 + 20.0 * curve["at"] ** 2)
+    assert np.mean(np.abs(away) < 2.0 * curve["std_nm"]) > 0.9
+
+
+def test_the_coefficient_of_a_law_in_a_model_is_learned_on() -> None:
+    (log, c), name = LAWS_HIDDEN[0].recorded(), LAWS_HIDDEN[0].name
+    entry = {"effect": name, "joints": [J + 1], "parameters": {"c": 0.5 * c}}
+    learned = adapter.learn(log, replace(panda_model(), effects=(entry,)), every=10)
+    assert abs(learned.effects[name][J] - c) < 0.1 * c
+    entries = [e for e in learned.model.effects if (e["effect"], e["joints"]) == (name, [J + 1])]
+    assert [e["parameters"]["c"] for e in entries] == [learned.effects[name][J]]
 
 
 @pytest.fixture
@@ -180,6 +194,15 @@ def test_the_command_lists_kept_laws_too(kept: Path, capsys: pytest.CaptureFixtu
     assert main(["effects", "--effects", str(kept)]) == 0
     said = capsys.readouterr().out
     assert "hose_joint_2" in said and "bristle_friction" in said and "tanh(tau/a)" in said
+
+
+def test_a_kept_law_is_learned_beside_others_where_it_has_no_setting(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text('[oil]\nlaw = "dq |dq|"\nc = 0.7\n')
+    assert effects_named(f"viscous_friction,{file}") == ("viscous_friction", "law: dq |dq|")
+    file.write_text('[hose]\nlaw = "max(q - a, 0)"\nc = 2.0\na = 0.1\n')
+    with pytest.raises(SettingsError, match=r"\[hose\] is c max\(q - a, 0\): .* not learned"):
+        effects_named(str(file))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ velocity of the stamp and position half a step later; the torque is that of the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -40,6 +40,7 @@ DRY = {
 }
 PUSHES = {"viscous_friction", "torque_ripple", "joint_spring"}
 FORCE = ("fx", "fy", "fz", "mx", "my", "mz")
+Push = Callable[[Array, Array, Array], Array]  # q, dq and rigid torque (n,) to torques (n,)
 
 
 def mjcf(truth: Truth, armature: Array) -> str:
@@ -69,8 +70,8 @@ def _text(values: Array) -> str:
 class Arm:
     """The simulated arm: its stages, its dry friction and whatever else pushes its joints."""
 
-    def __init__(self, trial: Trial) -> None:
-        self._effects = trial.effects
+    def __init__(self, trial: Trial, more: Push | None = None) -> None:
+        self._effects, self._more = trial.effects, more
         self._stages = [
             (start, mujoco.MjModel.from_xml_string(mjcf(arm, trial.motor_inertia)))
             for start, arm in rigid_stages(trial.arm, trial.effects)
@@ -110,7 +111,7 @@ class Arm:
         if self._friction is not None:
             self._bent = self._friction.after(self._bent, v, H_S)
             out += self._bent + self._friction.viscous * v
-        if any(e.name == "load_dependent_friction" for e in self._effects):
+        if self._more or any(e.name == "load_dependent_friction" for e in self._effects):
             mujoco.mj_rne(self._model, self._data, 1, self._rigid)
         for effect in (e for e in self._effects if e.acts(t)):
             if effect.name == "x_cross_viscous":
@@ -125,7 +126,7 @@ class Arm:
                     torque = float(link_side(effect, *rows)[0])
                     target[j] += abs(torque) if effect.name in DRY else torque
         self._model.dof_frictionloss[:] = level
-        return out
+        return out if self._more is None else out + self._more(q, v, self._rigid)
 
     def _bend(self, effect: Effect, out: Array) -> None:
         """Dahl's bristles, one explicit step."""
@@ -164,11 +165,11 @@ class Controller:
         return np.clip(data.qfrc_inverse, -self._effort, self._effort)
 
 
-def simulate(trial: Trial) -> tuple[Array, Array, Array, Array]:
-    """Noise-free readings q, dq, tau and commands (m, n)."""
+def simulate(trial: Trial, more: Push | None = None) -> tuple[Array, Array, Array, Array]:
+    """Noise-free readings q, dq, tau and commands (m, n); `more` takes torques of its own."""
     t, disturbance = trial.times, trial.disturbance()
     wanted = trial.motion.at(np.append(t, t[-1] + 1e-3))
-    arm, controller = Arm(trial), Controller(trial)
+    arm, controller = Arm(trial, more), Controller(trial)
     q, dq, drive, command = (np.empty_like(disturbance) for _ in range(4))
     before = after = controller.torque(*arm.state(), [x[0] for x in wanted]) - disturbance[0]
     for k in range(len(t)):

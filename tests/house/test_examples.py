@@ -52,3 +52,14 @@ def test_simulate_what_was_learned(tmp_path, monkeypatch, capsys) -> None:
     assert bare == has != 0.0 and abs(reads - 1.05 * has) < 0.02
     free, stuck = map(float, re.findall(r"(\S+) rad", text))
     assert free > 0.05 > 0.01 > stuck >= 0.0
+
+
+def test_find_a_law(tmp_path, monkeypatch, capsys) -> None:
+    text = said("find_a_law", tmp_path, monkeypatch, capsys)
+    assert "law: max(q - a, 0)² found" in text
+    (c, std), (a, _) = (
+        tuple(map(float, re.findall(rf"^{key} = (\S+) .*± (\S+)", text, re.M)[0])) for key in "ca"
+    )
+    assert abs(c - 9.0) < 3.0 * std < 2.0 and abs(a + 0.9) < 0.05
+    without, with_law = map(float, re.findall(r"(\S+) mrad", text))
+    assert with_law < 0.1 * without
