@@ -359,6 +359,10 @@ class Effect(ABC):
         """ln of how much rarer these parameters are met than others of the effect."""
         return 0.0
 
+    def templates_over(self, low: float, high: float) -> tuple[Template, ...]:
+        """The same on a joint that was seen between two angles, rad."""
+        return self.templates()
+
     def log_odds_over(self, values: Values, turned: float) -> float:
         """The same where the joint turned by so many rad, of what cannot be told from it."""
         return 0.0

@@ -12,6 +12,7 @@ from adapter.effects.base import (
     JointTorque,
     LearnedEffect,
     Parameter,
+    Template,
     Values,
 )
 from adapter.effects.phrases import Phrase
@@ -36,6 +37,15 @@ class JointSpring(LearnedEffect, JointTorque):
     shows = ((TURN, "keeps growing with the angle"),)
     watched = True
     over_angle = True
+
+    def templates_over(self, low: float, high: float) -> tuple[Template, ...]:
+        """Two springs that rest at the ends of what was seen: none is likelier near zero."""
+
+        def decode(x: Array) -> dict[str, Any]:
+            k = float(x[0] + x[1])
+            return {"k": k, "q0": float(low * x[0] + high * x[1]) / k if k else 0.0}
+
+        return (Template(self.prior_std, decode, f"between {low:.4g} and {high:.4g}"),)
 
     def decode(self, x: Array) -> dict[str, Any]:
         """Of two springs that rest at 0 and at 1 rad."""

@@ -36,7 +36,7 @@ CURVE_NM = 0.3  # of a curve's coefficients
 EDGES = tuple(np.linspace(0.05, 0.95, 19))  # shares of a range in which something begins
 BENDS = tuple(np.geomspace(0.1, 3.0, 12))  # shares of the largest torque at which a sensor bends
 BY, MOST_JOINTS = "ⱼ", 32
-POWERS = (0.3, 0.5, 0.7, 1.4, 1.7, 2.5)
+POWERS = (1.25, 1.5, 1.75, 2.25, 2.5, 2.75)  # below 1 it is friction that falls with speed
 TURNS = tuple(map(float, range(1, 21)))  # per turn
 
 
@@ -82,7 +82,7 @@ class Setting:
 EDGE = Setting("a", "rad", EDGES, within="q")
 PLAY = Setting("a", "N m", EDGES, within="|tau|", size=10.0, lower=0.0)
 BEND = Setting("a", "N m", BENDS, within="|tau|", size=10.0, lower=0.1)
-POWER = Setting("p", "", POWERS, lower=0.05)
+POWER = Setting("p", "", POWERS, lower=1.0)
 WAVE = Setting("n", "per turn", TURNS, wave=True)
 
 
@@ -219,6 +219,8 @@ class Law(OverSignals):
         self.title = f"torque of c {text}"  # type: ignore[misc]
         self.variables = frozenset(re.findall(r"ddq|dq|tau|q", expression.text))
         self.by_load = "tau" in self.variables  # type: ignore[misc]
+        drags = self.variables == {"dq"} and not by and text not in ("|dq|", "dq²")
+        self.positive = ("c",) if drags else ()  # type: ignore[misc]
         self.log_odds = LOG_ODDS - SETTING_NATS * (setting is not None)  # type: ignore[misc]
         own = [Parameter("c", expression.unit)]
         own += [Parameter(setting.key, setting.unit, lower=setting.lower)] if setting else []

@@ -157,9 +157,13 @@ def places(effect: Effect, n: int) -> tuple[int, ...]:
     return (-1, *range(n)) if effect.scope == ALL else tuple(range(n))
 
 
-def templates(effect: Effect, hand: Hand) -> tuple[Template, ...]:
-    """Ways to look for an effect on an arm with this hand."""
-    return hand.templates() if effect is HELD else effect.templates()
+def templates(effect: Effect, hand: Hand, q: Array | None = None) -> tuple[Template, ...]:
+    """Ways to look for an effect on an arm with this hand, on a joint at angles q (m,) rad."""
+    if effect is HELD:
+        return hand.templates()
+    if q is None:
+        return effect.templates()
+    return effect.templates_over(float(q.min()), float(q.max()))
 
 
 def signatures(
@@ -187,7 +191,7 @@ def signatures(
         for effect in CATALOGUE.values()
         for joint in places(effect, n)
         if joint < 0 or effect.scope == LINK or joint in joints
-        for template in templates(effect, hand)
+        for template in templates(effect, hand, at.links.q[:, joint] if joint >= 0 else None)
     ]
     ways += extra
     for effect, joint, template in ways:

@@ -17,6 +17,7 @@ from adapter.effects.splits import experiments
 from adapter.gap.candidates import Pattern, prior_log_odds, signal_of
 from adapter.gap.evidence import LEAST_NM, Carried, Moments, score
 from adapter.gap.fit import Fit, Named, honest_covariance, place_of
+from adapter.gap.laws import in_doubt
 from adapter.gap.result import Curves, Finding, Leftover
 from adapter.gap.rivals import Rival, Standing
 from adapter.gap.search import Found, from_the_start
@@ -56,8 +57,9 @@ def entries(
         recording: of several, whose own effects are among them; None: what is common alone.
         known: of the coefficients, for standard deviations.
     """
-    out, alone = [], len(fit.recordings) == 1
-    covariance = None if known is None else honest_covariance(fit, known)
+    out, alone, covariance = [], len(fit.recordings) == 1, None
+    if known is not None:
+        fit, covariance = _doubts(fit, known)
     for k, named in enumerate(fit.named):
         here = alone or named.recording in (None, recording)
         here &= not named.assumed or named.possible
@@ -75,6 +77,14 @@ def entries(
             if covariance is not None:
                 out[-1]["std"] = parameter_std(fit, covariance, k)
     return out
+
+
+def _doubts(fit: Fit, known: Carried | Moments) -> tuple[Fit, Array]:
+    """A fit whose laws' settings are free, too, and the covariance of its coefficients."""
+    free = in_doubt(fit)
+    if free is fit or isinstance(known, Moments):
+        return fit, honest_covariance(fit, known)
+    return free, honest_covariance(free, free.carried())
 
 
 def _curve(fit: Fit, covariance: Array, k: int) -> dict[str, Any] | None:
@@ -196,8 +206,7 @@ def _wrong_link(
 
 def findings_of(found: Found, ends: Mapping[str, float]) -> tuple[Finding, ...]:
     """Every named effect of the catalogue. `ends`: recordings by name -> s, when each ends."""
-    fit = found.fit
-    covariance = honest_covariance(fit, found.known or found.carried)
+    fit, covariance = _doubts(found.fit, found.known or found.carried)
     # of an offset that is there but has no name, its friction may be asymmetric in its place
     shifted = {
         e.candidate.joint

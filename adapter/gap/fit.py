@@ -36,6 +36,8 @@ BLOCK = 25  # samples: errors of the model last so long, noise does not
 DATE_REACHES_S, DATE_REACH = (0.06, 0.02, 0.008), 3  # steps in which a date is sought; how many
 SHAPE_STEPS = (1.25, 1.08, 1.03)  # factors by which a nonlinear setting is changed
 FAR_STEP = 3.0  # where others stay as they are
+HALVED = 7  # steps between two settings, each half of the one before
+WIDER = 2.0  # than what any arm has: what may have a name beside it
 MOST_FITTED = 0.5  # of independent rows that coefficients may have taken
 
 
@@ -77,6 +79,11 @@ class Named:
     def possible(self) -> bool:
         """Whether physics allows its parameters."""
         return self.candidate.possible(self.x, self.interval_s)
+
+    def covers(self, candidate: Candidate) -> bool:
+        """Whether a candidate is no more than it: what any arm has is small, a name need not be."""
+        own, other = self.candidate.prior_std[0], candidate.prior_std[0]
+        return self.candidate.key == candidate.key and not (self.assumed and other > WIDER * own)
 
     def active(self) -> Active:
         """As the model uses it."""
@@ -559,6 +566,18 @@ def _reshaped(fit: Fit, place: int) -> Fit:
             trial = _with_shape(fit, carried, place, other)
             if trial.g @ trial.x > best.g @ best.x:
                 best, named = trial, other
+    return fit.instead(place, named).at(best.x)
+
+
+def between(fit: Fit, place: int, value: float, step: float, at: Callable[[float], Named]) -> Fit:
+    """A named effect with the setting near `value` that the data like best, up to a fine step."""
+    carried = fit.carried()
+    best, named = carried, fit.named[place]
+    for finer in step * 0.5 ** np.arange(1, HALVED):
+        for other in (value - finer, value + finer):
+            trial = _with_shape(fit, carried, place, at(other))
+            if trial.g @ trial.x > best.g @ best.x:
+                best, named, value = trial, at(other), other
     return fit.instead(place, named).at(best.x)
 
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from adapter.effects.law import Curve, Law, OverSignals
 from adapter.gap.candidates import Pattern, signal_of
-from adapter.gap.fit import Fit, Named, place_of, refitted, under_own_noise
+from adapter.gap.fit import Fit, Named, between, place_of, refitted, under_own_noise
 from adapter.gap.rivals import price
 from adapter.gap.scan import BELIEF, FORMS, Lead, SignatureTable
 
 MOST_TERMS = 3  # of one joint: more are a curve with another name
 COMPARED = 4  # laws, each at its best setting
 PASSIVE = 0.03  # share of exchanged energy that a law may feed in and count as friction
-ROUNDS = 2  # in which a setting is fitted about where it was
+STEP = 0.1  # of what was seen: between two settings that are tried
 
 
 def lawful(fit: Fit, without: Container[int] = ()) -> Fit:
@@ -97,8 +97,6 @@ def _of_joint(fit: Fit, joint: int, most: int) -> Fit:
 
 def _together(fit: Fit, places: Sequence[int]) -> float:
     """Nats that named effects are worth together, their odds included."""
-    for k in places:
-        fit = fit.instead(k, _fixed(fit.named[k]))
     own = np.concatenate([place_of(fit, k) for k in places]) if places else np.zeros(0, int)
     carried = fit.carried()
     found = carried.worth(own, np.delete(np.arange(len(carried.g)), own))
@@ -123,7 +121,8 @@ def _with_law(fit: Fit, joint: int) -> Fit:
     best: dict[str, Lead] = {}
     table = SignatureTable(fit, [joint], FORMS, rich=False)
     for lead in sorted(table.whole(), key=lambda lead: -lead.log_evidence):
-        best.setdefault(lead.candidate.effect.name, lead)
+        if lead.candidate.possible(lead.x, lead.interval_s):
+            best.setdefault(lead.candidate.effect.name, lead)
     found, most, place = fit, BELIEF, len(fit.named)
     for lead in list(best.values())[:COMPARED]:
         if lead.log_evidence > BELIEF:
@@ -132,16 +131,6 @@ def _with_law(fit: Fit, joint: int) -> Fit:
             if nats > most:
                 found, most = more, nats
     return found
-
-
-def _fixed(named: Named) -> Named:
-    """A law whose setting is no longer sought: linear, it is worth no more than it explains."""
-    law, c = named.candidate.effect, named.candidate
-    if c.template.linear or not isinstance(law, Law) or law.expression.setting is None:
-        return named
-    template = law.at(float(named.values[law.expression.setting.key]))
-    template = replace(template, prior_std=c.template.prior_std[:1])
-    return replace(named, candidate=replace(c, template=template), x=named.x[:1])
 
 
 def _as_curve(fit: Fit, named: Named) -> Named:
@@ -163,14 +152,34 @@ def _is_curve(fit: Fit, named: Named) -> bool:
 
 
 def _settled(fit: Fit, place: int) -> Fit:
-    """With the setting of a law, if it has one, fitted beside all else."""
-    for _ in range(ROUNDS):
-        named = fit.named[place]
-        effect, c = named.candidate.effect, named.candidate
-        assert isinstance(effect, Law)
-        around = effect.around(named.values, float(c.prior_std[0]))
+    """With the setting of a law, if it has one, between those that were tried."""
+    named = fit.named[place]
+    law, c = named.candidate.effect, named.candidate
+    assert isinstance(law, Law)
+    setting = law.expression.setting
+    if setting is None or setting.wave:
+        return refitted(fit)[0]
+
+    def at(value: float) -> Named:
+        template = law.at(max(value, setting.lower))
+        template = replace(template, prior_std=c.template.prior_std)
+        return replace(named, candidate=replace(c, template=template))
+
+    seen, stages = float(np.ptp(setting.tried)), fit.model.stages(0)
+    if setting.within:
+        own = signal_of(setting.within.strip("|"), stages.links, stages.rigid, c.joint)
+        seen = float(np.ptp(own))
+    value = float(named.values[setting.key])
+    return refitted(between(fit, place, value, STEP * seen, at))[0]
+
+
+def in_doubt(fit: Fit) -> Fit:
+    """With the settings of laws free, about what they are: for their standard deviations."""
+    named = list(fit.named)
+    for k, e in enumerate(named):
+        law, c = e.candidate.effect, e.candidate
+        around = law.around(e.values, float(c.prior_std[0])) if isinstance(law, Law) else None
         if around is not None:
-            x = np.array([named.x[0], 0.0])
-            fit = fit.instead(place, replace(named, candidate=replace(c, template=around), x=x))
-        fit, _ = refitted(fit)
-    return fit
+            x = np.array([e.x[0], 0.0])
+            named[k] = replace(e, candidate=replace(c, template=around), x=x)
+    return fit if named == list(fit.named) else fit.with_named(named)

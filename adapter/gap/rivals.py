@@ -129,8 +129,10 @@ def _standing(
         if named.interval_s == WHOLE or not rival.candidate.effect.steady:
             best.setdefault(rival.candidate.key, rival)
     best.pop(named.candidate.key, None)
-    taken = {e.candidate.key for e in fit.named}
-    rivals = (replace(r, credible=r.credible and key not in taken) for key, r in best.items())
+    rivals = (
+        replace(r, credible=r.credible and not any(e.covers(r.candidate) for e in fit.named))
+        for r in best.values()
+    )
     value = mine.log_evidence + price(named)
     return Standing(named.candidate, value, mine.chi2, tuple(rivals), named.tried)
 

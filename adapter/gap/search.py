@@ -149,11 +149,13 @@ def _round(
     # a hand may pick up and put down as often as it likes, and what any arm has may change
     once = (e for e in fit.named if not (e.assumed or e.candidate.effect is HELD))
     moves = honest_moves(table, refused | {e.candidate.key for e in once})
-    there = {e.candidate.key for e in fit.named if e.assumed}
+    there = [e for e in fit.named if e.assumed]
     moves = [
         move
         for move in moves
-        if not any(x.candidate.key in there and x.interval_s == WHOLE for x in move.leads)
+        if not any(
+            x.interval_s == WHOLE and any(e.covers(x.candidate) for e in there) for x in move.leads
+        )
     ]
     for move in moves[:TRIED]:
         again = _dated_anew_beside(fit, move)
