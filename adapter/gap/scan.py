@@ -58,6 +58,7 @@ BELIEF = 8.0  # nats that a finding is worth after the price of looking for it
 # Fall of the squared distance below which nothing is named: always there, of what does come in
 # mid-recording, of what rarely does. Slow noise looks like a small start.
 CHI2_LEAST, CHI2_LEAST_SUDDEN, CHI2_LEAST_DATED = 30.0, 90.0, 250.0
+QUIETER = 0.3  # of that: what may be far more under its own noise
 BEST_OF_ALL, BEST_OF_JOINT = 6, 4  # leads that are looked at under their own noise
 CHANGE_NATS = 6.0  # by which acting from some time on must beat acting always
 CHANGE_SHARE = 0.1  # of the squared distance explained, a nat each: no arm is quite steady
@@ -462,7 +463,8 @@ def _shortlist(leads: Sequence[Lead]) -> list[Lead]:
     seen: dict[int, int] = {}
     chosen = []
     for place, lead in enumerate(leads):
-        if lead.log_evidence < 0.0 and not isinstance(lead.candidate.effect, Pattern | Law):
+        lawless = not isinstance(lead.candidate.effect, Pattern | Law)
+        if lead.log_evidence < 0.0 and (lawless or lead.chi2 < QUIETER * CHI2_LEAST):
             continue
         joint = lead.candidate.joint
         plain = lead.candidate.effect.bundled and lead.interval_s == WHOLE

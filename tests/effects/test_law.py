@@ -49,7 +49,7 @@ def values_of(law: Law | Curve) -> dict[str, Any]:
     """Parameters that none of its own defaults are."""
     if isinstance(law, Curve):
         return {"x": list(np.linspace(-1.0, 2.0, 8) ** 2), "low": -0.5, "high": 0.4}
-    return {"c": 0.7} | {p.key: 0.4 for p in law.parameters[1:]}
+    return {"c": 0.7} | {p.key: max(0.4, 1.4 * p.lower) for p in law.parameters[1:]}
 
 
 def torque_of(law: Law | Curve, values: dict[str, Any]) -> np.ndarray:
