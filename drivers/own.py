@@ -33,7 +33,11 @@ def open_own(address: str, joint_names: Sequence[str] | None, allow_motion: bool
     """
     file, _, rest = address.partition(":")
     name, _, query = rest.partition("?")
-    made = _class_of(Path(file), name)
+    found = vars(_loaded(Path(file)))
+    classes = [key for key, x in found.items() if inspect.isclass(x) and hasattr(x, "read")]
+    if name not in classes:
+        raise DriverError(f"{file}: no driver '{name}'; {choices(name, classes)}")
+    made: type[Driver] = found[name]
     given: dict[str, object] = dict(parse_qsl(query, keep_blank_values=True))
     names = None if joint_names is None else tuple(joint_names)
     for key, value in (("joint_names", names), ("allow_motion", allow_motion)):
@@ -57,15 +61,6 @@ def open_own(address: str, joint_names: Sequence[str] | None, allow_motion: bool
             "__init__ and let can_move say it"
         )
     return arm
-
-
-def _class_of(file: Path, name: str) -> type[Driver]:
-    module = _loaded(file)
-    classes = [key for key, x in vars(module).items() if inspect.isclass(x) and hasattr(x, "read")]
-    if name not in classes:
-        raise DriverError(f"{file}: no driver '{name}'; {choices(name, classes)}")
-    found: type[Driver] = getattr(module, name)
-    return found
 
 
 def _loaded(file: Path) -> ModuleType:

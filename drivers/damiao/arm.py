@@ -146,7 +146,12 @@ class DamiaoArm:
         self._say_who_holds()
         self._stream.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
         if self.can_move:
-            self._settle()
+            self._driving = True
+            self._beat()
+            if self._guardian is not None:  # it watches meanwhile and holds afterwards
+                self._guardian.memory.mode = GuardianMode.BRAKE
+            hold, self._carried = settle(self._stream, self.limits, self._carried, self._beat)
+            self._hand_over(hold)
             self._stream.rounds(FIRST_ROUNDS, ROUND_TIMEOUT_S)
 
     def _take_charge(self, talk: Dialogue, mode: Sequence[float]) -> None:
@@ -169,15 +174,6 @@ class DamiaoArm:
             self._guardian.memory.hold(q)
             self._relieved = self._guardian.relieve_former()
             talk.write(codec.TIMEOUT, round(WATCHDOG_S / TIMEOUT_UNIT_S))
-
-    def _settle(self) -> None:
-        """See `holding.settle`; the guardian watches meanwhile and holds afterwards."""
-        self._driving = True
-        self._beat()
-        if self._guardian is not None:
-            self._guardian.memory.mode = GuardianMode.BRAKE
-        hold, self._carried = settle(self._stream, self.limits, self._carried, self._beat)
-        self._hand_over(hold)
 
     def _hand_over(self, hold: Sequence[float]) -> None:
         """From driving to holding at these angles."""
@@ -293,13 +289,14 @@ class DamiaoArm:
         """
         if self._bus is None or not self._driving:
             return
-        self._driving = False
+        self._driving, held = False, "its motors' last command"
         if self._guardian is not None:
+            held = "the guardian process"
             self._guardian.memory.mode = GuardianMode.BRAKE
-        if self._guardian is not None and not self._guardian.alive:
-            self._replies.note("guardian gone", "the process that held the arm is gone; start anew")
+            if not self._guardian.alive:
+                gone = "the process that held the arm is gone; start anew"
+                self._replies.note("guardian gone", gone)
         self._hand_over(brake(self._stream, self.limits, self._carried, self._beat))
-        held = "the guardian process" if self._guardian is not None else "its motors' last command"
         self._replies.note("stopped", f"the arm was braked and stands; {held} holds it")
 
     def close(self) -> None:
@@ -343,8 +340,8 @@ class DamiaoArm:
             for old, new in zip(self._carried, values[2 * n :], strict=True)
         ]
         if self._guardian is not None:
-            parts = values[:n], values[n : 2 * n], self._carried, values[2 * n :]
-            self._guardian.memory.put(*parts)
+            q, dq, tau = values[:n], values[n : 2 * n], values[2 * n :]
+            self._guardian.memory.put(q, dq, self._carried, tau)
 
 
 def torque_frames(tau: Array, tau_max: Sequence[float]) -> tuple[list[bytes], bool]:

@@ -70,11 +70,8 @@ def budget(
             ways.append(f"CAN FD with {data_rate / 1e6:g} Mbit/s (?fd=1&data_bitrate={data_rate})")
             break
     ways.append("fewer joints on this bus")
-    kind = (
-        f"CAN FD {bitrate / 1e6:g}/{(data_bitrate or bitrate) / 1e6:g}"
-        if fd
-        else (f"classic CAN {bitrate / 1e6:g}")
-    )
+    fast = f"/{(data_bitrate or bitrate) / 1e6:g}" if fd else ""
+    kind = f"{'CAN FD' if fd else 'classic CAN'} {bitrate / 1e6:g}{fast}"
     raise DriverError(
         f"{2 * joints} frames take {found.typical_us:.0f} us (at worst {found.worst_us:.0f}) on "
         f"{kind} Mbit/s: {100 * found.load:.0f} % of a tick at {rate_hz} Hz; what fits: "
@@ -113,10 +110,8 @@ def fd_bits(can_id: int, data: bytes) -> tuple[int, int]:
     for byte in data:
         body += _bits(byte, 8)
     in_head = _stuffed(head)
-    return (
-        len(head) + in_head + FD_TAIL,
-        len(body) + _stuffed(head + body) - in_head + FD_CHECK,
-    )
+    in_body = _stuffed(head + body) - in_head
+    return len(head) + in_head + FD_TAIL, len(body) + in_body + FD_CHECK
 
 
 def _fits(found: BusTime, rate_hz: int) -> bool:

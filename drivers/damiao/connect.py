@@ -66,8 +66,19 @@ class Dialogue:
                     time.sleep(REPLY_TIMEOUT_S)
                     self._take(index, {}, parse)
                 return [replies[j] for j in range(len(requests))]
+        if not replies:
+            raise DriverError(
+                f"no motor answers on {self._settings.channel}: check power, cable, terminators, "
+                f"bit rates and whether the motors speak {'CAN FD' if self._settings.fd else 'CAN'}"
+                f" ({'?fd=0' if self._settings.fd else '?fd=1'} for the other)"
+            )
         silent = [j for j in range(len(requests)) if j not in replies]
-        raise DriverError(self._silence(silent, len(requests)))
+        names = ", ".join(f"{j + 1} (id 0x{self._settings.ids[j]:02x})" for j in silent)
+        many = len(silent) > 1
+        raise DriverError(
+            f"motor{'s' * many} {names} do{'es' * (not many)} not answer; check power, cable and "
+            f"id (first_id={self._settings.first_id}, joints={self._settings.joints})"
+        )
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send a frame now. Raises DriverError."""
@@ -97,20 +108,6 @@ class Dialogue:
                 replies.setdefault(j, parse(j, data))
             except WireError:
                 continue  # somebody else asked for this one
-
-    def _silence(self, silent: list[int], asked: int) -> str:
-        if len(silent) == asked:
-            return (
-                f"no motor answers on {self._settings.channel}: check power, cable, terminators, "
-                f"bit rates and whether the motors speak {'CAN FD' if self._settings.fd else 'CAN'}"
-                f" ({'?fd=0' if self._settings.fd else '?fd=1'} for the other)"
-            )
-        names = ", ".join(f"{j + 1} (id 0x{self._settings.ids[j]:02x})" for j in silent)
-        many = len(silent) > 1
-        return (
-            f"motor{'s' * many} {names} do{'es' * (not many)} not answer; check power, cable and "
-            f"id (first_id={self._settings.first_id}, joints={self._settings.joints})"
-        )
 
     def register(self, register: int) -> list[float]:
         """The register's value in every motor. Raises DriverError."""

@@ -39,33 +39,26 @@ class SpeedCheck:
 
     def add(self, stamp_ns: int, q: Array, dq: Array) -> None:
         """One sample without gaps. Raises DriverError where a speed is clearly off."""
-        if not self._count:
-            self._start_ns, self._start_q, self._start_dq = stamp_ns, q, dq
-            self._sum[:] = dq
-            self._count = 1
-            return
-        self._sum += dq
-        self._count += 1
-        span_ns = stamp_ns - self._start_ns
-        if span_ns >= WINDOW_NS:
-            self._close(stamp_ns, 1e-9 * span_ns, q, dq)
+        if self._count:
+            self._sum += dq
+            self._count += 1
+            span_ns = stamp_ns - self._start_ns
+            if span_ns < WINDOW_NS:
+                return
+            mean = (self._sum - 0.5 * (self._start_dq + dq)) / (self._count - 1)
+            self._windows[:, self._filled] = q - self._start_q, mean * (1e-9 * span_ns)
+            self._filled += 1
+            if self._filled % LEAST_WINDOWS == 0:
+                self._judge(self._filled)
+            if self._filled == MOST_WINDOWS:
+                self._filled = 0
+        self._start_ns, self._start_q, self._start_dq = stamp_ns, q, dq
+        self._sum[:] = dq
+        self._count = 1
 
     def skip(self) -> None:
         """A sample with a gap came; the window that it lies in is left out."""
         self._count = 0
-
-    def _close(self, stamp_ns: int, span_s: float, q: Array, dq: Array) -> None:
-        mean = (self._sum - 0.5 * (self._start_dq + dq)) / (self._count - 1)
-        self._windows[0, self._filled] = q - self._start_q
-        self._windows[1, self._filled] = mean * span_s
-        self._filled += 1
-        if self._filled >= LEAST_WINDOWS and self._filled % LEAST_WINDOWS == 0:
-            self._judge(self._filled)
-        if self._filled == MOST_WINDOWS:
-            self._filled = 0
-        self._start_ns, self._start_q, self._start_dq = stamp_ns, q, dq
-        self._sum[:] = dq
-        self._count = 1
 
     def _judge(self, m: int) -> None:
         change, integral = self._windows[:, :m]

@@ -137,7 +137,11 @@ class ReplyIntake:
             if data[0] != heads[j] and not self._look_at_status(j, data[0]):
                 continue
             if pending[j] <= 0:
-                self._unasked()
+                why = "a motor replied without having been asked by this driver"
+                if self.others_ask:
+                    self._refuse(Refusal.GUARDIANS)
+                else:
+                    self._refuse(Refusal.UNASKED, why)
                 continue
             pending[j] -= 1
             arrived_ns = int(1e9 * stamp_s) + offset_ns
@@ -187,9 +191,16 @@ class ReplyIntake:
         """
         values, missing = at_instant(stamp_ns, self._before, self.latest, self._reach_ns)
         if missing:
+            silent = []
             for j in missing:
                 self._missed[j] += 1
-            self._need_signs_of_life(missing, stamp_ns)
+                if self._missed[j] >= SILENT_TICKS and stamp_ns - self.latest[j][0] >= SILENT_NS:
+                    silent.append(f"{j + 1} (id 0x{self._settings.ids[j]:02x})")
+            if silent:
+                raise DriverError(
+                    f"motor{'s' * (len(silent) > 1)} {', '.join(silent)} silent for "
+                    f"{1e-9 * SILENT_NS:g} s: check power, cable and bus-off"
+                )
         elif self._any_missed:
             self._missed = [0] * len(self._missed)
         self._any_missed = bool(missing)
@@ -202,33 +213,23 @@ class ReplyIntake:
             if j < 0 or kind:
                 continue
             self.pending[j] = max(self.pending[j] - 1, 0)
-            self._intake.received += 1
-            self._intake.refused[Refusal.GUARDIANS] += 1
+            self._refuse(Refusal.GUARDIANS)
 
     def finish(self, on_the_way: bool) -> None:
         """Count what is still missing as lost, but for one reply of each joint `on_the_way`."""
         self._intake.lost += sum(max(count - on_the_way, 0) for count in self.pending)
         self.pending = [0] * len(self.pending)
 
-    def _refuse(self, reason: Refusal, sentence: str) -> None:
+    def _refuse(self, reason: Refusal, sentence: str = "") -> None:
         self._intake.received += 1
         self._intake.refused[reason] += 1
-        self.note(reason, f"{sentence}; it was refused")
-
-    def _unasked(self) -> None:
-        if self.others_ask:
-            self._intake.received += 1
-            self._intake.refused[Refusal.GUARDIANS] += 1
-        else:
-            self._refuse(
-                Refusal.UNASKED, "a motor replied without having been asked by this driver"
-            )
+        if sentence:
+            self.note(reason, f"{sentence}; it was refused")
 
     def _odd(self, can_id: int, data: bytes | bytearray, kind: int, j: int) -> None:
         """A frame that is no reply."""
         if kind == ERROR_FRAME:
-            self._intake.received += 1
-            self._intake.refused[Refusal.ERROR_FRAME] += 1
+            self._refuse(Refusal.ERROR_FRAME)
             for trouble in troubles_of(can_id, data, self._settings.channel):
                 if trouble.fatal:
                     raise DriverError(trouble.sentence)
@@ -270,8 +271,7 @@ class ReplyIntake:
             self._heads[j] = head
             return True
         self.pending[j] = max(self.pending[j] - 1, 0)
-        self._intake.received += 1
-        self._intake.refused[Refusal.UNCONFIRMED] += 1
+        self._refuse(Refusal.UNCONFIRMED)
         return False
 
     def _alarm(self, j: int, sentence: str) -> None:
@@ -296,20 +296,6 @@ class ReplyIntake:
                     f"warm {part} {j}",
                     f"{who} are at {degc} deg C; the run ends at {HOT_DEGC}: move less or slower",
                 )
-
-    def _need_signs_of_life(self, missing: Sequence[int], stamp_ns: int) -> None:
-        silent = [
-            j
-            for j in missing
-            if self._missed[j] >= SILENT_TICKS and stamp_ns - self.latest[j][0] >= SILENT_NS
-        ]
-        if not silent:
-            return
-        names = ", ".join(f"{k + 1} (id 0x{self._settings.ids[k]:02x})" for k in silent)
-        raise DriverError(
-            f"motor{'s' * (len(silent) > 1)} {names} silent for {1e-9 * SILENT_NS:g} s: check "
-            "power, cable and bus-off"
-        )
 
     def _settle(self) -> None:
         """A reply that was missing at every look of a window is lost."""
@@ -413,10 +399,7 @@ class MotorStream:
                 self.asked_ns, self.fresh = asked_ns, True
         if failure is None:
             self._failed_ticks = 0
-        else:
-            self._fail(failure)
-
-    def _fail(self, failure: Exception) -> None:
+            return
         self._failed_ticks += 1
         where = self._settings.channel
         if self._failed_ticks > SEND_FAILURES:

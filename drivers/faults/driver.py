@@ -197,28 +197,23 @@ class FaultyDriver(PassedOn):
         """The sample as stuck joints, jumps, clocks and single wrong numbers leave it."""
         now_s = self._time_s(sample)
         for fault in self._lasting:
-            if fault.at_s is not None and now_s >= fault.at_s:
-                sample = self._lasting_fault(fault, sample, now_s)
+            assert fault.at_s is not None and fault.amount is not None
+            joint = (fault.joint or 1) - 1
+            if now_s < fault.at_s or (fault.name == "stuck" and now_s >= fault.at_s + fault.amount):
+                continue
+            if fault.name == "stuck":
+                q, dq, tau = (float(getattr(sample, name)[joint]) for name in SIGNALS)
+                sample = frozen(sample, joint, self._stuck.setdefault(fault, (q, dq, tau)))
+            elif fault.name == "jump":
+                sample = shifted(sample, joint, fault.amount)
+            else:
+                sample = replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * fault.amount))
+            self.account.injected[fault.name] += 1
         if self._hits("spike"):
             sample = spike(sample, self._rng["spike"], self._amount("spike"))
         for name, change in (("corrupt", corrupt), ("nan", blank), ("stamp", corrupt_stamp)):
             if self._hits(name):
                 sample = change(sample, self._rng[name])
-        return sample
-
-    def _lasting_fault(self, fault: Fault, sample: JointSample, now_s: float) -> JointSample:
-        assert fault.at_s is not None and fault.amount is not None
-        joint = (fault.joint or 1) - 1
-        if fault.name == "stuck":
-            if now_s >= fault.at_s + fault.amount:
-                return sample
-            now = tuple(float(getattr(sample, name)[joint]) for name in SIGNALS)
-            sample = frozen(sample, joint, self._stuck.setdefault(fault, (now[0], now[1], now[2])))
-        elif fault.name == "jump":
-            sample = shifted(sample, joint, fault.amount)
-        else:
-            sample = replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * fault.amount))
-        self.account.injected[fault.name] += 1
         return sample
 
     def _hits(self, name: str) -> bool:

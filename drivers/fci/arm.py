@@ -137,7 +137,11 @@ class FciArm:
             self._control = TorqueControl(connection.version, connection.channel, stream.send)
             self._first = self._make_ready(stream)
             if self.can_move:
-                self._set_up(stream, connection)
+                mass, *rest = stream.load().tolist()
+                former = Load(mass, np.array(rest[9:]), np.array(rest[:9]))
+                channel, wanted = connection.channel, self._safeguards
+                self._settings = RobotSettings(connection.version, channel, wanted)
+                self._account.note("settings", self._settings.apply(former))
                 self.intake.commands = self._control.count
         except BaseException:
             self.close()
@@ -152,9 +156,11 @@ class FciArm:
         stream, motion = self._need_open()
         if motion.fault is not None:
             raise DriverError(motion.fault)
-        state = self._take_first() or stream.next(SILENCE_S)
-        if state is None:
-            raise DriverError(stream.silence())
+        state, self._first = self._first, None  # that of connect, unless it waited for too long
+        if state is not None and time.monotonic_ns() - self.arrived_ns > STALE_NS:
+            self.intake.refused[Refusal.STALE] += 1
+            state = None
+        state = state or _next_of(stream)
         self.intake.used += 1
         self.arrived_ns = stream.arrived_ns
         if motion.active:
@@ -207,9 +213,7 @@ class FciArm:
 
     def _make_ready(self, stream: StateStream) -> State:
         """The first state, after a recovery where that was asked for. Raises DriverError."""
-        state = stream.next(SILENCE_S)
-        if state is None:
-            raise DriverError(stream.silence())
+        state = _next_of(stream)
         if state.status.robot_mode == tables.ROBOT_REFLEX and self._target.recover:
             state = self._recovered(stream, state)
         self._note_status(state.status)
@@ -218,51 +222,30 @@ class FciArm:
             raise NotReady(f"no motion: the robot {tables.ROBOT_MODE_MEANING[mode]}")
         return state
 
-    def _set_up(self, stream: StateStream, connection: Connection) -> None:
-        """Thresholds and load of this run; says them. Raises DriverError."""
-        mass, *inertia_and_com = stream.load().tolist()
-        former = Load(mass, np.array(inertia_and_com[9:]), np.array(inertia_and_com[:9]))
-        version, channel = connection.version, connection.channel
-        self._settings = RobotSettings(version, channel, self._safeguards)
-        self._account.note("settings", self._settings.apply(former))
-
     def _recovered(self, stream: StateStream, first: State) -> State:
         """The first state that shows no reflex any more. Raises DriverError."""
         assert self._connection is not None
         recover(self._connection)
-        state: State | None = first
-        deadline = time.monotonic() + RECOVERED_S
-        while state is not None and state.status.robot_mode in _RECOVERING_MODES:
+        state, deadline = first, time.monotonic() + RECOVERED_S
+        while state.status.robot_mode in _RECOVERING_MODES:
             if time.monotonic() > deadline:
                 raise NotReady(
                     f"the robot {tables.ROBOT_MODE_MEANING[state.status.robot_mode]}: it said "
                     "that it recovered, but does not show it"
                 )
             self.intake.refused[Refusal.RECOVERING] += 1
-            state = stream.next(SILENCE_S)
-        if state is None:
-            raise DriverError(stream.silence())
+            state = _next_of(stream)
         return state
-
-    def _take_first(self) -> State | None:
-        """The state that connect has read, unless it waited for too long."""
-        first, self._first = self._first, None
-        if first is not None and time.monotonic_ns() - self.arrived_ns > STALE_NS:
-            self.intake.refused[Refusal.STALE] += 1
-            return None
-        return first
 
     def _state_while_stopping(self, wait_s: float) -> State | None:
         """The newest state there is."""
         stream = self._need_open()[0]
         with contextlib.suppress(DriverError):  # the motion is then ended over TCP
-            state = stream.next(wait_s)
-            while state is not None:
+            while (state := stream.next(wait_s)) is not None:
                 self.intake.refused[Refusal.STOPPING] += 1
                 self._state = state
                 if not stream.behind:
                     return state
-                state = stream.next(wait_s)
         return None
 
     def _note_status(self, status: Status) -> None:
@@ -272,3 +255,11 @@ class FciArm:
             why = f" ({told(status.reflex_reason)})" if any(status.reflex_reason) else ""
             sentence = f"the robot {tables.ROBOT_MODE_MEANING[mode]}{why}"
             self._account.note(f"mode {mode}", sentence)
+
+
+def _next_of(stream: StateStream) -> State:
+    """The next state. Raises DriverError where none comes in time."""
+    state = stream.next(SILENCE_S)
+    if state is None:
+        raise DriverError(stream.silence())
+    return state

@@ -232,25 +232,22 @@ def _ask(connection: Connection) -> tuple[int, int]:
     connect_id = connection.channel.send(tables.CONNECT[connection.version], payload)
     try:
         reply = connection.channel.wait(connect_id, REPLY_LIMIT_S)
+        if reply is None and connection.channel.closed:
+            raise DriverError(
+                f"{connection.channel.robot_host} hung up during the handshake: end other programs "
+                "that use the robot and activate FCI in Desk"
+            )
         if reply is None:
-            raise DriverError(_silent(connection.channel))
+            raise DriverError(
+                f"{connection.channel.robot_host} does not answer Connect within "
+                f"{REPLY_LIMIT_S:.0f} s: end other programs that use the robot, or check that this "
+                "is an FCI port"
+            )
         return codec.connect_reply(reply)
     except WireError as error:
         raise DriverError(
             f"the robot at {connection.channel.robot_host} gives {error}: is this an FCI port?"
         ) from error
-
-
-def _silent(channel: Channel) -> str:
-    if channel.closed:
-        return (
-            f"{channel.robot_host} hung up during the handshake: end other programs that use the "
-            "robot and activate FCI in Desk"
-        )
-    return (
-        f"{channel.robot_host} does not answer Connect within {REPLY_LIMIT_S:.0f} s: end other "
-        "programs that use the robot, or check that this is an FCI port"
-    )
 
 
 def recover(connection: Connection) -> None:

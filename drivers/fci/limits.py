@@ -15,7 +15,6 @@ TORQUE_LIMIT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 # N m from one command to the next; the robot allows 1 (1000 N m/s at 1 kHz) and stops beyond.
 TORQUE_STEP = 0.99
 
-
 SETTLE_TICKS = 3  # an accepted torque that stays for so long is not on its way to ours
 OWN_COMMANDS = 32  # an accepted torque is one of so many that were sent last
 SAME = 1e-3  # N m; rounding of an f32 and some
@@ -68,11 +67,14 @@ class TorqueLimiter:
             self.cut += 1
             return None
         accepted = self._accepted = believed
-        if self._apart(accepted):
-            if not self._settled(accepted):
+        both = zip(self.last, accepted, strict=True)
+        if any(abs(last - own) > 2.0 * TORQUE_STEP for last, own in both):
+            self._waited = self._waited + 1 if accepted == self._seen else 0
+            self._seen = accepted
+            if self._waited < SETTLE_TICKS:
                 self.cut += 1
                 return None
-            self.last = accepted
+            self.last = accepted  # it stands still: it is not on its way to the one sent last
         self._waited = 0
         out = []
         for want, last, own, limit in zip(tau, self.last, accepted, TORQUE_LIMIT, strict=True):
@@ -93,18 +95,6 @@ class TorqueLimiter:
         if self._strange < STRANGE_TICKS or not all(map(math.isfinite, accepted)):
             return None
         return accepted
-
-    def _apart(self, accepted: list[float]) -> bool:
-        return any(
-            abs(last - own) > 2.0 * TORQUE_STEP
-            for last, own in zip(self.last, accepted, strict=True)
-        )
-
-    def _settled(self, accepted: list[float]) -> bool:
-        """The accepted torque stands still: it is not on its way to the one sent last."""
-        self._waited = self._waited + 1 if accepted == self._seen else 0
-        self._seen = accepted
-        return self._waited >= SETTLE_TICKS
 
 
 def checked(tau: Array) -> Array:

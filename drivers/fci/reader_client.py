@@ -215,8 +215,8 @@ class ReaderClient:
             if deadline <= now:
                 return False
             woken = self._wait(deadline - now)
-            if woken is None:
-                woken = not self._stuck()
+            if woken is None:  # where datagrams wait in the socket, the reader does not take them
+                woken = not select.select([self._udp], [], [], 0)[0]
             if not woken:
                 self._restart()
                 deadline = 0.0  # the new one needs its time
@@ -272,7 +272,3 @@ class ReaderClient:
             spare = None
         self._work_with(self._spawn(-1) if spare is None else spare)
         self.restarts += 1
-
-    def _stuck(self) -> bool:
-        """Datagrams wait in the socket and the reader does not take them."""
-        return bool(select.select([self._udp], [], [], 0)[0])

@@ -97,29 +97,23 @@ class StateIntake:
 
     def judge(self, message_id: int, record: Record, now_ns: int) -> Refusal | None:
         """Why a state of this id is refused; None takes it."""
-        if message_id != self._id + 1 and self._id >= 0:
-            reason = self._judge_jump(message_id, record)
-            if reason is not None:
-                return reason
+        ahead = message_id - self._id
+        if ahead != 1 and self._id >= 0:
+            passed = (record.arrived_ns - self._arrived_ns) // TICK_NS
+            if 0 < ahead <= SLACK_TICKS + 2 * passed:
+                missing = max(0, ahead - 1 - self._unread)
+                self.intake.lost += missing
+                if missing:
+                    self.note("lost", "states got lost between the robot and this program")
+            elif self._is_new_count(message_id):
+                self.note("count", f"the robot went over to another count, from {message_id} on")
+            elif ahead == 0:
+                return Refusal.REPEATED
+            else:
+                return Refusal.OUT_OF_ORDER if ahead < 0 else Refusal.MALFORMED
         self._id, self._arrived_ns = message_id, record.arrived_ns
         self._unread = self._others = self._refused_since_ns = 0
         return Refusal.STALE if now_ns - record.arrived_ns > STALE_NS else None
-
-    def _judge_jump(self, message_id: int, record: Record) -> Refusal | None:
-        ahead = message_id - self._id
-        passed = (record.arrived_ns - self._arrived_ns) // TICK_NS
-        if 0 < ahead <= SLACK_TICKS + 2 * passed:
-            missing = max(0, ahead - 1 - self._unread)
-            self.intake.lost += missing
-            if missing:
-                self.note("lost", "states got lost between the robot and this program")
-            return None
-        if self._is_new_count(message_id):
-            self.note("count", f"the robot went over to another count, from {message_id} on")
-            return None
-        if ahead == 0:
-            return Refusal.REPEATED
-        return Refusal.OUT_OF_ORDER if ahead < 0 else Refusal.MALFORMED
 
     def _is_new_count(self, message_id: int) -> bool:
         """Whether a run of ids apart from ours is long enough to be followed."""

@@ -133,24 +133,19 @@ class TorqueControl:
                 self._look_at_start(state)
             elif self._phase == _RUNNING:
                 self._note_rate(state.success_rate)
-                if state.status is not self._status:
-                    self._look_at_change(state)
+                if state.status is not self._status and self._runs(state.status):
+                    self._status, self._odd = state.status, 0
+                elif state.status is not self._status:
+                    self._odd = self._odd + 1 if self._ticks == self._odd_tick + 1 else 1
+                    self._odd_tick = self._ticks
+                    if self._odd >= ENDED_AFTER:
+                        self._ended(state)
                 elif self._ticks % LOOK_EVERY == 0:
                     self._channel.poll()
                     if self._channel.closed:
                         self._fail("the robot cut the connection; it brakes by itself: see Desk")
         except WireError as error:
             self._fail(f"the robot answers on TCP with {error}: connect again")
-
-    def _look_at_change(self, state: State) -> None:
-        """A status that is not that of the running motion, or another that is."""
-        if self._runs(state.status):
-            self._status, self._odd = state.status, 0
-            return
-        self._odd = self._odd + 1 if self._ticks == self._odd_tick + 1 else 1
-        self._odd_tick = self._ticks
-        if self._odd >= ENDED_AFTER:
-            self._ended(state)
 
     def _runs(self, status: Status) -> bool:
         return (
@@ -196,7 +191,9 @@ class TorqueControl:
             self._fail(f"the arm was stopped: {tables.meaning('user_stop')}")
         else:
             why = tables.meaning(name) if name else "it does not say why: look at Desk"
-            self._fail(f"the robot ended the motion: {why}{_named(status)}")
+            flags = status.errors if raised(status.errors) else status.reflex_reason
+            named = f"; {told(flags)}" if any(flags) else ""
+            self._fail(f"the robot ended the motion: {why}{named}")
 
     def _fail(self, sentence: str) -> None:
         self.fault, self._phase = sentence, _IDLE
@@ -273,16 +270,9 @@ class TorqueControl:
             return
         name = tables.status_name(tables.STOP_STATUS[self._version], number)
         state, deadline = next_state(QUIET_S), time.monotonic() + STOP_MOVE_S
-        while state is not None and state.status.robot_mode == tables.ROBOT_MOVE:
-            if time.monotonic() > deadline:
-                self.fault = f"{unsure} (StopMove: {tables.meaning(name)})"
-                return
-            state = next_state(QUIET_S)
-        if state is None and name != "success":
+        late = False
+        while state is not None and state.status.robot_mode == tables.ROBOT_MOVE and not late:
+            late = time.monotonic() > deadline
+            state = state if late else next_state(QUIET_S)
+        if late or (state is None and name != "success"):
             self.fault = f"{unsure} (StopMove: {tables.meaning(name)})"
-
-
-def _named(status: Status) -> str:
-    """The errors of a state as the end of a sentence; nothing where there are none."""
-    flags = status.errors if raised(status.errors) else status.reflex_reason
-    return f"; {told(flags)}" if any(flags) else ""

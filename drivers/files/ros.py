@@ -216,14 +216,13 @@ def decode_many(
     left = np.arange(len(rows))
     while left.size:
         sample = rows[left[0]]
-        together = len(blocks) < _LAYOUTS_VECTORISED
         try:
             layout = parse(sample.tobytes())
         except CdrError as error:
             bad.append((int(left[0]), str(error)))
             left = left[1:]
             continue
-        if together:
+        if len(blocks) < _LAYOUTS_VECTORISED:
             candidates = rows if left.size == len(rows) else rows[left]
             same = _same_layout(candidates, sample, layout)
         else:

@@ -97,10 +97,10 @@ class Ros2Arm:
             self.intake.commands = CommandCount()
         self._driving, self._fault = False, ""
         self._bridge = self._started()
-        self._begin_with(self._bridge)
         self._stamp_ns = 0
 
     def _started(self, rescue: bool = False) -> _Process:
+        """A new bridge; samples and counts begin with what it hears from now on."""
         bridge = _Process(self._settings, self.joint_names, (self.can_move, rescue))
         try:
             told = bridge.first_word(READY_S)
@@ -110,6 +110,8 @@ class Ros2Arm:
         except BaseException:
             bridge.end(0.0)
             raise
+        self._next = bridge.memory.words.head
+        self._ignored = bridge.memory.words.refused[:]
         return bridge
 
     def read(self) -> JointSample:
@@ -129,7 +131,9 @@ class Ros2Arm:
         behind = bridge.memory.words.head - self._next - (SLOTS - 8)
         if behind > 0:
             self._next += behind
-            self._refused(Refusal.OVERTAKEN, behind)
+            self.intake.refused[Refusal.OVERTAKEN.name.lower()] += behind
+            if self._driving:  # before that it only says that somebody took a while to begin
+                self._note(Refusal.OVERTAKEN)
         stamp_ns, self.arrived_ns, values = bridge.memory.state(self._next)
         self._next += 1
         self._count(bridge, stamp_ns)
@@ -162,9 +166,10 @@ class Ros2Arm:
         bridge = self._bridge
         if bridge is None or not self._driving:
             return
-        if not bridge.alive:
+        if not bridge.alive:  # a new one in its place
+            bridge.end(0.0)
             with contextlib.suppress(DriverError):
-                bridge = self._bridge = self._rescued(bridge)
+                bridge = self._bridge = self._started(rescue=True)
         bridge.memory.words.asked = Asked.BRAKE
         end = time.monotonic() + STOP_S
         while (
@@ -174,18 +179,6 @@ class Ros2Arm:
                 break  # no command of ours was sent yet
             time.sleep(POLL_S)
         self._driving, self._fault = False, ""
-
-    def _rescued(self, dead: _Process) -> _Process:
-        """A new bridge in the place of one that died while the arm was driven."""
-        dead.end(0.0)
-        bridge = self._started(rescue=True)
-        self._begin_with(bridge)
-        return bridge
-
-    def _begin_with(self, bridge: _Process) -> None:
-        """Samples and counts begin with what a new bridge hears from now on."""
-        self._next = bridge.memory.words.head
-        self._ignored = bridge.memory.words.refused[:]
 
     def close(self) -> None:
         """Stop, then end the bridge. The controller goes on with the torques that hold the arm."""
@@ -229,18 +222,18 @@ class Ros2Arm:
             intake.lost += max(math.floor(periods + 0.5) - 1, 0)
         self._stamp_ns = stamp_ns
 
-    def _refused(self, why: Refusal, count: int) -> None:
-        self.intake.refused[why.name.lower()] += count
-        if self._driving:  # before that it only says that somebody took a while to begin
-            self._note(why)
-
     def _note(self, why: Refusal) -> None:
         if NOTES[why] not in self.intake.notes:
             self.intake.notes.append(NOTES[why])
 
 
 class _Process:
-    """The bridge from the driver's side."""
+    """The bridge from the driver's side.
+
+    Attributes:
+        pid: of the process.
+        alive: it runs; costs no system call while it has not closed its output.
+    """
 
     def __init__(self, settings: Any, joints: tuple[str, ...], leave: tuple[bool, bool]) -> None:
         self.memory = Memory(len(joints))
@@ -260,17 +253,7 @@ class _Process:
         self._out = self._process.stdout.fileno()
         os.set_blocking(self._out, False)
         self._rest = b""
-        self._ended = False
-
-    @property
-    def pid(self) -> int:
-        """Of the process."""
-        return self._process.pid
-
-    @property
-    def alive(self) -> bool:
-        """Whether it runs; costs no system call while it has not closed its output."""
-        return not self._ended
+        self.pid, self.alive = self._process.pid, True
 
     def first_word(self, timeout_s: float) -> dict[str, Any]:
         """What it says first; empty where it ends, or says nothing in time."""
@@ -287,7 +270,7 @@ class _Process:
             data = os.read(self._out, 65536)
         except BlockingIOError:
             return []
-        self._ended = self._ended or not data
+        self.alive = self.alive and bool(data)
         *lines, self._rest = (self._rest + data).split(b"\n")
         return [json.loads(line) for line in lines]
 

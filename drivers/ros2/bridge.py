@@ -111,13 +111,14 @@ class States:
 
     def take(self, data: bytes) -> tuple[int, Array] | None:
         """Stamp and (3, n) of a message; None where it is refused."""
-        found = self._values(data)
+        found = self._judged(data)
         if isinstance(found, Refusal):
             self._memory.words.refused[found] += 1
             return None
+        self.jumps, self._last = 0, (found[0], found[1][0])
         return found
 
-    def _values(self, data: bytes) -> tuple[int, Array] | Refusal:
+    def _judged(self, data: bytes) -> tuple[int, Array] | Refusal:
         try:
             layout = parse_joint_state(data)
         except CdrError:
@@ -132,9 +133,7 @@ class States:
             return Refusal.INCOMPLETE
         values = np.stack([run[self._order] for run in runs]).astype(np.float64)
         sec, nanosec = np.frombuffer(data, f"{order}i4", 2, 4).tolist()
-        return self._judged(sec * 1_000_000_000 + nanosec, values)
-
-    def _judged(self, stamp_ns: int, values: Array) -> tuple[int, Array] | Refusal:
+        stamp_ns = sec * 1_000_000_000 + nanosec
         if not np.isfinite(values).all():
             return Refusal.NOT_FINITE
         if self._last is not None:
@@ -145,8 +144,6 @@ class States:
             if np.abs(values[0] - before).max() > reach and self.jumps < JUMPS:
                 self.jumps += 1
                 return Refusal.JUMP
-        self.jumps = 0
-        self._last = stamp_ns, values[0]
         return stamp_ns, values
 
 
@@ -182,10 +179,8 @@ class Bridge:
             raise DriverError(
                 f"{where.states} has no joint {', '.join(missing)}; it has: {', '.join(names)}"
             )
-        runs = dict(
-            zip(("velocity", "effort"), parse_joint_state(first[-1]).doubles[1:], strict=True)
-        )
-        absent = [key for key, run in runs.items() if run.stop - run.start != 8 * len(names)]  # type: ignore[union-attr]
+        runs = dict(zip(("velocity", "effort"), runs_of(first[-1])[1][1:], strict=True))
+        absent = [key for key, run in runs.items() if len(run) != len(names)]
         if absent:
             raise DriverError(
                 f"{where.states} tells no {' and no '.join(absent)}; the arm's state interfaces "
@@ -282,7 +277,12 @@ class Bridge:
 
         threading.Thread(target=wait_for_end, daemon=True).start()
         threading.Thread(target=self._pass_on, daemon=True).start()
-        waiter = self._waiter()
+        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
+
+        waiter = WaitSet(self._network.participant)
+        mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
+        self._condition = ReadCondition(self._states.reader, mask)
+        waiter.attach(self._condition)
         while not self._done():
             waiter.wait(2_000_000)
             self._answer = None
@@ -292,15 +292,6 @@ class Bridge:
                 if self._answer is not None and self._memory.words.doing in BRAKES:
                     self._send(self._answer)
                 self._supervise()
-
-    def _waiter(self) -> Any:
-        from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
-
-        waiter = WaitSet(self._network.participant)
-        mask = SampleState.NotRead | ViewState.Any | InstanceState.Any
-        self._condition = ReadCondition(self._states.reader, mask)
-        waiter.attach(self._condition)
-        return waiter
 
     def _done(self) -> bool:
         if not self._gone.is_set():
@@ -314,21 +305,18 @@ class Bridge:
 
     def _pass_on(self) -> None:
         """Send a command as soon as it is there."""
+        words = self._memory.words
         while True:
             os.eventfd_read(self._start.nudge)
             with self._lock:
-                self._send_newest()
-
-    def _send_newest(self) -> None:
-        memory = self._memory
-        sequence = memory.words.sequence
-        if sequence == self._sent or memory.words.asked != Asked.DRIVE or self._taken:
-            return
-        if memory.words.doing != Doing.DRIVING:
-            self._braker.release()
-        memory.words.doing = Doing.DRIVING
-        self._sent = sequence
-        self._send(memory.command())
+                sequence = words.sequence
+                if sequence == self._sent or words.asked != Asked.DRIVE or self._taken:
+                    continue
+                if words.doing != Doing.DRIVING:
+                    self._braker.release()
+                words.doing = Doing.DRIVING
+                self._sent = sequence
+                self._send(self._memory.command())
 
     def _send(self, tau: Array) -> None:
         if self._commands is not None:
@@ -338,10 +326,9 @@ class Bridge:
         found = self._reader.take(data)
         if found is None:
             if self._reader.jumps == JUMPS:
+                why = f"{JUMPS} joint states in a row are further on than joints move"
                 with self._lock:
-                    self._take_over(
-                        f"{JUMPS} joint states in a row are further on than joints move"
-                    )
+                    self._take_over(why)
             return
         stamp_ns, values = found
         self._heard = time.monotonic()

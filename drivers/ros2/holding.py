@@ -38,6 +38,7 @@ class Braker:
 
     Attributes:
         effort: (n,) as given.
+        standing: it holds its place.
     """
 
     def __init__(self, effort: Array, period_s: float, gravity: bool) -> None:
@@ -45,22 +46,14 @@ class Braker:
         self._kd = DAMPED_SHARE * effort / MOST_ACCELERATION / max(period_s, 1e-3)
         self._kp = SPRING_RATE * self._kd
         self._mean: Array | None = None  # [dq, tau] (2, n)
-        self._begin()
-
-    def _begin(self) -> None:
-        self._goal: Array | None = None  # (n,) where the joints should be, rad
-        self._integral = self._speed = self._carry = np.zeros(len(self.effort))
-        self._standing = False
-        self._braked_s = self._slow_s = 0.0
-
-    @property
-    def standing(self) -> bool:
-        """Whether it holds its place."""
-        return self._standing
+        self.release()
 
     def release(self) -> None:
         """Somebody else drives the arm from here on."""
-        self._begin()
+        self._goal: Array | None = None  # (n,) where the joints should be, rad
+        self._integral = self._speed = self._carry = np.zeros(len(self.effort))
+        self.standing = False
+        self._braked_s = self._slow_s = 0.0
 
     def listen(self, dq: Array, tau: Array) -> None:
         """Speeds and torques (n,) measured; while somebody else drives, too."""
@@ -84,9 +77,7 @@ class Braker:
         speed = max(1.0 - self._braked_s / BRAKE_S, 0.0) * self._speed
         self._goal = self._goal + speed * self._period_s
         self._look_whether_it_stands(q, dq)
-        away, most = self._goal - q, self.effort
-        if self._standing:
-            most = SOFT_SHARE * self.effort
+        away, most = self._goal - q, (SOFT_SHARE if self.standing else 1.0) * self.effort
         self._integral = np.clip(
             self._integral + INTEGRAL_RATE * self._kp * away * self._period_s, -most, most
         )
@@ -97,10 +88,10 @@ class Braker:
     def _look_whether_it_stands(self, q: Array, dq: Array) -> None:
         slow = bool((np.abs(dq) < SLOW).all())
         self._slow_s = self._slow_s + self._period_s if slow else 0.0
-        if self._standing or self._braked_s < BRAKE_S:
+        if self.standing or self._braked_s < BRAKE_S:
             return
         if self._slow_s >= SLOW_S or self._braked_s >= SETTLE_AT_MOST_S:
-            self._standing = True
+            self.standing = True
             if slow and self._mean is not None:
                 self._goal, self._integral = q, np.zeros(len(q))
                 self._carry = np.zeros_like(q) if self._gravity else self._mean[1]

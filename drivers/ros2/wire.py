@@ -48,6 +48,9 @@ class Network:
         domain: its number, ROS_DOMAIN_ID.
         local: on this machine only, without multicast; what CYCLONEDDS_URI says is not looked at.
 
+    Attributes:
+        participant: for what waits on it.
+
     Raises:
         DriverError: the library is not installed, or there is no such network.
     """
@@ -62,19 +65,14 @@ class Network:
         try:
             if local:
                 _domain_of_this_machine(domain)
-            self._participant = DomainParticipant(domain)
+            self.participant = DomainParticipant(domain)
             readers = builtin.BuiltinTopicDcpsPublication, builtin.BuiltinTopicDcpsSubscription
-            self._seen = [builtin.BuiltinDataReader(self._participant, kind) for kind in readers]
+            self._seen = [builtin.BuiltinDataReader(self.participant, kind) for kind in readers]
         except DDSException as error:
             raise DriverError(
                 f"no DDS in domain {domain}: {error.msg}; is the network up, is CYCLONEDDS_URI "
                 f"right ({os.environ.get('CYCLONEDDS_URI') or 'not set'})?"
             ) from error
-
-    @property
-    def participant(self) -> Any:
-        """For what waits on it."""
-        return self._participant
 
     def publishers(self) -> list[Found]:
         """All that publish, as far as discovery has come."""
@@ -228,11 +226,10 @@ def _member(kind: str, fields: dict[str, str]) -> Any:
 
     base, bracket, size = kind.removesuffix("]").partition("[")
     base = _ALIASES.get(base, base)
-    one: Any
+    plain: dict[str, Any] = {"string": str, "bool": bool}
     if base in fields:
         one = _struct(base, fields)
     else:
-        plain = {"string": str, "bool": bool}
         one = plain[base] if base in plain else getattr(types, base)
     if not bracket:
         return one

@@ -64,15 +64,12 @@ def driven(opened):
     return opened(MotorBus(Bank()), allow_motion=True)
 
 
-def test_it_is_a_driver(moving):
+def test_a_listener_is_a_driver_and_changes_nothing(moving):
     arm: Driver = moving[0]
+    bus = moving[1]
     assert arm.joint_names == tuple(f"joint{j}" for j in range(1, 8))
     assert not (arm.paced or arm.can_move or arm.adds_gravity)
     assert arm.period_ns == 10**6
-
-
-def test_a_listener_changes_nothing(moving):
-    arm, bus = moving
     ticks(50, arm, bus)
     assert {can_id for can_id, _ in bus.sent} == {0x7FF}
     assert {data[2] for _, data in bus.sent} == {0x33, 0xCC}
@@ -518,20 +515,16 @@ def test_it_is_connected_once_and_again_after_its_end(moving):
 
 
 @pytest.mark.parametrize(
-    ("interface", "said"),
+    ("address", "said"),
     [
-        ("nosuch", "no CAN interface 'nosuch'; python-can has: .*socketcan"),
-        ("virtual", "no motor answers"),
+        ("nobody?interface=nosuch", "no CAN interface 'nosuch'; python-can has: .*socketcan"),
+        ("nobody?interface=virtual", "no motor answers"),
+        ("can77", r"no CAN; use|no such device; plug|not permitted"),
     ],
 )
-def test_what_cannot_be_opened_is_explained(interface, said):
+def test_what_cannot_be_opened_is_explained(address, said):
     with pytest.raises(DriverError, match=said):
-        DamiaoArm(f"can://nobody?interface={interface}").connect()
-
-
-def test_a_missing_can_device_is_explained():
-    with pytest.raises(DriverError, match=r"no CAN; use|no such device; plug|not permitted"):
-        DamiaoArm("can://can77").connect()
+        DamiaoArm(f"can://{address}").connect()
 
 
 def test_too_many_frames_are_refused_at_once():

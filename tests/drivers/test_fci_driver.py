@@ -205,30 +205,21 @@ def test_a_handshake_byte_by_byte_with_surplus(peer5, connected):
 
 
 @pytest.mark.parametrize(
-    ("answer", "why"),
-    [
-        (b"", "answer to Connect of 12 bytes; it has 15"),
-        (b"\0\0", "answer to Connect of 14 bytes; it has 15"),
-        (b"\7\5\0", "status 7, which is not defined"),
-    ],
-)
-def test_a_handshake_that_is_none(peer5, answer, why):
-    peer5.connect_reply = lambda version, command_id: fci_peer.reply(0, command_id, answer)
-    with pytest.raises(DriverError, match=why):
-        FciArm(peer5.address).connect()
-
-
-@pytest.mark.parametrize(
     ("answered", "why"),
     [
-        (lambda peer: b"HTTP/1.1 400 Bad Request\r\n", "is this an FCI port"),
-        (lambda peer: None, "does not answer Connect"),
-        (lambda peer: peer.hang_up(), "hung up during the handshake"),
+        (lambda _, k: fci_peer.reply(0, k, b""), "answer to Connect of 12 bytes; it has 15"),
+        (lambda _, k: fci_peer.reply(0, k, b"\0\0"), "answer to Connect of 14 bytes; it has 15"),
+        (lambda _, k: fci_peer.reply(0, k, b"\7\5\0"), "status 7, which is not defined"),
+        (lambda peer, _: b"HTTP/1.1 400 Bad Request\r\n", "is this an FCI port"),
+        (lambda peer, _: None, "does not answer Connect"),
+        (lambda peer, _: peer.hang_up(), "hung up during the handshake"),
     ],
 )
-def test_another_kind_of_server_none_and_a_hang_up(peer5, monkeypatch, answered, why):
-    monkeypatch.setattr("drivers.fci.connect.REPLY_LIMIT_S", 0.2)
-    peer5.connect_reply = lambda version, command_id: answered(peer5)
+def test_a_handshake_that_is_none_another_kind_of_server_and_a_hang_up(
+    peer5, monkeypatch, answered, why
+):
+    monkeypatch.setattr("drivers.fci.connect.REPLY_LIMIT_S", 1.0)
+    peer5.connect_reply = lambda version, command_id: answered(peer5, command_id)
     with pytest.raises(DriverError, match=why):
         FciArm(peer5.address).connect()
 

@@ -104,26 +104,6 @@ def test_replies_random_and_mutated():
     assert 0.05 * (RANDOM + MUTATED) < taken < 0.95 * (RANDOM + MUTATED)
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
-@given(
-    protocol=st.sampled_from([5, 10]),
-    patches=st.lists(st.tuples(st.integers(0, 2400), st.binary(min_size=1, max_size=16))),
-    keep=st.integers(0, 2500),
-)
-def test_any_patch_of_a_state(protocol, patches, keep):
-    data = bytearray(fci_peer.state(protocol, 5, modes=(1, 2, 2)))
-    for at, patch in patches:
-        data[at : at + len(patch)] = patch
-    assert state_or_error(protocol, bytes(data)) in (0, 1)
-    assert state_or_error(protocol, bytes(data[:keep])) in (0, 1)
-
-
-@settings(max_examples=300, deadline=None, derandomize=True)
-@given(stream=st.binary(max_size=300), cut=st.integers(0, 300))
-def test_any_stream_of_replies(stream, cut):
-    assert replies_or_error(stream, [min(cut, len(stream))]) in (0, 1)
-
-
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
     payloads=st.lists(st.binary(max_size=60), max_size=8),

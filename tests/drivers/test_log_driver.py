@@ -15,14 +15,10 @@ def path(tmp_path):
     return record(tmp_path / "a.mcap", samples(20, links=True))
 
 
-def test_it_is_what_was_recorded(path):
+def test_it_is_and_gives_what_was_recorded_and_ends(path):
     arm = LogArm(path)
     assert (arm.joint_names, arm.link_names) == (JOINTS, LINKS)
     assert arm.period_ns == STEP_NS and not arm.paced
-
-
-def test_it_gives_what_was_recorded_and_ends(path):
-    arm = LogArm(path)
     arm.connect()
     for expected in samples(20, links=True):
         sample = arm.read()

@@ -275,25 +275,21 @@ class BagScan(Scan):
     def _messages(self, link: Path) -> Iterator[Region]:
         chunks = _Growth(self.stored)
         with _open_ros1(link, chunks) if self._one else _open_sqlite(link) as bag:
-            self._note(bag.connections)
+            for c in bag.connections:
+                if not (isinstance(c.topic, str) and isinstance(c.msgtype, str)):
+                    raise ValueError("the name or type of a topic is no text")
+                kind = JOINT_STATE if self._one and c.msgtype == FRANKA_STATE else c.msgtype
+                self.schemas[c.id] = Schema(c.id, b"", "ros2msg", kind)
+                encoding = "cdr" if self._one else c.ext.serialization_format
+                self.channels[c.id] = Channel(c.id, c.topic, encoding, {}, c.id)
             chosen = [c for c in bag.connections if c.msgtype in PARSERS]
             for c in bag.connections:
                 if c not in chosen:
                     self.passed[c.topic] = self.passed.get(c.topic, 0) + c.msgcount
             if chosen:
-                convert = None
-                if self._one:
-                    convert = _to_cdr({c.msgtype: c.msgdef.data for c in chosen})
+                told = {c.msgtype: c.msgdef.data for c in chosen} if self._one else {}
+                convert = _to_cdr(told) if self._one else None
                 yield from _regions(self._told(bag.messages(chosen), convert))
-
-    def _note(self, connections: list[Any]) -> None:
-        for c in connections:
-            if not (isinstance(c.topic, str) and isinstance(c.msgtype, str)):
-                raise ValueError("the name or type of a topic is no text")
-            kind = JOINT_STATE if self._one and c.msgtype == FRANKA_STATE else c.msgtype
-            self.schemas[c.id] = Schema(c.id, b"", "ros2msg", kind)
-            encoding = "cdr" if self._one else c.ext.serialization_format
-            self.channels[c.id] = Channel(c.id, c.topic, encoding, {}, c.id)
 
     def _told(
         self, messages: Iterator[Any], convert: Callable[[str, bytes], bytes] | None
@@ -339,9 +335,15 @@ def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
     left = path.stat().st_size  # of the index, which lies in the file
 
     def read_bounded() -> Any:
-        def unpack(data: bytes) -> bytes:
-            content = _chunk_of_ros1(data)
-            growth.spend(len(content) if content is not data else 0)
+        def unpack(data: bytes) -> bytes:  # records never begin like what packs them
+            if data.startswith(b"BZh"):
+                content = _bounded(bz2.BZ2File(BytesIO(data)))
+            elif data.startswith(_LZ4):
+                frame = importlib.import_module("lz4.frame")
+                content = _bounded(frame.LZ4FrameFile(BytesIO(data)))
+            else:
+                return data
+            growth.spend(len(content))
             return content
 
         return read_chunk()._replace(decompressor=unpack)
@@ -357,15 +359,6 @@ def _open_ros1(path: Path, growth: _Growth) -> Iterator[Any]:
     reader.read_chunk, reader.read_index_data = read_bounded, read_index_once
     with reader:
         yield reader
-
-
-def _chunk_of_ros1(data: bytes) -> bytes:
-    """The records of a chunk, which never begin like what packs them. Raises _TooLarge."""
-    if data.startswith(b"BZh"):
-        return _bounded(bz2.BZ2File(BytesIO(data)))
-    if data.startswith(_LZ4):
-        return _bounded(importlib.import_module("lz4.frame").LZ4FrameFile(BytesIO(data)))
-    return data
 
 
 class McapOfAnyRos(McapScan):

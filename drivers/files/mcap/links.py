@@ -70,7 +70,8 @@ class Carrier:
         own, first = np.unique(own_ns, return_index=True)
         near, close = _nearest(onto, own)
         if not close.any():
-            theirs, joints = (_span(stamps, onto[0]) for stamps in (own, onto))
+            spans = (1e-9 * (x[[0, -1]] - onto[0]) for x in (own, onto))
+            theirs, joints = (f"{first:.3f} to {last:.3f} s" for first, last in spans)
             self.warnings.append(
                 f"{self.path}: {name}: its stamps ({theirs}) lie outside those of the joint "
                 f"samples ({joints}); do they share a clock? Left out"
@@ -88,8 +89,9 @@ class Carrier:
             use = close & np.isfinite(x).all(axis=1)
             cells, moved = _moved(onto, own[use], near[use], x[use])
             out[rows[cells], k : k + 3] = moved
-        hz = 1e9 / float(np.median(np.diff(own))) if len(own) > 1 else None
-        rate = "one message" if hz is None else f"{hz:.0f} Hz"
+        rate = "one message"
+        if len(own) > 1:
+            rate = f"{1e9 / float(np.median(np.diff(own))):.0f} Hz"
         self._carried.setdefault(rate, []).append(name)
         return out
 
@@ -99,11 +101,6 @@ class Carrier:
             self.warnings.append(
                 f"{self.path}: {', '.join(names)}: {rate}, carried to the joint samples' stamps"
             )
-
-
-def _span(stamp_ns: NDArray[np.int64], start_ns: int) -> str:
-    first, last = 1e-9 * (stamp_ns[[0, -1]] - start_ns)
-    return f"{first:.3f} to {last:.3f} s"
 
 
 def _nearest(
@@ -282,7 +279,14 @@ def _match(
 
 def _with_imus(links: Links, topics: Mapping[str, Series], carrier: Carrier) -> Links:
     """The links' motion, and behind it that of all Imu topics at the joint samples."""
-    found = _distinct(topics, carrier)
+    found: list[FrameMotion] = []  # without those that another topic holds too (raw and processed)
+    for imu in frame_motions(topics, (IMU,), carrier.path, carrier.warnings):
+        twin = next((other for other in found if _same(other, imu)), None)
+        if twin is None:
+            found.append(imu)
+        else:
+            said = f"{imu.topic} holds the sensor of {twin.topic} again; left out"
+            carrier.warnings.append(f"{carrier.path}: {said}")
     names, motion = list(links.names), []
     for imu, name in zip(found, _names(found, links.names), strict=True):
         values = carrier.carry(name, imu.stamp_ns, np.concatenate([imu.w, imu.a], axis=1))
@@ -383,19 +387,6 @@ def _measured(
         warnings.append(f"{what} of {int(wild.sum())} messages are impossible; left out")
     x[wild | np.isnan(x).any(axis=1)] = np.nan
     return x
-
-
-def _distinct(topics: Mapping[str, Series], carrier: Carrier) -> list[FrameMotion]:
-    """Imus without those that another topic holds too (raw and processed, say)."""
-    kept: list[FrameMotion] = []
-    for imu in frame_motions(topics, (IMU,), carrier.path, carrier.warnings):
-        twin = next((k for k in kept if _same(k, imu)), None)
-        if twin is None:
-            kept.append(imu)
-        else:
-            said = f"{imu.topic} holds the sensor of {twin.topic} again; left out"
-            carrier.warnings.append(f"{carrier.path}: {said}")
-    return kept
 
 
 def _same(one: FrameMotion, other: FrameMotion) -> bool:

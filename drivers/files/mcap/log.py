@@ -214,9 +214,19 @@ class Log:
             own = None if asked.q is None else _columns(asked.q, columns)
             asked = replace(asked, tau=_columns(asked.tau, columns), q=own)
             log = replace(log, commands=asked)
-        if link_names is None:
-            link_names = self._links_moved_by(joint_names)
-        return log if link_names is None else log._select_links(link_names)
+        if link_names is None and self.pairs_links:
+            pairs = dict(
+                zip(self.metadata["joint_names"], self.metadata["link_names"], strict=True)
+            )
+            moved = [pairs.get(name) for name in joint_names]
+            if all(name in self.link_names for name in moved):
+                link_names = [name for name in moved if name]
+        if link_names is None or not self.link_names:
+            return log
+        rows = _places_of(self.link_names, link_names, f"{self.path}: has no motion of link")
+        both = (None if x is None else _columns(x, rows) for x in (self.twists, self.accels))
+        twists, accels = both
+        return replace(log, link_names=tuple(link_names), twists=twists, accels=accels)
 
     def take(self, rows: NDArray[np.bool_ | np.int64] | slice) -> Log:
         """The same recording with these samples only."""
@@ -230,23 +240,6 @@ class Log:
         """Whether the recording says which joint moves which link."""
         joints, links = self.metadata.get("joint_names"), self.metadata.get("link_names")
         return isinstance(joints, list) and isinstance(links, list) and len(joints) == len(links)
-
-    def _links_moved_by(self, joint_names: Sequence[str]) -> list[str] | None:
-        """The links that these joints move, where the recording says so and has them all."""
-        if not self.pairs_links:
-            return None
-        joints, links = self.metadata["joint_names"], self.metadata["link_names"]
-        pairs = dict(zip(joints, links, strict=True))
-        moved = [pairs.get(name) for name in joint_names]
-        return [n for n in moved if n] if all(n in self.link_names for n in moved) else None
-
-    def _select_links(self, link_names: Sequence[str]) -> Log:
-        if not self.link_names:
-            return self
-        rows = _places_of(self.link_names, link_names, f"{self.path}: has no motion of link")
-        both = (None if x is None else _columns(x, rows) for x in (self.twists, self.accels))
-        twists, accels = both
-        return replace(self, link_names=tuple(link_names), twists=twists, accels=accels)
 
 
 def mapped(like: Log, pieces: Iterable[Log]) -> Log:

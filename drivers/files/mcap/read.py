@@ -103,7 +103,13 @@ def assembled(
                 commanding.take(series)
             series.blocks.clear()
 
-    topics = collect(scan, lambda series: _is_wanted(series, topic, kinds), take)
+    def is_wanted(series: Series) -> bool:
+        """Whether the messages of a topic are decoded."""
+        if series.topic in (topic, JOINT_COMMANDS) or series.schema in kinds:
+            return True
+        return topic is None if series.schema in JOINT_SCHEMAS else _is_of_links(series)
+
+    topics = collect(scan, is_wanted, take)
     series = _choose_topic(scan, topics, topic, not sensors)
     check_type(series, scan.path)
     for other in topics.values():
@@ -255,12 +261,10 @@ def _choose_topic(
 ) -> Series:
     """The topic that was named, or `/joint_states`, or the only one of use."""
     series = topics.get(topic or JOINT_STATES)
-    if topic is not None:
-        if series is None or not series.count:
-            raise DriverError(_nothing_found(scan, topics, topic))
-        return series
-    fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, effort))
-    if series is not None and fits(series, effort):
+    fitting = []
+    if topic is None:
+        fitting = sorted(k for k, s in topics.items() if k != JOINT_COMMANDS and fits(s, effort))
+    if series is not None and JOINT_STATES in fitting:
         others = [name for name in fitting if name != JOINT_STATES]
         if others:
             scan.warnings.append(
@@ -277,15 +281,8 @@ def _choose_topic(
         scan.warnings.append(f"{scan.path}: joint states are those of {fitting[0]}")
         return topics[fitting[0]]
     if series is None or not series.count:
-        raise DriverError(_nothing_found(scan, topics, JOINT_STATES))
+        raise DriverError(_nothing_found(scan, topics, topic or JOINT_STATES))
     return series
-
-
-def _is_wanted(series: Series, topic: str | None, kinds: Sequence[str]) -> bool:
-    """Whether the messages of a topic are decoded."""
-    if series.topic in (topic, JOINT_COMMANDS) or series.schema in kinds:
-        return True
-    return topic is None if series.schema in JOINT_SCHEMAS else _is_of_links(series)
 
 
 def _is_of_links(series: Series) -> bool:

@@ -313,7 +313,17 @@ class McapScan(Scan):
                 if is_chunk:
                     yield from self._chunk(at, stop)
                 break
-        self._judge_end(at)
+        ended = at + HEAD <= self.size and self._data[at] in (Opcode.DATA_END, Opcode.FOOTER)
+        self.truncated = not ended or bytes(self._data[-len(MAGIC) :]) != MAGIC
+        if not ended:
+            self.lost_bytes += self.size - at
+            rescued = f"; {self._rescued} messages of them could be read" if self._rescued else ""
+            self._warn(
+                f"the file is cut: of its {self.size} bytes the last {self.size - at} are an "
+                f"incomplete record{rescued} (`adapter recover` mends it)"
+            )
+        elif self.truncated:
+            self._warn("the file is cut in its index; no message is lost")
 
     def _give_back(self, at: int) -> None:
         """Let go of mapped pages before `at`, which would count as memory in use."""
@@ -421,22 +431,6 @@ class McapScan(Scan):
         first = name_at + length + _LENGTH.size
         data: Any = self._data[first : first + stored]
         return Chunk(name, data, end, begin, crc, size)
-
-    def _judge_end(self, at: int) -> None:
-        """Say whether the file was cut, and where."""
-        ended = at + HEAD <= self.size and self._data[at] in (Opcode.DATA_END, Opcode.FOOTER)
-        self.truncated = not ended or bytes(self._data[-len(MAGIC) :]) != MAGIC
-        if not self.truncated:
-            return
-        if ended:
-            self._warn("the file is cut in its index; no message is lost")
-            return
-        self.lost_bytes += self.size - at
-        rescued = f"; {self._rescued} messages of them could be read" if self._rescued else ""
-        self._warn(
-            f"the file is cut: of its {self.size} bytes the last {self.size - at} are an "
-            f"incomplete record{rescued} (`adapter recover` mends it)"
-        )
 
     def _warn(self, sentence: str) -> None:
         if len(self.warnings) < _MOST_WARNINGS:

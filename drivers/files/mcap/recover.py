@@ -115,10 +115,8 @@ def _copy(scan: McapScan, file: IO[bytes]) -> Counter[str]:
         scan.warnings.append(f"{scan.path}: {orphans} messages belong to no channel; left out")
     for record in scan.metadata:
         writer.add_metadata(record.name, record.metadata)
-    for item in scan.attachments:
-        writer.add_attachment(
-            item.create_time, item.log_time, item.name, item.media_type, item.data
-        )
+    for x in scan.attachments:
+        writer.add_attachment(x.create_time, x.log_time, x.name, x.media_type, x.data)
     writer.finish()
     return counts
 
@@ -144,9 +142,8 @@ def _told_anew(scan: McapScan, payload: bytes) -> bytes:
         fields = estimate_fields(int(values["stamp_ns"]), names, values)
         return encode(ESTIMATE, {**fields, **{key: values[key] for key in FLAGS}})
     except (ValueError, KeyError, TypeError) as error:
-        raise DriverError(
-            f"{scan.path}: an estimate in JSON cannot be told anew: {error}"
-        ) from error
+        said = f"an estimate in JSON cannot be told anew: {error}"
+        raise DriverError(f"{scan.path}: {said}") from error
 
 
 def _is_old(channel: Channel) -> bool:
@@ -158,12 +155,10 @@ def _register(writer: Writer, scan: McapScan, channel: Channel, written: dict[in
     if _is_old(channel):
         number = writer.register_schema(ESTIMATE, "ros2msg", schemas()[ESTIMATE].encode())
         return int(writer.register_channel(channel.topic, "cdr", number))
-    schema = scan.schemas.get(channel.schema_id)
-    if schema is not None and schema.id not in written:
-        written[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
-    schema_id = written[schema.id] if schema is not None else 0
-    return int(
-        writer.register_channel(
-            channel.topic, channel.message_encoding, schema_id, channel.metadata
-        )
-    )
+    schema, number = scan.schemas.get(channel.schema_id), 0
+    if schema is not None:
+        if schema.id not in written:
+            written[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        number = written[schema.id]
+    about = channel.topic, channel.message_encoding, number, channel.metadata
+    return int(writer.register_channel(*about))
