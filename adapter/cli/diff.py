@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
 
-from rich.console import Console
 from rich.table import Table
 
 from adapter.cli.common import robot_of
@@ -41,16 +39,11 @@ def run(args: argparse.Namespace) -> int:
         (MATRIX_HEADS, difference_matrix(found)),
         (EFFECT_HEADS, effect_rows(found)),
     ):
+        table = Table(*heads, box=None, pad_edge=False, title_justify="left", padding=(0, 2, 0, 0))
+        for row in rows:
+            table.add_row(*row)  # cells hold lines of their own
         if rows:
-            _print(shown, heads, rows)
+            shown.print(table)
     if found.changes:
         shown.print(LEGEND, soft_wrap=True)
     return 0
-
-
-def _print(shown: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table whose cells hold lines of their own."""
-    table = Table(*heads, box=None, pad_edge=False, title_justify="left", padding=(0, 2, 0, 0))
-    for row in rows:
-        table.add_row(*row)
-    shown.print(table)

@@ -91,13 +91,10 @@ def _hang(on: Shown, parent: str, edges: tuple[Edge, ...]) -> None:
             by = edge.joint if edge.joint is not None else "(no joint)"
             way = "" if edge.directed else " this way or the other"
             label = Text.assemble(f"{edge.link}  ", ("by", "dim"), f" {by}  ")
-            label.append(_shown(sure), style).append(way, "dim")
+            # never rounded up to certainty
+            said = f"{min(sure, 0.9999):.4f}" if sure >= DECIDED else f"{sure:.2f}"
+            label.append(said, style).append(way, "dim")
             _hang(on.add(label), edge.link, edges)
-
-
-def _shown(confidence: float) -> str:
-    """Never rounded up to certainty."""
-    return f"{min(confidence, 0.9999):.4f}" if confidence >= DECIDED else f"{confidence:.2f}"
 
 
 def _print_lambda(learned: LearnedTree, known: np.ndarray) -> None:

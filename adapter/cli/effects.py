@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.table import Table
 
-from adapter.effects.base import Effect
 from adapter.effects.catalogue import CATALOGUE
 from adapter.effects.kept import keep, with_kept
 from adapter.effects.law import EXPRESSIONS, LAW
@@ -23,17 +22,13 @@ def run(args: argparse.Namespace) -> int:
         show(keep(Path(args.keep[1]), args.name, args.joint, args.kept))
         show(f"kept in {args.kept}; looked for by adapter gap ... --effects {args.kept}")
         return 0
+    table = Table("name", "what", "of", "numbers", box=None, pad_edge=False)
     with with_kept(args.kept if args.kept.exists() else None):
-        output.print(_table(list(CATALOGUE.values())))
+        for effect in CATALOGUE.values():
+            numbers = ", ".join(f"{p.key} {p.written}".rstrip() for p in effect.parameters)
+            own = f" ({effect.in_files.removeprefix(LAW)})" if effect.in_files else ""
+            table.add_row(effect.name, f"{effect.title}{own}", effect.scope, numbers)
+    output.print(table)
     said = ", ".join(EXPRESSIONS)
     show(f"laws of what none of these is: c times {said} (ⱼ: another joint's)")
     return 0
-
-
-def _table(effects: list[Effect]) -> Table:
-    table = Table("name", "what", "of", "numbers", box=None, pad_edge=False)
-    for effect in effects:
-        numbers = ", ".join(f"{p.key} {p.written}".rstrip() for p in effect.parameters)
-        own = f" ({effect.in_files.removeprefix(LAW)})" if effect.in_files else ""
-        table.add_row(effect.name, f"{effect.title}{own}", effect.scope, numbers)
-    return table

@@ -75,7 +75,10 @@ def run(args: argparse.Namespace) -> int:
     q0 = _start(args, arm, limits, known)
     folder = results_folder(args.out, "excite")
     if args.gap is not None:
-        swept = _swept(args, arm, limits, q0, settings)
+        todo = _measured_next(args.gap, arm.model)
+        length_s = _sweeps(todo, limits, q0, settings).length_s
+        swept = FreeMotion(arm, length_s, partial(_sweeps, todo))(limits, q0, settings)
+        assert isinstance(swept, SweepMotion)
         _write(args, folder, arm, swept, limits, swept.length_s)
         return ExitCode.DONE
     designer = Designer(told, known.information).within(arm)
@@ -103,21 +106,6 @@ def _start(args: argparse.Namespace, arm: ArmInCell, limits: MotionLimits, known
             "or describe the cell in --config ([cell])"
         )
     return q0
-
-
-def _swept(
-    args: argparse.Namespace,
-    arm: ArmInCell,
-    limits: MotionLimits,
-    q0: Array,
-    settings: ExcitationSettings,
-) -> SweepMotion:
-    """The motion that a gap report asks for, free in the cell."""
-    todo = _measured_next(args.gap, arm.model)
-    length_s = _sweeps(todo, limits, q0, settings).length_s
-    swept = FreeMotion(arm, length_s, partial(_sweeps, todo))(limits, q0, settings)
-    assert isinstance(swept, SweepMotion)
-    return swept
 
 
 def _of_joints(option: str, values: Sequence[float], robot: SelfModel) -> Array | None:
@@ -276,7 +264,14 @@ def _write(
     least = arm.clearance(motion, seconds)
     lines = whole_plan(arm, motion, limits, seconds, least)
     write_plan(folder / PLAN_PAGE, arm, motion, limits, least, PlanWords(lines))
-    times_ns, points = _points(motion, seconds, args.rate)
+    step_ns = round(SECOND_NS / args.rate)
+    rows = [np.array([motion.q, motion.dq, motion.ddq])]
+    while not motion.at_rest:
+        if motion.time_s >= seconds:
+            motion.begin_stop()
+        motion.advance(1e-9 * step_ns)
+        rows.append(np.array([motion.q, motion.dq, motion.ddq]))
+    times_ns, points = step_ns * np.arange(len(rows), dtype=np.int64), np.array(rows)
     with (folder / "motion.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         heads = [f"{kind}_{name}" for kind in ("q", "dq", "ddq") for name in names]
@@ -290,15 +285,3 @@ def _write(
         show(line)
     show(f"{len(points)} points at {args.rate:g} Hz: {folder / 'motion.csv'}, motion.mcap")
     say(f"As a page: {folder / PLAN_PAGE}")
-
-
-def _points(motion: PathMotion, seconds: float, rate_hz: float) -> tuple[Any, Array]:
-    """(m,) ns and (m, 3, n) from rest to rest."""
-    step_ns = round(SECOND_NS / rate_hz)
-    rows = [np.array([motion.q, motion.dq, motion.ddq])]
-    while not motion.at_rest:
-        if motion.time_s >= seconds:
-            motion.begin_stop()
-        motion.advance(1e-9 * step_ns)
-        rows.append(np.array([motion.q, motion.dq, motion.ddq]))
-    return step_ns * np.arange(len(rows), dtype=np.int64), np.array(rows)

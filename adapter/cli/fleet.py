@@ -6,7 +6,6 @@ import argparse
 import csv
 import importlib
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from adapter.cli.results import write_urdf
 from adapter.model.model_file import save_model, whole_file
 from adapter.report.fleet_page import write_fleet_page
 from adapter.report.fleet_words import HEADS, as_json, log_cells, sentences, summary, to_be_shown
-from adapter.runs.fleet.arm import FleetArm, OfLog
+from adapter.runs.fleet.arm import FleetArm
 from adapter.runs.fleet.fleet import (
     Fleet,
     Manifest,
@@ -30,15 +29,7 @@ from adapter.runs.fleet.fleet import (
     read_manifest,
     recall,
 )
-from adapter.runs.terminal import (
-    console,
-    output,
-    results_folder,
-    say,
-    show,
-    warn,
-    write_json,
-)
+from adapter.runs.terminal import console, output, results_folder, say, show, warn, write_json
 
 MOST_ROWS = 40  # on the terminal; of more recordings those that there is something to say of
 
@@ -66,7 +57,10 @@ def run(args: argparse.Namespace) -> int:
     warn([f"{path}: the same recording as {other}; it counts once" for path, other in found.alike])
     figures = as_json(found)
     for arm, names in zip(found.arms, figures["arms"], strict=True):
-        names["model"] = str(_write_model(arm, folder))
+        name = re.sub(r"[^\w.-]+", "_", arm.name).strip("._") or "arm"
+        path = save_model(arm.model, folder / f"{name}.json")
+        write_urdf(arm.model, path.with_suffix(".urdf"), f"{arm.name}: ")
+        names["model"] = str(path)
         if not args.quiet:
             _print(arm)
     for line in summary(found):
@@ -81,17 +75,17 @@ def run(args: argparse.Namespace) -> int:
     return ExitCode.DONE if found.arms else ExitCode.NOTHING_LEARNED
 
 
-def _write_model(arm: FleetArm, folder: Path) -> Path:
-    """Model file and URDF under the arm's name."""
-    name = re.sub(r"[^\w.-]+", "_", arm.name).strip("._") or "arm"
-    path = save_model(arm.model, folder / f"{name}.json")
-    write_urdf(arm.model, path.with_suffix(".urdf"), f"{arm.name}: ")
-    return path
-
-
 def _write_table(found: Fleet, folder: Path) -> Path:
-    """A row for each recording, whole or not at all: Parquet, or CSV where there is no pyarrow."""
-    listed, path = _rows(found), folder / "fleet.parquet"
+    """A row for each recording, whole or not at all: Parquet, or CSV where there is no pyarrow.
+
+    Columns of joints are numbered from 1.
+    """
+    rows = [_row(arm, k) for arm in found.arms for k in range(len(arm.logs))]
+    rows += [{"log": x.path, "state": "broken", "why": x.why} for x in found.broken]
+    rows += [{"log": path, "state": "forgotten"} for path in found.forgotten]
+    columns = dict.fromkeys(key for row in rows for key in row)
+    listed = [{key: row.get(key) for key in columns} for row in rows]
+    path = folder / "fleet.parquet"
     try:
         arrow = importlib.import_module("pyarrow")
         parquet = importlib.import_module("pyarrow.parquet")
@@ -109,19 +103,15 @@ def _write_table(found: Fleet, folder: Path) -> Path:
     return path
 
 
-def _rows(found: Fleet) -> list[dict[str, Any]]:
-    """A row for each recording; columns of joints are numbered from 1."""
-    out = [_row(arm, k) for arm in found.arms for k in range(len(arm.logs))]
-    out += [{"log": x.path, "state": "broken", "why": x.why} for x in found.broken]
-    out += [{"log": path, "state": "forgotten"} for path in found.forgotten]
-    columns = dict.fromkeys(key for row in out for key in row)
-    return [{key: row.get(key) for key in columns} for row in out]
-
-
 def _row(arm: FleetArm, number: int) -> dict[str, Any]:
     log = arm.logs[number]
     taken, load = log.moments, log.load
     out = [f"{x.effect}_{x.joint}" for x in arm.standing_out if x.number == number]
+    by_joint = {f"rmse_nm_{j}": float(x) for j, x in enumerate(log.rmse, start=1)}
+    for k, name in enumerate(arm.effects):
+        for j in range(len(log.rmse)):
+            by_joint[f"{name}_{j + 1}"] = float(log.effects[k, j])
+            by_joint[f"{name}_std_{j + 1}"] = float(log.effects_std[k, j])
     return {
         "log": taken.path,
         "state": "used" if log.used else "disagrees",
@@ -136,17 +126,8 @@ def _row(arm: FleetArm, number: int) -> dict[str, Any]:
         "disagrees": " ".join(map(str, log.disagrees)),
         "stands_out": " ".join(out),
         "worth_nats": log.worth,
-        **dict(_by_joint(arm, log)),
+        **by_joint,
     }
-
-
-def _by_joint(arm: FleetArm, log: OfLog) -> Iterator[tuple[str, float]]:
-    for j in range(len(log.rmse)):
-        yield f"rmse_nm_{j + 1}", float(log.rmse[j])
-    for k, name in enumerate(arm.effects):
-        for j in range(len(log.rmse)):
-            yield f"{name}_{j + 1}", float(log.effects[k, j])
-            yield f"{name}_std_{j + 1}", float(log.effects_std[k, j])
 
 
 def _print(arm: FleetArm) -> None:

@@ -6,7 +6,7 @@ Of a position-controlled arm, whose recordings have commands and encoders but no
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,10 @@ def _run(args: argparse.Namespace) -> int:
     positions = _position_logs(args)
     if positions is not None:
         return _explain_positions(args, *positions)
-    logs, hold_out = _opened(args)
+    logs, hold_out = args.logs, tuple(args.hold_out)
+    if args.topic is not None:  # read here
+        read = {path: read_log(path, topic=args.topic) for path in {*logs, *hold_out}}
+        logs, hold_out = [read[path] for path in logs], tuple(read[path] for path in hold_out)
     told = told_of(args)
     settings = GapSettings(validate_from_s=args.validate_from, hold_out=hold_out, told=told)
     if args.inertia_prior is not None:
@@ -69,7 +72,10 @@ def _run(args: argparse.Namespace) -> int:
     announce_compiling(say)
     nominal = robot_of(args, args.model)
     folder = results_folder(args.out, "gap")
-    model_out = _new_model(folder, args.model)
+    model_out = folder / "model.json"
+    for new in (model_out, model_out.with_suffix(".urdf")):  # never over the one it comes from
+        if new.exists() and Path(args.model).exists() and new.samefile(args.model):
+            raise UsageError(f"--out {folder} would overwrite {args.model}; give another folder")
     rollouts = _rollouts(args)
     try:
         with _progress(args.quiet) as tell:
@@ -99,23 +105,6 @@ def _rollouts(args: argparse.Namespace) -> Rollouts | None:
             raise
         warn([f"torques are compared, and nothing is simulated: {error}"])
         return None
-
-
-def _opened(args: argparse.Namespace) -> tuple[Sequence[Path | Log], tuple[Path | Log, ...]]:
-    """The recordings and those held out; read here where a topic was named. Raises DriverError."""
-    if args.topic is None:
-        return args.logs, tuple(args.hold_out)
-    read = {path: read_log(path, topic=args.topic) for path in {*args.logs, *args.hold_out}}
-    return [read[path] for path in args.logs], tuple(read[path] for path in args.hold_out)
-
-
-def _new_model(folder: Path, model: str) -> Path:
-    """Where the new model goes: never over the one it comes from. Raises UsageError."""
-    path = folder / "model.json"
-    for new in (path, path.with_suffix(".urdf")):
-        if new.exists() and Path(model).exists() and new.samefile(model):
-            raise UsageError(f"--out {folder} would overwrite {model}; give another folder")
-    return path
 
 
 @contextmanager

@@ -16,7 +16,6 @@ from adapter.control.resting import check_resting_torque
 from adapter.report.next_steps import Step, command, without
 from adapter.report.plan_page import PlanWords, write_plan
 from adapter.runs.terminal import results_folder, say, show
-from drivers.interface import Driver, JointSample
 
 READS = 200  # among which every joint has to be measured
 
@@ -29,7 +28,10 @@ def run(args: argparse.Namespace) -> int:
     driver = plan.open(args.driver, False)
     driver.connect()
     try:
-        sample = _measured(driver)
+        for _ in range(READS):  # the first with the position of every joint, else the last one
+            sample = driver.read()
+            if np.isfinite(sample.q).all() and np.isfinite(sample.tau).all():
+                break
         need_same_robot(driver, limits)
     finally:
         driver.close()
@@ -52,12 +54,3 @@ def run(args: argparse.Namespace) -> int:
     if not args.trust_model:
         check_resting_torque(robot, sample.q, sample.tau)
     return ExitCode.DONE
-
-
-def _measured(driver: Driver) -> JointSample:
-    """The first sample with the position of every joint, else the last one read."""
-    for _ in range(READS):
-        sample = driver.read()
-        if np.isfinite(sample.q).all() and np.isfinite(sample.tau).all():
-            break
-    return sample

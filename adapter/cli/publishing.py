@@ -21,7 +21,6 @@ from functools import partial
 import numpy as np
 
 from adapter.model.self_model import SelfModel
-from adapter.model.spatial import Array
 from adapter.realtime.run_messages import TF_FIXED, TF_MOVING, RunMessages, ShownArm, table_fields
 from adapter.realtime.showing import DisplayJob, View
 from adapter.signals.records import StateLayout, stamp_of
@@ -95,7 +94,12 @@ class Publisher:
             told = self._messages.estimate(view.snapshot)
             found += told
             if told:
-                found += self._tables(stamp_ns, view.snapshot.lam, view.snapshot.theta)
+                for name, rows, columns, table in (
+                    ("/lambda", self._names.joints, LAMBDA_FIELDS, view.snapshot.lam),
+                    ("/theta", self._names.bodies, THETA_FIELDS, view.snapshot.theta),
+                ):
+                    fields = table_fields((",".join(rows), ",".join(columns)), table)
+                    found.append(Message(name, FLOAT64_MULTI_ARRAY, stamp_ns, fields))
         found += self._messages.frames(stamp_ns, q)
         if view.push is not None:
             found += self._messages.push(view.push, q)
@@ -104,15 +108,6 @@ class Publisher:
             found += self._messages.timing(stamp_ns, view.timing)
         for message in found:
             self._send(message)
-
-    def _tables(self, stamp_ns: int, lam: Array, theta: Array) -> list[Message]:
-        return [
-            Message(name, FLOAT64_MULTI_ARRAY, stamp_ns, table_fields((",".join(rows), columns), x))
-            for name, rows, columns, x in (
-                ("/lambda", self._names.joints, ",".join(LAMBDA_FIELDS), lam),
-                ("/theta", self._names.bodies, ",".join(THETA_FIELDS), theta),
-            )
-        ]
 
     def _send(self, message: Message) -> None:
         if message.schema == LOAD:  # a public type, so that everybody reads it

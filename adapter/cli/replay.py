@@ -71,9 +71,13 @@ def run(args: argparse.Namespace) -> int:
     if front_end.first_moving_ns is None:
         warn([f"{source}: the arm never moves (no |dq| above 0.02 rad/s); nothing is learned"])
     numbers["torque_gains"] = None if gains is None else gains.as_dict()
-    held_out = _held_out(args, log, robot)
-    if held_out is not None and args.validate is not None:
-        held_out = told_of(args).log(held_out, robot, 1.0 if gains is None else gains.gain)
+    held_out = None if args.validate_from is None else from_s(log, args.validate_from)
+    if args.validate is not None:
+        other = read_log(
+            args.validate, topic=args.topic, beside="" if args.base is None else "frames"
+        )
+        other = _joined(args, other, robot)
+        held_out = told_of(args).log(other, robot, 1.0 if gains is None else gains.gain)
     if held_out is not None:
         model = learned_model(result.outcome, robot)
         for key, judged in (("", model), ("documented_", robot)):
@@ -174,15 +178,3 @@ def _learn(args: argparse.Namespace, log: Log, robot: SelfModel, config: Config)
             say=None if args.quiet else partial(labelled, f"{DISAGREEMENT}:", "yellow"),
         )
         return learn_from(log, robot, config.pipeline, options)
-
-
-def _held_out(args: argparse.Namespace, log: Log, robot: SelfModel) -> Log | None:
-    """What to score on, or None."""
-    if args.validate_from is not None:
-        return from_s(log, args.validate_from)
-    if args.validate is not None:
-        other = read_log(
-            args.validate, topic=args.topic, beside="" if args.base is None else "frames"
-        )
-        return _joined(args, other, robot)
-    return None

@@ -83,7 +83,8 @@ def difference_summary(found: ModelDifference) -> list[str]:
     if len(left) == len(found.changes):
         lines.insert(0, f"{found.names[0]} and {found.names[1]} agree, as far as they are known")
     noise = [change for change in left if not change.significant]
-    idle = ", ".join(_name(change) for change in left if change.significant)
+    owners = [(c, c.link if c.what == BODY else c.joint) for c in left if c.significant]
+    idle = ", ".join(f"{owner} {c.what}".strip() for c, owner in owners)
     parts = []
     if noise:
         kinds = Counter(change.what for change in noise)
@@ -95,11 +96,6 @@ def difference_summary(found: ModelDifference) -> list[str]:
 
 def _listed(change: Change) -> bool:
     return change.significant and change.matters
-
-
-def _name(change: Change) -> str:
-    owner = change.link if change.what == BODY else change.joint
-    return f"{owner} {change.what}".strip()
 
 
 def _change_words(change: Change) -> str:

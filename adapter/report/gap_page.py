@@ -87,12 +87,13 @@ def context(result: GapResult, folder: Path | None = None) -> dict[str, Any]:
     found = "what was found" if result.findings else ""
     corrected = "the small correction of the inertias" if correction else ""
     largest = 0.0 if ratio is None or not ratio.size else float(np.abs(ratio).max())
+    more = len(result.recordings) - MOST_NAMED
     took = f"{result.wall_s:.1f} s" if result.wall_s > 0.0 else DASH
     return {
         "robot": result.model_name,
         "headline": _headline(result),
         "problem": not told,
-        "recordings": _named(result.recordings),
+        "recordings": [*result.recordings[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])],
         "several": len(result.recordings) > 1,
         "tiles": shown,
         "columns": max(len(shown), 1),
@@ -148,12 +149,6 @@ def _leftover(item: Leftover) -> str:
     follows = f"that follow {listed(signals) or 'no signal'}"
     said = f"{plain(item.rmse_nm, 2)} N m{size} {follows}, from {begin:.1f} to {end:.1f} s"
     return tied(f"Joint {item.joint}: {said}.")
-
-
-def _named(recordings: Sequence[str]) -> list[str]:
-    """The first few, and how many more."""
-    more = len(recordings) - MOST_NAMED
-    return [*recordings[:MOST_NAMED], *([f"{more} more"] if more > 0 else [])]
 
 
 def _tiles(result: GapResult) -> list[Tile]:

@@ -65,7 +65,12 @@ def _row(findings: Sequence[Finding]) -> FindingRow:
         when=when,
         values=[f"{_ranges(ordered)}; joint by joint below"]
         if in_matrix(ordered)
-        else [line for f in ordered for line in _values(f, alone)],
+        else [tied(line) for line in parameter_lines(first)]
+        if alone
+        else [
+            f"{f.recording or who(f.effect, f.joints)}: {', '.join(map(tied, parameter_lines(f)))}"
+            for f in ordered
+        ],
         evidence=sure if alone or least >= 0.999 else f"{sure} and more",
         worth=_worth(ordered),
     )
@@ -120,15 +125,6 @@ def joint_matrix(result: GapResult) -> Table | None:
         for j, name in enumerate(result.joint_names, start=1)
     ]
     return Table(heads, rows, units)
-
-
-def _values(finding: Finding, alone: bool) -> list[str]:
-    """A line per parameter; of one of several findings all on one, behind its joint."""
-    lines = [tied(line) for line in parameter_lines(finding)]
-    if alone:
-        return lines
-    where = finding.recording or who(finding.effect, finding.joints)
-    return [f"{where}: {', '.join(lines)}"]
 
 
 def _worth(findings: Sequence[Finding]) -> str:

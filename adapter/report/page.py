@@ -58,6 +58,9 @@ def context(data: RunData) -> dict[str, Any]:
     """What the template shows."""
     figures, started, worth = data.figures, theta_started(data), Worth.of(data)
     fit = data.times(data.score_trace)[fit_window(data)] if started else []
+    fault, start_s = figures.get("fault"), figures.get("start_s") or 0.0
+    ended = [f"The run ended early: {fault}"] if fault else []
+    new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
     return {
         "robot": data.documented.name,
         "headline": headline(data, worth),
@@ -89,7 +92,7 @@ def context(data: RunData) -> dict[str, Any]:
         "changes": tables.changes_table(data),
         "refused": tables.refused_table(figures),
         "gaps": len(figures.get("gaps") or []),
-        "warnings": _warnings(figures),
+        "warnings": [*ended, *new, *map(str, figures.get("warnings") or [])],
         "granted": [str(line) for line in figures.get("granted") or []],
         "speed": words.number(figures.get("times_real_time")),
         "timing": tables.timing_table(figures),
@@ -99,14 +102,6 @@ def context(data: RunData) -> dict[str, Any]:
         "schema_table": tables.schema_table(data),
         "provenance": tables.provenance_rows(data),
     }
-
-
-def _warnings(figures: dict[str, Any]) -> list[str]:
-    fault = figures.get("fault")
-    ended = [f"The run ended early: {fault}"] if fault else []
-    start_s = figures.get("start_s") or 0.0
-    new = [f"New disagreement: {sentence(x, start_s)}" for x in words.not_learned(figures)]
-    return [*ended, *new, *map(str, figures.get("warnings") or [])]
 
 
 def _histogram_panels(figures: Mapping[str, Any]) -> list[Panel]:

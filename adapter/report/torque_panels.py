@@ -77,6 +77,8 @@ def bodies_over_time(data: RunData, rows: Array) -> Array:
 
 def body_panels(data: RunData) -> list[Panel]:
     """θ over time (the paper's Fig. 6b), a panel per link: mass, first moments, inertia."""
+    from matplotlib.ticker import MaxNLocator
+
     t, rows = thin_rows(data.times(data.theta_trace), data.theta_trace, MOST_ROWS)
     theta = bodies_over_time(data, rows)
     panels = []
@@ -94,18 +96,12 @@ def body_panels(data: RunData) -> list[Panel]:
                     gid=named(PARAMETERS[k] if alone else f"({PARAMETERS[k]})"),
                 )
             ax.set_ylabel(unit, color=MUTED, fontsize=SIZES["quarter"][2], labelpad=1.0)
-            ax.yaxis.set_major_locator(_few())
+            ax.yaxis.set_major_locator(MaxNLocator(3))
         drawing.figure.subplots_adjust(left=0.21, hspace=0.1)
         drawing.figure.align_ylabels()
         _finish(drawing, t, data)
         panels.append(drawing.panel(link, ""))
     return panels
-
-
-def _few() -> Any:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(3)
 
 
 def effect_panels(data: RunData) -> list[Panel]:

@@ -127,7 +127,12 @@ def _frames(data: RunData) -> Check:
     rank, every = schema.get("identifiable_rank"), 6 * data.n
     start, at = counted_from(data.figures), schema.get("converged_s")
     goal = against(data.figures) if data.reference is not None else "documentation"
-    off = _off_words(data, goal)
+    turn, shift = schema.get("rotation_error_rad"), schema.get("position_error_m")
+    off = ""
+    if data.reference is not None and turn and shift and None not in [*turn, *shift]:
+        worst = f"{small(1e3 * max(turn), 'mrad')} and {small(1e3 * max(shift), 'mm')}"
+        what = "the documentation" if goal == "documentation" else goal
+        off = f", off {what} by {worst} on the worst joint"
     shown = f"motion shows {rank} of {every} directions of λ"
     if schema.get("source") == LAMBDA_MEASURED:
         when = f"did not stay within {GOALS}"
@@ -143,16 +148,6 @@ def _frames(data: RunData) -> Check:
         "measurement of this arm, which needs sensors on its links"
     )
     return Check(GOOD, "Where the joints are", said)
-
-
-def _off_words(data: RunData, goal: str) -> str:
-    schema = data.figures["lambda"]
-    turn, shift = schema.get("rotation_error_rad"), schema.get("position_error_m")
-    if data.reference is None or not turn or not shift or None in [*turn, *shift]:
-        return ""
-    worst = f"{small(1e3 * max(turn), 'mrad')} and {small(1e3 * max(shift), 'mm')}"
-    what = "the documentation" if goal == "documentation" else goal
-    return f", off {what} by {worst} on the worst joint"
 
 
 def _learner(data: RunData) -> Check | None:

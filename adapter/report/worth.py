@@ -187,7 +187,9 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
         shown = _values(torque.after, torque.after_std)
         columns.append(("Error, learned model", "N m rms", shown))
         if torque.before is not None:
-            columns.append(("Change", "", _changes(torque)))
+            shares = 100.0 * (torque.after / np.maximum(torque.before, 1e-12) - 1.0)
+            changes = [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
+            columns.append(("Change", "", changes))
     if tracking is not None and tracking.before is not None:
         columns.append(("Path error, feedback alone", "mrad rms", _values(1e3 * tracking.before)))
         columns.append(("Path error, with model", "mrad rms", _values(1e3 * tracking.after)))
@@ -199,12 +201,6 @@ def worth_table(data: RunData, worth: Worth) -> Table | None:
 def _values(values: Any, std: Any = None) -> list[str]:
     doubts = [None] * len(values) if std is None else std
     return [with_doubt(x, s) for x, s in zip(values, doubts, strict=True)]
-
-
-def _changes(fall: Fall) -> list[str]:
-    assert fall.before is not None
-    shares = 100.0 * (fall.after / np.maximum(fall.before, 1e-12) - 1.0)
-    return [f"{x:+.0f} %".replace("-", "−") if np.isfinite(x) else DASH for x in shares]
 
 
 def worth_panels(data: RunData, worth: Worth) -> list[Panel]:

@@ -18,13 +18,7 @@ from adapter.control.observer import Contact, ContactObserver
 from adapter.learning.learner import OnlineLearner
 from adapter.model.self_model import SelfModel
 from adapter.model.spatial import Array
-from adapter.physics.kernels import (
-    Frames,
-    JointMotion,
-    base_at_rest,
-    regressors,
-    wrench_torques,
-)
+from adapter.physics.kernels import Frames, JointMotion, base_at_rest, regressors, wrench_torques
 from drivers.interface import JointSample
 
 ADOPT_EVERY = 100  # samples
@@ -62,7 +56,10 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
     if len(seen) < LEAST:
         return Kind.OPEN
     since_s, q, dq, torque, std = np.array(seen).transpose(1, 0, 2).copy()
-    joints = JointMotion(q, dq, _rate(since_s[:, 0], dq))
+    times = since_s[:, 0]
+    cubics = np.polynomial.polynomial.polyder(np.polynomial.polynomial.polyfit(times, dq, 3))
+    ddq = np.ascontiguousarray(np.polynomial.polynomial.polyval(times, cubics).T)
+    joints = JointMotion(q, dq, ddq)
     crude = CRUDE * np.sqrt((torque**2).mean(axis=0))
     weight = 1.0 / np.sqrt(ALIKE * (std**2 + crude**2))
     ways = _ways(joints, frames, gravity, np.where(np.isfinite(effort), effort, 10.0))
@@ -76,13 +73,6 @@ def kind_of(contact: Contact, frames: Frames, gravity: Array, effort: Array) -> 
         if share > PROBABLE * odds.sum():
             return name
     return Kind.OPEN
-
-
-def _rate(times: Array, dq: Array) -> Array:
-    """Accelerations (m, n) of velocities that a cubic follows."""
-    factors = np.polynomial.polynomial.polyfit(times, dq, 3)
-    rates = np.polynomial.polynomial.polyder(factors)
-    return np.ascontiguousarray(np.polynomial.polynomial.polyval(times, rates).T)
 
 
 def _ways(

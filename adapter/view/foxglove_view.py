@@ -106,7 +106,13 @@ class FoxgloveView:
 
         arm = self._arm = known.documented
         self._context = context = foxglove.Context()  # channels end with it
-        self._channels = {topic: self._channel(topic, context) for topic in TOPICS}
+        self._channels: dict[str, Any] = {}
+        for topic, name in TOPICS.items():
+            data = schemas()[name].encode()
+            schema = foxglove.Schema(name=name, encoding="ros2msg", data=data)
+            self._channels[topic] = foxglove.Channel(
+                topic, schema=schema, message_encoding="cdr", context=context
+            )
         try:
             self._server = foxglove.start_server(
                 name=f"panda-adapter, {arm.name}",
@@ -122,14 +128,6 @@ class FoxgloveView:
         self._described_s, self._version = -np.inf, 0
         self._told: set[str] = set()
         self._headline = ""
-
-    def _channel(self, topic: str, context: Any) -> Any:
-        import foxglove
-
-        name = TOPICS[topic]
-        data = schemas()[name].encode()
-        schema = foxglove.Schema(name=name, encoding="ros2msg", data=data)
-        return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=context)
 
     def __call__(self, now: Now) -> None:
         """Take what is to be seen now; waits for nobody."""
@@ -152,7 +150,7 @@ class FoxgloveView:
             due["/external_torques"] = self._joints(push.stamp_ns, push.torque)
             base, wrench = self._arm.tree.base_name, push.wrench.reshape(2, 3)
             due["/external_wrench"] = wrench_fields(push.stamp_ns, base, wrench)
-        return due | self._slow(now) | self._words(now)
+        return due | self._slow(now)
 
     def _joints(self, stamp_ns: int, tau: Array, q: Array = NONE, dq: Array = NONE) -> Fields:
         """Torques (n,) N m, where they are told with q and dq (n,) rad and rad/s."""
@@ -160,7 +158,7 @@ class FoxgloveView:
         return {"header": header(stamp_ns), "name": self._arm.tree.joint_names, **signals}
 
     def _slow(self, now: Now) -> dict[str, Fields]:
-        """What is said when there is a new estimate, or news."""
+        """What is said when there is a new estimate, or news; and words, now and then."""
         due, snapshot = dict[str, Fields](), now.view.snapshot
         if snapshot is not None and now.frames is not None and snapshot.version != self._version:
             self._version = snapshot.version
@@ -177,10 +175,6 @@ class FoxgloveView:
             loop = now.lately.of("loop_us")
             shares = np.array([loop.percentile_us(share) or np.nan for share in (50.0, 99.0)])
             due["/loop_time"] = table_fields(("p50 and p99 of the last seconds, us",), shares)
-        return due
-
-    def _words(self, now: Now) -> dict[str, Fields]:
-        due = dict[str, Fields]()
         if now.view.elapsed_s - self._described_s > DESCRIPTION_S:
             self._described_s = now.view.elapsed_s
             due["/robot_description"] = self._description

@@ -151,8 +151,7 @@ class Messages:
         arm = self._documented
         if not np.isfinite(now.q).all():
             return {}
-        told = matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:]
-        placed = {"documented": told}
+        placed = {"documented": (matrix_from_zxz(arm.lam[:, :3]), arm.lam[:, 3:])}
         if now.frames is not None:
             placed["learned"] = now.frames.R, now.frames.p
         return {

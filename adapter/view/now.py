@@ -148,15 +148,12 @@ class Residual:
             for k in np.unique(np.linspace(0, len(records) - 1, ROWS_A_LOOK).astype(int)):
                 row = records[k]
                 self._last = row[at.joint_tau] - self._model(row[at.q], row[at.dq], row[at.ddq])
-                self._count(stamp_of(row))
+                since_s = 1e-9 * (stamp_of(row) - self._stamp_ns)
+                keep = math.exp(-since_s / RMS_S) if since_s > 0.0 else 0.0
+                self._stamp_ns = stamp_of(row)
+                before = np.where(np.isfinite(self._power), self._power, self._last**2)
+                self._power = keep * before + (1.0 - keep) * self._last**2
         return self._last, np.sqrt(self._power)
-
-    def _count(self, stamp_ns: int) -> None:
-        since_s = 1e-9 * (stamp_ns - self._stamp_ns)
-        keep = math.exp(-since_s / RMS_S) if since_s > 0.0 else 0.0
-        self._stamp_ns = stamp_ns
-        before = np.where(np.isfinite(self._power), self._power, self._last**2)
-        self._power = keep * before + (1.0 - keep) * self._last**2
 
 
 class Onlooker:

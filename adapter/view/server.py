@@ -280,22 +280,18 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header(name, value)
             self.end_headers()
             self.wfile.write(b"retry: %d\n\n" % RETRY_MS)
-            self._stream(server.newest)
+            seen: dict[str, int] = {}
+            last = False
+            while not last:
+                last = server.newest.closed
+                parts = server.newest.after(seen, KEEP_ALIVE_S)
+                events = [b"event: %s\ndata: %s\n\n" % (k.encode(), v) for k, v in parts.items()]
+                self.wfile.write(b"".join(events) or b": still here\n\n")
+                seen["history"] = 1 << 62  # once
         except OSError:  # gone, or too slow for too long
             pass
         finally:
             server.drop_listener()
-
-    def _stream(self, newest: Newest) -> None:
-        seen: dict[str, int] = {}
-        while True:
-            last = newest.closed
-            parts = newest.after(seen, KEEP_ALIVE_S)
-            events = [b"event: %s\ndata: %s\n\n" % (k.encode(), v) for k, v in parts.items()]
-            self.wfile.write(b"".join(events) or b": still here\n\n")
-            seen["history"] = 1 << 62  # once
-            if last:
-                return
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nobody asked."""

@@ -60,16 +60,13 @@ def test_a_wrong_option_is_told_with_the_likeliest(command: str, here: Path, ref
     words = [word.replace("FILE", "gone") for word in FILES.get(command, [])]
     words = {"sim": ["fci"], "experiment": ["panda"], "completion": ["bash"]}.get(command, words)
     assert "has no option '--nonsense'" in refused(command, *words, "--nonsense")
-    options = [o for a in _parser(command)._actions for o in a.option_strings if len(o) > 6]
+    (found,) = (a for a in build_parser()._actions if a.dest == "command")
+    parser = found.choices[command]
+    options = [o for a in parser._actions for o in a.option_strings if len(o) > 6]
     for option in (o for o in options if o != "--help"):
         wrong = option[:-2] + option[-1] + option[-2]
         if wrong not in options and wrong != option:
             assert "did you mean --" in refused(command, *words, f"{wrong}=1")
-
-
-def _parser(command: str):
-    (found,) = (a for a in build_parser()._actions if a.dest == "command")
-    return found.choices[command]
 
 
 @pytest.mark.parametrize(

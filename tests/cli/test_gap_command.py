@@ -98,6 +98,8 @@ def test_the_new_model_explains_more_and_the_old_one_stays(
     assert (data / "arm.urdf").read_text() == nominal_urdf(draw(5, "null").nominal)
     assert Path(figures["model_out"]) == folder / "out" / "model.json"
     assert all((folder / "out" / name).exists() for name in ("model.urdf", "gap.json"))
+    page = folder / "out" / "report.html"
+    assert figures["report"] == str(page) and "Coulomb friction" in page.read_text()
     log = read_log(data / "two.mcap")
     signals = 1e-9 * log.stamp_ns, log.q, log.dq, log.tau
     old, new = (
@@ -105,13 +107,6 @@ def test_the_new_model_explains_more_and_the_old_one_stays(
         for model in (documented(data / "arm.urdf"), load_model(figures["model_out"]))
     )
     assert new[3] < 0.2 * old[3] and (new < 1.1 * old).all()
-
-
-def test_the_page(found: tuple[Path, dict[str, Any]]) -> None:
-    folder, figures = found
-    page = folder / "out" / "report.html"
-    assert figures["report"] == str(page)
-    assert "Coulomb friction" in page.read_text()
 
 
 def test_a_model_is_never_written_over(data: Path, tmp_path: Path, refused) -> None:

@@ -255,7 +255,8 @@ def test_lines_come_out_above_the_table(seen: Seen, tmp_path: Path) -> None:
             table(replace(view, lines=["the recorder process died"] if k > 3 else []))
         table(seen.views[-1])
     rows, row = [""] * 400, 0
-    for part in _pieces(path.read_bytes().decode()):
+    text = path.read_bytes().decode().replace("\r", "")
+    for part in filter(None, re.split(r"(\x1b\[[0-9;?]*[A-Za-z]|\n)", text)):
         if part == "\n":
             row += 1
         elif part == "\x1b[1A":
@@ -266,10 +267,6 @@ def test_lines_come_out_above_the_table(seen: Seen, tmp_path: Path) -> None:
             rows[row] = part if part.strip("\r") else rows[row]
     left = [line.strip() for line in rows if line.strip()]
     assert left == ["the recorder process died"]
-
-
-def _pieces(text: str) -> Iterator[str]:
-    yield from (x for x in re.split(r"(\x1b\[[0-9;?]*[A-Za-z]|\n)", text.replace("\r", "")) if x)
 
 
 def test_the_page_needs_nothing_but_itself(seen: Seen) -> None:
@@ -386,7 +383,20 @@ def test_foxgloves_protocol(seen: Seen, course: list[Now]) -> None:
     assert got["/state"][-1][1].data == now.headline
     assert got["/findings"][-1][1].data.startswith("viscous friction (or coulomb")
     assert got["/robot_description"][-1][1].data.lstrip().startswith("<?xml")
-    _check_transforms(got["/tf"][-1][1].transforms, now)
+    model = pin.buildModelFromUrdf(str(PANDA_URDF))  # both arms' hands stand where it puts them
+    data = model.createData()
+    pin.forwardKinematics(model, data, now.q)
+    chain = {x.child_frame_id: x for x in got["/tf"][-1][1].transforms}
+    for prefix in ("", "learned/"):
+        place, name = pin.SE3.Identity(), prefix + PANDA.tree.link_names[-1]
+        while name in chain:
+            step = chain[name]
+            turn, shift = step.transform.rotation, step.transform.translation
+            turned = pin.Quaternion(turn.w, turn.x, turn.y, turn.z).matrix()
+            place = pin.SE3(turned, np.array([shift.x, shift.y, shift.z])) * place
+            name = step.header.frame_id
+        assert name == PANDA.tree.base_name
+        np.testing.assert_allclose(place.homogeneous, data.oMi[7].homogeneous, atol=1e-6)
 
 
 def _feed(shown: FoxgloveView, now: Now) -> None:
@@ -398,24 +408,6 @@ def _feed(shown: FoxgloveView, now: Now) -> None:
         shown._told.clear()
         time.sleep(0.05)
     shown._server.stop()
-
-
-def _check_transforms(transforms: list, now: Now) -> None:
-    """Of both arms, chained up from the base: the hand stands where pinocchio puts it."""
-    model = pin.buildModelFromUrdf(str(PANDA_URDF))
-    data = model.createData()
-    pin.forwardKinematics(model, data, now.q)
-    chain = {x.child_frame_id: x for x in transforms}
-    for prefix in ("", "learned/"):
-        place, name = pin.SE3.Identity(), prefix + PANDA.tree.link_names[-1]
-        while name in chain:
-            step = chain[name]
-            turn, shift = step.transform.rotation, step.transform.translation
-            turned = pin.Quaternion(turn.w, turn.x, turn.y, turn.z).matrix()
-            place = pin.SE3(turned, np.array([shift.x, shift.y, shift.z])) * place
-            name = step.header.frame_id
-        assert name == PANDA.tree.base_name
-        np.testing.assert_allclose(place.homogeneous, data.oMi[7].homogeneous, atol=1e-6)
 
 
 def test_a_port_of_foxglove_that_is_taken() -> None:

@@ -16,14 +16,7 @@ from adapter.model import model_file
 from adapter.model.self_model import SelfModel
 from adapter.runs.fleet.arm import FleetArm, learn_arm
 from adapter.runs.fleet.engine import here, on_cluster
-from adapter.runs.fleet.moments import (
-    Broken,
-    LogMoments,
-    Task,
-    content_of,
-    moments_of,
-    opened,
-)
+from adapter.runs.fleet.moments import Broken, LogMoments, Task, content_of, moments_of, opened
 from adapter.runs.fleet.store import Store, mark_of
 from adapter.signals.told import AS_RECORDED, Told
 from drivers.files.names import RECORDINGS, is_recording
@@ -342,7 +335,11 @@ def _arms(
     """One after the other, so that no more than the moments of one are in memory."""
     groups: dict[str, list[LogMoments]] = {}
     for head in heads:
-        groups.setdefault(_arm_of(head, documented, settings), []).append(head)
+        name = settings.manifest.arms.get(head.path)
+        if name is None:
+            by_folder = settings.by == "folder"
+            name = Path(head.path).parent.name if by_folder else head.arm or documented.name
+        groups.setdefault(name, []).append(head)
     told = {x.content: settings.manifest.told.get(x.path, {}) for x in heads}
     found = []
     for name in sorted(groups):
@@ -351,11 +348,3 @@ def _arms(
         if logs:
             found.append(learn_arm(name, logs, documented, told))
     return tuple(found)
-
-
-def _arm_of(log: LogMoments, documented: SelfModel, settings: Settings) -> str:
-    if log.path in settings.manifest.arms:
-        return settings.manifest.arms[log.path]
-    if settings.by == "folder":
-        return Path(log.path).parent.name
-    return log.arm or documented.name
